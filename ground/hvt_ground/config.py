@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from urllib.parse import urlsplit
 
-from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
+from hvt_common.config import BYTES, DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
@@ -18,6 +20,8 @@ from hvt_common.units import Limit, parse_limit
 __all__ = ["DEFAULT_PAGE", "DETECTOR", "MOTION", "NONE", "GroundConfig", "check"]
 
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
+LEAST_LOG_BYTES = 20_000_000
+"""Twice the largest message that there is, and room for a flight between."""
 DEFAULT_PAGE = "127.0.0.1:8080"
 
 
@@ -28,8 +32,24 @@ def _age(text: str, *, name: str) -> Limit:
     return limit
 
 
+def _cot_url(text: str, *, name: str) -> str:
+    """``udp``, ``tcp`` or ``tls``, a host and a port. No IPv6 address: the client, pytak, knows none."""
+    try:
+        parts = urlsplit(text)
+        good = parts.scheme in ("udp", "tcp", "tls") and bool(parts.hostname) and bool(parts.port)
+    except ValueError:
+        good = False
+    if not good or re.fullmatch(r"[a-z]+://[\w.-]+:[0-9]+", text, re.ASCII) is None:
+        raise UserError(
+            f"{name} {text!r} is not accepted: give udp://HOST:PORT, tcp://HOST:PORT or tls://HOST:PORT, with a "
+            "name or an IPv4 address"
+        )
+    return text
+
+
 _LIMIT = SettingType("LIMIT", parse_limit)
 _AGE = SettingType("AGE", _age)
+_COT = SettingType("URL", _cot_url)
 
 _LINK, _MODELS, _FILES = Group("link and edges"), Group("models"), Group("files and views")
 _LINK_RARE, _MODELS_RARE, _FILES_RARE = (replace(group, rare=True) for group in (_LINK, _MODELS, _FILES))
@@ -130,14 +150,36 @@ class GroundConfig:
     mcap: Path | None = _FILES.option(
         PATH, None, "also write MCAP for Foxglove: FILE.mcap, or a folder for one file a session"
     )
+    ts: str | None = _FILES_RARE.option(
+        TEXT,
+        None,
+        "also write MPEG-TS with KLV (docs/klv.md): FILE.ts, a folder for one file a session, udp://HOST:PORT or "
+        "srt://HOST:PORT",
+    )
     stills: Path | None = _FILES.option(
         PATH, None, "also write each still as a picture, with a table of them: a folder that is there"
     )
     log: Path | None = _FILES.option(
         PATH, None, "also keep every message as it came, for hvt-ground replay: FILE.hvtlog"
     )
+    log_size: int = _FILES_RARE.option(
+        BYTES, 4_000_000_000, "how large the log may become: then its older half makes room"
+    )
+    cot: tuple[str, ...] = _FILES_RARE.option(
+        _COT,
+        (),
+        "also report the camera and the tracks to ATAK as Cursor on Target, for example udp://239.2.3.1:6969 or "
+        "tls://takserver:8089 (docs/atak.md)",
+        many=True,
+    )
+    cot_types: Path | None = _FILES_RARE.option(
+        PATH, None, "with --cot: FILE.toml, which class and which edge is of which type (docs/atak.md)"
+    )
     timing: Path | None = _FILES_RARE.option(
         PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
+    )
+    terrain: Path | None = _FILES_RARE.option(
+        PATH, None, "place tracks on this elevation model, a GeoTIFF, in place of flat ground (docs/pose.md)"
     )
     view: bool = _FILES.switch("also open the Rerun viewer")
     serve: bool = _FILES.switch("also serve the Rerun web viewer on this machine")
@@ -184,8 +226,14 @@ def check(config: GroundConfig) -> GroundConfig:
     _check_retention(config)
     if config.web_proxy is not None and config.web is None:
         raise UserError(f"--web-proxy {config.web_proxy} is given without --web: give --web too")
+    if config.cot_types is not None and not config.cot:
+        raise UserError(f"--cot-types {config.cot_types} is given without --cot: give --cot too")
     if config.group is not None:
         GroupKeys(config.group)
+    if config.log_size < LEAST_LOG_BYTES:
+        raise UserError(
+            f"--log-size {config.log_size} bytes is not accepted: give at least {LEAST_LOG_BYTES // 10**6}MB"
+        )
     if config.view and config.serve:
         raise UserError("--view and --serve are both given: choose the viewer here or the one in a browser")
     if config.labels is not None and config.classifier in (None, DETECTOR, NONE):
@@ -226,6 +274,7 @@ def _check_files(config: GroundConfig) -> None:
         ("--record", config.record, ".rrd"),
         ("--tracks", config.tracks, ".csv"),
         ("--mcap", config.mcap, ".mcap"),
+        ("--ts", None if config.ts is None or "://" in config.ts else Path(config.ts), ".ts"),
         ("--timing", config.timing, None),
         ("--log", config.log, None),
         ("--summary", config.summary, None),

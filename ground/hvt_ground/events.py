@@ -12,7 +12,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.values import Boxes, Image
+from hvt_common.protocol.messages import RoiHeader
+from hvt_common.values import Boxes, Image, Pose, View
 
 __all__ = [
     "Event",
@@ -20,6 +21,8 @@ __all__ = [
     "Notice",
     "Origin",
     "Overlay",
+    "Places",
+    "PoseUpdate",
     "Refinement",
     "StillsRead",
     "Traffic",
@@ -41,6 +44,29 @@ class VideoSample:
     keyframe: bool
     stored: bool = False
     """It was stored at the edge while the link was down: it lies before others that are logged already."""
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where on the ground N objects are; NaN where that is not known."""
+
+    places_deg: npt.NDArray[np.float64]
+    """(N, 2) latitude and longitude, WGS 84."""
+    ellipses: npt.NDArray[np.float64]
+    """(N, 3) of the ellipse that holds the object with 95 %: half its longer axis and half its shorter one, metres,
+    and the longer one's direction, degrees clockwise from north, 0 up to 180."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseUpdate:
+    """Where the camera was."""
+
+    frame_index: int
+    """The newest frame when it came."""
+    capture_ns: int
+    pose: Pose
+    view: View
+    """From the source frame, whose field of view the pose says, to the base."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +98,8 @@ class Overlay:
     """(N,) True where stills say that it is nothing of mine; None is nowhere."""
     sure: npt.NDArray[np.bool_] | None = None
     """(N,) True where stills agree on the class with a calibrated probability above .9; None is nowhere."""
+    places: Places | None = None
+    """Where on the ground they are; None where no pose tells."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +145,8 @@ class Refinement:
     """``class_after`` has a calibrated probability above .9."""
     shown_index: int = 0
     """The frame that the still shows; ``frame_index`` is the one at which it was known."""
+    header: RoiHeader | None = None
+    """The still's own message, in source pixels; None where nobody has it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +205,6 @@ class StillsRead:
     at_ns: int
 
 
-FrameEvent = VideoSample | Overlay | Refinement | Traffic | Notice
+FrameEvent = VideoSample | Overlay | Refinement | Traffic | Notice | PoseUpdate
 """What a recording shows, at the frame and capture time that it carries."""
 Event = FrameEvent | MessageTiming | StillsRead

@@ -22,6 +22,15 @@ _GAUGES: Table[SessionState] = {
     "hvt_overlay_delay_p50_seconds": ("Capture to overlay.", lambda one: seconds(one.delay_p50_ms)),
     "hvt_overlay_delay_p95_seconds": ("Capture to overlay.", lambda one: seconds(one.delay_p95_ms)),
     "hvt_picture_age_seconds": ("Since the newest picture was captured.", lambda one: one.picture_age_s),
+    "hvt_pose_latitude_degrees": ("Of the camera.", lambda one: one.pose.latitude_deg if one.pose else None),
+    "hvt_pose_longitude_degrees": (
+        "Of the camera.",
+        lambda one: one.pose.longitude_deg if one.pose else None,
+    ),
+    "hvt_pose_age_seconds": (
+        "Of that place at the newest picture.",
+        lambda one: one.pose.age_s if one.pose else None,
+    ),
     "hvt_tracks": ("Distinct tracks of the session.", lambda one: one.tracks),
     "hvt_tracks_refined": ("Of these, refined by a still.", lambda one: one.tracks_refined),
     "hvt_tracks_doubted": ("Shown, and doubted by stills.", lambda one: one.tracks_doubted),

@@ -32,6 +32,18 @@ _THIN_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
+class PoseState:
+    """Where the camera was when it last said so."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float | None
+    """Above the ground."""
+    age_s: float
+    """Of the newest pose at the newest picture; after 10 s it places nothing."""
+
+
+@dataclass(frozen=True, slots=True)
 class SessionState:
     """The session of an edge that is open."""
 
@@ -62,6 +74,8 @@ class SessionState:
     delay_p95_ms: float | None
     picture_age_s: float | None
     """Since the newest picture was captured; None in lockstep."""
+    pose: PoseState | None
+    """None where none ever came."""
     frames_received: int
     frames_decoded: int
     frames_untracked: int
@@ -225,6 +239,14 @@ def _left_out(status: Status | None) -> int:
     return 0 if status is None else status.health.frames_dropped - status.health.frames_dropped_cpu
 
 
+def _pose(session: GroundSession) -> PoseState | None:
+    newest = session.geolocation.newest
+    if newest is None:
+        return None
+    age_s = max(0.0, (session.newest_capture_ns - newest.capture_ns) / SECOND_NS)
+    return PoseState(newest.latitude_deg, newest.longitude_deg, newest.height_m, age_s)
+
+
 def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState, now_ns: int) -> SessionState:
     info, pipeline, counters, status = session.info, session.pipeline, session.counters, session.last_status
     now: Traffic | None = None if link == "lost" else session.traffic
@@ -250,6 +272,7 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
         delay_p50_ms=None if session.lockstep else session.overlay_latency.percentile(50),
         delay_p95_ms=None if session.lockstep else session.overlay_latency.percentile(95),
         picture_age_s=None if captured_ns is None else max(0.0, (now_ns - captured_ns) / SECOND_NS),
+        pose=_pose(session),
         frames_received=session.frames_received,
         frames_decoded=session.frames_decoded,
         frames_untracked=session.frames_untracked,

@@ -25,7 +25,8 @@ from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording
 from hvt_ground.config import DETECTOR, GroundConfig
-from hvt_ground.events import Event
+from hvt_ground.events import Event, Refinement
+from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.models import Models, stills_calibrated, track_confidence
@@ -38,12 +39,17 @@ from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
+from hvt_ground.sinks.cot.reporter import SessionReporter, StillAddress
+from hvt_ground.sinks.cot.type_table import read_types
 from hvt_ground.sinks.message_log import MessageLog
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.still_files import StillFiles
+from hvt_ground.sinks.still_files import StillFiles, picture_of
 from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.sinks.tracks_table import TrackTable
+from hvt_ground.sinks.transport_stream.destination import Addresses, check_destination, destination
+from hvt_ground.sinks.transport_stream.stream import live_stream, stream_file
+from hvt_ground.sinks.transport_stream.uas import Platform
 
 if TYPE_CHECKING:  # who serves no page needs no web server, nor protobuf who writes no MCAP
     from hvt_ground.sinks.mcap_file import McapFile
@@ -53,11 +59,13 @@ __all__ = [
     "Models",
     "OpenSink",
     "SessionFactory",
+    "check_cot",
     "check_outputs",
     "make_backlog_perception",
     "make_link_settings",
     "make_pipeline",
     "make_record_folder",
+    "make_surface",
     "output_path",
 ]
 
@@ -100,9 +108,12 @@ class SessionFactory:
         """Whether there are recordings: a program takes their place unless they are asked for."""
         self._paths: set[Path] = set()
         """Taken by this process."""
+        self._addresses = Addresses()
         self._naming = threading.Lock()
         if config.mcap is not None:
             _mcap_file()  # that it is there
+        make_surface(config.terrain)
+        self._cot = _cot(config, outputs)
         self._timing: QueuedSink[str] | None = None
         if config.timing is not None:
             names = partial(_take, [config.timing], number=2, may_exist=config.timing)
@@ -111,7 +122,8 @@ class SessionFactory:
         """Takes all that comes from edges."""
         if config.log is not None:
             names = partial(_take, [config.log], number=2, may_exist=config.log)
-            self.message_log = outputs.open("message log", partial(self._opened, MessageLog, names)).log
+            make_log = partial(MessageLog, most_bytes=config.log_size)
+            self.message_log = outputs.open("message log", partial(self._opened, make_log, names)).log
 
     def open_session(self, info: Info, reports: ReceiverReports) -> GroundSession:
         """A session with its perception and its sinks."""
@@ -134,6 +146,7 @@ class SessionFactory:
             sinks.append(self._outputs.open(f"live view of {edge}", open_live))
         if self._page is not None:
             sinks.append(self._outputs.open(f"web page of {edge}", self._page.feed(info)))
+        files: dict[str, QueuedSink[Event]] = {}
         for target, what, suffix, make in (
             (config.tracks, "tracks table", ".csv", TrackTable),
             (config.mcap, "MCAP file", ".mcap", lambda path: _mcap_file()(path, edge=edge)),
@@ -142,7 +155,15 @@ class SessionFactory:
             if target is not None:
                 names = partial(output_path, target, suffix=suffix, edge=edge, stamp=stamp)
                 open_file = partial(self._opened, make, names)
-                sinks.append(self._outputs.open(f"{what} of {edge}", open_file, wait_s=wait_s))
+                files[what] = self._outputs.open(f"{what} of {edge}", open_file, wait_s=wait_s)
+        sinks += files.values()
+        if config.ts is not None:
+            opens_stream = self._transport_stream(info, config.ts, stamp=stamp)
+            sinks.append(self._outputs.open(f"MPEG-TS of {edge}", opens_stream, wait_s=wait_s))
+        if self._cot is not None:
+            address = self._still_address(info, files.get("stills"))
+            open_reporter = partial(self._cot, info, clock=self._clock, still_address=address)
+            sinks.append(self._outputs.open(f"CoT of {edge}", open_reporter))
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
         return GroundSession(
@@ -152,6 +173,7 @@ class SessionFactory:
             clock=self._clock,
             reports=reports,
             backlog_perception=make_backlog_perception(config, models, info=info),
+            surface=make_surface(config.terrain),
         )
 
     def open_backlog(self, info: Info) -> BacklogRecording:
@@ -163,6 +185,30 @@ class SessionFactory:
         sink = self._outputs.open(part, partial(self._opened, self._files(settings, backlog=True), names))
         perception = make_backlog_perception(self._config, self._models, info=info)
         return BacklogRecording(info, sink=sink, perception=perception)
+
+    def _transport_stream(self, info: Info, target: str, *, stamp: str) -> Callable[[], SinkWriter[Event]]:
+        surface = make_surface(self._config.terrain)
+        platform = Platform(info.edge, f"{info.session_id:016x}", info.view, surface)
+        where = destination(target)
+        if isinstance(where, Path):
+            make = partial(stream_file, platform=platform, fps=info.fps)
+            names = partial(output_path, where, suffix=".ts", edge=info.edge, stamp=stamp)
+            return partial(self._opened, make, names)
+        address = where.of_edge(info.edge)
+        return partial(live_stream, address, platform=platform, fps=info.fps, addresses=self._addresses)
+
+    def _still_address(self, info: Info, files: QueuedSink[Event] | None) -> StillAddress:
+        """Where the picture of a still is: on the page, else in the folder of ``--stills``, else nowhere."""
+        page = self._page
+
+        def address(still: Refinement) -> str:
+            if page is not None:
+                return page.still_address(info, still)
+            if files is None or not files.files or still.still_bgr is None or still.crop_base_px is None:
+                return ""
+            return str(picture_of(still, files.files[-1].resolve()))
+
+        return address
 
     def _files(
         self, settings: RecorderSettings, *, split: Limit | None = None, backlog: bool = False
@@ -197,14 +243,45 @@ class SessionFactory:
                 "detector": Path(config.detector).name,
                 "classifier": Path(config.classifier or "none").name,
             },
+            info=info.pack(),
             clocked=info.pace == "realtime",
         )
+
+
+def make_surface(terrain: Path | None) -> Surface:
+    """What tracks stand on; `UserError` where the file is no elevation model."""
+    if terrain is None:
+        return FLAT_GROUND
+    with needs_extra("'hvt[terrain]'"):
+        from hvt_ground.geolocation.terrain import Terrain  # noqa: PLC0415 - who has none needs no GDAL
+    return Terrain(terrain)
 
 
 def _mcap_file() -> type[McapFile]:
     with needs_extra("'hvt[mcap]'"):
         from hvt_ground.sinks.mcap_file import McapFile  # noqa: PLC0415 - who writes none needs no protobuf
     return McapFile
+
+
+def check_cot(config: GroundConfig) -> None:
+    """Refuse types and certificates of ``--cot`` that cannot be used, before anything is received; `UserError`."""
+    if config.cot:
+        with needs_extra("'hvt[cot]'"):
+            from hvt_ground.sinks.cot.connection import check_connection  # noqa: PLC0415 - who has none needs no pytak
+        read_types(config.cot_types)
+        for url in config.cot:
+            check_connection(url)
+
+
+def _cot(config: GroundConfig, outputs: Outputs) -> Callable[..., SinkWriter[Event]] | None:
+    """What makes the reporter of a session to all of ``--cot``; None without."""
+    if not config.cot:
+        return None
+    check_cot(config)
+    from hvt_ground.sinks.cot.connection import CotConnection  # noqa: PLC0415 - as above
+
+    targets = [outputs.open(f"CoT {url}", partial(CotConnection, url)) for url in config.cot]
+    return partial(SessionReporter, targets=targets, types=read_types(config.cot_types))
 
 
 def _live_recorder(settings: RecorderSettings, view: LiveView) -> Recorder:
@@ -217,6 +294,7 @@ def check_outputs(config: GroundConfig) -> None:
     check_writable(config.summary, name="--summary")
     check_writable(config.timing, name="--timing")
     check_writable(config.log, name="--log")
+    check_destination(config.ts)
     for path, suffix, name in (
         (config.tracks, ".csv", "--tracks"),
         (config.mcap, ".mcap", "--mcap"),

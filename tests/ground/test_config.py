@@ -42,6 +42,7 @@ def test_without_flags_it_listens_and_needs_no_model():
         (["--timing", "a.csv", "--tracks", "./a.csv"], "--tracks and --timing both name a.csv: give each"),
         (["--timing", "a.csv", "--summary", "b/../a.csv"], "--timing and --summary both name b/../a.csv"),
         (["--record", "a.rrd", "--summary", "a.rrd"], "--record and --summary both name a.rrd"),
+        (["--ts", "a.ts", "--summary", "./a.ts"], "--ts and --summary both name a.ts"),
         (["--detect-every", "0"], "whole number from 1"),
         (["--threads", "many"], "whole number from 1"),
     ],
@@ -56,6 +57,7 @@ def test_folders_and_devices_may_be_named_twice(tmp_path):
     """``--record out --tracks out`` would be refused, though each file in it has a name of its own."""
     read("--record", str(tmp_path), "--tracks", str(tmp_path), "--timing", str(tmp_path / "a.csv"))
     read("--record", "out", "--tracks", "out")
+    read("--ts", "udp://127.0.0.1:5600", "--summary", "udp:")
     read("--timing", "/dev/null", "--summary", "/dev/null")
 
 

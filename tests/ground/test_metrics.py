@@ -49,7 +49,7 @@ def test_a_ground_in_service_can_be_watched(tmp_path):
     address = f"127.0.0.1:{free_ports(1)[0]}"
     with Link(tmp_path) as link:
         ground = link.ground("--metrics", address, "--detector", "motion", "--classifier", "none")
-        edge = link.edge(*EDGE, "--edge-id", "uav-1")
+        edge = link.edge(*EDGE, "--edge-id", "uav-1", "--pose", "fixed:48.1,11.5,120,90,-45", "--fov", "60")
         received = ("hvt_frames_received_total", "uav-1")
 
         def flies() -> bool:
@@ -59,7 +59,14 @@ def test_a_ground_in_service_can_be_watched(tmp_path):
                 return False  # it is starting
 
         eventually(flies, within_s=60, what="the metrics show frames")
+        eventually(
+            lambda: ("hvt_pose_age_seconds", "uav-1") in series(address),
+            within_s=30,
+            what="it says where it is",
+        )
         found = series(address)
+        assert found["hvt_pose_latitude_degrees", "uav-1"] == pytest.approx(48.1)
+        assert found["hvt_pose_age_seconds", "uav-1"] < 30
         assert found["hvt_budget_bits_per_second", "uav-1"] == 800_000
         assert found["hvt_received_bits_per_second", "uav-1"] > 0
         assert found["hvt_link", "uav-1"] == 1
@@ -67,11 +74,13 @@ def test_a_ground_in_service_can_be_watched(tmp_path):
         said = status("--at", address)
         assert said.returncode == 0, said.stderr
         assert "uav-1" in said.stdout
+        assert "uav-1 is at 48.10000, 11.50000" in said.stdout
         state = json.loads(status("--at", address, "--json").stdout)
         session = state["edges"][0]["session"]
         assert session["frames_received"] > 5
         assert 0 < session["budget_share"] <= 1
         assert (session["stills_pending"], session["tracks_doubted"]) == (0, 0), "video alone"
+        assert session["pose"]["height_m"] == pytest.approx(120, abs=0.1)
         assert state["schema_version"] == WIRE_VERSION
         with pytest.raises(urllib.error.HTTPError, match="404"):
             read(address, "/../../etc/passwd")

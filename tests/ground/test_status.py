@@ -122,6 +122,7 @@ def test_the_state_says_what_is_known_and_nothing_else(ground):
     assert (edge.link, edge.session.frames_received, edge.session.tracks_refined) == ("up", 5, 0)
     assert edge.session.stills_not_sent == {"base_good": 49, "cooldown": 3, "too_large": 1}
     assert edge.session.edge_frames_dropped == 0
+    assert edge.session.pose is None
     since_ns = edge.link_since_ns
     now_ns[0] += 10**9
     assert maker.make([("uav-1", ground.sessions)]).edges[0].link_since_ns == since_ns

@@ -26,7 +26,15 @@ import zenoh
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, parse_key, selector
-from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, Info, RoiHeader, WireError
+from hvt_common.protocol.messages import (
+    Command,
+    ControlAnswer,
+    ControlRequest,
+    Info,
+    RoiHeader,
+    UnknownVersionError,
+    WireError,
+)
 from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.transport.rights import Rights
@@ -221,7 +229,7 @@ class RemoteEdge:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
         received = ReceivedStill(header, item.payload)
         try:
-            image = decode_still(received, base_bgr=None, view=info.view)
+            image = decode_still(received, base=None, view=info.view)
         except StillError as error:
             raise UserError(f"{self.name} sent a still that cannot be decoded: {error}") from None
         return RequestedStill(self.name, header, item.payload, image)
@@ -293,6 +301,8 @@ class RemoteEdge:
     def _parsed(self, parse: Callable[[bytes], _Answer], data: bytes) -> _Answer:
         try:
             return parse(data)
+        except UnknownVersionError as error:
+            raise UserError(error.between(f"edge {self.name}", "this ground")) from None
         except WireError as error:
             raise UserError(f"the answer of {self.name} cannot be used: {error}") from None
 

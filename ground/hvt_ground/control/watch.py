@@ -12,6 +12,10 @@ from hvt_common.units import SECOND_NS, bitrate_text, counts_text
 
 __all__ = ["run"]
 
+_COLUMNS = ("edge", "link", "of budget", "delay p95", "picture", "stills", "tracks", "does not work")
+_FRESH_S = 3.0
+"""A pose comes about once a second: of an older one is said how old it is."""
+
 
 def run(argv: Sequence[str]) -> int:
     """Print it once, or each second; `FlightError` where no ground answers."""
@@ -21,7 +25,7 @@ def run(argv: Sequence[str]) -> int:
 def _table(state: dict[str, Any]) -> Table:
     title = f"hvt-ground {state['version']}, {', '.join(filter(None, (state['member'], state['detector'])))}"
     table = Table(title=title, title_justify="left")
-    for name in ("edge", "link", "of budget", "delay p95", "picture", "stills", "tracks", "does not work"):
+    for name in _COLUMNS:
         table.add_column(name)
     for one in state["edges"]:
         for_s = max(0, (state["at_ns"] - one["link_since_ns"]) / SECOND_NS)
@@ -31,14 +35,25 @@ def _table(state: dict[str, Any]) -> Table:
             one["edge"], link, *_session_cells(one["session"]), "; ".join(f["part"] for f in failed)
         )
     for edge, one in state["elsewhere"].items():
-        table.add_row(edge, f"at {one['member']}", *("",) * 6)
-    table.caption = "; ".join(f"{one['part']}: {one['reason']}" for one in state["failed"]) or None
+        table.add_row(edge, f"at {one['member']}", *("",) * (len(_COLUMNS) - 2))
+    said = [
+        f"{one['edge']} is at {_place(one['session']['pose'])}"
+        for one in state["edges"]
+        if one["session"] and one["session"]["pose"]
+    ]
+    said += [f"{one['part']}: {one['reason']}" for one in state["failed"]]
+    table.caption = "; ".join(said) or None
     return table
+
+
+def _place(pose: dict[str, Any]) -> str:
+    place = f"{pose['latitude_deg']:.5f}, {pose['longitude_deg']:.5f}"
+    return place if pose["age_s"] < _FRESH_S else f"{place} ({pose['age_s']:.0f} s old)"
 
 
 def _session_cells(session: dict[str, Any] | None) -> tuple[str, ...]:
     if session is None:
-        return ("",) * 5
+        return ("",) * (len(_COLUMNS) - 3)
     rate = "no bits" if session["total_bps"] is None else bitrate_text(session["total_bps"])
     p95, age, why = session["delay_p95_ms"], session["picture_age_s"], session["stills_not_sent"]
     return (

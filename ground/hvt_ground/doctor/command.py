@@ -25,7 +25,7 @@ from hvt_common.runtime.reporting import check_writable
 from hvt_common.transport.reach import check_link
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.models import Models
-from hvt_ground.wiring import make_link_settings
+from hvt_ground.wiring import check_cot, make_link_settings
 
 __all__ = ["run"]
 
@@ -47,6 +47,7 @@ def run(argv: Sequence[str]) -> int:
         "models": lambda: _models(config),
         "recordings": lambda: _recordings(config),
         "ports": lambda: _ports(config),
+        **({"reports": lambda: _reports(config)} if config.cot else {}),
         "clock": check_clock,
         "link": lambda: check_link(make_link_settings(config), _edges, other="edge"),
     }
@@ -100,6 +101,12 @@ def _ports(config: GroundConfig) -> Finding:
             check_port(address, name=name, packages=packages)
             free.append(f"{address} for {name}")
     return Finding("ok", f"free: {', '.join(free)}" if free else "no --web, no --metrics")
+
+
+def _reports(config: GroundConfig) -> Finding:
+    """Whether they could be sent; not whether anybody is there, for who connects is shown to others."""
+    check_cot(config)
+    return Finding("ok", f"to {', '.join(config.cot)}; types and certificates can be read")
 
 
 def _edges(session: zenoh.Session) -> str:

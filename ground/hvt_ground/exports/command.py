@@ -12,11 +12,13 @@ from pathlib import Path
 
 from hvt_common.errors import Parser, UserError, needs_extra
 from hvt_common.runtime.reporting import say
+from hvt_ground.exports.maps import write_geojson, write_kml
 from hvt_ground.exports.pictures import write_coco, write_stills
-from hvt_ground.exports.recorded import Recorded, RecordedStill, read_recordings
 from hvt_ground.exports.tables import write_csv, write_mot, write_parquet
 from hvt_ground.exports.video import CONTAINERS, write_video
 from hvt_ground.exports.whole import whole_file, whole_folder
+from hvt_ground.recordings.recorded import Recorded, RecordedStill, read_recordings
+from hvt_ground.wiring import make_surface
 
 __all__ = ["run"]
 
@@ -41,6 +43,8 @@ def _write_mcap(recorded: Recorded, path: Path) -> None:
 
 _FILES: dict[str, Callable[[Recorded, Path], None]] = {
     "csv": write_csv,
+    "geojson": write_geojson,
+    "kml": write_kml,
     "mcap": _write_mcap,
     "mot": write_mot,
     "parquet": write_parquet,
@@ -55,7 +59,7 @@ def run(argv: Sequence[str]) -> int:
     if given.burn_in and kind not in CONTAINERS:
         raise UserError(f"--burn-in draws into video, and --to is {kind}: give {', '.join(CONTAINERS)}")
     out = given.out or _beside(given.recordings[0], kind)
-    recorded = read_recordings(given.recordings)
+    recorded = read_recordings(given.recordings, surface=make_surface(given.terrain))
     if kind in _FOLDERS:
         with whole_folder(out) as part:
             _FOLDERS[kind](recorded, part)
@@ -106,6 +110,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PATH",
         type=Path,
         help=f"the file, of {' and '.join(_FOLDERS)} the folder, to write (default: beside the recording)",
+    )
+    parser.add_argument(
+        "--terrain",
+        metavar="FILE.tif",
+        type=Path,
+        help="an elevation model that tracks stand on (default: flat)",
     )
     parser.add_argument("--burn-in", action="store_true", help="draw boxes, ids and classes into the video")
     return parser

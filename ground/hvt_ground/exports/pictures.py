@@ -11,8 +11,8 @@ import cv2
 
 from hvt_common.errors import UserError
 from hvt_ground.events import Overlay
-from hvt_ground.exports.recorded import Recorded
 from hvt_ground.exports.video import pictures
+from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.tracks_table import utc_text
 
 __all__ = ["STILL_COLUMNS", "write_coco", "write_stills"]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hvt_ground.exports.recorded import Recorded
+from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.tracks_table import COLUMNS, track_rows
 
 __all__ = ["write_csv", "write_mot", "write_parquet"]
@@ -23,6 +23,8 @@ _TYPES = {
     **dict.fromkeys(("x", "y", "w", "h", "confidence"), pa.float32()),
     **dict.fromkeys(("base_class", "class", "origin"), pa.dictionary(pa.int32(), pa.string())),
     **dict.fromkeys(("refined", "late", "doubted"), pa.bool_()),
+    **dict.fromkeys(("latitude", "longitude"), pa.float64()),
+    "error_m": pa.float32(),
 }
 
 
@@ -48,7 +50,7 @@ def _table(rows: Sequence[tuple[object, ...]], schema: pa.Schema) -> pa.Table:
     for field, column in zip(schema, zip(*rows, strict=True), strict=True):
         kind = field.type
         number = float if pa.types.is_floating(kind) else bool if pa.types.is_boolean(kind) else None
-        values = column if number is None else [number(one) for one in column]
+        values = column if number is None else [None if one == "" else number(one) for one in column]
         text = pa.types.is_dictionary(kind)
         columns.append(pa.array(values, pa.string()).cast(kind) if text else pa.array(values, kind))
     return pa.table(columns, schema=schema)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import io
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -15,12 +16,14 @@ from av.container import OutputContainer
 
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Image
+from hvt_common.values import Image, View
 from hvt_common.video.annex_b import parameter_sets
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Overlay, VideoSample
-from hvt_ground.exports.recorded import Recorded
+from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.palette import class_colour
+from hvt_ground.sinks.transport_stream.stream import stream_file
+from hvt_ground.sinks.transport_stream.uas import Platform
 
 __all__ = ["CONTAINERS", "pictures", "write_video"]
 
@@ -29,15 +32,20 @@ CONTAINERS = {"mp4": "mp4", "mkv": "matroska", "ts": "mpegts"}
 _TIME_BASE = Fraction(1, 1000)
 """MP4 has 32 bits for the time between two pictures: 24 days."""
 _CRF = "20"
+_USUAL_FPS = 15.0
+"""A recording does not say it; it counts where a clock was set."""
 
 
 def write_video(recorded: Recorded, path: Path, *, container: str, burn_in: bool) -> None:
     """Write the pictures with their capture times, from 0 on; ``creation_time`` is when the first was taken.
 
-    ``burn_in`` draws boxes, ids and classes into them, which codes them again (H.264). Raises `UserError` where the
-    recording has no video.
+    ``burn_in`` draws boxes, ids and classes into them, which codes them again (H.264). MPEG-TS has KLV beside them,
+    as ``--ts`` has, but not beside pictures with boxes. Raises `UserError` where the recording has no video.
     """
     samples = _from_keyframe(recorded)
+    if container == "ts" and not burn_in:
+        _write_stream(recorded, samples[0], path)
+        return
     taken = datetime.fromtimestamp(samples[0].capture_ns / SECOND_NS, UTC).isoformat()
     with av.open(str(path.absolute()), "w", format=CONTAINERS[container]) as output:
         output.metadata["creation_time"] = taken
@@ -45,7 +53,7 @@ def write_video(recorded: Recorded, path: Path, *, container: str, burn_in: bool
         if burn_in:
             _draw(recorded, output)
         else:
-            _copy(samples, output)
+            _copy(samples, output, container)
 
 
 def pictures(recorded: Recorded) -> Iterator[tuple[VideoSample, Image, Overlay]]:
@@ -71,9 +79,33 @@ def _from_keyframe(recorded: Recorded) -> list[VideoSample]:
     return list(recorded.video[first:])
 
 
-def _copy(samples: list[VideoSample], output: OutputContainer) -> None:
+def _write_stream(recorded: Recorded, first: VideoSample, path: Path) -> None:
+    if recorded.info is not None:
+        view = recorded.info.view
+    elif recorded.poses:
+        view = recorded.poses[0].view
+    else:
+        with av.open(io.BytesIO(first.data), format="hevc") as probe:
+            size = probe.streams.video[0].width, probe.streams.video[0].height
+        view = View.fitted(size, size, fit="letterbox")
+    platform = Platform(recorded.edge, recorded.session, view, recorded.surface)
+    stream = stream_file(path, platform=platform, fps=_USUAL_FPS, trail=recorded.trail)
+    items: Iterator[VideoSample | Overlay] = heapq.merge(
+        recorded.video, recorded.overlays(), key=lambda one: one.frame_index
+    )
+    try:
+        for item in items:
+            stream.log(item)
+    finally:
+        stream.close()
+
+
+def _copy(samples: list[VideoSample], output: OutputContainer, container: str) -> None:
     with av.open(io.BytesIO(samples[0].data), format="hevc") as probe:
         stream = output.add_stream_from_template(probe.streams.video[0])
+    if container == "mp4" and len({parameter_sets(one.data) for one in samples if one.keyframe}) == 1:
+        # Apple's players take no other; it has parameter sets once for all, so that they must not change.
+        stream.codec_context.codec_tag = "hvc1"
     stream.time_base = _TIME_BASE
     for sample, at in _timed(samples):
         packet = av.Packet(sample.data)

@@ -20,7 +20,7 @@ from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig, check
-from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
 
 __all__ = ["Listening", "Picture", "Received", "listen"]
 
@@ -47,7 +47,7 @@ class Received:
 
     edge: str
     session_id: int
-    event: Picture | Overlay | Refinement | Traffic | Notice
+    event: Picture | Overlay | PoseUpdate | Refinement | Traffic | Notice
 
 
 def listen(**settings: object) -> Listening:
@@ -128,11 +128,11 @@ class _Queue:
         self._awaits_keyframe = {False: True, True: True}
 
     def log(self, item: Event) -> None:
-        event: Picture | Overlay | Refinement | Traffic | Notice | None = None
+        event: Picture | Overlay | PoseUpdate | Refinement | Traffic | Notice | None = None
         match item:
             case VideoSample():
                 event = self._decoded(item)
-            case Overlay() | Refinement() | Traffic() | Notice():
+            case Overlay() | PoseUpdate() | Refinement() | Traffic() | Notice():
                 event = item
         if event is not None:
             self._put(Received(self._info.edge, self._info.session_id, event))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hvt_common.protocol.messages import BacklogHeader, RoiHeader, Status, TrackStep
+from hvt_common.protocol.messages import BacklogHeader, PoseReport, RoiHeader, Status, TrackStep
 from hvt_common.transport.inbox import Received
 from hvt_ground.link.reassemble import Arrival
 
@@ -25,5 +25,5 @@ class BasePacket:
 class Packet:
     """Any other message."""
 
-    header: RoiHeader | TrackStep | BacklogHeader | Status
+    header: RoiHeader | TrackStep | PoseReport | BacklogHeader | Status
     item: Received

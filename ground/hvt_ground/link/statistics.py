@@ -20,6 +20,7 @@ from hvt_common.protocol.messages import (
     BacklogHeader,
     BaseHeader,
     Info,
+    PoseReport,
     RoiHeader,
     Status,
     TrackStep,
@@ -240,7 +241,7 @@ class SessionAccount:
         self,
         kind: str,
         item: Received,
-        header: BaseHeader | RoiHeader | TrackStep | Status | BacklogHeader,
+        header: BaseHeader | RoiHeader | TrackStep | PoseReport | Status | BacklogHeader,
         *,
         handled: bool | None,
     ) -> None:
@@ -252,7 +253,7 @@ class SessionAccount:
         self._emit(
             MessageTiming(
                 kind=kind,
-                sequence=header.number if isinstance(header, BacklogHeader) else header.sequence,
+                sequence=header.number if isinstance(header, BacklogHeader | PoseReport) else header.sequence,
                 frame_index=frame_index,
                 capture_ns=capture_ns,
                 send_ns=header.send_ns,

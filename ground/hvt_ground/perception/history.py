@@ -90,8 +90,12 @@ class History:
             if len(self._tracks) > self._track_frames:
                 self._tracks.popitem(last=False)
 
-    def frame(self, frame_index: int) -> Image | None:
+    def picture(self, frame_index: int) -> Image | YuvPicture | None:
         """The picture of that frame as it was given; None if it was never decoded or is gone."""
+        return self._frames.get(frame_index)
+
+    def frame(self, frame_index: int) -> Image | None:
+        """The same as BGR."""
         picture = self._frames.get(frame_index)
         return None if picture is None else as_bgr(picture)
 

@@ -1,4 +1,4 @@
-"""``hvt-ground replay FILE.hvtlog [SETTINGS]``: receive again what was received, with other models or rules.
+"""``hvt-ground replay FILE [SETTINGS]``: receive again what was received, with other models or rules.
 
 It is the ground of the flight without its link: nothing is skipped for lack of time, so that the same file and the
 same settings give the same recording, tables and summary.
@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,8 @@ from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.models import Models
+from hvt_ground.recordings.recorded import read_recordings
+from hvt_ground.replay.from_recording import messages_of
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import InfoAnswer
@@ -37,8 +41,10 @@ from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.status import completed, summary, table
 from hvt_ground.wiring import SessionFactory, check_outputs, make_record_folder
 
-__all__ = ["run"]
+__all__ = ["messages_in", "run"]
 
+_Messages = Callable[[], Iterator[Received]]
+"""All that was received, from the beginning."""
 _OF_A_LINK = (
     "listen",
     "connect",
@@ -63,24 +69,29 @@ def run(argv: Sequence[str]) -> int:
     parser.add_argument("--speed", type=float, default=math.inf)
     parser.add_argument("--help", "-h", action="store_true")
     given, words = parser.parse_known_args(list(argv))
-    if given.help or not words or words[0].startswith("-"):
+    files = [Path(one) for one in takewhile(lambda one: not one.startswith("-"), words)]
+    if given.help or not files:
         raise UserError(
-            "give the file first: hvt-ground replay FILE.hvtlog [--speed 1] [settings of hvt-ground]"
+            "give the files first: hvt-ground replay FILE.hvtlog|FILE.rrd … [--speed 1] [settings of hvt-ground]"
         )
     if not given.speed > 0:
         raise UserError(f"--speed {given.speed:g} is not accepted: give more than 0; 1 is as it came")
-    path = Path(words[0])
-    config, loaded = load(GroundConfig, words[1:], program="hvt-ground replay", description=str(__doc__))
+    messages = messages_in(files)
+    config, loaded = load(
+        GroundConfig, words[len(files) :], program="hvt-ground replay", description=str(__doc__)
+    )
     for name in _OF_A_LINK:
         if name in loaded.values:
             raise UserError(f"--{name.replace('_', '-')} is not accepted: a replay has no link")
+    if "cot" in loaded.values:
+        raise UserError("--cot is not accepted: others would take what is replayed for what is there now")
     if config.provider == "auto":  # by its speed it may choose one this time and another the next
         config = replace(config, provider="cpu")
-    sessions = _Replay(check(config), path, speed=given.speed).run()
+    sessions = _Replay(check(config), messages, speed=given.speed).run()
     for content in sessions:
         print_table(f"{content['edge']}: received", table(content))
     if not sessions:
-        say(f"hvt-ground: {path} has no session that can be shown")
+        say(f"hvt-ground: {files[0]} has no session that can be shown")
     if config.summary is not None:
         write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions)
     return 0
@@ -116,9 +127,9 @@ class _ReplayPort:
 
 
 class _Replay:
-    def __init__(self, config: GroundConfig, path: Path, *, speed: float) -> None:
+    def __init__(self, config: GroundConfig, messages: _Messages, *, speed: float) -> None:
         self._config = config
-        self._path = path
+        self._messages = messages
         self._speed = speed
         self._now_ns = 0
         self._stop = stop_on_signals()
@@ -127,7 +138,7 @@ class _Replay:
         """Play all of it; a summary a session."""
         check_edge_pattern(self._config.edges)
         check_outputs(self._config)
-        infos = _infos(self._path)
+        infos = _infos(self._messages())
         make_record_folder(self._config)
         models = Models(self._config)
         ended: list[tuple[dict[str, Any], GroundSession]] = []
@@ -164,10 +175,10 @@ class _Replay:
 
     def _paced(self) -> Iterator[Received]:
         """The messages, each at its time."""
-        size = self._path.stat().st_size
+        size = sum(one.size_bytes for one in self._messages())
         with Progress(transient=True, disable=self._config.quiet) as progress:
-            task = progress.add_task(self._path.name, total=size)
-            for item in read_log(self._path):
+            task = progress.add_task("replay", total=size)
+            for item in self._messages():
                 if self._stop.is_set():
                     return
                 if parse_key(item.key) is None or item.key.endswith(f"/{Channel.INFO}"):
@@ -176,14 +187,28 @@ class _Replay:
                 if pause_s > 0:
                     time.sleep(min(pause_s, _MOST_PAUSE_S))
                 self._now_ns = max(self._now_ns, item.received_ns)
-                progress.advance(task, item.size_bytes + len(item.key))
+                progress.advance(task, item.size_bytes)
                 yield item
 
 
-def _infos(path: Path) -> dict[str, dict[int, Info]]:
+def messages_in(files: Sequence[Path]) -> _Messages:
+    """What was received: of logs that follow each other, or of the recordings of one session."""
+    if any(one.suffix == ".rrd" for one in files):
+        return partial(iter, messages_of(read_recordings(files)))
+    ordered = sorted(files, key=_first_ns)
+    return lambda: chain.from_iterable(map(read_log, ordered))
+
+
+def _first_ns(log: Path) -> int:
+    """When its first message came; answers to ``info`` are at the beginning of each file, however old."""
+    times = (one.received_ns for one in read_log(log) if not one.key.endswith(f"/{Channel.INFO}"))
+    return next(times, 0)
+
+
+def _infos(messages: Iterator[Received]) -> dict[str, dict[int, Info]]:
     """What each edge said of its sessions, by session; all are played in lockstep."""
     found: dict[str, dict[int, Info]] = {}
-    for item in read_log(path):
+    for item in messages:
         parsed = parse_key(item.key)
         if parsed is None or parsed[1] is not Channel.INFO:
             continue

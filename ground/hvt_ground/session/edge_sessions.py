@@ -10,7 +10,15 @@ from functools import partial
 
 from hvt_common import __version__
 from hvt_common.protocol.clock_offset import ClockOffset
-from hvt_common.protocol.messages import BacklogHeader, Info, RoiHeader, Status, TrackStep, WireError
+from hvt_common.protocol.messages import (
+    BacklogHeader,
+    Info,
+    PoseReport,
+    RoiHeader,
+    Status,
+    TrackStep,
+    WireError,
+)
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.runtime.log import log_fields
@@ -196,12 +204,14 @@ class EdgeSessions:
             self._base(packet)
             return
         session, header, item = self.session, packet.header, packet.item
-        shown = session is not None and header.session_id == session.info.session_id
         row = item.key.rpartition("/")[2]
         try:
             if isinstance(header, BacklogHeader):
                 self._backlog(header, item)
-            elif session is not None and shown:
+            elif isinstance(header, PoseReport):
+                if session is not None and header.is_of(session.info.session_id):
+                    session.pose(header, item)
+            elif session is not None and header.session_id == session.info.session_id:
                 self._take(session, header, item)
             elif isinstance(header, Status) or (isinstance(header, RoiHeader) and session is None):
                 self._pre_session.hold(packet)

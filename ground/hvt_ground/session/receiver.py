@@ -11,6 +11,7 @@ from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (
     BacklogHeader,
     BaseHeader,
+    PoseReport,
     RoiHeader,
     Status,
     TrackStep,
@@ -41,8 +42,14 @@ class Receiver:
         self._duplicates = DuplicatePublishers(edge)
         self._uptime = Uptime()
         self._last_message_ns = time.monotonic_ns()
-        self.unusable = 0
+        self._damaged = 0
+        self.of_other_versions = 0
+        """Messages that were skipped for their schema version."""
+
+    @property
+    def unusable(self) -> int:
         """Messages that were skipped: damaged, foreign, or of another version."""
+        return self._damaged + self.of_other_versions
 
     @property
     def counters(self) -> StreamCounters:
@@ -61,19 +68,11 @@ class Receiver:
         parsed = parse_key(item.key)
         row = parsed[1] if parsed else None
         try:
-            match row:
-                case Channel.BASE:
-                    header = BaseHeader.parse(item.attachment, item.payload)
-                    arrivals = self._reassembler.accept(header, item.payload, now_ns=at_ns)
-                    return [_base_packet(arrival, item) for arrival in arrivals]
-                case Channel.ROI:
-                    return [Packet(RoiHeader.parse(item.attachment, item.payload), item)]
-                case Channel.TRACKS:
-                    return [Packet(TrackStep.parse(item.payload), item)]
-                case Channel.BACKLOG:
-                    return [Packet(BacklogHeader.parse(item.attachment, item.payload), item)]
-                case Channel.STATUS:
-                    return [Packet(Status.parse(item.payload), item)]
+            if row is Channel.BASE:
+                header = BaseHeader.parse(item.attachment, item.payload)
+                arrivals = self._reassembler.accept(header, item.payload, now_ns=at_ns)
+                return [_base_packet(arrival, item) for arrival in arrivals]
+            return _packets(row, item)
         except WireError as error:
             if row is Channel.BASE:
                 self._reassembler.corrupt()
@@ -104,16 +103,20 @@ class Receiver:
         return text
 
     def skip(self, row: str, error: WireError) -> None:
-        """Count an unusable message."""
-        self.unusable += 1
-        if self.unusable.bit_count() == 1:  # 1, 2, 4, 8 …: a flood does not fill the log
-            kind = "of another version" if isinstance(error, UnknownVersionError) else "unusable"
-            _log.warning("%s: %s message %s (%d so far): %s", self._edge, row, kind, self.unusable, error)
+        """Count an unusable message; those of another version apart, which are said once."""
+        if isinstance(error, UnknownVersionError):
+            self.of_other_versions += 1
+            if self.of_other_versions == 1:
+                _log.warning("%s", error.between(f"edge {self._edge}", "this ground"))
+            return
+        self._damaged += 1
+        if self._damaged.bit_count() == 1:  # 1, 2, 4, 8 …: a flood does not fill the log
+            _log.warning("%s: %s message unusable (%d so far): %s", self._edge, row, self._damaged, error)
 
     def skip_stranger(self, row: str, session_id: int) -> None:
         """Count a message of a session that is not open."""
         if self._duplicates.knows(session_id):
-            self.unusable += 1
+            self._damaged += 1
         else:
             self.skip(row, WireError(f"it belongs to the session {session_id:016x}, which is not shown"))
 
@@ -123,3 +126,19 @@ def _base_packet(arrival: Arrival, item: Received) -> BasePacket:
         return BasePacket(arrival, item, on_time=True)
     attachment = arrival.header.pack(arrival.payload)
     return BasePacket(arrival, replace(item, payload=arrival.payload, attachment=attachment), on_time=False)
+
+
+def _packets(row: Channel | None, item: Received) -> list[Packet]:
+    """Of any channel but ``base``; none for one that the ground does not read."""
+    match row:
+        case Channel.ROI:
+            return [Packet(RoiHeader.parse(item.attachment, item.payload), item)]
+        case Channel.BACKLOG:
+            return [Packet(BacklogHeader.parse(item.attachment, item.payload), item)]
+        case Channel.TRACKS:
+            return [Packet(TrackStep.parse(item.payload), item)]
+        case Channel.POSE:
+            return [Packet(PoseReport.parse(item.payload), item)]
+        case Channel.STATUS:
+            return [Packet(Status.parse(item.payload), item)]
+    return []

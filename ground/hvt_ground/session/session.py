@@ -18,6 +18,7 @@ from hvt_common.protocol.messages import (
     BacklogKind,
     BaseHeader,
     Info,
+    PoseReport,
     RoiHeader,
     Status,
     StillResult,
@@ -30,7 +31,9 @@ from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice, Refinement, StillsRead, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
+from hvt_ground.geolocation.locate import Geolocation
+from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.sequence_window import StillSequenceWindow
@@ -69,6 +72,7 @@ class GroundSession:
         reports: ReceiverReports | None = None,
         backlog_perception: BacklogPerception | None = None,
         worker_of: WorkerFactory | None = None,
+        surface: Surface = FLAT_GROUND,
     ) -> None:
         self.sinks = sinks
         self._queued = [one for one in sinks if isinstance(one, QueuedSink)]
@@ -100,6 +104,8 @@ class GroundSession:
         self._statistics = ReceptionStatistics(lockstep=self.lockstep)
         self._decoder = BaseDecoder(size=info.base_size)
         self._step_decoder = TrackStepDecoder()
+        self.geolocation = Geolocation(info.view, surface=surface)
+        """Where the camera is, and where tracks are on the ground."""
         self.last_status: Status | None = None
         self.levers = ""
         """What the edge last said that it sends beside the video, and why."""
@@ -199,6 +205,15 @@ class GroundSession:
         if tracks is not None:
             self.worker.step(tracks, step.capture_ns)
 
+    def pose(self, report: PoseReport, item: Received) -> None:
+        """Take a report of where the camera is. Raises `WireError` where its bits make no sense."""
+        self._account.count(Channel.POSE, Account.META, item, at_ns=report.send_ns)
+        pose = self.geolocation.report(report)
+        self._account.time(Channel.POSE, item, report, handled=pose is not None)
+        if pose is not None:
+            self._emit(PoseUpdate(max(0, self._last_index), pose.capture_ns, pose, self.info.view))
+            self._note_stale(pose.capture_ns)
+
     def status(self, status: Status, item: Received) -> None:
         """Take the edge's report; one that is not newer than the last is ignored."""
         now_ns = self._clock()
@@ -209,6 +224,7 @@ class GroundSession:
         self._account.count(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
         self._account.time(Channel.STATUS, item, status, handled=True)
         self.last_status = status
+        self._note_stale(self._last_capture_ns)
         if status.levers and status.levers != self.levers:
             self.levers = status.levers
             self.note("info", status.levers)
@@ -277,6 +293,11 @@ class GroundSession:
     def newest_index(self) -> int:
         """Frame index of the newest access unit; -1 before the first."""
         return self._last_index
+
+    @property
+    def newest_capture_ns(self) -> int:
+        """When the newest access unit was captured, the edge's clock; 0 before the first."""
+        return self._last_capture_ns
 
     @property
     def newest_captured_ns(self) -> int | None:
@@ -377,6 +398,15 @@ class GroundSession:
         with self._results_lock:
             self._results = (self._results + self.pipeline.take_results())[-_MOST_RESULTS:]
 
+    def _note_stale(self, capture_ns: int) -> None:
+        stale = self.geolocation.turned_stale(capture_ns)
+        if stale:
+            self.note(
+                "warning", "the pose is stale: nothing is placed on the ground until there is a new one"
+            )
+        elif stale is False:
+            self.note("info", "there is a pose again")
+
     # In the worker's thread
 
     def _analyze(self, picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - called by the worker only
@@ -402,5 +432,7 @@ class GroundSession:
     def _emit(self, event: Event) -> None:
         if isinstance(event, Refinement):
             self.backlog.note(event)
+        if self.geolocation.has_pose and isinstance(event, Overlay) and not event.stored:
+            event = self.geolocation.located(event)
         for sink in self.sinks:
             sink.log(event)

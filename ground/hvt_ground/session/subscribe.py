@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -13,7 +14,17 @@ from typing import Self
 import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys, matches, parse_key, selector
-from hvt_common.protocol.messages import Command, ControlRequest, Feedback, Info, WireError
+from hvt_common.protocol.messages import (
+    WIRE_VERSION,
+    Command,
+    ControlRequest,
+    Feedback,
+    Info,
+    InfoRequest,
+    UnknownVersionError,
+    WireError,
+    wire_version,
+)
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import reason_of
 from hvt_common.transport.doctor.diagnose import control_unanswered
@@ -21,6 +32,7 @@ from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.transport.session import declare_publisher, query_later, subscribe
 from hvt_ground.link.group import GroundGroup
+from hvt_ground.perception.stills.decode import readable_codecs
 
 __all__ = ["MAX_EDGES", "EdgePort", "GroundLink"]
 
@@ -36,7 +48,10 @@ _INBOX_SHARE = 0.75
 """Of the inbox for one row: reports by the thousand do not keep pictures out."""
 _MOST_PER_S = 2000
 """Messages of one row from one edge. A camera has 240 pictures a second at the very most."""
-_SUBSCRIBED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.BACKLOG, Channel.STATUS)
+_SUBSCRIBED = (
+    *(Channel.BASE, Channel.ROI, Channel.TRACKS),
+    *(Channel.POSE, Channel.BACKLOG, Channel.STATUS),
+)
 _ANSWER_S = 1.0
 _MOST_ANSWERS, _MOST_ERRORS = 4, 16
 _UNANSWERED = 3
@@ -60,8 +75,11 @@ class EdgePort:
         *,
         clock: Callable[[], int],
         log: Callable[[Received], None] | None = None,
+        still_codecs: tuple[str, ...] = (),
     ) -> None:
         self.edge = edge
+        self._still_codecs = still_codecs
+        self._requester_id = secrets.randbits(64)
         self._clock = clock
         self._log = log
         self.inbox = Inbox(capacity=_INBOX_MESSAGES, overflow="newest", share=_INBOX_SHARE)
@@ -71,6 +89,7 @@ class EdgePort:
         self.used = threading.Event()
         """Set once there is more to this edge than messages under its name: a session."""
         self._unanswered = 0
+        self._version_said = False
         self._session = session
         self._keys = EdgeKeys(edge)
         self._feedback: zenoh.Publisher | None = None
@@ -102,14 +121,29 @@ class EdgePort:
                 self._log(Received(self._keys.key(Channel.INFO), data, b"", "", answered_ns))
             try:
                 info = Info.parse(data)
+            except UnknownVersionError as error:
+                self._say_version(error.between(f"edge {self.edge}", "this ground"))
+                return
             except WireError as error:
                 _log.warning("%s: its answer to info cannot be used: %s", self.edge, error)
                 return
+            if (version := wire_version(data)) != WIRE_VERSION:
+                self._say_version(
+                    f"edge {self.edge} speaks wire version {version}: it is shown, but reads no report and no "
+                    f"request of this ground, which speaks {WIRE_VERSION}: update the edge"
+                )
             if info.session_id == session_id:
                 found.append((info, requested_ns, answered_ns))
                 on_end()
 
-        self._query(Channel.INFO, b"", on_answer=note, on_end=on_end)
+        request = InfoRequest(requester_id=self._requester_id, still_codecs=self._still_codecs)
+        self._query(Channel.INFO, request.pack(), on_answer=note, on_end=on_end)
+
+    def _say_version(self, sentence: str) -> None:
+        """Once: it is asked again and again."""
+        if not self._version_said:
+            self._version_said = True
+            _log.warning("%s", sentence)
 
     def fail(self, error: Exception) -> None:
         """Hand over what went wrong in a callback."""
@@ -195,7 +229,8 @@ class GroundLink:
     """Sorts what comes by edge. `ports` grows as edges appear that ``edges``, the pattern, accepts.
 
     With a ``group`` only the edges that are this member's are subscribed to, and a port goes when its edge moves.
-    ``log`` gets all that comes from an edge, in Zenoh's callbacks.
+    ``log`` gets all that comes from an edge, in Zenoh's callbacks. ``still_codecs`` are those that edges are told to
+    send; without it all that are installed here.
     """
 
     def __init__(
@@ -206,8 +241,10 @@ class GroundLink:
         clock: Callable[[], int] | None = None,
         group: GroundGroup | None = None,
         log: Callable[[Received], None] | None = None,
+        still_codecs: tuple[str, ...] | None = None,
     ) -> None:
         self._session = session
+        self._still_codecs = readable_codecs() if still_codecs is None else still_codecs
         self._group = group
         self._log = log
         self._alive: set[str] = set()
@@ -317,7 +354,9 @@ class GroundLink:
                     self.foreign += 1
                     self._say_refused(edge)
                     return None
-                port = self._ports[edge] = EdgePort(self._session, edge, clock=self._clock, log=self._log)
+                port = self._ports[edge] = EdgePort(
+                    self._session, edge, clock=self._clock, log=self._log, still_codecs=self._still_codecs
+                )
             return port
 
     def _make_space(self) -> bool:

@@ -5,6 +5,7 @@ Times are capture times. Topics begin with the edge's id, so that files of sever
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Point2_pb2 import Point2
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
@@ -25,8 +27,9 @@ from mcap_protobuf.writer import Writer
 
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
-from hvt_common.video.annex_b import parameter_sets
-from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, VideoSample
+from hvt_common.values import Pose
+from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, VideoSample
+from hvt_ground.sinks.decodable import DecodableRun
 from hvt_ground.sinks.line_file import check_there
 from hvt_ground.sinks.palette import Rgb, class_colour
 from hvt_ground.sinks.rerun.stills.pairs import event_text, still_picture
@@ -38,7 +41,7 @@ _CHUNK_BYTES = 256 * 1024
 _LATEST_NS = (1 << 63) - 1
 _THIN_PX, _THICK_PX = 1.0, 3.0
 _FONT_PX = 12.0
-_Message = CompressedVideo | CompressedImage | ImageAnnotations | Log
+_Message = CompressedVideo | CompressedImage | ImageAnnotations | LocationFix | Log
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 
 
@@ -54,9 +57,7 @@ class McapFile:
     def __init__(self, path: Path, *, edge: str) -> None:
         self.path = path
         self._edge = edge
-        self._sets = b""
-        """The newest parameter sets."""
-        self._awaits_keyframe = True
+        self._run = DecodableRun()
         try:
             self._file: BinaryIO = path.open("wb")
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
@@ -67,7 +68,7 @@ class McapFile:
         """Write what there is a schema for; the rest passes by."""
         match item:
             case VideoSample():
-                data = self._sample(item)
+                data = self._run.decodable(item)
                 if data:
                     self._write("video", CompressedVideo(data=data, format="h265"), item)
             case Overlay():
@@ -77,6 +78,8 @@ class McapFile:
                 if picture is not None:
                     self.still(picture[0], frame_index=item.frame_index, capture_ns=item.capture_ns)
                 self._write("events", Log(level=Log.INFO, message=event_text(item)), item)
+            case PoseUpdate():
+                self._write("location", _location(item.pose), item)
             case Notice():
                 self._write("events", Log(level=_LEVELS[item.level], message=item.text), item)
 
@@ -88,7 +91,7 @@ class McapFile:
     def skipped(self, count: int) -> None:
         """So many events are missing: video goes on at its next keyframe."""
         del count
-        self._awaits_keyframe = True
+        self._run.interrupt()
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
         """Write index and footer, and close; a second call does nothing."""
@@ -107,7 +110,7 @@ class McapFile:
         # What no timestamp can hold is held at its end: times come from the wire.
         capture_ns = min(max(at.capture_ns, 0), _LATEST_NS)
         message.timestamp.CopyFrom(Timestamp(seconds=capture_ns // SECOND_NS, nanos=capture_ns % SECOND_NS))
-        if isinstance(message, CompressedVideo | CompressedImage):
+        if isinstance(message, CompressedVideo | CompressedImage | LocationFix):
             message.frame_id = self._edge
         elif isinstance(message, Log):
             message.name = self._edge
@@ -125,14 +128,17 @@ class McapFile:
                 f"MCAP file {self.path} cannot be written any further: {error.strerror}"
             ) from error
 
-    def _sample(self, sample: VideoSample) -> bytes:
-        """The access unit; a keyframe always with its parameter sets, which a reader that joins there needs."""
-        if sample.keyframe:
-            sets = parameter_sets(sample.data)
-            self._sets = sets or self._sets
-            self._awaits_keyframe = not self._sets
-            return sample.data if sets else self._sets + sample.data
-        return b"" if self._awaits_keyframe else sample.data
+
+def _location(pose: Pose) -> LocationFix:
+    """The camera's place; NaN for an altitude that nobody says."""
+    spread = pose.position_error_m**2
+    return LocationFix(
+        latitude=pose.latitude_deg,
+        longitude=pose.longitude_deg,
+        altitude=math.nan if pose.altitude_m is None else pose.altitude_m,
+        position_covariance=[spread, 0, 0, 0, spread, 0, 0, 0, pose.height_error_m**2],
+        position_covariance_type=LocationFix.DIAGONAL_KNOWN,
+    )
 
 
 def _annotations(overlay: Overlay) -> ImageAnnotations:

@@ -2,7 +2,8 @@
 
 ``HVTLOG`` and two bytes for the version of the form; then records: length (4 bytes, little-endian) and CRC-32 (4
 bytes, of zlib) of a MessagePack array ``[received_ns, key, encoding, attachment, payload]``. Answers to ``info`` are
-among them, because nothing can be read without them.
+among them, because nothing can be read without them. A file that has become too large stays as ``FILE-before`` until
+the next one has, which begins with the last answer of each edge.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import struct
 import threading
 import zlib
+from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -17,7 +19,8 @@ from typing import BinaryIO
 import msgpack
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, Info, WireError
 from hvt_common.transport.inbox import Received
 from hvt_ground.sinks.line_file import check_there
 
@@ -27,20 +30,35 @@ _MAGIC = b"HVTLOG\x00\x01"
 _HEAD = struct.Struct("<II")
 _MOST_BYTES = MAX_PAYLOAD_BYTES + 2**17
 """Of a record: the largest payload, the largest message beside it, and the names."""
+_MOST_EDGES = 256
+"""Whose answers are remembered; beyond, the oldest is forgotten."""
 _TYPES = [int, str, str, bytes, bytes]
 
 
 class MessageLog:
-    """Appends messages to a new file; takes the place of one of that name. `UserError` where it cannot be written."""
+    """Appends messages to a new file; takes the place of one of that name. `UserError` where it cannot be written.
 
-    def __init__(self, path: Path) -> None:
+    The file and the one before it are at most ``most_bytes`` together, or one message longer.
+    """
+
+    def __init__(self, path: Path, *, most_bytes: int) -> None:
         self.path = path
-        self._written = 0
+        self._most_bytes = most_bytes
+        self._answers: OrderedDict[str, bytes] = OrderedDict()
+        """By key, the record of the last answer to ``info``."""
+        self._file = _created(path)
         try:
-            self._file: BinaryIO = path.open("wb", buffering=0)
-            self._file.write(_MAGIC)
+            self.before.unlink(missing_ok=True)  # of another flight
         except OSError as error:
-            raise UserError(f"message log {path} cannot be created: {error.strerror}") from None
+            self._file.close()
+            raise UserError(
+                f"message log {path} cannot be created: {self.before} is in the way ({error.strerror})"
+            ) from None
+
+    @property
+    def before(self) -> Path:
+        """Where the older half of the messages is."""
+        return self.path.with_stem(f"{self.path.stem}-before")
 
     def log(self, item: Received) -> None:
         """Append a message, whole or not at all; one that is larger than any of ours is left out."""
@@ -50,6 +68,29 @@ class MessageLog:
         if len(body) > _MOST_BYTES:  # no message of ours is so large, and a reader would stop at it
             return
         record = _HEAD.pack(len(body), zlib.crc32(body)) + body
+        if self._file.tell() + len(record) > self._most_bytes // 2:
+            self._begin_anew()
+        if item.key.endswith(f"/{Channel.INFO}") and _is_info(item.payload):
+            self._answers[item.key] = record
+            self._answers.move_to_end(item.key)
+            if len(self._answers) > _MOST_EDGES:
+                self._answers.popitem(last=False)
+        self._append(record)
+
+    def _begin_anew(self) -> None:
+        try:
+            check_there(self._file.fileno(), self.path)
+            self.path.replace(self.before)
+        except OSError as error:
+            raise UserError(
+                f"message log {self.path} cannot be written any further: {error.strerror}"
+            ) from error
+        self._file.close()
+        self._file = _created(self.path)
+        for answer in self._answers.values():
+            self._append(answer)
+
+    def _append(self, record: bytes) -> None:
         at = self._file.tell()
         try:
             check_there(self._file.fileno(), self.path)
@@ -69,6 +110,24 @@ class MessageLog:
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
         """Close the file; a second call does nothing."""
         self._file.close()
+
+
+def _is_info(payload: bytes) -> bool:
+    """Anybody on the link may send what is none, and as large as a picture."""
+    try:
+        Info.parse(payload)
+    except WireError:
+        return False
+    return True
+
+
+def _created(path: Path) -> BinaryIO:
+    try:
+        file = path.open("wb", buffering=0)
+        file.write(_MAGIC)
+    except OSError as error:
+        raise UserError(f"message log {path} cannot be created: {error.strerror}") from None
+    return file
 
 
 def read_log(path: Path) -> Iterator[Received]:

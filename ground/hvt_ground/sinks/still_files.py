@@ -16,7 +16,7 @@ from hvt_common.errors import UserError
 from hvt_ground.events import Event, Refinement
 from hvt_ground.sinks.line_file import LineFile
 
-__all__ = ["COLUMNS", "StillFiles"]
+__all__ = ["COLUMNS", "StillFiles", "picture_of"]
 
 COLUMNS = (
     *("file", "frame", "known_frame", "still", "track", "edge_track", "x", "y", "w", "h"),
@@ -41,7 +41,7 @@ class StillFiles:
         """Write a still; `UserError` where there is no room for it."""
         if not isinstance(item, Refinement) or item.still_bgr is None or item.crop_base_px is None:
             return
-        picture = self.path.with_name(f"{self.path.stem}-{item.still_sequence:06d}.png")
+        picture = picture_of(item, self.path)
         if item.still_sequence != self._last:
             _, data = cv2.imencode(".png", item.still_bgr)
             try:
@@ -59,6 +59,11 @@ class StillFiles:
     def close(self, hurry: threading.Event | None = None) -> None:
         """Close the table."""
         self._table.close(hurry)
+
+
+def picture_of(still: Refinement, table: Path) -> Path:
+    """The picture of a still, beside the table; it is there where the still was decoded and has a place."""
+    return table.with_name(f"{table.stem}-{still.still_sequence:06d}.png")
 
 
 def _row(item: Refinement, name: str) -> tuple[object, ...]:

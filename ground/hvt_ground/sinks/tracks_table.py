@@ -9,8 +9,10 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+
 from hvt_common.units import SECOND_NS
-from hvt_ground.events import Event, Overlay
+from hvt_ground.events import Event, Overlay, Places
 from hvt_ground.sinks.line_file import LineFile
 
 __all__ = ["COLUMNS", "TrackTable", "track_rows", "utc_text"]
@@ -18,13 +20,15 @@ __all__ = ["COLUMNS", "TrackTable", "track_rows", "utc_text"]
 COLUMNS = (
     *("frame", "capture_utc", "id", "x", "y", "w", "h", "confidence"),
     *("base_class", "class", "refined", "origin", "late", "doubted"),
+    *("latitude", "longitude", "error_m"),
 )
 """``frame`` counts from 1 and ``x y w h`` are base pixels, as in MOTChallenge; ``capture_utc`` is the time at the
 camera by the edge's clock; ``base_class`` is what the detectors say without stills, ``class`` the same after
 refinement, ``refined`` 1 once a still has refined it; ``origin``: ``base``, ``edge``, ``edge+base`` or ``still``;
 ``late``: 1 where it is of stored video that came after an outage, behind later frames; ``doubted``: 1 where stills
-say that it is nothing of mine. A source frame that the base stream left out has lines too where the edge reported
-it."""
+say that it is nothing of mine; ``latitude longitude`` are where it stands (WGS 84, degrees) and ``error_m`` half the
+longer axis of the ellipse that holds it with 95 %, empty where no pose tells. A source frame that the base stream
+left out has lines too where the edge reported it."""
 
 
 class TrackTable:
@@ -67,7 +71,15 @@ def track_rows(overlay: Overlay) -> Iterator[tuple[object, ...]]:
             origins[row],
             int(overlay.stored),
             0 if overlay.doubted is None else int(overlay.doubted[row]),
+            *_place_texts(overlay.places, row),
         )
+
+
+def _place_texts(places: Places | None, row: int) -> tuple[str, str, str]:
+    if places is None or not np.isfinite(places.places_deg[row]).all():
+        return "", "", ""
+    latitude, longitude = places.places_deg[row]
+    return f"{latitude:.7f}", f"{longitude:.7f}", f"{places.ellipses[row, 0]:.1f}"
 
 
 def utc_text(unix_ns: int) -> str:

@@ -18,7 +18,7 @@ from hvt_ground.state import EdgeState, GroundState, SessionState
 from hvt_ground.web.pictures import Pictures, jpeg
 from hvt_ground.web.viewers import EdgePage, Hub, text
 
-__all__ = ["SessionFeed", "state_loads", "state_message"]
+__all__ = ["SessionFeed", "state_loads", "state_message", "still_name"]
 
 _LATE_NS = 300_000_000
 """Behind the link by so much, pictures are decoded and not coded again until it has caught up."""
@@ -42,7 +42,6 @@ class SessionFeed:
         self._pictures = Pictures(info)
         self._offset_ns = 0
         self._late_ns = 0
-        self._stills = 0
         session = {
             "edge": info.edge,
             "session": f"{info.session_id:016x}",
@@ -124,8 +123,7 @@ class SessionFeed:
         return self._text("overlay", item, tracks=tracks)
 
     def _still(self, item: Refinement) -> None:
-        self._stills += 1
-        still = f"{self._info.session_id & 0xFFFFFF:06x}-{self._stills}"
+        still = still_name(self._info, item)
         pictures: list[tuple[str, str, bytes, str]] = []
         if item.media_type in _SHOWN_BY_BROWSERS:
             pictures.append((still, "still", item.still, item.media_type))
@@ -154,6 +152,11 @@ class SessionFeed:
             note=item.note,
         )
         self._hub.post(partial(self._hub.still, self._page, message, pictures))
+
+
+def still_name(info: Info, still: Refinement) -> str:
+    """The name of a still's pictures in addresses: a still of several objects has one."""
+    return f"{info.session_id & 0xFFFFFF:06x}-{still.still_sequence}"
 
 
 def state_message(state: GroundState) -> str:

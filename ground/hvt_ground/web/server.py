@@ -19,9 +19,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Info
 from hvt_ground.control import EdgeClient
+from hvt_ground.events import Refinement
 from hvt_ground.state import GroundState
 from hvt_ground.web.access import Access, is_loopback, own_tokens
-from hvt_ground.web.feed import SessionFeed, state_loads, state_message
+from hvt_ground.web.feed import SessionFeed, state_loads, state_message, still_name
 from hvt_ground.web.requests import EdgeRequests
 from hvt_ground.web.site import MOST_MESSAGE_BYTES, make_site
 from hvt_ground.web.viewers import EdgePage, Hub
@@ -98,6 +99,10 @@ class WebPage:
         """What opens a sink for a session, in the sink's thread."""
         page = EdgePage(info.edge)
         return lambda: SessionFeed(info, page, self._hub, clock=self._clock)
+
+    def still_address(self, info: Info, still: Refinement) -> str:
+        """Where a browser finds the picture of a still, as long as the page has it; without a token."""
+        return f"{self.address}stills/{info.edge}/{still_name(info, still)}/still"
 
     def show(self, state: GroundState) -> None:
         """Give out how all edges are; for any thread."""

@@ -134,7 +134,9 @@ class StillPictures:
         self._bytes = 0
 
     def add(self, still: str, which: str, picture: bytes, media_type: str) -> None:
-        """Take one; the oldest make room."""
+        """Take one, in place of one of that name; the oldest make room."""
+        before = self._pictures.pop((still, which), None)
+        self._bytes -= 0 if before is None else len(before[0])
         self._pictures[still, which] = (picture, media_type)
         self._bytes += len(picture)
         while self._bytes > _MOST_STILL_BYTES or len(self._pictures) > 2 * _MOST_STILLS:

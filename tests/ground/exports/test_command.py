@@ -99,6 +99,19 @@ def test_the_mp4_says_when_the_first_picture_was_taken(recording, tmp_path):
         assert video.metadata["creation_time"].startswith("2026-09-21T14:13:20")
 
 
+@pytest.mark.parametrize(("sizes", "tag"), [((SIZE,), "hvc1"), ((SIZE, (640, 384)), "hev1")])
+def test_an_mp4_is_what_apple_plays_where_that_can_be(tmp_path, sizes, tag):
+    """It would not open; or, with parameter sets that changed on the way, break off there."""
+    units = [unit for size in sizes for unit, _ in coded(drawn_frames(20, size), kbps=300, keyint=20)]
+    path = tmp_path / "flight.rrd"
+    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
+        for index, unit in enumerate(units):
+            recorder.log(VideoSample(index, START_NS + index * STEP_NS, unit, keyframe=index % 20 == 0))
+    with av.open(str(export(path, tmp_path / "flight.mp4"))) as video:
+        assert video.streams.video[0].codec_context.codec_tag == tag
+        assert sum(1 for _ in video.decode(video=0)) == len(units)
+
+
 def test_boxes_are_drawn_in_on_request(recording, events, tmp_path):
     """Whoever gets the file has no viewer that lays boxes over it."""
     out = export(recording, tmp_path / "flight.mp4", "--burn-in")

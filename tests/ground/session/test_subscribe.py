@@ -5,14 +5,19 @@ from __future__ import annotations
 import logging
 import threading
 import time
+import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 
+import msgpack
 import pytest
 import zenoh
 
-from hvt_common.transport.session import open_session
+from hvt_common.protocol.channels import Channel, EdgeKeys
+from hvt_common.protocol.messages import InfoRequest
+from hvt_common.transport.session import open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_common.video.still_codecs import still_codec_names
 from hvt_ground.session.subscribe import MAX_EDGES, GroundLink
 from programs.outsider import Tap, joined
 from programs.processes import eventually
@@ -80,6 +85,57 @@ def test_edges_that_are_there_or_have_flown_keep_their_place(link):
     assert "late" not in served(ground)
     for token in tokens:
         token.undeclare()
+
+
+@pytest.mark.parametrize(
+    ("version", "said"),
+    [
+        (5, "edge uav-1 speaks wire version 5, this ground reads 3 and 4: update this ground"),
+        (2, "edge uav-1 speaks wire version 2, this ground reads 3 and 4: update edge uav-1"),
+        (
+            3,
+            "edge uav-1 speaks wire version 3: it is shown, but reads no report and no request of this ground",
+        ),
+    ],
+)
+def test_another_version_of_the_wire_is_said_once(link, caplog, version, said):
+    """The operator would see no picture, or an edge that obeys nothing, and no reason."""
+    ground, outsider = link
+    values = msgpack.unpackb(INFO.pack())[1:-1]
+    body = msgpack.packb([version, *values, 2**32 - 1])[:-5]
+    answer = body + b"\xce" + zlib.crc32(body).to_bytes(4, "big")
+    keys = EdgeKeys("uav-1")
+    with outsider.liveliness().declare_token(keys.key(Channel.ALIVE)):
+        queryable = serve(outsider, Channel.INFO, keys=keys, answer=lambda _question: answer)
+        eventually(lambda: served(ground) == {"uav-1"}, within_s=20, what="it is served")
+        (port,) = ground.ports()
+        answers = [port.query_info(7) for _ in range(2)]
+        queryable.undeclare()
+    assert [one is not None for one in answers] == [version == 3] * 2
+    assert [one.getMessage()[: len(said)] for one in caplog.records if one.levelno == logging.WARNING] == [
+        said
+    ]
+
+
+def test_a_ground_says_which_stills_it_reads(link):
+    """The edge would send what nobody here can show."""
+    ground, outsider = link
+    keys, questions = EdgeKeys("uav-1"), []
+    with outsider.liveliness().declare_token(keys.key(Channel.ALIVE)):
+        queryable = serve(
+            outsider,
+            Channel.INFO,
+            keys=keys,
+            answer=lambda question: questions.append(question) or INFO.pack(),
+        )
+        eventually(lambda: served(ground) == {"uav-1"}, within_s=20, what="it is served")
+        (port,) = ground.ports()
+        assert port.query_info(7) is not None
+        assert port.query_info(7) is not None
+        queryable.undeclare()
+    first, second = map(InfoRequest.parse, questions)
+    assert first == second
+    assert {"jpeg", "h264-intra", "residual"} <= set(first.still_codecs) <= set(still_codec_names())
 
 
 class Clock:

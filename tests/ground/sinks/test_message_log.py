@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,9 @@ from hvt_common.errors import UserError
 from hvt_common.transport.inbox import Received
 from hvt_ground.sinks.message_log import MessageLog, read_log
 from programs.small_disk import small_disk
+from rigs.messages import INFO
 
+MOST_BYTES = 10**9
 MESSAGES = [
     Received(
         f"hvt/uav-1/{row}",
@@ -32,7 +35,7 @@ MESSAGES = [
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file with all of them."""
     path = tmp_path_factory.mktemp("log") / "flight.hvtlog"
-    sink = MessageLog(path)
+    sink = MessageLog(path, most_bytes=MOST_BYTES)
     for one in MESSAGES:
         sink.log(one)
     sink.close()
@@ -75,9 +78,40 @@ def test_a_record_that_claims_gigabytes_takes_no_memory(tmp_path):
     assert list(read_log(path)) == []
 
 
+def test_a_log_takes_no_more_than_was_allowed(tmp_path):
+    """A ground that is left alone would fill the disk, and the newest would be what is missing."""
+    path, most = tmp_path / "flight.hvtlog", 60_000
+    sink = MessageLog(path, most_bytes=most)
+    sink.log(Received("hvt/uav-1/info", INFO.pack(), b"", "", 10**18 - 2))
+    for edge in range(20):  # what is no answer is not remembered, however often it comes
+        sink.log(Received(f"hvt/forged-{edge}/info", bytes(2_000), b"", "", 10**18 - 1))
+    messages = [one for one in MESSAGES if not one.key.endswith("/info")]
+    for number in range(40):
+        for one in messages:
+            sink.log(replace(one, received_ns=one.received_ns + number * 100))
+        there = [file.stat().st_size for file in tmp_path.iterdir()]
+        assert sum(there) <= most
+        assert len(there) <= 2
+    sink.close()
+    newest = list(read_log(path))
+    assert newest[-1] == replace(messages[-1], received_ns=messages[-1].received_ns + 39 * 100)
+    assert [one.key for one in newest if one.key.endswith("/info")] == ["hvt/uav-1/info"]
+    assert newest[0].payload == INFO.pack(), "nothing can be read without it"
+    every = sorted(one.received_ns for file in (sink.before, path) for one in read_log(file))
+    assert len(set(every)) == len(every) - 1
+    assert sum(file.stat().st_size for file in tmp_path.iterdir()) > most / 3
+
+
+def test_what_is_in_the_way_of_the_older_half_is_said(tmp_path):
+    """A traceback, and a file that stays open."""
+    (tmp_path / "flight-before.hvtlog").mkdir()
+    with pytest.raises(UserError, match=r"flight-before\.hvtlog is in the way"):
+        MessageLog(tmp_path / "flight.hvtlog", most_bytes=MOST_BYTES)
+
+
 def test_what_no_edge_sends_ends_no_replay(tmp_path):
     """Anybody on the link could end what is read of a log with one large message."""
-    sink = MessageLog(tmp_path / "flight.hvtlog")
+    sink = MessageLog(tmp_path / "flight.hvtlog", most_bytes=MOST_BYTES)
     for one in (MESSAGES[1], Received("hvt/intruder/base", bytes(5 * 2**20), b"", "", 1), MESSAGES[2]):
         sink.log(one)
     sink.close()
@@ -97,7 +131,7 @@ def test_what_is_no_log_is_said(tmp_path):
 def test_a_full_disk_leaves_whole_records(tmp_path):
     """What was kept so far would be lost with what found no room."""
     with small_disk(tmp_path / "small", size="8k") as disk:
-        sink = MessageLog(disk / "flight.hvtlog")
+        sink = MessageLog(disk / "flight.hvtlog", most_bytes=MOST_BYTES)
         endless = itertools.cycle(MESSAGES)
         with pytest.raises(UserError, match="cannot be written any further: No space left on device"):
             _write_all(sink, endless)

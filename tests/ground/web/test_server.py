@@ -10,6 +10,7 @@ import ssl
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
@@ -18,9 +19,11 @@ from websockets.sync.client import ClientConnection, connect
 from hvt_common.errors import UserError
 from hvt_common.transport.zenoh_config import key_pair
 from hvt_ground.cli import main
+from hvt_ground.events import Refinement
 from hvt_ground.web import WebPage
 from programs.fleet_keys import Fleet
 from programs.processes import eventually, free_ports
+from rigs.flight import Flight
 
 
 @pytest.fixture(autouse=True)
@@ -88,6 +91,36 @@ def test_on_this_machine_the_page_opens_without_more(local):
     assert "<title>HVT</title>" in text
     assert "unsafe" not in headers["content-security-policy"]
     assert greets(local)
+
+
+def test_a_still_is_where_others_are_told_that_it_is(port):
+    """The link on a map would lead to another still, or to none."""
+    flight = Flight(1)
+    still = Refinement(
+        **dict.fromkeys(("frame_index", "capture_ns", "shown_index"), 0),
+        **dict.fromkeys(("class_before", "class_after"), "car"),
+        still_sequence=12,
+        track_id=1,
+        edge_track_id=2,
+        box_base_px=(0, 0, 9, 9),
+        still=b"\xff\xd8 12",
+        media_type="image/jpeg",
+        base_crop_bgr=None,
+        confidence=0.9,
+        reason="gain",
+        quality_pct=50,
+    )
+    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns) as page:
+        feed = page.feed(flight.info())()
+        for number in (11, 12, 13):  # the twelfth is not the twelfth one that came
+            feed.log(replace(still, still_sequence=number, still=b"\xff\xd8 %d" % number))
+        address = page.still_address(flight.info(), still)
+        assert address.startswith(f"http://127.0.0.1:{port}/stills/")
+        path = address.partition(f":{port}")[2]
+        eventually(lambda: asked(port, path)[0] == 200, within_s=10, what="the still is there")
+        _, headers, text = asked(port, path)
+    assert headers["content-type"] == "image/jpeg"
+    assert text.endswith(" 12")
 
 
 def test_all_files_of_the_page_are_there_and_nothing_else(local):

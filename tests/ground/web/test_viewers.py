@@ -10,7 +10,7 @@ import pytest
 
 from hvt_ground.web.fmp4 import Fragment, Start
 from hvt_ground.web.pictures import Made
-from hvt_ground.web.viewers import EdgePage, Hub, Viewer
+from hvt_ground.web.viewers import EdgePage, Hub, StillPictures, Viewer
 
 
 def fragment(number: int, *, keyframe: bool = False, size: int = 10) -> Made:
@@ -98,6 +98,16 @@ def test_nothing_is_made_for_nobody(hub):
     assert edge.wanted["h264"] != first, "a stream that nobody saw the start of would go on"
     hub.leave_edge(viewer)
     assert not edge.wanted
+
+
+def test_a_still_that_comes_again_takes_its_own_place():
+    """One that shows several objects comes several times: in the end no picture at all would be there."""
+    pictures = StillPictures()
+    for number in range(4000):
+        pictures.add(str(number // 4), "still", bytes(30_000), "image/jpeg")
+    there = [number for number in range(1000) if pictures.get(str(number), "still") is not None]
+    assert there[-1] == 999
+    assert len(there) > 100
 
 
 def test_who_takes_nothing_at_all_is_given_up():

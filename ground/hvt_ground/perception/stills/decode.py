@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.messages import RoiHeader
+from hvt_common.protocol.messages import MAX_STILL_CODECS, RoiHeader
 from hvt_common.values import Image, View
 from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop
-from hvt_common.video.still_codecs import BaseMissingError, StillError, still_codec
+from hvt_common.video.hevc import YuvPicture
+from hvt_common.video.still_codecs import BaseMissingError, StillError, still_codec, still_codec_names
 
-__all__ = ["Box", "DecodedStill", "ReceivedStill", "decode_still", "needs_base"]
+__all__ = ["Box", "DecodedStill", "ReceivedStill", "decode_still", "needs_base", "readable_codecs"]
+
+_MOST_BASE_PX = 32
+"""Of a side, for one pixel of a still: a stranger's `Info` may say any scale, and each of them costs memory."""
 
 Box = tuple[float, float, float, float]
 """x1 y1 x2 y2."""
@@ -41,6 +46,13 @@ class DecodedStill:
         return (self.box_base_px, *self.also_boxes_base_px)
 
 
+def readable_codecs() -> tuple[str, ...]:
+    """Names of the codecs whose stills can be read here, as `InfoRequest` takes them; HVT's own come first."""
+    return tuple(name for name in still_codec_names() if re.fullmatch(r"[a-z0-9-]{1,24}", name))[
+        :MAX_STILL_CODECS
+    ]
+
+
 def needs_base(header: RoiHeader) -> bool:
     """Whether the still builds on the decoded base frame of its own index; False for a codec that is not known."""
     try:
@@ -49,10 +61,10 @@ def needs_base(header: RoiHeader) -> bool:
         return False
 
 
-def decode_still(still: ReceivedStill, *, base_bgr: Image | None, view: View) -> Image:
+def decode_still(still: ReceivedStill, *, base: Image | YuvPicture | None, view: View) -> Image:
     """The crop at the size at which it was coded, BGR.
 
-    ``base_bgr`` is the decoded base frame of the still's own index, None where it is not at hand; only codecs that
+    ``base`` is the decoded base frame of the still's own index, None where it is not at hand; only codecs that
     need it use it.
 
     Raises:
@@ -67,9 +79,9 @@ def decode_still(still: ReceivedStill, *, base_bgr: Image | None, view: View) ->
         raise StillError(str(error)) from None
     if not codec.needs_base:
         return codec.decode(still.data, size=size, parameters=header.parameters)
-    if base_bgr is None:
+    if base is None:
         raise BaseMissingError(f"it builds on frame {header.frame_index}, which is not at hand")
-    crop = base_crop(base_bgr, view=view, crop_source_px=header.crop_source_px, size=size)
+    crop = base_crop(base, view=view, crop_source_px=header.crop_source_px, size=size)
     return codec.decode(still.data, size=size, parameters=header.parameters, base_bgr=crop)
 
 
@@ -87,6 +99,8 @@ def _coded_size(header: RoiHeader, *, view: View) -> tuple[int, int]:
         # Both sides are shrunk by one factor, each rounded to a pixel. A needle of a picture would cost the base
         # crop the area of the whole frame for each of its pixels.
         raise StillError(f"size {width}x{height} is not the shape of what it shows")
+    if max((x2 - x1) / width, (y2 - y1) / height) * view.scale > _MOST_BASE_PX:
+        raise StillError(f"size {width}x{height} is far smaller than what the base shows of it")
     if max(width, height) > MAX_SIDE_PX:
         raise StillError(
             f"size {width}x{height} is larger than any still, whose sides are up to {MAX_SIDE_PX}"

@@ -156,8 +156,8 @@ class StillStage:
             self._answer(header, header.track_id, None)
             return None
         try:
-            base_bgr = self._history.frame(header.frame_index)
-            image = decode_still(still, base_bgr=base_bgr, view=self._view)
+            base = self._history.picture(header.frame_index)
+            image = decode_still(still, base=base, view=self._view)
         except BaseMissingError as error:
             self.dropped["base_missing"] += 1
             self._notice(now, f"still {header.sequence} is asked for again: {error}")
@@ -280,6 +280,7 @@ class StillStage:
             crop_base_px=self._to_base(header.crop_source_px),
             stored=stored,
             shown_index=header.frame_index,
+            header=header,
         )
 
     # Results and notices

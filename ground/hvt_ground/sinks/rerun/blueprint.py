@@ -17,12 +17,15 @@ __all__ = [
     "LABELS",
     "LATENCY",
     "LEGEND",
+    "MAP_CAMERA",
+    "MAP_TRACKS",
     "OVERFLOW",
     "PATCHES",
     "REFINED",
     "REPORTED",
     "SESSION",
     "STILLS",
+    "STILL_MESSAGES",
     "TRACKS",
     "TRACK_COUNT",
     "VIDEO",
@@ -40,26 +43,39 @@ LEGEND = "/base/legend"
 PATCHES = "/base/patches"
 STILLS = "/stills"
 OVERFLOW = "/stills/more"
+STILL_MESSAGES = "/stills/messages"
 BITRATE = "/link/bitrate"
 LATENCY = "/link/latency"
 TRACK_COUNT = "/link/tracks"
+MAP_CAMERA = "/map/camera"
+MAP_TRACKS = "/map/tracks"
 EVENTS = "/events"
 SESSION = "/session"
 
+_MAP_ZOOM = 18.0
+"""Half a kilometre on a screen: about what a camera in the air sees."""
 _PAPER = (14, 17, 22)
 """Background behind pictures."""
 
 
 def screen(
-    *, base_size: tuple[int, int], fps: float, budget_bps: float, clocked: bool, live: bool
+    *,
+    base_size: tuple[int, int],
+    fps: float,
+    budget_bps: float,
+    clocked: bool,
+    live: bool,
+    located: bool = False,
 ) -> rrb.Blueprint:
     """Video with boxes, plots below; gallery of stills, session facts and events to the right.
 
     The video has a second tab: with the stills in their places, and boxes only of tracks that a still has spoken
     on. ``fps`` sets the pace of the frame timeline, ``budget_bps`` the height of the bitrate plot. Latencies are
-    plotted where ``clocked``; ``live`` follows the newest data rather than play from the beginning.
+    plotted where ``clocked``; ``live`` follows the newest data rather than play from the beginning; where
+    ``located`` a third tab is the map.
     """
-    page = _page("", base_size=base_size, clocked=clocked, top_kbps=1.8 * budget_bps / 1000)
+    top_kbps = 1.8 * budget_bps / 1000
+    page = _page("", base_size=base_size, clocked=clocked, top_kbps=top_kbps, located=located)
     return _blueprint(page, fps=fps, live=live)
 
 
@@ -105,15 +121,17 @@ def _page(
     clocked: bool,
     top_kbps: float | None = None,
     name: str | None = None,
+    located: bool = False,
 ) -> rrb.Horizontal:
     """All of one edge, whose entities lie below ``root``."""
     plots = _plots(root, clocked=clocked, top_kbps=top_kbps)
-    left = rrb.Vertical(_videos(root, base_size), plots, row_shares=[2.9, 1.0])
+    left = rrb.Vertical(_videos(root, base_size, located=located), plots, row_shares=[2.9, 1.0])
     right = rrb.Vertical(_gallery(root), _session(root), _events(root), row_shares=[2.3, 0.67, 0.93])
     return rrb.Horizontal(left, right, column_shares=[1.72, 1.0], name=name)
 
 
-def _videos(root: str, base_size: tuple[int, int]) -> rrb.Tabs:
+def _videos(root: str, base_size: tuple[int, int], *, located: bool) -> rrb.Tabs:
+    maps = [rrb.MapView(origin=f"{root}/map", name="Map", zoom=_MAP_ZOOM)] if located else []
     return rrb.Tabs(
         _video(base_size, "Base stream and tracks", root=root, without=(f"{PATCHES}/**",)),
         # Boxes say which objects a still has spoken on; thin and without words, for the picture is the matter.
@@ -124,6 +142,7 @@ def _videos(root: str, base_size: tuple[int, int]) -> rrb.Tabs:
             without=(TRACKS, REPORTED, DOUBTED, LABELS),
             bare=REFINED,
         ),
+        *maps,
     )
 
 

@@ -106,6 +106,7 @@ class LiveRecording:
         self, url: str, recording_id: RecordingId, screen: rrb.Blueprint, chunks: Sequence[Chunk]
     ) -> None:
         self._url = url
+        self._id = recording_id
         self._port = int(url.rsplit(":", 1)[1].split("/", maxsplit=1)[0])
         self._next_check_s = 0.0
         self._check()
@@ -119,6 +120,10 @@ class LiveRecording:
         """Send."""
         self._check()
         self._recording.send_chunks(chunks)
+
+    def show(self, screen: rrb.Blueprint) -> None:
+        """Show another screen from now on."""
+        send_blueprint(self._recording, self._id, screen)
 
     def compact(self, chunks: Sequence[Chunk]) -> None:
         """A viewer has them already."""

@@ -15,14 +15,16 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
+import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.units import bitrate_text
 from hvt_common.video.annex_b import parameter_sets
-from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.palette import AMBER, GREY, VERMILLION, Rgb
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.live_view import LiveRecording
+from hvt_ground.sinks.rerun.map_rows import MapRows
 from hvt_ground.sinks.rerun.overlays import (
     BRIGHTNESS,
     LAYERS,
@@ -49,7 +51,7 @@ _PLOT_GAP_NS = 2_500_000_000
 """Plots have a hole where nothing was measured for longer."""
 _BYTES_EACH = {"boxes": 6, "identity": 2, "places": 4, "words": 5}
 """About what the component costs a track; others cost little more than their row."""
-_MOMENTARY = ("video", "text", "lines", "jpeg")
+_MOMENTARY = ("video", "text", "lines", "jpeg", "message")
 """Tables whose values hold for one frame: a file that begins later does not begin with them."""
 _LAYER_PATHS: dict[Layer, str] = {
     "tracks": names.TRACKS,
@@ -77,6 +79,8 @@ class RecorderSettings:
     budget_bps: float
     facts: Mapping[str, str] = field(default_factory=dict)
     """Further lines of the session panel: ``{"method": "M5", "source": "clip.mp4"}``."""
+    info: bytes = b""
+    """The edge's `Info` as a message: with it the recording can be received again. Empty leaves it out."""
     clocked: bool = True
     """Whether latencies will be known; False leaves their plot out."""
     live_url: str | None = None
@@ -97,6 +101,9 @@ class Recorder:
         self._backlog_overlays = BacklogOverlays(settings.base_size, fps=settings.fps)
         self._size_limit = SizeLimit()
         self._stills = StillRows(self._size_limit)
+        self._map = MapRows()
+        self._located = False
+        """Whether there was ever a pose."""
         self._class_ids: dict[tuple[str, int], int] = {}
         """By name and level of brightness; of all files, which may be opened together."""
         self._shown: dict[tuple[str, str], TableRow] = {}
@@ -146,14 +153,10 @@ class Recorder:
         Whoever opens one closes it, but for `file`.
         """
         settings = self._settings
-        screen = names.screen(
-            base_size=settings.base_size,
-            fps=settings.fps,
-            budget_bps=settings.budget_bps,
-            clocked=settings.clocked,
-            live=path is None,
+        screen = self._screen(path)
+        chunks = static_chunks(
+            settings.edge_id, _facts(settings, f"up to {settings.fps:g} fps"), info=settings.info
         )
-        chunks = static_chunks(settings.edge_id, _facts(settings, f"up to {settings.fps:g} fps"))
         recording_id = RecordingId(settings.edge_id, settings.session)
         output: RrdFile | LiveRecording
         if path is not None:
@@ -162,6 +165,17 @@ class Recorder:
             assert settings.live_url is not None, "a recording goes into a file or a viewer"
             output = LiveRecording(settings.live_url, recording_id, screen, chunks)
         return RecordingFile(output, size_limit=self._size_limit, compact_bytes=settings.compact_bytes)
+
+    def _screen(self, path: Path | None) -> rrb.Blueprint:
+        settings = self._settings
+        return names.screen(
+            base_size=settings.base_size,
+            fps=settings.fps,
+            budget_bps=settings.budget_bps,
+            clocked=settings.clocked,
+            live=path is None,
+            located=self._located,
+        )
 
     def begins_with(self, item: Event) -> bool:
         """Whether a file may begin with this: a live keyframe that a decoder can start at."""
@@ -250,9 +264,17 @@ class Recorder:
                 return self._refinement(event)
             case Traffic():
                 return self._traffic(event)
+            case PoseUpdate():
+                return self._pose(event)
             case Notice():
                 text = LogText(event.text, _NOTICE_LEVELS[event.level], _NOTICE_COLOURS[event.level])
                 return [TableRow(names.EVENTS, "text", text, len(event.text))]
+
+    def _pose(self, update: PoseUpdate) -> list[TableRow]:
+        if not self._located:
+            self._located = True
+            self._into.show(self._screen(self._into.path))
+        return self._map.pose(update)
 
     def _sample(self, sample: VideoSample) -> list[TableRow]:
         if self._awaits_keyframe[sample.stored] and not sample.keyframe:
@@ -278,7 +300,7 @@ class Recorder:
         return sample.frame_index > self._last_sample and bool(sample.data)
 
     def _overlay(self, overlay: Overlay) -> list[TableRow | Chunk]:
-        rows: list[TableRow | Chunk] = [*self._stills.overlay(overlay)]
+        rows: list[TableRow | Chunk] = [*self._stills.overlay(overlay), *self._map.overlay(overlay)]
         for update in self._overlays.encode(overlay):
             rows += self._layer(update, at=(overlay.frame_index, overlay.capture_ns))
         self._backlog_overlays.note(overlay, self._overlays)

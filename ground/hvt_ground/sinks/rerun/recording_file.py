@@ -6,6 +6,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
@@ -65,6 +66,11 @@ class RecordingFile:
             self._compact()  # the same in fewer bytes, these rows included, may be what the disk has room for
         if self._pending_bytes >= self._compact_bytes:
             self._compact()
+
+    def show(self, screen: rrb.Blueprint) -> None:
+        """Open with another screen from now on."""
+        self._compact()
+        self._output.show(screen)
 
     def new_classes(
         self, layer: Layer, path: str, class_ids: Mapping[tuple[str, int], int], *, size: tuple[int, int]

@@ -89,6 +89,13 @@ class RrdFile:
         self._write(self._encoded(chunks), at=self._compacted_bytes)
         self._compacted_bytes = self.size_bytes
 
+    def show(self, screen: rrb.Blueprint) -> None:
+        """Open with another screen from now on; right after `compact`, which would write over it."""
+        self._screen = screen
+        send_blueprint(self._recording, self._id, screen)
+        self._write(_messages(self._stream.read() or b""), at=self.size_bytes)
+        self._compacted_bytes = self.size_bytes
+
     def close(self, hurry: threading.Event | None) -> None:
         """Add a footer, unless ``hurry`` is set, close the file and release the SDK's stream."""
         removed = os.fstat(self._file).st_nlink == 0

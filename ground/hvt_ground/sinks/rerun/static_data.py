@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
 from hvt_ground.sinks.palette import (
+    AMBER,
     BASE_LINE,
     BUDGET_LINE,
     GREY,
@@ -39,9 +41,11 @@ _LEGEND = (
 )
 
 
-def static_chunks(title: str, facts: Mapping[str, str]) -> list[Chunk]:
-    """All static chunks of a recording whose session panel shows ``title`` and ``facts``."""
+def static_chunks(title: str, facts: Mapping[str, str], *, info: bytes) -> list[Chunk]:
+    """All static chunks of a recording whose session panel shows ``title`` and ``facts``; ``info`` is the message."""
+    message = [static_chunk(names.SESSION, rr.AnyValues(info=pa.array([info], pa.binary())))] if info else []
     return [
+        *message,
         static_chunk(names.VIDEO, rr.VideoStream.from_fields(codec=rr.VideoCodec.H265)),
         static_chunk(names.TRACKS, _box_style(width=1.0, draw_order=10.0)),
         static_chunk(names.REPORTED, _ellipse_style(width=1.0, draw_order=15.0)),
@@ -50,6 +54,10 @@ def static_chunks(title: str, facts: Mapping[str, str]) -> list[Chunk]:
         static_chunk(names.LABELS, _text_style(points=0.0)),
         static_chunk(names.LEGEND, _text_style(points=4.0)),
         *(static_chunk(f"{names.STILLS}/{slot}", _caption_style()) for slot in range(SLOTS)),
+        static_chunk(
+            names.MAP_CAMERA, rr.GeoPoints.from_fields(radii=rr.Radius.ui_points(7.0), colors=AMBER)
+        ),
+        static_chunk(names.MAP_TRACKS, rr.GeoPoints.from_fields(radii=rr.Radius.ui_points(4.0))),
         static_chunk(names.BITRATE, _lines(_BITRATE)),
         static_chunk(names.LATENCY, _lines(_LATENCY)),
         static_chunk(names.TRACK_COUNT, _lines(_TRACKS)),

@@ -23,10 +23,12 @@ __all__ = [
     "Caption",
     "CodedIdentity",
     "LogText",
+    "MapPoints",
     "PlacedJpeg",
     "SizeLimit",
     "Table",
     "TableRow",
+    "packed",
     "static_chunk",
 ]
 
@@ -66,6 +68,16 @@ class CodedIdentity:
     track_ids: tuple[int, ...]
     before: tuple[int, ...]
     after: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MapPoints:
+    """Places of N tracks."""
+
+    places_deg: npt.NDArray[np.float64]
+    """(N, 2) latitude and longitude."""
+    colours: tuple[int, ...]
+    track_ids: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +239,22 @@ def _lines(rows: Sequence[tuple[float, ...]]) -> Columns:
     return rr.Scalars.columns(scalars=scalars).partition([len(row) for row in rows])
 
 
+def _poses(rows: Sequence[npt.NDArray[np.float64]]) -> Columns:
+    numbers = np.array(rows)
+    values = rr.AnyValues.columns(pose=pa.array(numbers.ravel(), pa.float64()))
+    return [*rr.GeoPoints.columns(positions=numbers[:, :2]), *values.partition([len(row) for row in rows])]
+
+
+def _map_points(rows: Sequence[MapPoints]) -> Columns:
+    lengths = [len(row.track_ids) for row in rows]
+    points = rr.GeoPoints.columns(
+        positions=np.concatenate([row.places_deg for row in rows]),
+        colors=np.array([one for row in rows for one in row.colours], np.uint32),
+    )
+    ids = rr.AnyValues.columns(track_id=pa.array([i for row in rows for i in row.track_ids], pa.uint32()))
+    return [*points.partition(lengths), *ids.partition(lengths)]
+
+
 def packed(colour: Rgb) -> int:
     """Opaque RGBA as one number, which is how Rerun stores a colour."""
     return colour[0] << 24 | colour[1] << 16 | colour[2] << 8 | 0xFF
@@ -251,6 +279,9 @@ COLUMNS: dict[str, Callable[[Sequence[Any]], Columns]] = {
     "place": _places,
     "patch": _patches,
     "caption": _captions,
+    "message": lambda rows: rr.AnyValues.columns(message=pa.array(rows, pa.binary())),
+    "pose": _poses,
+    "map points": _map_points,
     "text": _texts,
     "lines": _lines,
 }

@@ -10,6 +10,7 @@ import io
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -25,9 +26,12 @@ from hvt_common.video.still_codecs.h264_syntax import parameter_sets
 from hvt_common.video.still_codecs.plugins.avif import av1_data, avif_file
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
+from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
 from media.clips import framed
 from media.crops import textured
 from media.hevc_pictures import coded_picture
+from rigs.flight import Flight
+from rigs.messages import ROI
 
 SIZE = (56, 40)
 _MOST_MB = 48
@@ -248,6 +252,19 @@ def test_a_base_of_the_announced_size_is_shown_whatever_fills_it_up(size):
     encoder = BaseEncoder(EncoderSettings(size=size, fps=15, bitrate_bps=300_000, preset="ultrafast"))
     (frame,) = framed([np.full((size[1], size[0], 3), 90, np.uint8)])
     assert BaseDecoder(size=size).decode(encoder.encode(frame).data).shape == (size[1], size[0], 3)
+
+
+@pytest.mark.parametrize(("scale", "good"), [(1.0, True), (40.0, False), (1e4, False)])
+def test_a_scale_that_no_picture_has_costs_nothing(scale, good):
+    """An `Info` of a stranger would have each pixel of a still be the mean of a hundred million samples."""
+    flight = Flight(1)
+    picture = BaseDecoder().decode_yuv(flight.base(0).payload)
+    assert picture is not None
+    view = replace(flight.info().view, scale=scale, source_size=(4096, 4096))
+    size = {"w": 64, "h": 64} if scale > 1 else {}
+    header = replace(ROI, codec="residual", crop_source_px=(0, 0, 64, 64), parameters=size)
+    with pytest.raises(StillError, match="another base picture" if good else "far smaller"):
+        decode_still(ReceivedStill(header, b"\x20still"), base=picture, view=view)
 
 
 def test_a_still_of_more_bytes_than_any_has_is_not_taken():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import replace
 
+from hvt_common.protocol.messages import RoiHeader
 from hvt_ground.events import Overlay, Refinement
 from hvt_ground.sinks.palette import AMBER, GREY, class_colour
 from hvt_ground.sinks.rerun import blueprint as names
@@ -60,13 +62,13 @@ class StillRows:
         spent = sum(row.size_bytes for row in shown)
         # A still that found no slot in the gallery can be seen on the enhanced picture only. Patches ride on the
         # tracks of now: one of long ago has no place there.
-        if refinement.stored:
-            return rows + (shown or self._hidden(refinement, base, still))
-        if self._size_limit.has(spent + len(still[0]) + _PATCH_BYTES, ratio=PATCH_RATIO) or not (
-            shown or still[0] is not refinement.still
+        if not refinement.stored and (
+            self._size_limit.has(spent + len(still[0]) + _PATCH_BYTES, ratio=PATCH_RATIO)
+            or not (shown or still[0] is not refinement.still)
         ):
             shown += self._patch(refinement, still)
-        return rows + (shown or self._hidden(refinement, base, still))
+        shown = shown or self._hidden(refinement, base, still)
+        return [*rows, *shown, *(_message(refinement, still) if shown else [])]
 
     def overlay(self, overlay: Overlay) -> list[TableRow]:
         """The patches that move with their tracks, or go."""
@@ -134,3 +136,14 @@ class StillRows:
             if data is refinement.still or self._size_limit.has(len(data), ratio=HIDDEN_CROP_RATIO):
                 rows.append(TableRow(f"{path}/{name}", "jpeg", data, len(data)))
         return rows
+
+
+def _message(refinement: Refinement, still: Coded) -> list[TableRow]:
+    """The still as a message of its own that goes with the JPEG in the recording: its checksum covers the two."""
+    header, (data, size) = refinement.header, still
+    if header is None or len(data) > RoiHeader.MAX_PAYLOAD:
+        return []
+    x1, y1, x2, y2 = header.crop_source_px
+    coded = {} if size == (x2 - x1, y2 - y1) else {"w": size[0], "h": size[1]}
+    message = replace(header, codec="jpeg", parameters=coded).pack(data)
+    return [TableRow(names.STILL_MESSAGES, "message", message, len(message))]

@@ -9,10 +9,11 @@ import heapq
 import logging
 import tempfile
 import warnings
-from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,27 @@ import numpy as np
 from rerun.chunk import Chunk, RrdReader
 
 from hvt_common.errors import UserError
+from hvt_common.protocol.messages import Info, RoiHeader, WireError
 from hvt_common.video.annex_b import is_keyframe
-from hvt_ground.events import Notice, Origin, Overlay, VideoSample
-from hvt_ground.sinks.rerun.blueprint import DOUBTED, EVENTS, REFINED, REPORTED, STILLS, TRACKS, VIDEO
-from hvt_ground.sinks.rerun.overlays import ORIGINS
+from hvt_ground.events import Notice, Overlay, PoseUpdate, VideoSample
+from hvt_ground.geolocation.camera import places_of_boxes
+from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
+from hvt_ground.geolocation.trail import PoseTrail
+from hvt_ground.recordings.drawn_layer import TRACK_COMPONENTS, DrawnLayer
+from hvt_ground.sinks.rerun.blueprint import (
+    DOUBTED,
+    EVENTS,
+    MAP_CAMERA,
+    PATCHES,
+    REFINED,
+    REPORTED,
+    SESSION,
+    STILL_MESSAGES,
+    STILLS,
+    TRACKS,
+    VIDEO,
+)
+from hvt_ground.sinks.rerun.map_rows import pose_of
 from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages
 
 __all__ = ["Recorded", "RecordedStill", "read_recordings"]
@@ -32,11 +50,9 @@ _log = logging.getLogger(__name__)
 
 _LAYERS = {TRACKS: "Boxes2D", REPORTED: "Ellipses2D", REFINED: "Boxes2D", DOUBTED: "Boxes2D"}
 _LEVELS: Mapping[str, str] = {"INFO": "info", "WARN": "warning", "ERROR": "error"}
-_OF_TRACKS = frozenset(
-    {"centers", "half_sizes", "track_id", "class_before", "class_ids", "confidence_pct", "origin"}
-)
-"""The rest is of the layer, once: how it is drawn."""
-_HUNDRED = 100
+_POSE, _INFO, _MESSAGE = "pose", "info", "message"
+_ONE_COMPONENT = {MAP_CAMERA: _POSE, SESSION: _INFO, STILL_MESSAGES: _MESSAGE}
+"""What is used of these entities."""
 _SAMPLE, _PICTURE, _CAPTION = "VideoStream:sample", "EncodedImage:blob", "Boxes2D:labels"
 
 _Timed = tuple[int, int, Any]
@@ -55,19 +71,34 @@ class RecordedStill:
     """What the base showed of it; empty where the recording does not say."""
     caption: str
     """``17  car → van .93``; empty where it was never on the screen."""
+    header: RoiHeader | None = None
+    """What goes with ``jpeg`` on the wire; None where the recording does not say."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Recorded:
     """One session, from one file or from several that follow each other."""
 
     edge: str
     session: str
+    info: Info | None
+    """What the edge said of the session; None in a recording of an earlier HVT."""
     video: Sequence[VideoSample]
     """In order of frames."""
     stills: Sequence[RecordedStill]
     notices: Sequence[Notice]
-    _layers: Mapping[str, _Layer] = field(repr=False)
+    poses: Sequence[PoseUpdate]
+    surface: Surface
+    """What tracks stand on."""
+    _layers: Mapping[str, DrawnLayer] = field(repr=False)
+
+    @cached_property
+    def trail(self) -> PoseTrail:
+        """All poses."""
+        trail = PoseTrail(most=len(self.poses))
+        for one in self.poses:
+            trail.add(one.pose)
+        return trail
 
     def overlays(self) -> Iterator[Overlay]:
         """What was drawn at each frame that has a picture or at which boxes changed, in order of frames."""
@@ -78,9 +109,9 @@ class Recorded:
         for frame in sorted(times):
             yield self._overlay(frame, times[frame])
 
-    def all(self) -> Iterator[VideoSample | Overlay | RecordedStill | Notice]:
+    def all(self) -> Iterator[VideoSample | Overlay | RecordedStill | Notice | PoseUpdate]:
         """All of it, in order of frames; of a frame the picture comes first."""
-        streams = (self.video, self.overlays(), self.stills, self.notices)
+        streams = (self.video, self.overlays(), self.stills, self.notices, self.poses)
         return heapq.merge(*streams, key=lambda one: one.frame_index)
 
     def _overlay(self, frame: int, capture_ns: int) -> Overlay:
@@ -92,7 +123,7 @@ class Recorded:
             ),
             key=lambda one: one[0].track_id,
         )
-        return Overlay(
+        overlay = Overlay(
             frame_index=frame,
             capture_ns=capture_ns,
             track_ids=np.array([row.track_id for row, _ in rows], np.int64),
@@ -104,71 +135,22 @@ class Recorded:
             origins=tuple(row.origin for row, _ in rows),
             doubted=np.array([path == DOUBTED for _, path in rows], np.bool_),
         )
+        return self._located(overlay)
+
+    def _located(self, overlay: Overlay) -> Overlay:
+        """The overlay with the places of its tracks, by the poses before and after it."""
+        pose = self.trail.at(overlay.capture_ns)
+        if pose is None:
+            return overlay
+        return replace(
+            overlay,
+            places=places_of_boxes(
+                pose, overlay.boxes_base_px, view=self.poses[0].view, surface=self.surface
+            ),
+        )
 
 
-@dataclass(frozen=True, slots=True)
-class _DrawnBox:
-    track_id: int
-    box: tuple[float, float, float, float]
-    base_class: str
-    class_name: str
-    confidence: float
-    origin: Origin
-
-
-class _Layer:
-    """The components of one layer of boxes, each with its rows in order of frames."""
-
-    def __init__(self) -> None:
-        self._rows: dict[str, list[_Timed]] = defaultdict(list)
-        self._frames: dict[str, list[int]] = {}
-        self._names: dict[int, str] = {}
-
-    def add(self, component: str, rows: Iterable[_Timed]) -> None:
-        """Take rows of a component; the names of classes hold for all times."""
-        name = component.rpartition(":")[2]
-        if name == "context":
-            for _, _, value in rows:
-                for one in value[0]:
-                    self._names[one["class_id"]] = one["class_description"]["info"]["label"]
-        elif name in _OF_TRACKS:
-            self._rows[name] += rows
-
-    def sort(self) -> None:
-        """After the last row."""
-        for name, rows in self._rows.items():
-            rows.sort(key=lambda row: row[0])
-            self._frames[name] = [row[0] for row in rows]
-
-    def times(self) -> dict[int, int]:
-        """Capture time by frame, where boxes changed."""
-        return {frame: capture_ns for rows in self._rows.values() for frame, capture_ns, _ in rows}
-
-    def at(self, frame: int, *, reported: bool) -> Iterator[_DrawnBox]:
-        """What is drawn at a frame."""
-        ids = self._latest("track_id", frame)
-        before, after = self._latest("class_before", frame), self._latest("class_ids", frame)
-        percents = self._latest("confidence_pct", frame) or [0] * len(ids)
-        origins = self._latest("origin", frame) or [int(reported)] * len(ids)
-        places = zip(self._latest("centers", frame), self._latest("half_sizes", frame), strict=False)
-        for track, ((x, y), (w, h)), was, now, percent, origin in zip(
-            ids, places, before, after, percents, origins, strict=False
-        ):
-            yield _DrawnBox(
-                track,
-                (x - w, y - h, x + w, y + h),
-                self._names.get(was, "?"),
-                self._names.get(now, "?"),
-                percent / _HUNDRED,
-                ORIGINS[origin] if origin < len(ORIGINS) else "base",
-            )
-
-    def _latest(self, name: str, frame: int) -> list[Any]:
-        place = bisect_right(self._frames.get(name, []), frame)
-        return list(self._rows[name][place - 1][2]) if place else []
-
-
-def read_recordings(paths: Sequence[Path]) -> Recorded:
+def read_recordings(paths: Sequence[Path], *, surface: Surface = FLAT_GROUND) -> Recorded:
     """Read the files of one session; their order does not matter.
 
     Raises:
@@ -190,15 +172,17 @@ def read_recordings(paths: Sequence[Path]) -> Recorded:
             f"{', '.join(map(str, paths))}: no recording of one edge: give the files that hvt-ground wrote"
         )
     try:
-        return _recorded(*names.pop(), rows)
+        return _recorded(*names.pop(), rows, surface)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise UserError(
             f"{', '.join(map(str, paths))}: not as hvt-ground writes a recording ({type(error).__name__}: {error})"
         ) from None
 
 
-def _recorded(edge: str, session: str, rows: Mapping[tuple[str, str], list[_Timed]]) -> Recorded:
-    layers = {path: _Layer() for path in _LAYERS}
+def _recorded(
+    edge: str, session: str, rows: Mapping[tuple[str, str], list[_Timed]], surface: Surface
+) -> Recorded:
+    layers = {path: DrawnLayer() for path in _LAYERS}
     for (entity, component), found in rows.items():
         if entity in layers:
             layers[entity].add(component, found)
@@ -207,9 +191,12 @@ def _recorded(edge: str, session: str, rows: Mapping[tuple[str, str], list[_Time
     return Recorded(
         edge=edge,
         session=session,
+        info=_info(rows.get((SESSION, _INFO), [])),
         video=_video(rows.get((VIDEO, _SAMPLE), [])),
         stills=_stills(rows),
         notices=_notices(rows),
+        poses=_poses(rows),
+        surface=surface,
         _layers=layers,
     )
 
@@ -250,7 +237,7 @@ class _File:
             ids = self.rows.get((layer, "track_id"), [])
             if not any(frame <= self.first for frame, _, _ in ids):
                 for (entity, component), found in before.items():
-                    if entity == layer and found and component.rpartition(":")[2] in _OF_TRACKS:
+                    if entity == layer and found and component.rpartition(":")[2] in TRACK_COMPONENTS:
                         self.rows.setdefault((entity, component), []).insert(0, (*self._begins, []))
 
 
@@ -307,8 +294,10 @@ def _rows(chunk: Chunk) -> Iterator[tuple[str, list[_Timed]]]:
 
 def _is_used(entity: str, component: str) -> bool:
     if entity in _LAYERS:
-        return component.rpartition(":")[2] in _OF_TRACKS | {"context"}
-    if entity.startswith(STILLS):
+        return component.rpartition(":")[2] in TRACK_COMPONENTS | {"context"}
+    if entity in _ONE_COMPONENT:
+        return component == _ONE_COMPONENT[entity]
+    if entity.startswith((STILLS, PATCHES)):
         return component in (_PICTURE, _CAPTION)
     return component in (_SAMPLE, "TextLog:text", "TextLog:level")
 
@@ -329,7 +318,8 @@ def _video(rows: Iterable[_Timed]) -> list[VideoSample]:
 
 
 def _stills(rows: Mapping[tuple[str, str], list[_Timed]]) -> list[RecordedStill]:
-    """Pairs of the gallery, and what was never on the screen."""
+    """Pairs of the gallery, what was never on the screen, and what was on the enhanced picture alone."""
+    headers = _Headers(rows.get((STILL_MESSAGES, _MESSAGE), []))
     found = []
     for (entity, component), pictures in rows.items():
         if component != _PICTURE or not entity.endswith("/still"):
@@ -343,8 +333,47 @@ def _stills(rows: Mapping[tuple[str, str], list[_Timed]]) -> list[RecordedStill]
         for frame, capture_ns, jpeg in pictures:
             crop = crops.get(frame, b"") if several[frame] == 1 else b""
             caption = str(captions.get(frame, ""))
-            found.append(RecordedStill(frame, capture_ns, jpeg, crop, caption))
+            found.append(RecordedStill(frame, capture_ns, jpeg, crop, caption, headers.of(jpeg, frame=frame)))
+    there = {(one.frame_index, one.jpeg) for one in found}
+    for (entity, component), pictures in rows.items():
+        if component != _PICTURE or not entity.startswith(PATCHES):
+            continue
+        for frame, capture_ns, jpeg in pictures:
+            header = headers.of(jpeg, frame=frame)
+            if header is not None and (frame, jpeg) not in there:
+                found.append(RecordedStill(frame, capture_ns, jpeg, b"", "", header))
     return sorted(found, key=lambda one: (one.frame_index, one.caption))
+
+
+class _Headers:
+    """The messages of stills, by the frame at which each was known."""
+
+    def __init__(self, rows: Iterable[_Timed]) -> None:
+        self._by_frame = defaultdict[int, list[bytes]](list)
+        for frame, _, value in rows:
+            self._by_frame[frame].append(bytes(value[0]))
+
+    def of(self, jpeg: bytes, *, frame: int) -> RoiHeader | None:
+        """The one whose checksum covers this picture; None without one."""
+        for message in self._by_frame.get(frame, []):
+            with suppress(WireError):
+                return RoiHeader.parse(message, jpeg)
+        return None
+
+
+def _info(rows: Iterable[_Timed]) -> Info | None:
+    for _, _, value in rows:
+        with suppress(WireError):
+            return Info.parse(bytes(value[0]))
+    return None
+
+
+def _poses(rows: Mapping[tuple[str, str], list[_Timed]]) -> list[PoseUpdate]:
+    found = [
+        pose_of(numbers, frame_index=frame, capture_ns=capture_ns)
+        for frame, capture_ns, numbers in rows.get((MAP_CAMERA, _POSE), [])
+    ]
+    return sorted(found, key=lambda one: one.capture_ns)
 
 
 def _notices(rows: Mapping[tuple[str, str], list[_Timed]]) -> list[Notice]:

@@ -1,0 +1,230 @@
+"""Where things were, for maps: GeoJSON (RFC 7946) and KML (OGC 12-007r2).
+
+The camera's way is one line; each track is one, of its places at most once a second. A track that stayed within what
+its places may be off by is a point, the surest of them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import xml.etree.ElementTree as ET
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from hvt_common.errors import UserError
+from hvt_common.geodesy import metres_per_degree, moved
+from hvt_common.units import SECOND_NS
+from hvt_ground.recordings.recorded import Recorded
+from hvt_ground.sinks.palette import class_colour
+from hvt_ground.sinks.tracks_table import utc_text
+
+__all__ = ["write_geojson", "write_kml"]
+
+_EVERY_NS: Final = SECOND_NS
+_ELLIPSE_CORNERS: Final = 24
+_DIGITS: Final = 7
+_KML: Final = "http://www.opengis.net/kml/2.2"
+_GX: Final = "http://www.google.com/kml/ext/2.2"
+ET.register_namespace("", _KML)
+ET.register_namespace("gx", _GX)
+
+
+@dataclass(frozen=True, slots=True)
+class _Spot:
+    """A track at one moment."""
+
+    capture_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    ellipse: tuple[float, float, float]
+    """Half its axes in metres, and the longer one's direction."""
+
+
+@dataclass(slots=True)
+class _Track:
+    spots: list[_Spot] = field(default_factory=list)
+    classes: Counter[str] = field(default_factory=Counter)
+    confidence: float = 0.0
+    refined: bool = False
+    last_ns: int = 0
+
+    @property
+    def class_name(self) -> str:
+        """The one that it bore most often."""
+        return self.classes.most_common(1)[0][0]
+
+    @property
+    def surest(self) -> _Spot:
+        return min(self.spots, key=lambda one: one.ellipse[0])
+
+    @property
+    def moved(self) -> bool:
+        """Whether it went further than its places may be off by."""
+        first, reach_m = self.spots[0], max(one.ellipse[0] for one in self.spots)
+        north_m, east_m = metres_per_degree(first.latitude_deg)
+        return any(
+            math.hypot(
+                (one.latitude_deg - first.latitude_deg) * north_m,
+                (one.longitude_deg - first.longitude_deg) * east_m,
+            )
+            > reach_m
+            for one in self.spots
+        )
+
+
+def write_geojson(recorded: Recorded, path: Path) -> None:
+    """A FeatureCollection; longitude before latitude, as the standard has it. `UserError` without a pose."""
+    features = [_camera_feature(recorded)]
+    for track_id, track in _tracks(recorded).items():
+        spot = track.surest
+        geometry: dict[str, Any] = {"type": "Point", "coordinates": _position(spot)}
+        if track.moved:
+            geometry = {"type": "LineString", "coordinates": [_position(one) for one in track.spots]}
+        properties = {
+            "kind": "track",
+            "id": track_id,
+            "class": track.class_name,
+            "confidence": round(track.confidence, 3),
+            "refined": track.refined,
+            "first_utc": utc_text(track.spots[0].capture_ns),
+            "last_utc": utc_text(track.last_ns),
+            "error_m": round(spot.ellipse[0], 1),
+            "error_minor_m": round(spot.ellipse[1], 1),
+            "error_azimuth_deg": round(spot.ellipse[2], 1),
+        }
+        features.append({"type": "Feature", "geometry": geometry, "properties": properties})
+    collection = {"type": "FeatureCollection", "features": features}
+    path.write_text(json.dumps(collection, ensure_ascii=False), encoding="utf-8")
+
+
+def write_kml(recorded: Recorded, path: Path) -> None:
+    """Placemarks with times: the camera's way, and each track with its ellipse. `UserError` without a pose."""
+    root = ET.Element(f"{{{_KML}}}kml")
+    document = _with(root, "Document", name=recorded.edge)
+    camera = [
+        (one.capture_ns, one.pose.longitude_deg, one.pose.latitude_deg, one.pose.height_m)
+        for one in _poses(recorded)
+    ]
+    _timed_way(_with(document, "Placemark", name=recorded.edge), camera)
+    for track_id, track in _tracks(recorded).items():
+        spot = track.surest
+        place = _with(document, "Placemark", name=f"{track_id} {track.class_name}")
+        red, green, blue = class_colour(track.class_name)
+        style = _with(place, "Style")
+        for kind in ("LineStyle", "IconStyle"):
+            _with(style, kind, color=f"ff{blue:02x}{green:02x}{red:02x}")
+        _with(style, "PolyStyle", color=f"30{blue:02x}{green:02x}{red:02x}")
+        facts = _with(place, "ExtendedData")
+        for name, value in (
+            ("confidence", f"{track.confidence:.2f}"),
+            ("refined", str(int(track.refined))),
+            ("error_m", f"{spot.ellipse[0]:.1f}"),
+        ):
+            _with(_with(facts, "Data", {"name": name}), value=value)
+        shapes = _with(place, "MultiGeometry")
+        if track.moved:
+            _timed_way(
+                shapes, [(one.capture_ns, one.longitude_deg, one.latitude_deg, None) for one in track.spots]
+            )
+        else:
+            _with(_with(shapes, "Point"), coordinates=f"{spot.longitude_deg:.7f},{spot.latitude_deg:.7f}")
+        ring = _with(_with(_with(shapes, "Polygon"), "outerBoundaryIs"), "LinearRing")
+        _with(ring, coordinates=" ".join(f"{east:.7f},{north:.7f}" for north, east in _outline(spot)))
+    ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+
+
+def _poses(recorded: Recorded) -> Sequence[Any]:
+    if not recorded.poses:
+        raise UserError(
+            f"the recording of {recorded.edge} has no pose: give hvt-edge --pose when it is flown"
+        )
+    return recorded.poses
+
+
+def _tracks(recorded: Recorded) -> dict[int, _Track]:
+    """By id, of those whose place was ever known; tracks that stills doubt are left out."""
+    _poses(recorded)
+    tracks: defaultdict[int, _Track] = defaultdict(_Track)
+    for overlay in recorded.overlays():
+        places = overlay.places
+        if places is None:
+            continue
+        for row, track_id in enumerate(overlay.track_ids.tolist()):
+            latitude, longitude = places.places_deg[row].tolist()
+            if math.isnan(latitude) or (overlay.doubted is not None and overlay.doubted[row]):
+                continue
+            track = tracks[track_id]
+            track.classes[overlay.classes[row]] += 1
+            track.confidence = max(track.confidence, float(overlay.confidences[row]))
+            track.refined |= bool(overlay.refined[row])
+            track.last_ns = overlay.capture_ns
+            if not track.spots or overlay.capture_ns - track.spots[-1].capture_ns >= _EVERY_NS:
+                major, minor, azimuth = places.ellipses[row].tolist()
+                track.spots.append(_Spot(overlay.capture_ns, latitude, longitude, (major, minor, azimuth)))
+    return dict(sorted(tracks.items()))
+
+
+def _camera_feature(recorded: Recorded) -> dict[str, Any]:
+    poses = _poses(recorded)
+    places = [_rounded(one.pose.longitude_deg, one.pose.latitude_deg) for one in poses]
+    still = all(one == places[0] for one in places)
+    geometry = {"type": "Point" if still else "LineString", "coordinates": places[0] if still else places}
+    properties = {
+        "kind": "camera",
+        "edge": recorded.edge,
+        "session": recorded.session,
+        "utc": [utc_text(one.capture_ns) for one in poses],
+        "height_m": [one.pose.height_m for one in poses],
+    }
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def _position(spot: _Spot) -> list[float]:
+    return _rounded(spot.longitude_deg, spot.latitude_deg)
+
+
+def _rounded(*degrees: float) -> list[float]:
+    return [round(one, _DIGITS) for one in degrees]
+
+
+def _outline(spot: _Spot) -> list[tuple[float, float]]:
+    """Latitude and longitude around the ellipse, the first again at the end."""
+    major, minor, azimuth = spot.ellipse
+    turned = math.radians(azimuth)
+    corners = []
+    for number in range(_ELLIPSE_CORNERS + 1):
+        angle = 2 * math.pi * (number % _ELLIPSE_CORNERS) / _ELLIPSE_CORNERS
+        along, across = major * math.cos(angle), minor * math.sin(angle)
+        corners.append(
+            moved(
+                spot.latitude_deg,
+                spot.longitude_deg,
+                north_m=along * math.cos(turned) - across * math.sin(turned),
+                east_m=along * math.sin(turned) + across * math.cos(turned),
+            )
+        )
+    return corners
+
+
+def _timed_way(parent: ET.Element, places: Sequence[tuple[int, float, float, float | None]]) -> None:
+    """A track with times; each place is capture time, longitude, latitude and height or None."""
+    way = ET.SubElement(parent, f"{{{_GX}}}Track")
+    _with(way, altitudeMode="clampToGround" if places[0][3] is None else "relativeToGround")
+    for capture_ns, *_ in places:
+        _with(way, when=utc_text(capture_ns))
+    for _, longitude, latitude, height_m in places:
+        ET.SubElement(way, f"{{{_GX}}}coord").text = f"{longitude:.7f} {latitude:.7f} {height_m or 0:.1f}"
+
+
+def _with(
+    parent: ET.Element, tag: str = "", attributes: dict[str, str] | None = None, **texts: str
+) -> ET.Element:
+    """A new element below ``parent``, or itself, with an element for each text."""
+    element = ET.SubElement(parent, f"{{{_KML}}}{tag}", attributes or {}) if tag else parent
+    for name, text in texts.items():
+        ET.SubElement(element, f"{{{_KML}}}{name}").text = "".join(c for c in text if c.isprintable())
+    return element

@@ -1,0 +1,113 @@
+"""The poses of one session, and the pose of a moment between or shortly after them."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from dataclasses import replace
+from typing import Final
+
+from hvt_common.geodesy import between, metres_per_degree
+from hvt_common.units import SECOND_NS
+from hvt_common.values import Orientation, Pose
+
+__all__ = ["STALE_S", "PoseTrail"]
+
+STALE_S: Final = 10.0
+"""A pose this old is none."""
+_MOST_POSES: Final = 64
+"""A minute of them: pictures are not shown later than that."""
+_DRIFT: Final = 0.5
+"""Standard deviation of what it does otherwise than before, of what it did in as long a time."""
+
+
+class PoseTrail:
+    """Takes poses as they come, and remembers the last ``most``."""
+
+    def __init__(self, *, most: int = _MOST_POSES) -> None:
+        self._most = most
+        self._poses: list[Pose] = []
+        self._times: list[int] = []
+
+    def add(self, pose: Pose) -> bool:
+        """Take a pose; False for one that is not newer than the last."""
+        if self._poses and pose.capture_ns <= self._poses[-1].capture_ns:
+            return False
+        self._poses.append(pose)
+        self._times.append(pose.capture_ns)
+        if len(self._poses) > self._most:
+            del self._poses[0], self._times[0]
+        return True
+
+    @property
+    def newest(self) -> Pose | None:
+        """The last one that came."""
+        return self._poses[-1] if self._poses else None
+
+    def age_s(self, capture_ns: int) -> float | None:
+        """How much older than this moment the newest pose is; None without one."""
+        newest = self.newest
+        return None if newest is None else (capture_ns - newest.capture_ns) / SECOND_NS
+
+    def at(self, capture_ns: int) -> Pose | None:
+        """The pose of a moment; None where the nearest before it is stale.
+
+        Between two it is on the line from one to the other. After the last one it goes on as it did before, and its
+        errors grow with what that may be wrong by.
+        """
+        poses = self._poses
+        after = bisect_right(self._times, capture_ns)
+        if after == 0:
+            return poses[0] if poses and poses[0].capture_ns - capture_ns < SECOND_NS else None
+        last = poses[after - 1]
+        age_ns = capture_ns - last.capture_ns
+        if age_ns > STALE_S * SECOND_NS:
+            return None
+        if after < len(poses):
+            later = poses[after]
+            if later.capture_ns - last.capture_ns <= STALE_S * SECOND_NS:
+                return between(last, later, capture_ns)
+        if after < 2 or age_ns == 0:
+            return replace(last, capture_ns=capture_ns)
+        return _continued(poses[after - 2], last, capture_ns)
+
+
+def _continued(before: Pose, last: Pose, capture_ns: int) -> Pose:
+    """The pose after the last one, by what changed since the one before."""
+    lasted_ns = last.capture_ns - before.capture_ns
+    age_ns = capture_ns - last.capture_ns
+    if lasted_ns > STALE_S * SECOND_NS:
+        return replace(last, capture_ns=capture_ns)
+    ahead = between(before, last, last.capture_ns + min(age_ns, SECOND_NS))
+    share = _DRIFT * age_ns / lasted_ns
+    north_m, east_m = metres_per_degree(last.latitude_deg)
+    way_m = math.hypot(
+        (last.latitude_deg - before.latitude_deg) * north_m,
+        ((last.longitude_deg - before.longitude_deg + 180) % 360 - 180) * east_m,
+    )
+    climbed_m = abs((last.height_m or 0.0) - (before.height_m or 0.0))
+    return replace(
+        last,
+        capture_ns=capture_ns,
+        latitude_deg=ahead.latitude_deg,
+        longitude_deg=ahead.longitude_deg,
+        height_m=last.height_m if ahead.height_m is None else ahead.height_m,
+        altitude_m=last.altitude_m if ahead.altitude_m is None else ahead.altitude_m,
+        camera=ahead.camera or last.camera,
+        platform=ahead.platform or last.platform,
+        position_error_m=math.hypot(last.position_error_m, share * way_m),
+        height_error_m=math.hypot(last.height_error_m, share * climbed_m),
+        angle_error_deg=math.hypot(last.angle_error_deg, share * _turn_deg(before.camera, last.camera)),
+    )
+
+
+def _turn_deg(first: Orientation | None, second: Orientation | None) -> float:
+    """The largest change of the three angles."""
+    if first is None or second is None:
+        return 0.0
+    changes = (
+        (second.yaw_deg - first.yaw_deg + 180) % 360 - 180,
+        second.pitch_deg - first.pitch_deg,
+        (second.roll_deg - first.roll_deg + 180) % 360 - 180,
+    )
+    return max(abs(one) for one in changes)

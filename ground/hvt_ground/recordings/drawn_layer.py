@@ -1,0 +1,88 @@
+"""One layer of boxes of a recording: which box was drawn where at a frame."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from hvt_ground.events import Origin
+from hvt_ground.sinks.rerun.overlays import ORIGINS
+
+__all__ = ["TRACK_COMPONENTS", "DrawnBox", "DrawnLayer"]
+
+TRACK_COMPONENTS = frozenset(
+    {"centers", "half_sizes", "track_id", "class_before", "class_ids", "confidence_pct", "origin"}
+)
+"""The rest is of the layer, once: how it is drawn."""
+_HUNDRED = 100
+
+_Timed = tuple[int, int, Any]
+"""Frame index, capture time in nanoseconds, value."""
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnBox:
+    """A box of a track as it stood at a frame."""
+
+    track_id: int
+    box: tuple[float, float, float, float]
+    """x1 y1 x2 y2, base pixels."""
+    base_class: str
+    class_name: str
+    confidence: float
+    origin: Origin
+
+
+class DrawnLayer:
+    """The components of one layer of boxes, each with its rows in order of frames."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, list[_Timed]] = defaultdict(list)
+        self._frames: dict[str, list[int]] = {}
+        self._names: dict[int, str] = {}
+
+    def add(self, component: str, rows: Iterable[_Timed]) -> None:
+        """Take rows of a component; the names of classes hold for all times."""
+        name = component.rpartition(":")[2]
+        if name == "context":
+            for _, _, value in rows:
+                for one in value[0]:
+                    self._names[one["class_id"]] = one["class_description"]["info"]["label"]
+        elif name in TRACK_COMPONENTS:
+            self._rows[name] += rows
+
+    def sort(self) -> None:
+        """After the last row."""
+        for name, rows in self._rows.items():
+            rows.sort(key=lambda row: row[0])
+            self._frames[name] = [row[0] for row in rows]
+
+    def times(self) -> dict[int, int]:
+        """Capture time by frame, where boxes changed."""
+        return {frame: capture_ns for rows in self._rows.values() for frame, capture_ns, _ in rows}
+
+    def at(self, frame: int, *, reported: bool) -> Iterator[DrawnBox]:
+        """What is drawn at a frame."""
+        ids = self._latest("track_id", frame)
+        before, after = self._latest("class_before", frame), self._latest("class_ids", frame)
+        percents = self._latest("confidence_pct", frame) or [0] * len(ids)
+        origins = self._latest("origin", frame) or [int(reported)] * len(ids)
+        places = zip(self._latest("centers", frame), self._latest("half_sizes", frame), strict=False)
+        for track, ((x, y), (w, h)), was, now, percent, origin in zip(
+            ids, places, before, after, percents, origins, strict=False
+        ):
+            yield DrawnBox(
+                track,
+                (x - w, y - h, x + w, y + h),
+                self._names.get(was, "?"),
+                self._names.get(now, "?"),
+                percent / _HUNDRED,
+                ORIGINS[origin] if origin < len(ORIGINS) else "base",
+            )
+
+    def _latest(self, name: str, frame: int) -> list[Any]:
+        place = bisect_right(self._frames.get(name, []), frame)
+        return list(self._rows[name][place - 1][2]) if place else []

@@ -1,0 +1,313 @@
+"""One connection to where Cursor on Target goes, over pytak: UDP, TCP or TLS, in a thread and loop of its own.
+
+pytak makes the connection, so that its environment variables say about certificates and multicast what they say in
+its other programs. Of these only `VARIABLES` are used: no enrolment, which alone needs aiohttp.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import logging
+import os
+import re
+import socket
+import ssl
+import threading
+import warnings
+from collections.abc import Mapping
+from concurrent.futures import Future
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # that aiohttp is missing
+    import pytak
+    from pytak.client_functions import get_ssl_ctx, get_tls_config
+
+from hvt_common.errors import UserError
+from hvt_ground.sinks.cot.event import CotMessage
+
+__all__ = ["VARIABLES", "CotConnection", "check_connection"]
+
+_log = logging.getLogger(__name__)
+
+VARIABLES: Final = (
+    "PYTAK_TLS_CLIENT_CERT",
+    "PYTAK_TLS_CLIENT_KEY",
+    "PYTAK_TLS_CLIENT_PASSWORD",
+    "PYTAK_TLS_CLIENT_CAFILE",
+    "PYTAK_TLS_CLIENT_CIPHERS",
+    "PYTAK_TLS_DONT_VERIFY",
+    "PYTAK_TLS_DONT_CHECK_HOSTNAME",
+    "PYTAK_TLS_SERVER_EXPECTED_HOSTNAME",
+    "PYTAK_MULTICAST_LOCAL_ADDR",
+    "PYTAK_MULTICAST_LOCAL_ADDRS",
+    "PYTAK_MULTICAST_TTL",
+)
+_CERT, _KEY, _CAFILE = "PYTAK_TLS_CLIENT_CERT", "PYTAK_TLS_CLIENT_KEY", "PYTAK_TLS_CLIENT_CAFILE"
+_PASSWORD = "PYTAK_TLS_CLIENT_PASSWORD"  # noqa: S105 - its name
+_DONT_VERIFY = "PYTAK_TLS_DONT_VERIFY"
+_ADDR, _ADDRS = "PYTAK_MULTICAST_LOCAL_ADDR", "PYTAK_MULTICAST_LOCAL_ADDRS"
+_TTL: Final = "PYTAK_MULTICAST_TTL"
+_MOST_TTL: Final = 127
+"""pytak packs it into a signed byte."""
+_CONNECT_S: Final = 5.0
+_SEND_S: Final = 10.0
+_END_S: Final = 1.0
+_MOST_EVENTS: Final = 2048
+_SOCKET_BYTES: Final = 64 * 1024
+"""What the kernel may hold back: what lies there is not replaced by what is newer."""
+_BUFFER_BYTES: Final = 4096
+"""As above, in Python. Not 0: at that asyncio's TLS pauses and does not go on."""
+_READ_BYTES: Final = 64 * 1024
+
+
+def check_connection(url: str, environment: Mapping[str, str] = os.environ) -> None:
+    """Refuse certificates and interfaces that cannot be used, before anything is received; `UserError`."""
+    settings = _settings(url, environment)
+    if urlsplit(url).scheme == "udp":
+        _check_multicast(settings)
+    if urlsplit(url).scheme != "tls":
+        return
+    if _CERT not in settings:
+        raise UserError(
+            f"--cot {url} needs a certificate of this client: set {_CERT} to FILE.pem or FILE.p12 in the environment"
+        )
+    for name in (_CERT, _KEY, _CAFILE):
+        _check_readable(name, settings)
+    _check_key(settings)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            context = get_ssl_ctx(get_tls_config(settings))
+    except Exception as error:  # noqa: BLE001 - pytak raises SyntaxError, ValueError and others
+        reason = str(error.__cause__ or error) or type(error).__name__
+        raise UserError(
+            f"--cot {url} cannot use the certificate {settings[_CERT]} ({reason}): set {_CERT}, and where it needs "
+            "them PYTAK_TLS_CLIENT_KEY, _PASSWORD and _CAFILE"
+        ) from None
+    if context.verify_mode == ssl.CERT_NONE:
+        _log.warning("CoT %s: the server's certificate is not verified (%s)", url, _DONT_VERIFY)
+    # pytak says so at each connection, to whoever reads standard error.
+    warnings.filterwarnings("ignore", message="Disabled TLS", category=UserWarning)
+
+
+def _check_multicast(settings: Mapping[str, str]) -> None:
+    ttl = settings.get(_TTL, "1")
+    if not ttl.isascii() or not ttl.isdigit() or int(ttl) > _MOST_TTL:
+        raise UserError(f"{_TTL} {ttl!r} is not accepted: give a whole number from 0 to {_MOST_TTL}")
+    for name in (_ADDR, _ADDRS):
+        given = settings.get(name, "")
+        if given.strip().lower() == "auto":  # to pytak as if there were none
+            continue
+        for address in re.split(r"[\s,]+", given.strip()):
+            try:
+                if address:
+                    ipaddress.IPv4Address(address)
+            except ValueError:
+                raise UserError(
+                    f"{name} {given!r} is not accepted: give IPv4 addresses of this machine"
+                ) from None
+
+
+def _check_readable(name: str, settings: Mapping[str, str]) -> None:
+    if name not in settings:
+        return
+    path = settings[name].replace("%%", "%")
+    try:
+        with open(path, "rb"):  # noqa: PTH123 - a text from the environment
+            pass
+    except OSError as error:
+        raise UserError(
+            f"{name} {path} cannot be read ({error.strerror}): give a file that is there"
+        ) from None
+
+
+def _check_key(settings: Mapping[str, str]) -> None:
+    """OpenSSL would ask for a password at the terminal, at each connection; pytak opens a .p12 for writing."""
+    for name in (_CERT, _KEY):
+        path = Path(settings.get(name, "").replace("%%", "%"))
+        if name not in settings:
+            continue
+        if path.suffix.lower() in (".p12", ".pfx"):
+            if not os.access(path, os.W_OK):
+                raise UserError(f"{name} {path} can only be read, and pytak writes to it: give a copy")
+        elif b"ENCRYPTED" in path.read_bytes() and not settings.get(_PASSWORD):
+            raise UserError(f"{name} {path} has an encrypted key: set {_PASSWORD}")
+
+
+def _settings(url: str, environment: Mapping[str, str]) -> dict[str, str]:
+    """What pytak is to be told, of ``environment``."""
+    parts = urlsplit(url)
+    # It reads values through a `ConfigParser`, to which a percent sign is a beginning.
+    settings = {name: environment[name].replace("%", "%%") for name in VARIABLES if environment.get(name)}
+    certificate = settings.get(_CERT, "")
+    if certificate and not certificate.endswith(".p12"):
+        settings.setdefault(_KEY, certificate)  # both in one file
+    system = ssl.get_default_verify_paths().cafile
+    if system is not None:
+        settings.setdefault(_CAFILE, system)
+    scheme = parts.scheme
+    if scheme == "udp":  # write-only, or it would also bind the port; of a broadcast no refusal is noticed
+        broadcast = (parts.hostname or "").endswith(".255")
+        scheme = "udp+broadcast+wo" if broadcast else "udp+wo"
+    return {**settings, "COT_URL": f"{scheme}://{parts.netloc}"}
+
+
+class CotConnection:
+    """An open connection; the sink of a `QueuedSink`, which makes it anew once it has failed.
+
+    `log` never waits: of each uid the newest event is to be sent, in turn. What the other side sends is read and
+    thrown away. Raises `UserError` where it cannot be opened within five seconds; `log` does so after it has failed.
+    """
+
+    path = None
+
+    def __init__(self, url: str, environment: Mapping[str, str] = os.environ) -> None:
+        self._url = url
+        self._settings = _settings(url, environment)
+        self._lock = threading.Lock()
+        self._unsent: dict[str, bytes] = {}
+        """By uid, in the order in which they came first."""
+        self._ending = False
+        self._error: UserError | None = None
+        self._opened: Future[None] = Future()
+        self._loop = asyncio.new_event_loop()
+        self._loop.set_exception_handler(_say_quietly)
+        self._wake = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name="hvt-cot", daemon=True)
+        self._thread.start()
+        self._opened.result()
+
+    def log(self, item: CotMessage) -> None:
+        """Send it soon; in place of one of the same uid that is not sent yet."""
+        with self._lock:
+            if self._error is not None:
+                raise self._error
+            self._unsent[item.uid] = item.data
+            if len(self._unsent) > _MOST_EVENTS:
+                del self._unsent[next(iter(self._unsent))]
+        self._notify()
+
+    def skipped(self, count: int) -> None:
+        """Newer ones follow."""
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """Send what waits, within a second, and close; a second call does nothing."""
+        with self._lock:
+            self._ending = True
+            if hurry is not None and hurry.is_set():
+                self._unsent.clear()
+        self._notify()
+        self._thread.join(2 * _END_S)
+
+    def _notify(self) -> None:
+        with suppress(RuntimeError):  # the loop has ended, and `_error` says why
+            self._loop.call_soon_threadsafe(self._wake.set)
+
+    def _take(self) -> bytes | None:
+        with self._lock:
+            for uid in self._unsent:
+                return self._unsent.pop(uid)
+        return None
+
+    # In its own thread
+
+    def _run(self) -> None:
+        try:
+            self._loop.run_until_complete(self._use())
+        except Exception as error:  # noqa: BLE001 - pytak and the network raise what they like
+            failure = UserError(f"{self._url}: {_reason(error)}")
+            with self._lock:
+                self._error = failure
+                self._unsent.clear()
+            if not self._opened.done():
+                self._opened.set_exception(failure)
+        finally:
+            self._loop.close()
+
+    async def _use(self) -> None:
+        reader, writer = await asyncio.wait_for(pytak.protocol_factory(self._settings), _CONNECT_S)
+        tasks = []
+        try:
+            _bound_buffers(writer)
+            self._opened.set_result(None)
+            tasks = [asyncio.ensure_future(self._send(writer)), asyncio.ensure_future(_read(reader))]
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for one in done:
+                one.result()
+        finally:
+            for one in tasks:
+                one.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            await _close(writer)
+
+    async def _send(self, writer: Any) -> None:
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            while (data := self._take()) is not None:
+                await asyncio.wait_for(_send_one(writer, data), _END_S if self._ending else _SEND_S)
+            if self._ending:
+                return
+
+
+async def _send_one(writer: Any, data: bytes) -> None:
+    """Over pytak's writer of datagrams, or a stream."""
+    if isinstance(writer, asyncio.StreamWriter):
+        writer.write(data)
+        await writer.drain()
+    else:
+        await writer.send(data)
+
+
+async def _read(reader: asyncio.StreamReader | None) -> None:
+    """A server passes on what others say; who does not take it is cut off."""
+    if reader is None:
+        await asyncio.Event().wait()
+        return
+    while await reader.read(_READ_BYTES):
+        pass
+    raise ConnectionError("the server has closed the connection")
+
+
+def _bound_buffers(writer: Any) -> None:
+    if not isinstance(writer, asyncio.StreamWriter):
+        return
+    writer.transport.set_write_buffer_limits(high=_BUFFER_BYTES)
+    made = writer.get_extra_info("socket")
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BYTES)
+    if hasattr(socket, "TCP_USER_TIMEOUT"):  # a server that is gone without a word
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(_SEND_S * 1000))
+
+
+async def _close(writer: Any) -> None:
+    writer.close()
+    if isinstance(writer, asyncio.StreamWriter):
+        with suppress(Exception):  # it may be broken, which is why it is closed
+            await asyncio.wait_for(writer.wait_closed(), _END_S)
+        writer.transport.abort()  # of a server that does not answer the farewell of TLS
+    await asyncio.sleep(0)  # transports close in the loop's next round
+
+
+def _reason(error: BaseException) -> str:
+    """What went wrong, in a few words; pytak wraps what OpenSSL says into advice not to verify."""
+    root = error.__cause__ if isinstance(error, SyntaxError) and error.__cause__ is not None else error
+    if isinstance(root, ssl.SSLCertVerificationError):
+        return f"the server's certificate is not accepted ({root.verify_message}); {_CAFILE} names its CA"
+    if isinstance(root, TimeoutError):
+        return "it does not answer"
+    if isinstance(root, socket.gaierror):
+        return "there is no host of this name"
+    if isinstance(root, ssl.SSLError):
+        return f"TLS failed ({root.reason or root})"
+    if isinstance(root, OSError) and root.strerror:
+        return os.strerror(root.errno) if root.errno and root.errno > 0 else root.strerror
+    return str(root) or type(root).__name__
+
+
+def _say_quietly(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    _log.debug("CoT: %s", context.get("message"))

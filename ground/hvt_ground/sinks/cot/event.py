@@ -1,0 +1,175 @@
+"""One Cursor on Target event, version 2.0, and its XML.
+
+The attributes are those of MITRE's public base schema and of the sub-schemas ``contact``, ``track``, ``sensor``,
+``link`` and ``remarks``, as the source of ATAK-CIV 4.6 reads them.
+"""
+
+from __future__ import annotations
+
+import math
+import unicodedata
+from dataclasses import dataclass
+from typing import Final
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+from hvt_ground.sinks.tracks_table import utc_text
+
+__all__ = ["UNKNOWN_M", "CotEvent", "CotMessage", "Motion", "Parent", "Point", "Sensor", "plain"]
+
+UNKNOWN_M: Final = 9_999_999.0
+"""What the schema says for a height or an error that is not known."""
+_DECLARATION: Final = b'<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'
+_MOST_CALLSIGN: Final = 64
+_MOST_REMARKS: Final = 400
+_MOST_URL: Final = 300
+
+
+@dataclass(frozen=True, slots=True)
+class CotMessage:
+    """An event on its way."""
+
+    uid: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """Where it is, WGS 84."""
+
+    latitude_deg: float
+    longitude_deg: float
+    ce_m: float | None
+    """Radius of the circle that holds it with 95 %."""
+    le_m: float | None = None
+    """Half the interval that holds its height with 95 %."""
+    hae_m: float | None = None
+    """Height above the ellipsoid."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Where it goes."""
+
+    course_deg: float
+    """Clockwise from true north, 0 up to 360."""
+    speed_mps: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What a camera looks at."""
+
+    azimuth_deg: float
+    """Clockwise from true north."""
+    elevation_deg: float
+    """Up from the horizon."""
+    roll_deg: float
+    hfov_deg: float
+    vfov_deg: float
+    range_m: float | None
+    """As far as it sees the ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parent:
+    """Who says it: the event of the platform."""
+
+    uid: str
+    type: str
+    callsign: str
+
+
+@dataclass(frozen=True, slots=True)
+class CotEvent:
+    """An event. Texts may hold anything: `message` takes out what XML or a reader could be harmed by."""
+
+    uid: str
+    type: str
+    how: str
+    time_ns: int
+    """When it was made; this and the next two are Unix nanoseconds by the wall clock."""
+    start_ns: int
+    """When it was so."""
+    stale_ns: int
+    point: Point
+    callsign: str
+    remarks: str = ""
+    motion: Motion | None = None
+    sensor: Sensor | None = None
+    parent: Parent | None = None
+    url: str = ""
+    """Of a picture."""
+
+    def message(self) -> CotMessage:
+        """As UTF-8 with a declaration, in one line."""
+        event = Element(
+            "event",
+            version="2.0",
+            uid=self.uid,
+            type=self.type,
+            how=self.how,
+            time=utc_text(self.time_ns),
+            start=utc_text(self.start_ns),
+            stale=utc_text(self.stale_ns),
+        )
+        point = self.point
+        SubElement(
+            event,
+            "point",
+            lat=f"{point.latitude_deg:.7f}",
+            lon=f"{point.longitude_deg:.7f}",
+            hae=_metres(point.hae_m),
+            ce=_metres(point.ce_m),
+            le=_metres(point.le_m),
+        )
+        detail = SubElement(event, "detail")
+        SubElement(detail, "contact", callsign=plain(self.callsign, most=_MOST_CALLSIGN))
+        if self.motion is not None:
+            motion = self.motion
+            SubElement(detail, "track", course=f"{motion.course_deg:.1f}", speed=f"{motion.speed_mps:.1f}")
+        if self.sensor is not None:
+            SubElement(detail, "sensor", _sensor(self.sensor))
+        link = self._link()
+        if link:
+            SubElement(detail, "link", link)
+        SubElement(detail, "remarks").text = plain(self.remarks, most=_MOST_REMARKS)
+        return CotMessage(self.uid, _DECLARATION + tostring(event, encoding="utf-8", xml_declaration=False))
+
+    def _link(self) -> dict[str, str]:
+        """One for platform and picture: of two, ATAK takes each attribute from the last."""
+        link = {}
+        if self.parent is not None:
+            link = {
+                "relation": "p-p",
+                "uid": self.parent.uid,
+                "type": self.parent.type,
+                "parent_callsign": self.parent.callsign,
+                "production_time": utc_text(self.start_ns),
+            }
+        if self.url and len(self.url) <= _MOST_URL:
+            link |= {"url": self.url, "mime": "image/jpeg"}
+        return link
+
+
+def plain(text: str, *, most: int) -> str:
+    """In one line and at most so long; without control, invisible, direction and unassigned characters."""
+    visible = "".join(one for one in text[: 4 * most] if one.isspace() or unicodedata.category(one)[0] != "C")
+    words = " ".join(visible.split())
+    return words if len(words) <= most else f"{words[: most - 1]}…"
+
+
+def _metres(value: float | None) -> str:
+    return f"{UNKNOWN_M:.1f}" if value is None or not math.isfinite(value) else f"{value:.1f}"
+
+
+def _sensor(sensor: Sensor) -> dict[str, str]:
+    shown = {
+        "azimuth": sensor.azimuth_deg % 360,
+        "elevation": sensor.elevation_deg,
+        "roll": sensor.roll_deg,
+        "fov": sensor.hfov_deg,
+        "vfov": sensor.vfov_deg,
+        "range": sensor.range_m,
+    }
+    numbers = {name: f"{value:.1f}" for name, value in shown.items() if value is not None}
+    return numbers | {"displayMagneticReference": "0", "fovAlpha": "0.3"}

@@ -1,0 +1,102 @@
+"""Which tracks are reported now: each at most once a second, and all of them at most so many a second.
+
+| a track                                          | is due after |
+|--------------------------------------------------|--------------|
+| was never reported                               | nothing      |
+| has moved, or is called something else           | 1 s          |
+| is where it was                                  | 3 s          |
+
+Of those that are due, refined ones go first, then the most confident ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from hvt_common.units import SECOND_NS
+from hvt_ground.sinks.cot.motion import Place, metres_between
+
+__all__ = ["STALE_NS", "PlacedTrack", "Reported", "TrackSchedule"]
+
+STALE_NS: Final = 5 * SECOND_NS
+"""After so long without another report a receiver takes an object for lost."""
+_MOVED_NS: Final = SECOND_NS
+_UNMOVED_NS: Final = 3 * SECOND_NS
+_LEAST_MOVE: Final = 0.25
+"""Of the error: boxes tremble by less."""
+_MOST_A_SECOND: Final = 50
+_FORGOTTEN_NS: Final = 60 * SECOND_NS
+_MOST_TRACKS: Final = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedTrack:
+    """A track that has a place."""
+
+    track_id: int
+    place: Place
+    error_m: float
+    name: str
+    base_name: str
+    confidence: float
+    refined: bool
+    sure: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Reported:
+    """What was last said of a track."""
+
+    at_ns: int
+    place: Place
+    name: str
+
+
+class TrackSchedule:
+    """Remembers what was reported when. Time is an argument, and rises."""
+
+    def __init__(self, *, most_a_second: int = _MOST_A_SECOND) -> None:
+        self._most = most_a_second
+        self._tokens = float(most_a_second)
+        self._refilled_ns: int | None = None
+        self._reported: dict[int, Reported] = {}
+
+    def due(self, tracks: Sequence[PlacedTrack], *, now_ns: int) -> list[PlacedTrack]:
+        """Those to report now, the best first; they count as reported."""
+        self._refill(now_ns)
+        due = sorted(
+            (one for one in tracks if self._is_due(one, now_ns)),
+            key=lambda one: (not one.refined, -one.confidence, one.track_id),
+        )[: int(self._tokens)]
+        self._tokens -= len(due)
+        for one in due:
+            self._reported.pop(one.track_id, None)  # so that the oldest ones are in front
+            self._reported[one.track_id] = Reported(now_ns, one.place, one.name)
+        self._forget(now_ns)
+        return due
+
+    def _refill(self, now_ns: int) -> None:
+        if self._refilled_ns is not None:
+            self._tokens += max(0, now_ns - self._refilled_ns) / SECOND_NS * self._most
+        self._tokens = min(self._tokens, float(self._most))
+        self._refilled_ns = now_ns
+
+    def _is_due(self, track: PlacedTrack, now_ns: int) -> bool:
+        before = self._reported.get(track.track_id)
+        if before is None:
+            return True
+        since_ns = now_ns - before.at_ns
+        if since_ns < _MOVED_NS:
+            return False
+        moved_m = math.hypot(*metres_between(before.place, track.place))
+        changed = moved_m > _LEAST_MOVE * track.error_m or before.name != track.name
+        return changed or since_ns >= _UNMOVED_NS
+
+    def _forget(self, now_ns: int) -> None:
+        for track_id, one in list(self._reported.items()):
+            if now_ns - one.at_ns <= _FORGOTTEN_NS and len(self._reported) <= _MOST_TRACKS:
+                return
+            del self._reported[track_id]

@@ -1,0 +1,243 @@
+"""Where a transport stream goes: a file, UDP, or SRT where PyAV is built with it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal, Protocol
+from urllib.parse import SplitResult, parse_qs, urlsplit
+
+import av
+import av.error
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.reporting import check_writable
+from hvt_ground.sinks.line_file import check_there
+
+__all__ = ["Address", "Addresses", "Datagrams", "Output", "StreamFile", "check_destination", "destination"]
+
+_log = logging.getLogger(__name__)
+
+_ACCEPTED: Final = "give FILE.ts, a folder that is there, udp://HOST:PORT or srt://HOST:PORT"
+_PACKET_BYTES: Final = 188
+_DATAGRAM_BYTES: Final = 7 * _PACKET_BYTES
+"""As all senders of MPEG-TS have it: seven packets fit an Ethernet frame."""
+_SRT_WAITS: Final = {"connect_timeout": "3000", "listen_timeout": "5000000", "timeout": "3000000"}
+"""Milliseconds, microseconds, microseconds, as libavformat has them: by default it waits for ever."""
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """Of a receiver; ``{edge}`` in it stands for the edge's id."""
+
+    url: str
+
+    @property
+    def scheme(self) -> Literal["udp", "srt"]:
+        """The protocol."""
+        return "srt" if self.url.lower().startswith("srt:") else "udp"
+
+    @property
+    def shown(self) -> str:
+        """Without what follows a question mark, which may be a secret."""
+        return self.url.partition("?")[0]
+
+    def of_edge(self, edge: str) -> Address:
+        """With the edge's id in place."""
+        return replace(self, url=self.url.replace("{edge}", edge))
+
+    @property
+    def srt_url(self) -> str:
+        """With bounds on what it may wait for."""
+        given = parse_qs(urlsplit(self.url).query, keep_blank_values=True)
+        waits = "&".join(f"{name}={value}" for name, value in _SRT_WAITS.items() if name not in given)
+        return f"{self.url}{'&' if given else '?'}{waits}"
+
+
+def destination(text: str) -> Address | Path:
+    """What ``--ts`` names, a path where it is no URL. `UserError` where it can be neither."""
+    if "://" not in text:
+        path = Path(text)
+        if path.suffix != ".ts" and not path.is_dir():
+            raise UserError(f"--ts {text} is none of what it may be: {_ACCEPTED}")
+        return path
+    parts = _split(text)
+    address = Address(text)
+    if parts.scheme == "udp":
+        _ttl(parts, text)
+    if parts.scheme not in ("udp", "srt") or not parts.hostname or parts.path.strip("/") or parts.username:
+        raise UserError(f"--ts {address.shown} is none of what it may be: {_ACCEPTED}")
+    return address
+
+
+def check_destination(text: str | None) -> None:
+    """Refuse before anything is received what could not be written; `UserError`."""
+    if text is None:
+        return
+    where = destination(text)
+    if isinstance(where, Path):
+        if not where.is_dir():
+            check_writable(where, name="--ts")
+    elif where.scheme == "srt" and not _has_srt():
+        raise UserError(
+            f"--ts {where.shown} needs SRT, and this PyAV {av.__version__} is built without it: "
+            "give udp://HOST:PORT, which ffmpeg or a media server makes SRT of"
+        )
+
+
+def _split(text: str) -> SplitResult:
+    try:
+        parts = urlsplit(text.replace("{edge}", "edge"))
+        port = parts.port
+    except ValueError:
+        port = None
+    if not port:
+        raise UserError(f"--ts {Address(text).shown} has no port from 1 to 65535: {_ACCEPTED}")
+    return parts
+
+
+def _ttl(parts: SplitResult, text: str) -> int:
+    """Hops that multicast may take; 1 where nothing is said."""
+    given = parse_qs(parts.query, keep_blank_values=True)
+    ttl = given.pop("ttl", ["1"])[-1]
+    if given or not ttl.isdecimal() or not 1 <= int(ttl) <= 255:
+        raise UserError(f"--ts {text} says behind the question mark what is not known: ttl=1 to ttl=255 is")
+    return int(ttl)
+
+
+def _has_srt() -> bool:
+    """Whether libavformat knows the protocol; without a port it gives up before it does anything."""
+    try:
+        av.open("srt://127.0.0.1").close()
+    except av.error.ProtocolNotFoundError:
+        return False
+    except (av.error.FFmpegError, OSError, ValueError):
+        pass
+    return True
+
+
+class Addresses:
+    """Those in use: two streams at one port would be none. For any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users: dict[str, str] = {}
+
+    def take(self, address: Address, *, edge: str) -> None:
+        """Raise `UserError` where another stream goes there."""
+        with self._lock:
+            user = self._users.get(address.url)
+            if user == edge:
+                raise UserError(f"--ts {address.shown} is still taken by the session before")
+            if user is not None:
+                raise UserError(
+                    f"--ts {address.shown} is taken by edge {user}: put {{edge}} into it, or give a folder"
+                )
+            self._users[address.url] = edge
+
+    def free(self, address: Address) -> None:
+        """The stream there has ended."""
+        with self._lock:
+            self._users.pop(address.url, None)
+
+    @contextmanager
+    def taken(self, address: Address, *, edge: str) -> Iterator[None]:
+        """Taken, and free again where what follows fails."""
+        self.take(address, edge=edge)
+        try:
+            yield
+        except BaseException:
+            self.free(address)
+            raise
+
+
+class Output(Protocol):
+    """Takes whole packets of a transport stream, in runs."""
+
+    def write(self, data: bytes) -> int:
+        """Take them; how many bytes those were."""
+
+    def close(self) -> None:
+        """The last came; a second call does nothing."""
+
+
+class StreamFile:
+    """A file; takes the place of one of that name. `UserError` where it cannot be written, or no further."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+        try:
+            self._file = os.open(path, flags, 0o644)
+        except OSError as error:
+            raise UserError(f"MPEG-TS file {path} cannot be created: {error.strerror}") from None
+
+    def write(self, data: bytes) -> int:
+        """As `Output.write`."""
+        left = memoryview(data)
+        try:
+            check_there(self._file, self._path)
+            while left:
+                left = left[os.write(self._file, left) :]
+        except OSError as error:
+            raise UserError(
+                f"MPEG-TS file {self._path} cannot be written any further: {error.strerror}"
+            ) from error
+        return len(data)
+
+    def close(self) -> None:
+        """As `Output.close`."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+
+class Datagrams:
+    """UDP to one host or group; never waits. `UserError` where the name leads nowhere.
+
+    What the network does not take is lost, and said once: the receiver may come later.
+    """
+
+    def __init__(self, address: Address) -> None:
+        parts = _split(address.url)
+        assert parts.port is not None, "else it is refused"
+        try:
+            family, kind, protocol, _, where = socket.getaddrinfo(
+                parts.hostname, parts.port, type=socket.SOCK_DGRAM
+            )[0]
+        except (OSError, UnicodeError) as error:
+            reason = (error.strerror if isinstance(error, OSError) else None) or error
+            raise UserError(f"--ts {address.shown} has no host that can be found: {reason}") from None
+        self._shown = address.shown
+        self._said = False
+        self._socket = socket.socket(family, kind, protocol)
+        self._socket.setblocking(False)
+        ttl = _ttl(parts, address.url)
+        if family == socket.AF_INET6:
+            self._socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, ttl)
+        else:
+            self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, ttl)
+        self._where = where
+
+    def write(self, data: bytes) -> int:
+        """As `Output.write`."""
+        for begin in range(0, len(data), _DATAGRAM_BYTES):
+            try:
+                self._socket.sendto(data[begin : begin + _DATAGRAM_BYTES], self._where)
+            except OSError as error:
+                if not self._said:
+                    self._said = True
+                    _log.warning(
+                        "%s does not take all: %s; what is lost is lost", self._shown, error.strerror
+                    )
+        return len(data)
+
+    def close(self) -> None:
+        """As `Output.close`."""
+        self._socket.close()

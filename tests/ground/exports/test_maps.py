@@ -1,0 +1,173 @@
+"""Exports for maps: they open elsewhere, and say where things were."""
+
+from __future__ import annotations
+
+import csv
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import geojson
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from mcap.reader import make_reader
+
+import hvt_ground.cli
+from hvt_common.geodesy import metres_per_degree
+from hvt_common.values import Orientation, Pose, View
+from hvt_ground.events import Overlay, PoseUpdate
+from hvt_ground.geolocation.camera import places_of_boxes
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
+from programs.rrd import Recording
+
+FRAMES, SIZE, TRACKS = 60, (320, 192), 6
+VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
+KML = "{http://www.opengis.net/kml/2.2}"
+GX = "{http://www.google.com/kml/ext/2.2}"
+
+
+def pose_at(frame: int) -> Pose:
+    """Eastwards at 8 m/s, 60 m above the ground, looking down."""
+    return Pose(
+        START_NS + frame * STEP_NS,
+        47.0,
+        8.5 + 8 * frame / 15 / metres_per_degree(47.0)[1],
+        height_m=60.0,
+        altitude_m=460.0,
+        camera=Orientation(0, -90, 0),
+        hfov_deg=70.0,
+        position_error_m=0.5,
+        height_error_m=0.5,
+        angle_error_deg=0.2,
+    )
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    """As the ground writes it, with a pose a second."""
+    drawn = drawn_frames(FRAMES, SIZE)
+    path = tmp_path_factory.mktemp("flight") / "flight.rrd"
+    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
+        for event, _ in session(drawn, coded(drawn, kbps=300, keyint=20), tracks=TRACKS, total_kbps=500):
+            if isinstance(event, Overlay):
+                frame = event.frame_index
+                places = places_of_boxes(pose_at(frame), event.boxes_base_px, view=VIEW)
+                recorder.log(replace(event, places=places))
+                if frame % 15 == 0:
+                    recorder.log(PoseUpdate(frame, event.capture_ns, pose_at(frame), VIEW))
+            else:
+                recorder.log(event)
+    return path
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory) -> Path:
+    """A flight without a pose."""
+    drawn = drawn_frames(20, SIZE)
+    path = tmp_path_factory.mktemp("bare") / "flight.rrd"
+    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
+        for event, _ in session(drawn, coded(drawn, kbps=300), tracks=2, total_kbps=500):
+            recorder.log(event)
+    return path
+
+
+def export(recording: Path, out: Path) -> Path:
+    """Run the command; it must be content."""
+    assert hvt_ground.cli.main(["export", str(recording), "--out", str(out)]) == 0
+    return out
+
+
+def test_the_recording_has_a_map_and_opens_with_it(recording, bare):
+    """A viewer would have a tab that is empty, or none where there is something to show."""
+    read = Recording(recording)
+    assert len(read.rows("/map/camera", "GeoPoints:positions")) == 4
+    points = read.rows("/map/tracks", "GeoPoints:positions")
+    assert 3 <= len(points) <= 5
+    assert all(len(row[2]) == TRACKS for row in points)
+    assert read.rows("/map/tracks", "track_id")[0][2] == list(range(1, TRACKS + 1))
+    without = Recording(bare)
+    assert without.rows("/map/tracks", "GeoPoints:positions") == []
+
+
+def test_geojson_is_read_by_its_library_and_places_are_right(recording, tmp_path):
+    """QGIS would show nothing, or things in the sea: longitude comes first."""
+    found = geojson.loads(export(recording, tmp_path / "map.geojson").read_text(encoding="utf-8"))
+    assert found.is_valid, found.errors()
+    camera, *tracks = found["features"]
+    assert camera["properties"]["kind"] == "camera"
+    assert camera["geometry"]["type"] == "LineString"
+    assert camera["geometry"]["coordinates"][0] == pytest.approx([8.5, 47.0])
+    assert camera["properties"]["height_m"] == [60.0] * 4
+    assert sorted(one["properties"]["id"] for one in tracks) == list(range(1, TRACKS + 1))
+    for one in tracks:
+        spots = one["geometry"]["coordinates"]
+        assert one["geometry"]["type"] == "LineString"  # 8 m/s is more than their error
+        assert spots[0] == pytest.approx([8.5, 47.0], abs=2e-3)
+        assert 0 < one["properties"]["error_minor_m"] <= one["properties"]["error_m"] < 20
+    utc = camera["properties"]["utc"][0]
+    assert utc.startswith("2026-09-21T")
+
+
+def test_kml_is_placemarks_with_times_and_ellipses(recording, tmp_path):
+    """Google Earth would refuse it, or have no slider."""
+    root = ET.fromstring(export(recording, tmp_path / "map.kml").read_text(encoding="utf-8"))
+    marks = root.findall(f".//{KML}Placemark")
+    assert len(marks) == 1 + TRACKS
+    for mark in marks:
+        (way,) = mark.findall(f".//{GX}Track")
+        assert len(way.findall(f"{KML}when")) == len(way.findall(f"{GX}coord")) >= 3
+    ring = marks[1].find(f".//{KML}Polygon//{KML}coordinates")
+    assert ring is not None
+    corners = np.array([[float(v) for v in one.split(",")] for one in (ring.text or "").split()])
+    assert corners[0] == pytest.approx(corners[-1])
+    assert (np.ptp(corners, axis=0) > 0).all()
+
+
+def test_tables_have_places_between_two_poses(recording, tmp_path):
+    """Three rows of four would have no place, or one of another second."""
+    with export(recording, tmp_path / "t.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    placed = [row for row in rows if row["latitude"]]
+    assert len(placed) == len(rows)
+    first = [row for row in rows if row["id"] == "1"]
+    for row in first[:45]:
+        box = np.array([[float(row[name]) for name in "xywh"]], np.float32)
+        box[:, 2:] += box[:, :2]
+        truth = places_of_boxes(pose_at(int(row["frame"]) - 1), box, view=VIEW)
+        assert truth is not None
+        assert [float(row["latitude"]), float(row["longitude"])] == pytest.approx(
+            truth.places_deg[0].tolist(), abs=2e-6
+        )
+    table = pq.read_table(export(recording, tmp_path / "t.parquet"))
+    assert table["latitude"].null_count == 0
+    assert table["error_m"].to_pylist()[0] == pytest.approx(float(rows[0]["error_m"]))
+
+
+def test_mcap_has_the_cameras_place(recording, tmp_path):
+    """Foxglove's map panel would stay empty."""
+    with export(recording, tmp_path / "f.mcap").open("rb") as file:
+        fixes = [
+            LocationFix.FromString(message.data)
+            for _, channel, message in make_reader(file).iter_messages()
+            if channel.topic == "/uav-1/location"
+        ]
+    assert [round(one.latitude, 4) for one in fixes] == [47.0] * 4
+    assert fixes[0].altitude == pytest.approx(460.0)
+
+
+@pytest.mark.parametrize("kind", ["geojson", "kml"])
+def test_without_a_pose_it_says_what_is_missing(bare, tmp_path, capsys, kind):
+    """An empty map would be taken for an empty field."""
+    assert hvt_ground.cli.main(["export", str(bare), "--out", str(tmp_path / f"m.{kind}")]) == 2
+    assert "has no pose: give hvt-edge --pose" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_tables_without_a_pose_leave_the_place_empty(bare, tmp_path):
+    """A zero would be a place in the Gulf of Guinea."""
+    with export(bare, tmp_path / "t.csv").open(encoding="utf-8") as file:
+        assert {row["latitude"] for row in csv.DictReader(file)} == {""}
+    assert pq.read_table(export(bare, tmp_path / "t.parquet"))["latitude"].null_count > 0

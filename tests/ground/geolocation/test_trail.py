@@ -1,0 +1,78 @@
+"""The pose of a moment."""
+
+from __future__ import annotations
+
+import pytest
+
+from hvt_common.values import Orientation, Pose
+from hvt_ground.geolocation.trail import PoseTrail
+
+SECOND_NS = 1_000_000_000
+
+
+def pose(second: float, *, north: float = 0.0, yaw: float = 0.0) -> Pose:
+    """On its way north."""
+    return Pose(
+        round(second * SECOND_NS),
+        50.0 + north / 111_229,
+        10.0,
+        height_m=50.0,
+        camera=Orientation(yaw, -60, 0),
+    )
+
+
+def test_between_two_it_is_on_the_line():
+    """Places would jump once a second."""
+    trail = PoseTrail()
+    trail.add(pose(0))
+    trail.add(pose(1, north=20, yaw=10))
+    found = trail.at(SECOND_NS // 4)
+    assert found is not None
+    assert found.latitude_deg == pytest.approx(50 + 5 / 111_229, abs=1e-8)
+    assert found.camera is not None
+    assert found.camera.yaw_deg == pytest.approx(2.5)
+    assert found.angle_error_deg == 2.0
+
+
+def test_after_the_last_it_goes_on_and_is_less_sure():
+    """A picture between two reports would be placed where the drone was a second ago."""
+    trail = PoseTrail()
+    trail.add(pose(0))
+    trail.add(pose(1, north=20, yaw=10))
+    found = trail.at(round(1.5 * SECOND_NS))
+    assert found is not None
+    assert found.latitude_deg == pytest.approx(50 + 30 / 111_229, abs=1e-8)
+    assert found.camera is not None
+    assert found.camera.yaw_deg == pytest.approx(15)
+    assert found.position_error_m == pytest.approx((3**2 + 5**2) ** 0.5, rel=0.01)
+    assert found.angle_error_deg > 2.0
+
+
+def test_a_camera_that_stands_is_as_sure_as_it_was():
+    """A fixed camera's places would grow vague between two reports."""
+    trail = PoseTrail()
+    trail.add(pose(0))
+    trail.add(pose(1))
+    found = trail.at(5 * SECOND_NS)
+    assert found is not None
+    assert (found.position_error_m, found.angle_error_deg) == (3.0, 2.0)
+
+
+def test_ten_seconds_old_is_no_pose():
+    """An aircraft that is gone would still place what it sees."""
+    trail = PoseTrail()
+    assert trail.at(0) is None
+    trail.add(pose(0))
+    assert trail.at(10 * SECOND_NS) is not None
+    assert trail.at(10 * SECOND_NS + 1) is None
+    assert trail.age_s(12 * SECOND_NS) == 12
+
+
+def test_an_old_one_is_left_out_and_memory_is_bounded():
+    """A repeated message would turn time back, and a long flight fill the memory."""
+    trail = PoseTrail(most=10)
+    for second in range(100):
+        assert trail.add(pose(second))
+    assert not trail.add(pose(50))
+    assert trail.at(80 * SECOND_NS) is None  # the last ten are from 90 on
+    assert trail.at(95 * SECOND_NS) is not None

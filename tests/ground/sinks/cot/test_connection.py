@@ -1,0 +1,432 @@
+"""Cursor on Target over real sockets: datagrams, streams, certificates, and servers that are bad or gone."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.serialization import pkcs12
+from cryptography.x509 import load_pem_x509_certificate
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures
+from hvt_ground.sinks import QueuedSink
+from hvt_ground.sinks.cot.connection import CotConnection, check_connection
+from hvt_ground.sinks.cot.event import CotMessage
+from programs.fleet_keys import EXPIRED, Fleet
+from programs.processes import eventually, free_ports
+
+# What pytak does is its affair.
+pytestmark = pytest.mark.filterwarnings("ignore:ssl.OP_NO_SSL:DeprecationWarning")
+
+LAST = b"</event>"
+
+
+def message(uid: str, number: int = 0, *, size: int = 600) -> CotMessage:
+    """As long as an event is."""
+    head = b'<event uid="%s" number="%d">' % (uid.encode(), number)
+    return CotMessage(uid, head + b"." * (size - len(head) - len(LAST)) + LAST)
+
+
+class Server:
+    """Accepts connections and reads what comes, until it is closed; ``reads`` False lets it lie."""
+
+    def __init__(self, port: int, *, tls: ssl.SSLContext | None = None, reads: bool = True) -> None:
+        self.received = b""
+        self.connections: list[socket.socket] = []
+        self._tls, self._reads = tls, reads
+        self._listening = socket.create_server(("127.0.0.1", port))
+        self._threads = [threading.Thread(target=self._accept, daemon=True)]
+        self._threads[0].start()
+
+    @property
+    def uids(self) -> list[str]:
+        """Of the events that came, in order."""
+        return [part.split(b'"')[1].decode() for part in self.received.split(LAST)[:-1]]
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                made, _ = self._listening.accept()
+                thread = threading.Thread(target=self._serve, args=(made,), daemon=True)
+                self._threads.append(thread)
+                thread.start()
+
+    def _serve(self, made: socket.socket) -> None:
+        with suppress(OSError):
+            if self._tls is not None:
+                made = self._tls.wrap_socket(made, server_side=True)
+            self.connections.append(made)
+            while self._reads and (data := made.recv(65536)):
+                self.received += data
+
+    def close(self) -> None:
+        """As a process ends: the port is free, the connections are cut."""
+        self._listening.shutdown(socket.SHUT_RDWR)
+        self._listening.close()
+        for one in self.connections:
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join(5)
+        for one in self.connections:
+            one.close()
+
+
+@pytest.fixture
+def port() -> int:
+    return free_ports(1)[0]
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory) -> Fleet:
+    """A CA with a server, a client, and a server of another name."""
+    fleet = Fleet(tmp_path_factory.mktemp("keys") / "keys")
+    fleet.keys("add-ground", "takserver", "--host", "127.0.0.1")
+    fleet.keys("add-ground", "elsewhere", "--host", "192.0.2.9")
+    fleet.keys("add-ground", "client")
+    return fleet
+
+
+def demanding(fleet: Fleet, name: str = "takserver") -> ssl.SSLContext:
+    """A server that wants a certificate of the client, as TAK Server does."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(fleet.folder / f"{name}.pem", fleet.folder / f"{name}.key")
+    context.load_verify_locations(fleet.folder / "ca.pem")
+    context.verify_mode = ssl.CERT_REQUIRED
+    return context
+
+
+def keys(fleet: Fleet, **changes: str) -> dict[str, str]:
+    """The environment of a client."""
+    said = {
+        "PYTAK_TLS_CLIENT_CERT": str(fleet.folder / "client.pem"),
+        "PYTAK_TLS_CLIENT_KEY": str(fleet.folder / "client.key"),
+        "PYTAK_TLS_CLIENT_CAFILE": str(fleet.folder / "ca.pem"),
+    }
+    return {**said, **{f"PYTAK_{name}": value for name, value in changes.items()}}
+
+
+def sink_of(url: str, environment: dict[str, str] | None = None) -> tuple[QueuedSink[CotMessage], Failures]:
+    failures = Failures(time.time_ns)
+    opened = QueuedSink(f"CoT {url}", lambda: CotConnection(url, environment or {}), failures=failures)
+    return opened, failures
+
+
+def ended(sink: QueuedSink[CotMessage]) -> bool:
+    return sink.join(time.monotonic() + 10)
+
+
+@pytest.fixture
+def datagrams(port: int) -> Iterator[socket.socket]:
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as made:
+        made.settimeout(10)
+        made.bind(("127.0.0.1", port))
+        yield made
+
+
+def test_a_datagram_is_one_event(port, datagrams):
+    """A receiver of datagrams can put nothing together."""
+    connection = CotConnection(f"udp://127.0.0.1:{port}", {})
+    for number in range(3):
+        connection.log(message(f"uid-{number}"))
+    assert [datagrams.recv(65536) for _ in range(3)] == [message(f"uid-{number}").data for number in range(3)]
+    connection.close()
+
+
+def test_a_multicast_group_gets_it(port):
+    """The first thing that anybody with three phones in a field tries."""
+    group, interface = "239.2.3.1", socket.inet_aton("127.0.0.1")
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as receiver:
+        receiver.settimeout(10)
+        receiver.bind((group, port))
+        receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(group) + interface)
+        connection = CotConnection(f"udp://{group}:{port}", {"PYTAK_MULTICAST_LOCAL_ADDR": "127.0.0.1"})
+        connection.log(message("here"))
+        assert receiver.recv(65536) == message("here").data
+        connection.close()
+
+
+def test_nobody_at_the_other_end_of_datagrams_is_known_and_tried_again(port, caplog):
+    """The machine that answers "port unreachable" would end the reports, or fill the log."""
+    sink, failures = sink_of(f"udp://127.0.0.1:{port}")
+
+    def refused() -> bool:
+        sink.log(message("a"))
+        return any(not one.working for one in failures.parts)
+
+    eventually(refused, within_s=10, what="a refusal is noticed")
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as receiver:
+        receiver.bind(("127.0.0.1", port))
+        receiver.settimeout(0.1)
+        got = []
+
+        def arrives() -> bool:
+            sink.log(message("b"))
+            with suppress(TimeoutError):
+                got.append(receiver.recv(65536))
+            return bool(got)
+
+        eventually(arrives, within_s=20, what="it is tried again")
+    assert ended(sink)
+    assert sum("Connection refused" in one for one in caplog.messages) == 1
+
+
+def test_a_server_that_restarts_gets_events_again_and_it_is_said_once(port, caplog):
+    """The map would stay empty for the rest of the flight after an update of the server."""
+    sink, _ = sink_of(f"tcp://127.0.0.1:{port}")
+    numbers = itertools.count()
+
+    def arrives(server: Server) -> bool:
+        sink.log(message(f"uid-{next(numbers)}"))
+        time.sleep(0.01)
+        return bool(server.uids)
+
+    eventually(lambda: not sink.is_open() and caplog.messages, within_s=10, what="nobody is there yet")
+
+    def noticed(sink: QueuedSink[CotMessage]) -> bool:
+        sink.log(message("is there anybody"))
+        return not sink.is_open()
+
+    for _ in range(2):
+        server = Server(port)
+        try:
+            eventually(lambda now=server: arrives(now), within_s=30, what="events come")
+        finally:
+            server.close()
+        eventually(lambda: noticed(sink), within_s=10, what="the end of the server is noticed")
+    assert ended(sink)
+    assert next(one for one in caplog.messages if "tried again" in one).endswith(
+        f"tcp://127.0.0.1:{port}: Connection refused; all else goes on, and it is tried again"
+    )
+    assert sum("tried again" in one for one in caplog.messages) <= 3
+    assert not any("Traceback" in one for one in caplog.messages)
+
+
+def test_a_server_that_takes_nothing_gets_the_newest_of_each_afterwards(port):
+    """It would hold up the flight, or be told for minutes where things were long ago."""
+    server = Server(port, reads=False)
+    try:
+        connection = CotConnection(f"tcp://127.0.0.1:{port}", {})
+        eventually(lambda: server.connections, within_s=10, what="the connection")
+        server.connections[0].setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8192)
+        began_s = time.monotonic()
+        for number in range(500):
+            for uid in range(20):
+                connection.log(message(f"uid-{uid}", number))
+        assert time.monotonic() - began_s < 5, "6 MB were logged, and nobody waited"
+        reader = server.connections[0]
+        reader.settimeout(2)
+        received = b""
+        with suppress(TimeoutError):
+            while data := reader.recv(65536):
+                received += data
+        assert len(received) < 3_000_000, "what was replaced was not sent"
+        parts = received.split(LAST)[:-1]
+        last = {part.split(b'"')[1]: int(part.split(b'"')[3]) for part in parts}
+        assert last == {f"uid-{uid}".encode(): 499 for uid in range(20)}
+        connection.close()
+    finally:
+        server.close()
+
+
+def test_a_server_that_talks_is_heard_out(port):
+    """A TAK server passes on what all others say, and cuts off whoever does not take it."""
+    server = Server(port)
+    try:
+        connection = CotConnection(f"tcp://127.0.0.1:{port}", {})
+        eventually(lambda: server.connections, within_s=10, what="the connection")
+        server.connections[0].settimeout(10)
+        server.connections[0].sendall(b"<event>" + b"x" * 20_000_000)
+        connection.log(message("still"))
+        eventually(lambda: server.uids == ["still"], within_s=10, what="it goes on")
+        connection.close()
+    finally:
+        server.close()
+
+
+def test_what_waits_at_the_end_is_sent(port):
+    """The last seconds of a flight would be missing."""
+    server = Server(port)
+    try:
+        sink, failures = sink_of(f"tcp://127.0.0.1:{port}")
+        assert sink.is_open(within_s=10)
+        for number in range(500):
+            sink.log(message(f"uid-{number}"))
+        assert ended(sink)
+        eventually(lambda: len(server.uids) == 500, within_s=5, what="all of it")
+        assert failures.parts == ()
+    finally:
+        server.close()
+
+
+def test_events_go_over_tls_with_the_certificate_of_the_client(port, fleet):
+    """TAK Server takes nothing else."""
+    server = Server(port, tls=demanding(fleet))
+    try:
+        url, said = f"tls://127.0.0.1:{port}", keys(fleet)
+        check_connection(url, said)
+        sink, failures = sink_of(url, said)
+        for number in range(200):
+            sink.log(message(f"secret-{number}"))
+            time.sleep(0.002 * (number % 3))
+        eventually(lambda: len(server.uids) == 200, within_s=10, what=f"all is sent, not {len(server.uids)}")
+        (made,) = server.connections
+        assert isinstance(made, ssl.SSLSocket)
+        names = dict(one[0] for one in made.getpeercert()["subject"])
+        assert names["commonName"] == "client"
+        assert ended(sink)
+        assert failures.parts == ()
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize("password", ["atakatak", "50%%s=${x}"])
+def test_the_keystore_of_a_tak_user_works(port, fleet, tmp_path, password):
+    """It is what the administrator of a TAK server hands out, with a password of his taste."""
+    certificate = load_pem_x509_certificate((fleet.folder / "client.pem").read_bytes())
+    key = serialization.load_pem_private_key((fleet.folder / "client.key").read_bytes(), None)
+    store = tmp_path / "client.p12"
+    locked = serialization.BestAvailableEncryption(password.encode())
+    store.write_bytes(pkcs12.serialize_key_and_certificates(b"client", key, certificate, None, locked))
+    said = {
+        "PYTAK_TLS_CLIENT_CERT": str(store),
+        "PYTAK_TLS_CLIENT_PASSWORD": password,
+        "PYTAK_TLS_CLIENT_CAFILE": str(fleet.folder / "ca.pem"),
+    }
+    url = f"tls://127.0.0.1:{port}"
+    with pytest.raises(UserError, match="cannot use the certificate"):
+        check_connection(url, {**said, "PYTAK_TLS_CLIENT_PASSWORD": "wrong"})
+    check_connection(url, said)
+    server = Server(port, tls=demanding(fleet))
+    try:
+        connection = CotConnection(url, said)
+        connection.log(message("secret"))
+        eventually(lambda: server.uids == ["secret"], within_s=10, what="it is sent")
+        connection.close()
+    finally:
+        server.close()
+
+
+def test_certificate_and_key_may_be_in_one_file(port, fleet, tmp_path):
+    """As many programs write them."""
+    both = tmp_path / "both.pem"
+    both.write_bytes(b"".join((fleet.folder / f"client.{one}").read_bytes() for one in ("key", "pem")))
+    said = keys(fleet, TLS_CLIENT_CERT=str(both), TLS_CLIENT_KEY="")
+    check_connection(f"tls://127.0.0.1:{port}", said)
+
+
+@pytest.mark.parametrize(
+    ("server_name", "changes", "reason"),
+    [
+        ("elsewhere", {}, "IP address mismatch"),
+        ("takserver", {"TLS_CLIENT_CAFILE": "other-ca.pem"}, "PYTAK_TLS_CLIENT_CAFILE names its CA"),
+        ("expired", {}, "certificate has expired"),
+        ("takserver", {"TLS_CLIENT_CERT": "stranger.pem", "TLS_CLIENT_KEY": "stranger.key"}, "TLS failed"),
+    ],
+)
+def test_certificates_that_do_not_fit_are_said(port, fleet, tmp_path, server_name, changes, reason):
+    """Nothing would come, and nobody would know which of four certificates it is; places would go to a stranger."""
+    other = Fleet(tmp_path / "other")
+    other.keys("add-ground", "stranger")
+    (tmp_path / "other-ca.pem").write_bytes((other.folder / "ca.pem").read_bytes())
+    fleet.reissue("expired", "127.0.0.1", now=EXPIRED)
+    for suffix in ("pem", "key"):
+        (tmp_path / f"stranger.{suffix}").write_bytes((other.folder / f"stranger.{suffix}").read_bytes())
+    server = Server(port, tls=demanding(fleet, server_name))
+    try:
+        said = keys(fleet, **{name: str(tmp_path / file) for name, file in changes.items()})
+        sink, failures = sink_of(f"tls://127.0.0.1:{port}", said)
+
+        def refused() -> bool:
+            sink.log(message("secret"))
+            return any(reason in one.reason for one in failures.parts)
+
+        eventually(refused, within_s=10, what=f"{reason}; there is {failures.parts}")
+        assert server.uids == []
+        assert ended(sink)
+    finally:
+        server.close()
+
+
+def test_a_server_that_never_shakes_hands_does_not_hold_up_the_end(port, fleet):
+    """Ctrl-C would be answered with kill -9."""
+    server = Server(port, reads=False)
+    try:
+        sink, failures = sink_of(f"tls://127.0.0.1:{port}", keys(fleet))
+        eventually(lambda: failures.parts, within_s=20, what="it is given up")
+        assert failures.parts[0].reason == f"tls://127.0.0.1:{port}: it does not answer"
+        began_s = time.monotonic()
+        assert ended(sink)
+        assert time.monotonic() - began_s < 5
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"TLS_CLIENT_CERT": ""}, "set PYTAK_TLS_CLIENT_CERT to FILE.pem or FILE.p12"),
+        (
+            {"TLS_CLIENT_CERT": "/nowhere/c.pem"},
+            "PYTAK_TLS_CLIENT_CERT /nowhere/c.pem cannot be read (No such file",
+        ),
+        ({"TLS_CLIENT_KEY": "/nowhere/c.key"}, "PYTAK_TLS_CLIENT_KEY /nowhere/c.key cannot be read"),
+        ({"TLS_CLIENT_CAFILE": "/nowhere/a.pem"}, "PYTAK_TLS_CLIENT_CAFILE /nowhere/a.pem cannot be read"),
+        ({"TLS_CLIENT_KEY": "NOTES"}, "cannot use the certificate"),
+        ({"TLS_CLIENT_CERT": "NOTES.p12"}, "cannot use the certificate"),
+        ({"TLS_CLIENT_CAFILE": "NOTES"}, "cannot use the certificate"),
+        ({"TLS_DONT_VERIFY": "perhaps"}, "cannot use the certificate"),
+    ],
+)
+def test_keys_that_cannot_be_used_end_the_start(fleet, tmp_path, changes, sentence):
+    """It would be noticed in the air."""
+    for name in ("NOTES", "NOTES.p12"):
+        (tmp_path / name).write_text("no key")
+    said = {name: str(tmp_path / one) if one.startswith("NOTES") else one for name, one in changes.items()}
+    with pytest.raises(UserError) as refusal:
+        check_connection("tls://takserver.example:8089", keys(fleet, **said))
+    assert sentence in str(refusal.value)
+
+
+def test_a_key_that_needs_a_password_is_asked_for_it_once(fleet, tmp_path):
+    """OpenSSL would ask at the terminal, and the ground would wait for an answer."""
+    key = serialization.load_pem_private_key((fleet.folder / "client.key").read_bytes(), None)
+    locked = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.BestAvailableEncryption(b"atakatak"),
+    )
+    path = tmp_path / "locked.key"
+    path.write_bytes(locked)
+    said = keys(fleet, TLS_CLIENT_KEY=str(path))
+    with pytest.raises(UserError, match=r"has an encrypted key: set PYTAK_TLS_CLIENT_PASSWORD"):
+        check_connection("tls://takserver.example:8089", said)
+    check_connection("tls://takserver.example:8089", {**said, "PYTAK_TLS_CLIENT_PASSWORD": "atakatak"})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("TTL", "far"), ("TTL", "128"), ("LOCAL_ADDR", "eth0"), ("LOCAL_ADDRS", "192.0.2.1, ::1")],
+)
+def test_settings_of_multicast_that_cannot_be_used_end_the_start(name, value):
+    """Nothing would ever be sent, and the log would say why in the words of another program."""
+    with pytest.raises(UserError, match=f"PYTAK_MULTICAST_{name} '{value}' is not accepted"):
+        check_connection("udp://239.2.3.1:6969", {f"PYTAK_MULTICAST_{name}": value})
+    check_connection("udp://239.2.3.1:6969", {"PYTAK_MULTICAST_LOCAL_ADDRS": "192.0.2.1, 192.0.2.2"})
+
+
+def test_no_private_key_is_left_behind(port, fleet, tmp_path, monkeypatch):
+    """Whoever else is on this machine could take part: pytak unpacks a keystore into files."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    (tmp_path / "tmp").mkdir()
+    test_the_keystore_of_a_tak_user_works(port, fleet, tmp_path, "x")
+    assert list(Path(tmp_path / "tmp").iterdir()) == []

@@ -1,0 +1,136 @@
+"""The XML of an event, read by a parser that knows nothing of it."""
+
+from __future__ import annotations
+
+import datetime as dt
+from dataclasses import replace
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from hvt_ground.sinks.cot.event import CotEvent, Motion, Parent, Point, Sensor
+
+NOW_NS = 1_800_000_000_123_000_000
+EVENT = CotEvent(
+    uid="hvt-uav-1-00c0ffee-17",
+    type="a-u-G-E-V-C",
+    how="m-f",
+    time_ns=NOW_NS,
+    start_ns=NOW_NS - 400_000_000,
+    stale_ns=NOW_NS + 4_600_000_000,
+    point=Point(52.0000001, -13.25, ce_m=4.25),
+    callsign="car 17",
+)
+
+
+def read(event: CotEvent) -> ET.Element:
+    return ET.fromstring(event.message().data)
+
+
+def test_an_event_has_what_the_schema_demands():
+    """ATAK drops what lacks one of these, without a word."""
+    event = read(EVENT)
+    assert event.tag == "event"
+    assert event.attrib == {
+        "version": "2.0",
+        "uid": "hvt-uav-1-00c0ffee-17",
+        "type": "a-u-G-E-V-C",
+        "how": "m-f",
+        "time": "2027-01-15T08:00:00.123Z",
+        "start": "2027-01-15T07:59:59.723Z",
+        "stale": "2027-01-15T08:00:04.723Z",
+    }
+    for name in ("time", "start", "stale"):
+        assert dt.datetime.fromisoformat(event.attrib[name]).tzinfo is not None
+    (point,) = event.findall("point")
+    assert {name: float(value) for name, value in point.attrib.items()} == {
+        "lat": 52.0000001,
+        "lon": -13.25,
+        "hae": 9999999.0,
+        "ce": 4.2,
+        "le": 9999999.0,
+    }
+    assert [one.tag for one in event] == ["point", "detail"]
+    assert event.find("detail/contact").attrib == {"callsign": "car 17"}
+
+
+def test_what_is_not_known_is_left_out():
+    """A course of 0 that nobody measured would be an arrow to the north."""
+    assert {one.tag for one in read(EVENT).find("detail")} == {"contact", "remarks"}
+    sensor = Sensor(azimuth_deg=-10, elevation_deg=-30, roll_deg=0, hfov_deg=45, vfov_deg=26, range_m=None)
+    assert "range" not in read(replace(EVENT, sensor=sensor)).find("detail/sensor").attrib
+
+
+def test_field_of_view_motion_and_link_are_where_atak_reads_them():
+    """The platform would be a point without a wedge, and the object one without an arrow."""
+    sensor = Sensor(azimuth_deg=-10, elevation_deg=-30, roll_deg=2, hfov_deg=45, vfov_deg=26, range_m=812)
+    event = replace(
+        EVENT,
+        sensor=sensor,
+        motion=Motion(271.04, 12.34),
+        parent=Parent("hvt-uav-1", "a-f-A-M-H-Q", "uav-1"),
+        url="http://ground:8080/stills/uav-1/00ff-3/still",
+    )
+    detail = read(event).find("detail")
+    shown = detail.find("sensor").attrib
+    assert {
+        name: float(shown[name]) for name in ("azimuth", "elevation", "roll", "fov", "vfov", "range")
+    } == {
+        "azimuth": 350,
+        "elevation": -30,
+        "roll": 2,
+        "fov": 45,
+        "vfov": 26,
+        "range": 812,
+    }
+    assert detail.find("track").attrib == {"course": "271.0", "speed": "12.3"}
+    (link,) = detail.findall("link")  # of two, ATAK would take the platform's uid from the one without
+    assert link.attrib == {
+        "relation": "p-p",
+        "uid": "hvt-uav-1",
+        "type": "a-f-A-M-H-Q",
+        "parent_callsign": "uav-1",
+        "production_time": "2027-01-15T07:59:59.723Z",
+        "url": "http://ground:8080/stills/uav-1/00ff-3/still",
+        "mime": "image/jpeg",
+    }
+
+
+@pytest.mark.parametrize(
+    ("said", "read_as"),
+    [
+        ("<b a='&\"'>]]></remarks>", "<b a='&\"'>]]></remarks>"),
+        ("car\x00\x07\x1b[31m red\x7f\x9f", "car[31m red"),
+        ("two\nlines\tof  it\u2028here", "two lines of it here"),
+        ("\u202egpj.rac\u2069\ufeff\u200b", "gpj.rac"),
+        ("\ud800 half \udfff", "half"),
+        ("\ufffe\uffff", None),
+        ("boat 船 🚤", "boat 船 🚤"),
+    ],
+)
+def test_text_from_the_network_harms_no_reader(said, read_as):
+    """A class name could end the event, forge a second one, or turn the words of the operator around."""
+    event = replace(EVENT, callsign=said, remarks=said)
+    data = event.message().data
+    assert data.count(b"<event") == data.count(b"</event>") == 1
+    detail = read(event).find("detail")
+    assert detail.find("remarks").text == read_as
+    assert detail.find("contact").attrib["callsign"] == (read_as or "")
+
+
+def test_an_event_is_bounded():
+    """A class name of a megabyte would be sent once a second, in datagrams that nobody can take."""
+    link = Parent("hvt-uav-1", "a-f-A-M-H-Q", "uav-1")
+    huge = replace(EVENT, callsign="x" * 10**6, remarks="&" * 10**6, url="http://" + "y" * 10**4, parent=link)
+    assert len(huge.message().data) < 8000
+    detail = read(huge).find("detail")
+    assert len(detail.find("contact").attrib["callsign"]) == 64
+    assert len(detail.find("remarks").text) == 400
+    assert "url" not in detail.find("link").attrib, "half an address leads nowhere"
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), None])
+def test_an_error_that_is_no_number_is_unknown(value):
+    """A reader that takes it for a number would fail, or draw a circle around the world."""
+    point = read(replace(EVENT, point=Point(1, 2, ce_m=value, hae_m=value))).find("point")
+    assert (point.attrib["ce"], point.attrib["hae"]) == ("9999999.0", "9999999.0")

@@ -1,0 +1,281 @@
+"""The stream as players and KLV readers have it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
+from hvt_common.values import Orientation, Pose, View
+from hvt_common.video.annex_b import nal_units, parameter_sets
+from hvt_common.video.hevc import BaseDecoder
+from hvt_ground.events import Event, Overlay, PoseUpdate, VideoSample
+from hvt_ground.sinks import QueuedSink
+from hvt_ground.sinks.transport_stream.destination import Address, Addresses
+from hvt_ground.sinks.transport_stream.stream import TransportStream, live_stream, stream_file
+from hvt_ground.sinks.transport_stream.uas import Platform
+from media.klv_reader import ReadStream, read_stream
+from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes
+from programs.processes import eventually, free_ports
+
+FRAMES, SIZE, KEYINT, TRACKS = 60, (320, 192), 20, 4
+VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
+PLATFORM = Platform("uav-1", "00ff", VIEW)
+_DELIMITER = 35
+
+
+def pose_at(frame: int) -> Pose:
+    """Northwards, 60 m above the ground, looking down."""
+    return Pose(
+        START_NS + frame * STEP_NS,
+        47.0 + frame * 1e-6,
+        8.5,
+        height_m=60.0,
+        camera=Orientation(0, -90, 0),
+        hfov_deg=70.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def events() -> list[Event]:
+    """Four seconds: pictures, tracks two frames later, a pose a second."""
+    found: list[Event] = []
+    waiting: list[Overlay] = []
+    for frame, (data, keyframe) in enumerate(coded(drawn_frames(FRAMES, SIZE), kbps=300, keyint=KEYINT)):
+        at_ns = START_NS + frame * STEP_NS
+        if frame % 15 == 0:
+            found.append(PoseUpdate(frame, at_ns, pose_at(frame), VIEW))
+        found.append(VideoSample(frame, at_ns, data, keyframe))
+        waiting.append(
+            Overlay(
+                frame_index=frame,
+                capture_ns=at_ns,
+                track_ids=np.arange(1, TRACKS + 1) + frame,
+                boxes_base_px=moving_boxes(frame, TRACKS, SIZE),
+                base_classes=("car",) * TRACKS,
+                classes=("car", "van") * (TRACKS // 2),
+                confidences=np.full(TRACKS, 0.8, np.float32),
+                refined=np.zeros(TRACKS, np.bool_),
+            )
+        )
+        if len(waiting) > 2:
+            found.append(waiting.pop(0))
+    return found + waiting
+
+
+def written(path: Path, events: list[Event]) -> ReadStream:
+    """The file of these events, read back."""
+    stream = stream_file(path, platform=PLATFORM, fps=15)
+    for event in events:
+        stream.log(event)
+    stream.close()
+    stream.close()
+    return read_stream(path)
+
+
+def units(data: bytes) -> list[bytes]:
+    """All but the access unit delimiter, which each picture of a transport stream has."""
+    return [one for one in nal_units(data) if one[0] >> 1 != _DELIMITER]
+
+
+def samples_of(events: list[Event]) -> list[VideoSample]:
+    """The pictures."""
+    return [one for one in events if isinstance(one, VideoSample)]
+
+
+def test_the_video_is_the_base_stream_unit_for_unit(events, tmp_path):
+    """A picture that was coded again is worse, and costs a processor."""
+    found = written(tmp_path / "flight.ts", events)
+    assert [units(data) for _, data in found.video] == [units(one.data) for one in samples_of(events)]
+    assert [at for at, _ in found.video] == [frame * 6_000 for frame in range(FRAMES)]
+
+
+def test_each_frame_has_its_metadata_at_its_time(events, tmp_path):
+    """Boxes would run ahead of the picture or lag behind it."""
+    found = written(tmp_path / "flight.ts", events).klv
+    assert [one.at for one in found] == [frame * 6_000 for frame in range(FRAMES)]
+    for frame, one in enumerate(found):
+        assert one.vmti is not None
+        assert int.from_bytes(one.vmti[7]) == frame
+        assert [target.track_id for target in one.targets] == list(range(frame + 1, frame + 1 + TRACKS))
+        assert [target.class_name for target in one.targets] == ["car", "van", "car", "van"]
+        assert one.items[2].timestamp() == pytest.approx((START_NS + frame * STEP_NS) / SECOND_NS, abs=1e-5)
+        at = frame if frame > 12 else 0  # from one pose alone nobody knows where it goes
+        assert one.items[13] == pytest.approx(47.0 + at * 1e-6, abs=1e-7), "the pose is that of the frame"
+
+
+def test_ffprobe_shows_video_and_klv(events, tmp_path):
+    """Other players would find one stream, or none."""
+    if shutil.which("ffprobe") is None:
+        pytest.skip("ffprobe is not installed")
+    written(tmp_path / "flight.ts", events)
+    words = ("-v", "error", "-count_packets", "-show_streams", "-show_programs", "-of", "json")
+    answer = subprocess.run(
+        ["ffprobe", *words, str(tmp_path / "flight.ts")], capture_output=True, text=True, check=True
+    )
+    assert answer.stderr.replace("Unsupported codec with id 98311 for input stream 1", "").strip() == ""
+    said = json.loads(answer.stdout)
+    video, klv = said["streams"]
+    assert (video["codec_name"], video["width"], video["height"]) == ("hevc", *SIZE)
+    assert (klv["codec_name"], klv["codec_tag_string"]) == ("klv", "KLVA")
+    assert (video["nb_read_packets"], klv["nb_read_packets"]) == (str(FRAMES), str(FRAMES))
+    assert said["programs"][0]["tags"]["service_name"] == "uav-1"
+
+
+def test_it_begins_at_a_keyframe_and_goes_on_at_one_after_a_gap(events, tmp_path):
+    """A player would show garbage, or nothing."""
+    stream = stream_file(tmp_path / "flight.ts", platform=PLATFORM, fps=15)
+    for event in events:
+        if event.frame_index == 30 and isinstance(event, VideoSample):
+            stream.skipped(5)
+        if event.frame_index >= 5:
+            stream.log(event)
+    stream.close()
+    found = read_stream(tmp_path / "flight.ts")
+    shown = [*range(20, 30), *range(40, 60)]
+    assert [at // 6_000 + 20 for at, _ in found.video] == shown
+    decoder = BaseDecoder()
+    assert all(decoder.decode(data) is not None for _, data in found.video)
+    said = [int.from_bytes(one.vmti[7]) for one in found.klv if one.vmti]
+    assert set(shown) <= {one.at // 6_000 + 20 for one in found.klv}
+    assert said == sorted(said)
+    assert said[0] == 20
+
+
+def test_every_keyframe_has_its_parameter_sets(events, tmp_path):
+    """Who tunes in later would see nothing for ever."""
+    bare = []
+    for event in events:
+        if isinstance(event, VideoSample) and event.keyframe and event.frame_index:
+            rest = [one for one in nal_units(event.data) if one[0] >> 1 not in (32, 33, 34)]
+            bare.append(replace(event, data=b"".join(b"\0\0\0\1" + one for one in rest)))
+        else:
+            bare.append(event)
+    found = written(tmp_path / "flight.ts", bare)
+    keyframes = [data for at, data in found.video if at // 6_000 % KEYINT == 0]
+    assert len(keyframes) == FRAMES // KEYINT
+    assert all(parameter_sets(data) for data in keyframes)
+    late = stream_file(tmp_path / "late.ts", platform=PLATFORM, fps=15)
+    for event in bare:
+        if event.frame_index:
+            late.log(event)
+    late.close()
+    assert (tmp_path / "late.ts").stat().st_size == 0, "without a parameter set nothing can be decoded"
+
+
+def test_what_was_stored_does_not_go_back_in_time(events, tmp_path):
+    """A player would jump."""
+    stored = [
+        replace(one, stored=True) if isinstance(one, VideoSample | Overlay) and one.frame_index < 20 else one
+        for one in events
+    ]
+    found = written(tmp_path / "flight.ts", stored)
+    assert len(found.video) == len(found.klv) == 40
+
+
+def test_pictures_without_tracks_still_say_where_the_camera_was(events, tmp_path):
+    """A detector that hangs would take the map along."""
+    found = written(tmp_path / "flight.ts", [one for one in events if not isinstance(one, Overlay)])
+    assert len(found.klv) == FRAMES
+    assert all(one.vmti is None and 13 in one.items for one in found.klv)
+
+
+def test_a_stream_that_nothing_came_for_can_be_ended(tmp_path):
+    """The end of a flight that failed would fail too."""
+    stream = stream_file(tmp_path / "flight.ts", platform=PLATFORM, fps=15)
+    stream.close()
+    assert stream.path == tmp_path / "flight.ts"
+
+
+def test_a_full_disk_is_one_sentence(events):
+    """The ground would say nothing, or end."""
+    failures = Failures(time.time_ns)
+    sink = QueuedSink(
+        "MPEG-TS", lambda: stream_file(Path("/dev/full"), platform=PLATFORM, fps=15), failures=failures
+    )
+    for event in events:
+        sink.log(event)
+    eventually(lambda: failures.now, within_s=10, what="the disk is full")
+    assert "MPEG-TS file /dev/full cannot be written any further: No space left" in failures.now[0].reason
+    assert sink.join(time.monotonic() + 10)
+
+
+def test_a_player_on_udp_has_it_live(events):
+    """The very use of it: somebody watches."""
+    (port,) = free_ports(1)
+    found: list[ReadStream] = []
+    options = {"timeout": "2000000", "fifo_size": "100000"}
+    player = threading.Thread(
+        target=lambda: found.append(read_stream(f"udp://127.0.0.1:{port}", format="mpegts", options=options))
+    )
+    player.start()
+    addresses = Addresses()
+    stream = live_stream(Address(f"udp://127.0.0.1:{port}"), platform=PLATFORM, fps=15, addresses=addresses)
+    eventually(lambda: _bound(port), within_s=10, what="the player listens")
+    for event in events:
+        stream.log(event)
+        time.sleep(0.005)
+    stream.close()
+    player.join(30)
+    assert len(found) == 1, "the player ended"
+    # A player that has not received the end does not know whether its last packets are whole.
+    assert len(found[0].video) >= FRAMES - 2
+    assert [units(data) for _, data in found[0].video[:-1]] == [
+        units(one.data) for one in samples_of(events)[: len(found[0].video) - 1]
+    ]
+    assert len(found[0].klv) >= FRAMES - 4
+    assert all(one.targets for one in found[0].klv)
+    addresses.take(Address(f"udp://127.0.0.1:{port}"), edge="uav-2")
+
+
+def _bound(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return True
+    return False
+
+
+def test_nobody_on_udp_costs_nothing(events, caplog):
+    """A flight would wait for a player that was never started."""
+    (port,) = free_ports(1)
+    stream = live_stream(Address(f"udp://127.0.0.1:{port}"), platform=PLATFORM, fps=15, addresses=Addresses())
+    for event in events:
+        stream.log(event)
+    stream.close()
+    assert len(caplog.messages) <= 1
+
+
+def test_a_second_edge_is_refused_until_the_first_has_ended(events):
+    """Two streams at one port are none."""
+    (port,) = free_ports(1)
+    address, addresses = Address(f"udp://127.0.0.1:{port}"), Addresses()
+
+    def opened(edge: str) -> TransportStream:
+        return live_stream(address, platform=replace(PLATFORM, edge=edge), fps=15, addresses=addresses)
+
+    first = opened("uav-1")
+    with pytest.raises(UserError, match="taken by edge uav-1"):
+        opened("uav-2")
+    first.close()
+    opened("uav-2").close()
+
+
+def test_an_address_that_cannot_be_used_is_free_again():
+    """A name that resolves a minute later would stay refused."""
+    address, addresses = Address("udp://nowhere.invalid:5600"), Addresses()
+    for _ in range(2):
+        with pytest.raises(UserError, match="has no host that can be found"):
+            live_stream(address, platform=PLATFORM, fps=15, addresses=addresses)
