@@ -1,4 +1,4 @@
-"""A still codec and a detector that HVT has never heard of, installed beside it, through the whole pipeline."""
+"""A still codec, a detector, encoders that HVT has never heard of, installed beside it, through the pipeline."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from media.third_party import BLOBS, install
-from programs.processes import Link
+from media.third_party import BLOBS, ENCODERS, install
+from programs.processes import Link, Running
 from programs.rrd import Recording
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
@@ -37,6 +37,8 @@ def acme(tmp_path, monkeypatch) -> None:
     folder = install(tmp_path / "site", {"acme-pixels": "PixelCodec", "acme-broken": "NoSuchThing"})
     detectors = {"acme-blobs": "BlobDetector", "acme-nothing": "NoSuchThing"}
     install(folder, detectors, module="acme_blobs", source=BLOBS, group="hvt.detectors")
+    encoders = {f"acme-{one.lower()}": one for one in ("Obedient", "Greedy", "Deaf", "Garbled")}
+    install(folder, encoders, module="acme_encoders", source=ENCODERS, group="hvt.encoders")
     old = os.environ.get("PYTHONPATH")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), *([old] if old else [])]))
 
@@ -57,8 +59,8 @@ def test_a_broken_plug_in_is_one_sentence(link, scene, acme):
     assert "Traceback" not in edge.said
 
 
-def test_a_ground_without_the_codec_flies_on(link, scene, acme, monkeypatch):
-    """One unknown codec would take the operator's whole picture away."""
+def test_a_ground_without_the_codec_gets_jpeg(link, scene, acme, monkeypatch):
+    """One unknown codec would take the operator's stills away, or the whole picture."""
     with_codec = os.environ["PYTHONPATH"]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(with_codec.split(os.pathsep)[1:]))
     ground = link.ground("--once", "--record", "flight.rrd", "--classifier", "none")
@@ -71,7 +73,9 @@ def test_a_ground_without_the_codec_flies_on(link, scene, acme, monkeypatch):
     sent, seen = edge.finish(), ground.finish(within_s=30)
     assert sent["stills"]["sent"] > 5
     assert seen["frames_decoded"] == FRAMES
-    assert Recording(link.folder / "flight.rrd").stills() == []
+    stills = [data for _, data in Recording(link.folder / "flight.rrd").stills()]
+    assert len(stills) > 5, "it has said what it reads"
+    assert {data[:2] for data in stills} == {b"\xff\xd8"}, "JPEG"
 
 
 def test_the_package_is_found_by_its_metadata_alone(acme):
@@ -97,3 +101,53 @@ def test_a_broken_detector_is_one_sentence(link, scene, acme):
     assert edge.wait(within_s=30) == 2
     assert "detector 'acme-nothing' of package acme_blobs" in edge.said
     assert "Traceback" not in edge.said
+
+
+def with_encoder(link: Link, source: str, name: str, *settings: str) -> Running:
+    """An edge of six seconds at 300 kbps, started."""
+    return link.edge(
+        *(
+            "--source",
+            source,
+            "--fps",
+            "10",
+            "--max-frames",
+            str(FRAMES),
+            "--pace",
+            "lockstep",
+            "--wait",
+            "60s",
+        ),
+        *("--size", "640x360", "--budget", "300kbps", "--preset", "ultrafast", "--detector", "motion"),
+        *("--encoder", name, *settings),
+    )
+
+
+@pytest.mark.parametrize(("name", "lowered"), [("acme-obedient", False), ("acme-greedy", True)])
+def test_another_encoder_flies_within_the_budget(link, scene, acme, name, lowered):
+    """Who has an encoder in his board would need a fork of HVT, or one that takes more than it says would be late."""
+    ground = link.ground("--once", "--classifier", "none", "--detector", "motion")
+    edge = with_encoder(link, str(scene), name)
+    sent, received = edge.finish(), ground.finish(within_s=30)
+    assert sent["frames"] == received["frames_decoded"] == FRAMES, "the clip begins anew after the run"
+    assert sent["worst_window_bps"]["total"] <= 300_000
+    assert (f"encoder {name} overshoots: it is asked for" in edge.said) == lowered
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("acme-deaf", "--encoder acme-deaf overshoots: its fullest 1 s took "),
+        (
+            "acme-garbled",
+            "--encoder acme-garbled does not work here (ValueError: its unit of frame 1 gives no picture",
+        ),
+    ],
+)
+def test_an_encoder_that_does_not_qualify_is_one_sentence(link, acme, name, says):
+    """A flight would begin whose picture is late, or garbage, all the time."""
+    edge = with_encoder(link, "demo", name)
+    assert edge.wait(within_s=60) == 2
+    (line,) = edge.said.splitlines()
+    assert says in line
+    assert "x265" in line

@@ -134,6 +134,7 @@ def test_a_password_is_not_printed(edge, free_port):
         ("method", "m5", "M5"),
         ("regime", "high", "low, moderate"),
         ("preset", "placebo", "ultrafast"),
+        ("encoder", "x266", "x265, passthrough, hevc_nvenc, hevc_qsv, hevc_v4l2m2m"),
         ("pace", "fast", "realtime, lockstep"),
         ("fit", "stretch", "letterbox, crop"),
     ],
@@ -157,6 +158,14 @@ def test_a_budget_below_what_the_video_needs(edge):
     assert "--budget 10 kbps" in sentence
     assert "at least" in sentence
     assert "--size" in sentence
+
+
+@pytest.mark.parametrize("regions", [("--roi-depth", "0.1"), ("--method", "R0")])
+def test_regions_for_an_encoder_that_takes_none(edge, regions):
+    """Who wants his tracks coded better would not learn that they are not."""
+    sentence = edge("--encoder", "hevc_nvenc", *regions)
+    assert "--roi-depth 0.1 needs x265" in sentence
+    assert "--encoder hevc_nvenc" in sentence
 
 
 def test_a_regime_and_a_budget(edge):

@@ -55,6 +55,12 @@ def test_an_open_door(ground, endpoint):
         ("--record", "/proc/flight.rrd"),
         ("--record", "/proc/flights"),
         ("--record", "notes.txt/flights"),
+        ("--ts", "missing/flight.ts"),
+        ("--ts", "/proc/flight.ts"),
+        ("--ts", "notes.txt"),
+        ("--ts", "missing"),
+        ("--ts", "udp://host:0"),
+        ("--ts", "rtp://host:5600"),
         ("--summary", "missing/s.json"),
         ("--summary", "folder"),
         ("--summary", "/proc/s.json"),
@@ -159,3 +165,41 @@ def test_a_detector_whose_own_threshold_makes_no_sense(ground, tmp_path):
     sentence = ground("--detector", str(path))
     assert f"{path} has hvt.confidence 'high'" in sentence
     assert "0.01 to 1" in sentence
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "takserver",
+        "http://takserver:80",
+        "udp://239.2.3.1",
+        "tls://:8089",
+        "tcp://[::1]:8087",
+        "tcp://a:0",
+        "tcp://a:70000",
+        "tcp://a:1/path",
+        "tcp://me:secret@a:1",
+        "udp://a b:1",
+    ],
+)
+def test_a_place_that_no_report_can_go_to(ground, url):
+    """The map would stay empty, and the log be full of the words of another program."""
+    sentence = ground("--cot", url)
+    assert url in sentence
+    assert "--cot" in sentence
+    assert "tls://HOST:PORT" in sentence
+
+
+def test_types_without_anybody_to_tell_and_types_that_are_none(ground):
+    """Every object would be something else than the user said."""
+    Path("types.toml").write_text('[classes]\ncar = "a vehicle"\n', encoding="utf-8")
+    assert "give --cot too" in ground("--cot-types", "types.toml")
+    url = ("--cot", "udp://127.0.0.1:9")
+    assert "car = 'a vehicle' is no Cursor on Target type" in ground(*url, "--cot-types", "types.toml")
+    assert "cannot be read" in ground(*url, "--cot-types", "nowhere.toml")
+
+
+def test_a_server_that_wants_a_certificate_that_is_not_there(ground, monkeypatch):
+    """It would be noticed in the air."""
+    monkeypatch.delenv("PYTAK_TLS_CLIENT_CERT", raising=False)
+    assert "PYTAK_TLS_CLIENT_CERT" in ground("--cot", "tls://127.0.0.1:8089")

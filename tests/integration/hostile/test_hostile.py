@@ -147,7 +147,7 @@ def attack_edge(session: zenoh.Session, ears: Tap, rng: Random) -> int:
         bad.say("hvt/uav-1/feedback", bytes(100_000))
         session.get("hvt/uav-1/control", lambda _reply: None, payload=rng.randbytes(50), timeout=1.0)
         session.get("hvt/uav-1/info", lambda _reply: None, payload=rng.randbytes(5000), timeout=1.0)
-        bad.said += 1
+        bad.said += 2
         time.sleep(0.1)
     return bad.said
 

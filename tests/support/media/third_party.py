@@ -1,4 +1,4 @@
-"""A package as a third party would install it, with still codecs or detectors behind the entry point."""
+"""A package as a third party would install it, with still codecs, detectors or encoders behind the entry point."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["BLOBS", "PIXELS", "install"]
+__all__ = ["BLOBS", "ENCODERS", "PIXELS", "install"]
 
 PIXELS = '''
 """Zlib-packed pixels: a codec that knows nothing of HVT but the contract."""
@@ -64,6 +64,73 @@ class BlobDetector:
         boxes = np.stack([rows[:, 0], rows[:, 1], rows[:, 0] + rows[:, 2], rows[:, 1] + rows[:, 3]], 1)
         kinds = (rows[:, 4] > 400).astype(np.int32)
         return Detections(boxes.astype(np.float32), np.full(len(rows), 0.8, np.float32), kinds)
+'''
+
+
+ENCODERS = '''
+"""Encoders that do not keep to their rate, or to the contract: x265 without what holds it."""
+
+from dataclasses import replace
+
+from hvt_common.values import AccessUnit
+from hvt_edge.video.x265 import BaseEncoder
+
+
+class Obedient:
+    """Codes at once, at the rate that it was opened for."""
+
+    factor, least_bps = 1.0, 0
+
+    def __init__(self, settings):
+        bitrate_bps = round(max(self.least_bps, settings.bitrate_bps * self.factor))
+        self._encoder = BaseEncoder(replace(settings, bitrate_bps=bitrate_bps))
+
+    def encode(self, frame, *, keyframe):
+        return self._encoder.encode(frame, keyframe=keyframe)
+
+
+class Greedy(Obedient):
+    """Takes half as much again."""
+
+    factor = 1.5
+
+
+class Deaf(Obedient):
+    """Takes as much as it likes."""
+
+    least_bps = 3_000_000
+
+
+class WithoutKeyframes(Obedient):
+    """Makes the first alone."""
+
+    def encode(self, frame, *, keyframe):
+        return self._encoder.encode(frame, keyframe=frame.index == 0)
+
+
+class Late(Obedient):
+    """Has a frame of delay."""
+
+    before = None
+
+    def encode(self, frame, *, keyframe):
+        self.before, unit = super().encode(frame, keyframe=keyframe), self.before
+        return unit
+
+
+class Garbled(Obedient):
+    """Loses the end of each unit but the keyframes."""
+
+    def encode(self, frame, *, keyframe):
+        unit = super().encode(frame, keyframe=keyframe)
+        return unit if unit.keyframe else replace(unit, data=unit.data[:3])
+
+
+class Absent:
+    """Takes no settings."""
+
+    def __init__(self, settings):
+        raise OSError("no such device")
 '''
 
 

@@ -7,12 +7,15 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable
+from base64 import b64encode
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
 
 import cv2
 import numpy as np
+
+from hvt_common.video.annex_b import PARAMETER_SETS, nal_kind, nal_units
 
 __all__ = ["RtspCamera"]
 
@@ -20,18 +23,33 @@ SIZE = (320, 240)
 _FPS = 25
 _NTP_EPOCH_S = 2_208_988_800
 _SSRC, _JPEG, _CLOCK_HZ = 0x48565431, 26, 90_000
-_SDP = "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nt=0 0\r\nm=video 0 RTP/AVP 26\r\na=control:track\r\n"
+_HEVC = 96
+_SDP = "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nt=0 0\r\nm=video 0 RTP/AVP {kind}\r\n{more}a=control:track\r\n"
 
 
 class RtspCamera:
     """Serves one viewer at a time; ``clock_ns`` is the camera's own, ``delay_s`` how late its frames are sent.
 
-    A picture is a motion JPEG (RFC 2435) of one grey level, in one packet.
+    A picture is a motion JPEG (RFC 2435) of one grey level, in one packet. With ``units``, HEVC access units (RFC
+    7798), those are sent over and over, and their parameter sets in the stream's description alone.
     """
 
     def __init__(
-        self, port: int, *, clock_ns: Callable[[], int] = time.time_ns, delay_s: float = 0.0
+        self,
+        port: int,
+        *,
+        clock_ns: Callable[[], int] = time.time_ns,
+        delay_s: float = 0.0,
+        units: Sequence[bytes] = (),
     ) -> None:
+        self._pictures = [
+            [one for one in nal_units(unit) if nal_kind(one) not in PARAMETER_SETS] for unit in units
+        ]
+        sets = {nal_kind(one): one for one in nal_units(units[0])} if units else {}
+        names = {32: "vps", 33: "sps", 34: "pps"}
+        sprop = ";".join(f"sprop-{names[kind]}={b64encode(sets[kind]).decode()}" for kind in names if sets)
+        more = f"a=rtpmap:{_HEVC} H265/{_CLOCK_HZ}\r\na=fmtp:{_HEVC} {sprop}\r\n" if units else ""
+        self._sdp = _SDP.format(kind=_HEVC if units else _JPEG, more=more)
         self.url = f"rtsp://127.0.0.1:{port}/camera"
         self._clock_ns = clock_ns
         self._delay_s = delay_s
@@ -78,7 +96,8 @@ class RtspCamera:
                 method, number = lines[0].split()[0], next(one for one in lines if one.startswith("CSeq"))
                 more, body = "", ""
                 if method == "DESCRIBE":
-                    more, body = f"Content-Type: application/sdp\r\nContent-Length: {len(_SDP)}\r\n", _SDP
+                    body = self._sdp
+                    more = f"Content-Type: application/sdp\r\nContent-Length: {len(body)}\r\n"
                 elif method == "SETUP":
                     more = "Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\nSession: 1\r\n"
                 elif method == "OPTIONS":
@@ -89,16 +108,25 @@ class RtspCamera:
                     return
 
     def _play(self, viewer: socket.socket) -> None:
-        began_ns, sent = self._clock_ns(), 0
+        began_ns, sent, packets = self._clock_ns(), 0, 0
         while not self._stop.wait(1 / _FPS):
             taken_ns = self._clock_ns()
             stamp = round((taken_ns - began_ns) * _CLOCK_HZ / 1e9) & 0xFFFFFFFF
             time.sleep(self._delay_s)
             if sent % _FPS == 0:
                 viewer.sendall(_interleaved(1, _sender_report(taken_ns, stamp, sent)))
-            header = struct.pack(">BBHII", 0x80, 0x80 | _JPEG, sent & 0xFFFF, stamp, _SSRC)
-            viewer.sendall(_interleaved(0, header + _picture(sent)))
+            for kind, payload in self._payloads(sent):
+                header = struct.pack(">BBHII", 0x80, kind, packets & 0xFFFF, stamp, _SSRC)
+                viewer.sendall(_interleaved(0, header + payload))
+                packets += 1
             sent += 1
+
+    def _payloads(self, number: int) -> list[tuple[int, bytes]]:
+        """(payload type, payload) of each packet of a picture; the last has the marker bit."""
+        if not self._pictures:
+            return [(0x80 | _JPEG, _picture(number))]
+        nals = self._pictures[number % len(self._pictures)]
+        return [(_HEVC | 0x80 * (nal is nals[-1]), nal) for nal in nals]
 
 
 def _interleaved(channel: int, packet: bytes) -> bytes:

@@ -267,7 +267,7 @@ class Rig:
 
     def base(self, frame: Frame) -> AccessUnit | None:
         """The base stage for one frame."""
-        decision = self.stage.decide(frame.index, now_ns=self.now_ns)
+        decision = self.stage.decide(frame, now_ns=self.now_ns)
         unit = self.stage.encode(frame, decision, now_ns=self.now_ns)
         if unit is not None:
             self.stage.send(unit, decision, now_ns=self.now_ns)

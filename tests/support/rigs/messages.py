@@ -17,6 +17,7 @@ from hvt_common.protocol.messages import (
     Flags,
     Health,
     Info,
+    InfoRequest,
     Message,
     RoiHeader,
     Status,
@@ -130,6 +131,8 @@ INFO = Info(
     class_names=("pedestrian", "people", "bicycle", "Straßenbahn"),
     received_ns=2,
     answered_ns=3,
+    still_codecs=("residual", "h264-intra"),
+    channels=("base", "roi", "tracks", "status"),
 )
 _SILENT = Feedback(
     session_id=7,
@@ -176,6 +179,7 @@ FEEDBACK = replace(
     backlog=(AcknowledgedRange(session_id=U64, kind="base", number=450, acknowledged_bytes=12_000),),
 )
 BACKLOG = BacklogHeader(session_id=7, kind="still", number=31, offset=1400, total_bytes=5_000, send_ns=I63)
+INFO_REQUEST = InfoRequest(requester_id=U64, still_codecs=("jpeg", "residual"))
 REQUEST = ControlRequest(session_id=0, command="keyframe", arguments={})
 ANSWER = ControlAnswer(
     session_id=7,
@@ -185,7 +189,18 @@ ANSWER = ControlAnswer(
     frame_index=9_100,
     tracks=(TrackNow(track_id=57, class_id=3, confidence=0.613, box_source_px=(-3.125, 10.0, 90.875, 64.5)),),
 )
-EXAMPLES: tuple[Message, ...] = (BASE, ROI, STEP, INFO, STATUS, REQUEST, ANSWER, FEEDBACK, BACKLOG)
+EXAMPLES: tuple[Message, ...] = (
+    BASE,
+    ROI,
+    STEP,
+    INFO,
+    STATUS,
+    INFO_REQUEST,
+    REQUEST,
+    ANSWER,
+    FEEDBACK,
+    BACKLOG,
+)
 
 
 def feedback(**changes: Any) -> Feedback:

@@ -1,0 +1,110 @@
+"""A camera that makes HEVC itself, through edge, Zenoh and ground: what is recorded is what it made."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+
+import pytest
+
+from hvt_common.video.annex_b import nal_kind, nal_units, parameter_sets
+from hvt_common.video.hevc import BaseDecoder
+from hvt_ground.control import EdgeClient, RefusedError
+from media.clips import hard_pictures, smooth_pictures
+from media.hevc_camera import SIZE, packets_of, pictures_of, write_clip
+from programs.processes import Link, Running, eventually
+from programs.rrd import Recording
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+
+
+def with_camera(link: Link, clip: object, *settings: str) -> Running:
+    """An edge that passes the clip through, started."""
+    return link.edge(
+        *("--source", str(clip), "--encoder", "passthrough", "--detector", "motion", "--wait", "60s"),
+        *settings,
+    )
+
+
+def ground_of(link: Link) -> Running:
+    """A ground that records."""
+    return link.ground("--once", "--record", "flight.rrd", "--classifier", "none", "--detector", "motion")
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "pace"),
+    [
+        ("camera.hevc", "", "lockstep"),
+        ("camera.ts", "aud=1:repeat-headers=1", "realtime"),
+        ("camera.mp4", "", "realtime"),
+        ("camera.mkv", "open-gop=1", "lockstep"),
+    ],
+)
+def test_the_recording_holds_the_cameras_own_units(link, name, more, pace):
+    """A camera's good picture would be coded a second time, and lose by it, or not be shown at all."""
+    clip = write_clip(link.folder / name, more=more)
+    ground = ground_of(link)
+    edge = with_camera(link, clip, "--pace", pace, "--budget", "400kbps", "--record-base", "copy.mkv")
+    sent, received = edge.finish(), ground.finish(within_s=30)
+    assert "is passed through: 15 fps, " in edge.said
+    assert sent["frames"] == received["frames_decoded"] == 45
+    assert sent["worst_window_bps"]["total"] <= 400_000
+    recorded = [data for _, _, data in Recording(link.folder / "flight.rrd").video()]
+    if clip.suffix in (".hevc", ".ts"):
+        assert recorded == packets_of(clip)
+    slices = [[nal for nal in nal_units(unit) if nal_kind(nal) < 32] for unit in recorded]
+    assert slices == pictures_of(clip)
+    assert [index for index, unit in enumerate(recorded) if parameter_sets(unit)] == [0, 10, 20, 30, 40]
+    for first in (0, 20):  # who joins there
+        decoder = BaseDecoder(size=SIZE)
+        assert all(decoder.decode(unit) is not None for unit in recorded[first:])
+    assert pictures_of(link.folder / "copy.mkv") == slices
+
+
+def test_a_ground_gets_a_closer_look_and_the_cameras_next_keyframe(link):
+    """A still would be of another picture than the video, or a ground that joins ask for a keyframe for ever."""
+    clip = write_clip(link.folder / "camera.mp4", smooth_pictures(200, size=SIZE), keyint=30)
+    ground = ground_of(link)
+    edge = with_camera(link, clip, "--still-codec", "residual", "--edge-id", "uav-1")
+    eventually(lambda: "uav-1" in ground.said and "kbps" in ground.said, within_s=40, what="it is received")
+    found = []
+
+    def asked() -> bool:
+        with contextlib.suppress(RefusedError):
+            found.append(client.still(box=(40, 40, 100, 80), quality_pct=90))
+        time.sleep(0.1)
+        return bool(found)
+
+    with EdgeClient.connect(link.ground_endpoint) as edges:
+        client = edges["uav-1"]
+        eventually(asked, within_s=20, what="a still is taken")
+        with pytest.raises(RefusedError, match=r"makes no keyframe on request: .* one each 2\.0 s or so"):
+            client.keyframe()
+    sent, received = edge.finish(), ground.finish(within_s=30)
+    assert sent["stills"]["sent"] == received["stills"]["received"] == 1
+    assert sent["frames"] == received["frames_decoded"] == 200, "played in real time, and none left out"
+
+
+@pytest.mark.parametrize(
+    ("source", "settings", "says"),
+    [
+        ({"more": "qp=20"}, ("--budget", "200kbps"), " kbps for it: re-encode it with --encoder x265"),
+        ({"bframes": 2}, (), "(B-frames)"),
+        ({"codec": "libx264"}, (), "is h264"),
+        ({}, ("--size", "640x360"), "is 320x192, --size is 640x360"),
+        ({}, ("--size", "auto"), "--size auto is not accepted with --encoder passthrough"),
+        ({}, ("--fps", "10"), "gives 15 frames a second, --fps is 10"),
+        ({}, ("--video-share", "auto"), "--video-share auto is not accepted"),
+        ({}, ("--roi-depth", "0.1"), "--encoder passthrough takes no regions"),
+        ("demo", (), "'demo' is the drawn demo"),
+    ],
+)
+def test_what_cannot_be_passed_through_is_one_sentence(link, source, settings, says):
+    """A traceback, or a flight whose picture is garbage or left out, in place of what to change."""
+    if isinstance(source, dict):
+        source = write_clip(link.folder / "camera.mp4", hard_pictures(45, size=SIZE), **source)
+    edge = with_camera(link, source, *settings)
+    assert edge.wait(within_s=60) == 2
+    (line,) = edge.said.splitlines()
+    assert line.startswith("hvt-edge: ")
+    assert says in line
