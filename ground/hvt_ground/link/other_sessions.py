@@ -4,36 +4,40 @@ from __future__ import annotations
 
 from collections import deque
 
-from hvt_common.protocol.messages import RoiHeader, Status
+from hvt_common.protocol.messages import PoseReport, RoiHeader, Status
 from hvt_common.units import SECOND_NS
 from hvt_ground.link.packets import Packet
 
 __all__ = ["DuplicatePublishers", "PreSessionBuffer"]
 
-_MOST_STILLS = 16
+_MOST_STILLS = _MOST_POSES = 16
 _AGAIN_NS = 60 * SECOND_NS
 """Between two warnings: sessions' ids cost a forger nothing, and a log is not to fill."""
 
 
 class PreSessionBuffer:
-    """Holds the first report and the newest stills that came while no session was open."""
+    """Holds the first report, the newest stills and the newest poses that came while no session was open."""
 
     def __init__(self) -> None:
         self._status: list[Packet] = []
         self._stills: deque[Packet] = deque(maxlen=_MOST_STILLS)
+        self._poses: deque[Packet] = deque(maxlen=_MOST_POSES)
 
     def hold(self, packet: Packet) -> None:
-        """Note a still, or the first report of a session: it may overtake the keyframe that begins it."""
+        """Note a still, a pose, or the first report of a session: it may overtake the keyframe that begins it."""
         if isinstance(packet.header, RoiHeader):
             self._stills.append(packet)
+        elif isinstance(packet.header, PoseReport):
+            self._poses.append(packet)
         elif isinstance(packet.header, Status) and packet.header.sequence == 0:
             self._status = [packet]
 
     def take(self) -> list[Packet]:
-        """Hand them out, once: the report, then the stills in the order in which they came."""
-        packets = [*self._status, *self._stills]
+        """Hand them out, once: the report, then poses and stills, each in the order in which they came."""
+        packets = [*self._status, *self._poses, *self._stills]
         self._status = []
         self._stills.clear()
+        self._poses.clear()
         return packets
 
 

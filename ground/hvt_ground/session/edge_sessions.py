@@ -209,7 +209,9 @@ class EdgeSessions:
             if isinstance(header, BacklogHeader):
                 self._backlog(header, item)
             elif isinstance(header, PoseReport):
-                if session is not None and header.is_of(session.info.session_id):
+                if session is None:
+                    self._pre_session.hold(packet)
+                elif header.is_of(session.info.session_id):
                     session.pose(header, item)
             elif session is not None and header.session_id == session.info.session_id:
                 self._take(session, header, item)

@@ -11,8 +11,9 @@ from typing import Self
 import pytest
 
 from hvt_common.protocol.ledger import Account, overhead_bytes
-from hvt_common.protocol.messages import Info
+from hvt_common.protocol.messages import Info, PoseEncoder
 from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.values import Pose
 from hvt_ground.perception.worker import LockstepWorker, RealtimeWorker
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
@@ -389,6 +390,27 @@ def test_a_still_that_comes_before_its_session_is_open_is_taken(flight):
         assert (session.stills_received, session.frames_received) == (1, 6)
         assert session.ledger.messages(Account.ROI) == 1
         assert rig.receiver.unusable == 1, "the other one's"
+
+
+def test_poses_that_come_before_their_session_is_open_are_taken(flight):
+    """The first report stands by itself and the next build on it: for ten seconds nothing would be on the map."""
+    encoder = PoseEncoder(session_id=flight.session_id)
+    of_another = PoseEncoder(session_id=flight.session_id + 1)
+
+    def pose(second: int, coder: PoseEncoder) -> Received:
+        report = coder.encode(Pose(second * 1_000_000_000, 48.1 + second * 1e-5, 11.5, height_m=60))
+        return Received(f"hvt/{flight.info().edge}/pose", report(flight.info().started_ns).pack(), b"", "", 1)
+
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(pose(0, encoder), pose(1, encoder), pose(0, of_another))
+        rig.settle()
+        rig.put(*bases(flight, *range(6)), pose(2, encoder))
+        rig.settle()
+        session = rig.receiver.session
+        assert session.ledger.messages(Account.META) == 3
+        assert session.geolocation.has_pose
+        assert rig.receiver.unusable == 0
 
 
 def test_a_lost_answer_does_not_lose_the_flight(flight):

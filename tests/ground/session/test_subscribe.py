@@ -105,33 +105,42 @@ def test_another_version_of_the_wire_is_said_once(link, caplog, version, said):
     body = msgpack.packb([version, *values, 2**32 - 1])[:-5]
     answer = body + b"\xce" + zlib.crc32(body).to_bytes(4, "big")
     keys = EdgeKeys("uav-1")
+    queryable = serve(outsider, Channel.INFO, keys=keys, answer=lambda _question: answer)
     with outsider.liveliness().declare_token(keys.key(Channel.ALIVE)):
-        queryable = serve(outsider, Channel.INFO, keys=keys, answer=lambda _question: answer)
         eventually(lambda: served(ground) == {"uav-1"}, within_s=20, what="it is served")
         (port,) = ground.ports()
-        answers = [port.query_info(7) for _ in range(2)]
+        answers: list[object] = []
+
+        def answered_twice() -> bool:
+            """A busy machine answers too late now and then."""
+            answers.append(port.query_info(7))
+            return len(answers) >= 2 and bool(warnings()) and (version != 3 or sum(map(bool, answers)) >= 2)
+
+        def warnings() -> list[str]:
+            return [one.getMessage()[: len(said)] for one in caplog.records if one.levelno == logging.WARNING]
+
+        eventually(answered_twice, within_s=20, what="it has answered")
         queryable.undeclare()
-    assert [one is not None for one in answers] == [version == 3] * 2
-    assert [one.getMessage()[: len(said)] for one in caplog.records if one.levelno == logging.WARNING] == [
-        said
-    ]
+    assert version == 3 or not any(answers)
+    assert warnings() == [said]
 
 
 def test_a_ground_says_which_stills_it_reads(link):
     """The edge would send what nobody here can show."""
     ground, outsider = link
     keys, questions = EdgeKeys("uav-1"), []
+    queryable = serve(
+        outsider,
+        Channel.INFO,
+        keys=keys,
+        answer=lambda question: questions.append(question) or INFO.pack(),
+    )
     with outsider.liveliness().declare_token(keys.key(Channel.ALIVE)):
-        queryable = serve(
-            outsider,
-            Channel.INFO,
-            keys=keys,
-            answer=lambda question: questions.append(question) or INFO.pack(),
-        )
         eventually(lambda: served(ground) == {"uav-1"}, within_s=20, what="it is served")
         (port,) = ground.ports()
-        assert port.query_info(7) is not None
-        assert port.query_info(7) is not None
+        for count in (1, 2):
+            port.query_info(7)
+            eventually(lambda count=count: len(questions) == count, within_s=20, what="it has asked")
         queryable.undeclare()
     first, second = map(InfoRequest.parse, questions)
     assert first == second
