@@ -257,6 +257,7 @@ const MESSAGES: Record<string, { most: number; payload?: number; fields: Fields 
     most: 16384,
     fields: [session, sequence, frame, capture, delay, ["reference", int(-1, U32)], ["boxes", bin(16000)]],
   },
+  PoseReport: { most: 80, fields: [["session", int(0, U32)], ["send_ns", int(0, I63)], ["coded", bin(48)]] },
   Status: {
     most: 6144,
     fields: [
@@ -513,6 +514,95 @@ class TrackReader {
   }
 }
 
+// ---- Poses, wire-messages.md ------------------------------------------------------------------------------------
+
+class Bits {
+  private readonly bits: string;
+  private next = 0;
+
+  constructor(bytes: Uint8Array) {
+    this.bits = Array.from(bytes, (one) => one.toString(2).padStart(8, "0")).join("");
+  }
+
+  plain(count: number): number {
+    need(this.next + count <= this.bits.length, "it ends too early");
+    this.next += count;
+    return count ? parseInt(this.bits.slice(this.next - count, this.next), 2) : 0;
+  }
+
+  // An Exp-Golomb code of order k.
+  change(k: number): number {
+    let zeros = 0;
+    while (!this.plain(1)) need(++zeros <= 40, "too many zeros");
+    const m = 2 ** (zeros + k) + this.plain(zeros + k) - 2 ** k;
+    return m % 2 ? (m + 1) / 2 : -m / 2;
+  }
+
+  finish(): void {
+    const rest = this.bits.slice(this.next);
+    need(rest.length < 8 && !rest.includes("1"), "something is left");
+  }
+}
+
+// From, to, bits, k, and whether it wraps.
+type Numbered = [number, number, number, number, boolean];
+const ANGLES: Numbered[] = [[0, 3599, 12, 3, true], [-900, 900, 11, 3, false], [-1800, 1799, 12, 3, true]];
+const METRES: Numbered[] = [[-1e4, 1e6, 20, 2, false]];
+const POSE: [string, Numbered[]][] = [
+  ["place", [[-9e8, 9e8, 31, 5, false], [-1.8e9, 1.8e9 - 1, 32, 5, true]]], ["height", METRES], ["altitude", METRES],
+  ["camera", ANGLES], ["platform", ANGLES], ["field", [[1, 1799, 11, 0, false]]],
+  ["errors", Array(3).fill([0, 31, 5, 0, false])],
+];
+const wrapped = (value: number, [from, to]: Numbered): number => {
+  const span = to - from + 1;
+  return ((((value - from) % span) + span) % span) + from;
+};
+
+class PoseReader {
+  private number = -1;
+  private time = 0;
+  private step = [0, 0];
+  private groups: Record<string, number[] | null> | undefined;
+
+  // The numbers of a report as the vectors write them, "skipped" or "damaged".
+  take(data: Uint8Array): unknown {
+    try {
+      return this.decode(new Bits(read("PoseReport", data, new Uint8Array())[2] as Uint8Array));
+    } catch (error) {
+      if (error instanceof Refused) return "damaged";
+      throw error;
+    }
+  }
+
+  private decode(bits: Bits): unknown {
+    const [alone, number] = [bits.plain(1), bits.plain(4)];
+    const before = this.groups;
+    if (!alone && (!before || number !== (this.number + 1) % 16)) return "skipped";
+    const time = alone ? bits.plain(42) : this.time + 1000 + bits.change(4);
+    need(alone === 1 || (time > this.time && time < 2 ** 42), "no time behind the last");
+    const there = alone ? Array.from({ length: 5 }, () => bits.plain(1)) : [];
+    const step = [0, 0];
+    const groups: Record<string, number[] | null> = {};
+    POSE.forEach(([name, kinds], place) => {
+      const known = alone ? place === 0 || place > 5 || there[place - 1] : before![name];
+      groups[name] = known
+        ? kinds.map((kind, index) => {
+            if (alone) return kind[0] + bits.plain(kind[2]);
+            let change = bits.change(kind[3]);
+            if (name === "place") change = step[index] = this.step[index] + change;
+            const value = before![name]![index] + change;
+            return kind[4] ? wrapped(value, kind) : value;
+          })
+        : null;
+      groups[name]?.forEach((value, index) => need(value >= kinds[index][0] && value <= kinds[index][1], "out of bounds"));
+    });
+    bits.finish();
+    [this.number, this.time, this.step, this.groups] = [number, time, step, groups];
+    const one = (name: string): number | null => (groups[name] ? groups[name]![0] : null);
+    return { ...groups, time_ms: time, height: one("height"), altitude: one("altitude"), field: one("field") };
+  }
+}
+
 // ---- Stills, wire-stills.md -------------------------------------------------------------------------------------
 
 type Plane = { width: number; height: number; at: ArrayLike<number> };
@@ -762,6 +852,15 @@ const CHECKS: Record<string, (vector: any) => string | undefined> = {
       const expected = step.damaged ? "damaged" : step.skipped ? "skipped" : "read";
       if (became !== expected) return `step ${number} is ${became}, not ${expected}`;
       if (step.tracks && canonical(reader.tracks) !== canonical(step.tracks)) return `step ${number}: another list`;
+    }
+    return undefined;
+  },
+  "poses.json": (vector) => {
+    const reader = new PoseReader();
+    for (const [number, report] of vector.reports.entries()) {
+      const became = reader.take(unhex(report.hex));
+      const expected = report.damaged ? "damaged" : report.skipped ? "skipped" : report.pose;
+      if (canonical(became) !== canonical(expected)) return `report ${number} is ${canonical(became)}`;
     }
     return undefined;
   },

@@ -42,7 +42,11 @@ def vectors() -> Iterator[dict[str, Any]]:
     for what, view, crop_px, size in _CROPS:
         yield _residual(what, planes, view, crop_px, size)
     crop = _texture(41, 29, seed=3)
-    yield _intra(crop)
+    yield _intra("one slice", crop, quality_pct=70)
+    # Found by trying: its data has zeros that look like a start code; without a loop filter.
+    noise = np.random.default_rng(5235).integers(-30, 30, (29, 41, 3))
+    grain = np.asarray(np.clip(_texture(41, 29, seed=5235) + noise, 0, 255), np.uint8)
+    yield _intra("data that is escaped, no loop filter", grain, quality_pct=100)
     for name, (mean, most) in _PLAIN.items():
         if name not in still_codec_names():
             raise SystemExit(f"{name} is not installed: install hvt[jxl] and an OpenCV with WebP and AVIF")
@@ -92,12 +96,12 @@ def _residual(
     }
 
 
-def _intra(crop: Image) -> dict[str, Any]:
+def _intra(what: str, crop: Image, *, quality_pct: int) -> dict[str, Any]:
     codec, size = still_codec("h264-intra"), (crop.shape[1], crop.shape[0])
-    data = codec.encode(crop, quality_pct=70).data
+    data = codec.encode(crop, quality_pct=quality_pct).data
     qp, cabac = split_payload(data)
     unit = parameter_sets(padded_size(size)) + coded_slice(cabac, qp=qp, intra=True)
-    return _vector("one slice", "h264-intra", data, size, codec.decode(data, size=size)) | {
+    return _vector(what, "h264-intra", data, size, codec.decode(data, size=size)) | {
         "stream": unit.hex(),
         "decoded": decoded([unit], decoder="h264", size=padded_size(size)).tobytes().hex(),
     }

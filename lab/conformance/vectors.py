@@ -22,6 +22,9 @@ from hvt_common.protocol.messages import (
     BaseHeader,
     Flags,
     Message,
+    PoseDecoder,
+    PoseEncoder,
+    PoseReport,
     RoiHeader,
     TrackStep,
     TrackStepEncoder,
@@ -35,7 +38,7 @@ from hvt_common.protocol.messages import (
 from hvt_common.protocol.messages.envelope import MOST_UNKNOWN_FIELDS, READ_VERSIONS, WIRE_VERSION
 from hvt_common.protocol.messages.fields import Int
 from hvt_common.protocol.messages.track_boxes import CodedTrack, read_tracks
-from hvt_common.values import Tracks
+from hvt_common.values import Orientation, Pose, Tracks
 from rigs.messages import EXAMPLES, ROI
 
 __all__ = ["FOLDER", "files", "main"]
@@ -69,6 +72,7 @@ def files() -> dict[str, str]:
         "refused.json": list(_refused()),
         "objects.json": list(_objects()),
         "track-steps.json": list(_track_steps()),
+        "poses.json": list(_poses()),
     }
     # A vector a line: a change shows which.
     return {
@@ -358,6 +362,82 @@ def _rows(state: list[CodedTrack]) -> list[dict[str, int]]:
         )
         for one in state
     ]
+
+
+# Poses
+
+
+def _poses() -> Iterator[dict[str, Any]]:
+    """Sessions of reports; one that builds on a report that never came is skipped, a damaged one changes nothing."""
+    camera = [Orientation(359.5 + second, -60.0 - second, 2.0 * second) for second in range(6)]
+    flight = [
+        Pose(
+            (1_000 + second * 1_037) * 1_000_000,
+            48.137 + 3e-5 * second,
+            179.99997 + 1e-5 * second - (360 if second > 2 else 0),
+            height_m=120.0 + second,
+            altitude_m=640.5,
+            camera=camera[second],
+            platform=Orientation(350.0 + 4 * second, -3.0, 1.0),
+            hfov_deg=65.0,
+            position_error_m=3.0 if second < 4 else 8.0,
+        )
+        for second in range(6)
+    ]
+    place = [Pose((5_000 + 1_000 * second) * 1_000_000, -33.8568, 151.2153) for second in range(3)]
+    encoder = PoseEncoder(session_id=9)
+    reports = [encoder.encode(one)(7) for one in flight]
+    yield {"session": "across the antimeridian and north", "reports": list(_read_poses(reports))}
+    encoder = PoseEncoder(session_id=9)
+    places = [encoder.encode(one)(7) for one in place]
+    yield {"session": "a place and no more", "reports": list(_read_poses(places))}
+    encoder = PoseEncoder(session_id=9, refresh_ns=2_500_000_000)
+    reports = [encoder.encode(one)(7) for one in flight]
+    damaged = [
+        replace(reports[1], coded=reports[1].coded[:-2]),
+        replace(reports[1], coded=reports[1].coded + b"\0"),
+        replace(reports[1], coded=b""),
+    ]
+    holes = [reports[1], reports[0], *damaged, reports[1], reports[1], *reports[3:]]
+    yield {"session": "holes, damage, and one that stands by itself", "reports": list(_read_poses(holes))}
+
+
+def _read_poses(reports: list[PoseReport]) -> Iterator[dict[str, Any]]:
+    decoder = PoseDecoder()
+    for report in reports:
+        found: dict[str, Any] = {"hex": report.pack().hex()}
+        try:
+            pose = decoder.decode(report)
+        except WireError:
+            yield found | {"damaged": True}
+            continue
+        yield found | ({"skipped": True} if pose is None else {"pose": _pose_numbers(pose)})
+
+
+def _pose_numbers(pose: Pose) -> dict[str, Any]:
+    """As they are coded; what is not there is null."""
+
+    def tenths(*values: float) -> list[int]:
+        return [round(10 * one) for one in values]
+
+    angles = [
+        None if one is None else tenths(one.yaw_deg, one.pitch_deg, one.roll_deg)
+        for one in (pose.camera, pose.platform)
+    ]
+    parts = [
+        None if one is None else tenths(one)[0] for one in (pose.height_m, pose.altitude_m, pose.hfov_deg)
+    ]
+    errors = (pose.position_error_m, pose.height_error_m, pose.angle_error_deg)
+    return {
+        "time_ms": pose.capture_ns // 1_000_000,
+        "place": [round(1e7 * pose.latitude_deg), round(1e7 * pose.longitude_deg)],
+        "height": parts[0],
+        "altitude": parts[1],
+        "camera": angles[0],
+        "platform": angles[1],
+        "field": parts[2],
+        "errors": [round(2 * np.log2(10 * one)) for one in errors],
+    }
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ def test_an_independent_reader_reads_all_of_them(reader):
     done = run(reader, FOLDER)
     assert done.returncode == 0, done.stdout + done.stderr
     assert [line.split(":")[0] for line in done.stdout.splitlines()] == [
-        *("messages.json", "refused.json", "objects.json", "track-steps.json", "stills.json"),
+        *("messages.json", "refused.json", "objects.json", "track-steps.json", "poses.json", "stills.json"),
     ]
 
 
@@ -74,6 +74,7 @@ def test_an_independent_reader_reads_all_of_them(reader):
         ("refused.json", '"version": true', '"version": false'),
         ("objects.json", '"values": [[7, 1000', '"values": [[8, 1000'),
         ("track-steps.json", '"width": ', '"width": 1'),
+        ("poses.json", '"errors": [1', '"errors": [2'),
         ("stills.json", '"b": ', '"b": 1'),
         ("stills.json", '"pixels": "', '"pixels": "0'),
         ("stills.json", '"payload": "', '"payload": "00'),

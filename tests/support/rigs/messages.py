@@ -19,6 +19,7 @@ from hvt_common.protocol.messages import (
     Info,
     InfoRequest,
     Message,
+    PoseReport,
     RoiHeader,
     Status,
     StillResult,
@@ -63,6 +64,7 @@ STEP = TrackStep(
     reference=1_799,
     boxes=bytes(range(120)),
 )
+POSE = PoseReport(session=0x90ABCDEF, send_ns=1_790_000_000_123_456_789, coded=bytes.fromhex("2ff8a4d1c0"))
 HEALTH = Health(
     frames_captured=9_101,
     frames_encoded=9_001,
@@ -193,6 +195,7 @@ EXAMPLES: tuple[Message, ...] = (
     BASE,
     ROI,
     STEP,
+    POSE,
     INFO,
     STATUS,
     INFO_REQUEST,

@@ -110,6 +110,9 @@ class Int(Kind):
         return f"int {_power(self.low)}…{_power(self.high)}"
 
 
+_PARTS = {8: "eighths", 10: "tenths", 100: "hundredths", 1000: "thousandths"}
+
+
 @dataclass(frozen=True, slots=True)
 class Scaled(Kind):
     """A real number in ``low … high`` sent as a whole number of ``1/per``."""
@@ -129,7 +132,8 @@ class Scaled(Kind):
         return raw / self.per
 
     def describe(self) -> str:
-        return f"int, {self.per} for 1; {self.low:g}…{self.high:g}"
+        low, high = (round(bound * self.per) for bound in (self.low, self.high))
+        return f"int {low}…{high}, {_PARTS[self.per]}"
 
 
 @dataclass(frozen=True, slots=True)
