@@ -16,16 +16,17 @@ __all__ = ["Geolocation"]
 
 
 class Geolocation:
-    """Takes poses in one thread, and overlays in another."""
+    """Takes poses in one thread, and overlays in another: these by the poses that `use` was told of."""
 
     def __init__(self, view: View, *, surface: Surface = FLAT_GROUND) -> None:
         self._view = view
         self._surface = surface
         self._decoder = PoseDecoder()
         self._trail = PoseTrail()
+        self._used = PoseTrail()
         self._stale = False
         self.has_pose = False
-        """Whether one ever came: without, there are no places to ask for."""
+        """Whether one is used: without, there are no places to ask for."""
         self._lock = threading.Lock()
 
     def report(self, report: PoseReport) -> Pose | None:
@@ -34,11 +35,13 @@ class Geolocation:
         Raises `WireError` where its bits make no sense.
         """
         pose = self._decoder.decode(report)
+        return None if pose is None or not self._trail.add(pose) else pose
+
+    def use(self, pose: Pose) -> None:
+        """Locate by this pose from now on."""
         with self._lock:
-            if pose is None or not self._trail.add(pose):
-                return None
+            self._used.add(pose)
         self.has_pose = True
-        return pose
 
     @property
     def newest(self) -> Pose | None:
@@ -61,7 +64,7 @@ class Geolocation:
     def located(self, overlay: Overlay) -> Overlay:
         """The overlay with the places of its tracks; as it is where no pose tells."""
         with self._lock:
-            pose = self._trail.at(overlay.capture_ns)
+            pose = self._used.at(overlay.capture_ns)
         if pose is None:
             return overlay
         places = places_of_boxes(pose, overlay.boxes_base_px, view=self._view, surface=self._surface)

@@ -35,14 +35,15 @@ _MOST_STILLS = 256
 _MOST_STILL_BYTES = 32 * 2**20
 _MOST_STEPS = 8
 """Reports of the edge's tracks: the newest count, each says all."""
+_MOST_POSES = 64
 _MOST_JOBS = 4096
 _MOST_LAST_JOBS = 8
 """Of those that come last: each holds a stretch of video."""
 _JOB_STEP_S = 0.1
 """On a machine that never comes to rest jobs still get one step in so long."""
 _STEP_LAG = 2
-"""In lockstep a step counts from so many frames on. It is sent right before the next access unit, which may overtake
-it by microseconds: this is what makes the order the same in every run."""
+"""In lockstep a step, or a pose, counts from so many frames on. It is sent right before the next access unit, which may
+overtake it by microseconds: this is what makes the order the same in every run."""
 _AHEAD = 2
 
 Analyze = Callable[[DecodedFrame, bool], None]
@@ -107,6 +108,10 @@ class PerceptionWorker(ABC):
     @abstractmethod
     def step(self, tracks: Tracks, capture_ns: int) -> None:
         """Hand over what the edge tracked at one frame."""
+
+    def pose(self, use: Callable[[], None], capture_ns: int) -> None:  # noqa: ARG002 - for lockstep
+        """Hand over where the camera was at that time; ``use()`` makes it count, here at once."""
+        use()
 
     @abstractmethod
     def still(self, still: ReceivedStill) -> None:
@@ -311,6 +316,9 @@ class LockstepWorker(PerceptionWorker):
         self._pending: deque[Future[None]] = deque()
         self._early: list[ReceivedStill] = []
         self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_MOST_STEPS)
+        self._poses: deque[tuple[int, Callable[[], None]]] = deque(maxlen=_MOST_POSES)
+        self._captures_ns: deque[int] = deque(maxlen=_STEP_LAG)
+        """Of the last pictures."""
         self._newest_frame = -1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"hvt-perception-{name}")
 
@@ -321,6 +329,9 @@ class LockstepWorker(PerceptionWorker):
 
     def picture(self, picture: DecodedFrame) -> None:
         """Analyze a frame, and read the stills of it that overtook it on the link."""
+        if len(self._captures_ns) == _STEP_LAG:
+            self._take_poses(until_ns=self._captures_ns[0])
+        self._captures_ns.append(picture.capture_ns)
         self._take_steps(before=picture.frame_index - _STEP_LAG + 1)
         self._newest_frame = picture.frame_index
         self._submit(self._worker.submit(self._analyze, picture, False))
@@ -332,6 +343,10 @@ class LockstepWorker(PerceptionWorker):
     def step(self, tracks: Tracks, capture_ns: int) -> None:
         """Take in a report of tracks before the frame that comes so many frames later."""
         self._steps.append((tracks, capture_ns))
+
+    def pose(self, use: Callable[[], None], capture_ns: int) -> None:
+        """It counts from so many pictures on, like a report of tracks."""
+        self._poses.append((capture_ns, use))
 
     def still(self, still: ReceivedStill) -> None:
         """Read a still once its frame has been analyzed."""
@@ -362,6 +377,10 @@ class LockstepWorker(PerceptionWorker):
     def _take_steps(self, *, before: int | None) -> None:
         while self._steps and (before is None or self._steps[0][0].frame_index < before):
             self._submit(self._worker.submit(self._step, *self._steps.popleft()))
+
+    def _take_poses(self, *, until_ns: int) -> None:
+        while self._poses and self._poses[0][0] <= until_ns:
+            self._submit(self._worker.submit(self._poses.popleft()[1]))
 
     def _submit(self, future: Future[None]) -> None:
         self._pending.append(future)

@@ -209,10 +209,10 @@ class EdgeSessions:
             if isinstance(header, BacklogHeader):
                 self._backlog(header, item)
             elif isinstance(header, PoseReport):
-                if session is None:
-                    self._pre_session.hold(packet)
-                elif header.is_of(session.info.session_id):
+                if session is not None and header.is_of(session.info.session_id):
                     session.pose(header, item)
+                else:  # it may overtake the first keyframe of its session
+                    self._pre_session.hold(packet)
             elif session is not None and header.session_id == session.info.session_id:
                 self._take(session, header, item)
             elif isinstance(header, Status) or (isinstance(header, RoiHeader) and session is None):

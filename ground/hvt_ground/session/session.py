@@ -211,6 +211,7 @@ class GroundSession:
         pose = self.geolocation.report(report)
         self._account.time(Channel.POSE, item, report, handled=pose is not None)
         if pose is not None:
+            self.worker.pose(partial(self.geolocation.use, pose), pose.capture_ns)
             self._emit(PoseUpdate(max(0, self._last_index), pose.capture_ns, pose, self.info.view))
             self._note_stale(pose.capture_ns)
 

@@ -12,7 +12,7 @@ import pytest
 from hvt_common.protocol.messages import RoiHeader
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.perception.worker import RealtimeWorker
+from hvt_ground.perception.worker import LockstepWorker, RealtimeWorker
 from programs.processes import eventually
 from rigs.flight import Flight
 
@@ -96,3 +96,22 @@ def test_detection_is_for_the_newest_picture():
     for index in (1, 2, 3):
         rig.worker.picture(picture(index))
     assert rig.finish() == [("picture", 0), ("hurry", 1), ("hurry", 2), ("picture", 3)]
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_in_lockstep_a_pose_counts_from_the_same_frame_on_however_long_perception_takes(slow):
+    """The same flight received again would place the same tracks elsewhere."""
+    done: list[Any] = []
+
+    def analyze(one: DecodedFrame, _hurry: bool) -> None:
+        time.sleep(0.03 * slow)
+        done.append(one.frame_index)
+
+    worker = LockstepWorker(analyze, lambda _tracks, _at_ns: None, lambda _stills: None, name="x")
+    for index in range(6):
+        worker.picture(picture(index))
+        if index in (1, 3):
+            worker.pose(lambda: done.append("pose"), index)
+        time.sleep(0.03 * (not slow))
+    worker.close()
+    assert done == [0, 1, 2, "pose", 3, 4, "pose", 5]

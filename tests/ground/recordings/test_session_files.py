@@ -12,7 +12,9 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.units import Limit
-from hvt_ground.events import Event, Notice, Overlay, Refinement, VideoSample
+from hvt_common.values import Pose, View
+from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, VideoSample
+from hvt_ground.recordings.recorded import read_recordings
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks.rerun.live_view import viewer_program
@@ -244,3 +246,14 @@ def plain(events: list[Event]) -> list[Event]:
         for one in events
         if isinstance(one, VideoSample | Overlay)
     ]
+
+
+def test_a_later_file_does_not_begin_with_an_old_pose(tmp_path, events):
+    """One that went stale long ago would place tracks for ten seconds of each file."""
+    view = View.fitted((320, 192), (320, 192), fit="letterbox")
+    said_ns = START_NS + 20 * STEP_NS
+    old = PoseUpdate(20, said_ns, Pose(said_ns, 48.1, 11.5, height_m=60.0), view)
+    at = next(place for place, one in enumerate(events) if one.frame_index > 20)
+    files, _ = recorded(tmp_path, [*events[:at], old, *events[at:]])
+    poses = [[one.capture_ns for one in read_recordings([file]).poses] for file in files]
+    assert poses == [[said_ns], *[[] for _ in files[1:]]]

@@ -51,7 +51,7 @@ _PLOT_GAP_NS = 2_500_000_000
 """Plots have a hole where nothing was measured for longer."""
 _BYTES_EACH = {"boxes": 6, "identity": 2, "places": 4, "words": 5}
 """About what the component costs a track; others cost little more than their row."""
-_MOMENTARY = ("video", "text", "lines", "jpeg", "message")
+_MOMENTARY = ("video", "text", "lines", "jpeg", "message", "pose", "map points")
 """Tables whose values hold for one frame: a file that begins later does not begin with them."""
 _LAYER_PATHS: dict[Layer, str] = {
     "tracks": names.TRACKS,
