@@ -65,7 +65,7 @@ __all__ = [
     "make_link_settings",
     "make_pipeline",
     "make_record_folder",
-    "make_surface",
+    "make_surfaces",
     "output_path",
 ]
 
@@ -112,7 +112,7 @@ class SessionFactory:
         self._naming = threading.Lock()
         if config.mcap is not None:
             _mcap_file()  # that it is there
-        make_surface(config.terrain)
+        self._surface_of = make_surfaces(config.terrain)
         self._cot = _cot(config, outputs)
         self._timing: QueuedSink[str] | None = None
         if config.timing is not None:
@@ -130,6 +130,7 @@ class SessionFactory:
         config, models, edge = self._config, self._models, info.edge
         stamp = time.strftime("%Y%m%d-%H%M%S")
         settings = self._recorder_settings(info)
+        surface = self._surface_of(edge)
         # In lockstep the edge waits, so that nothing need be lost to a slow disk.
         wait_s = _LOCKSTEP_WAIT_S if info.pace == "lockstep" else 0.0
         sinks: list[Sink[Event]] = []
@@ -158,7 +159,7 @@ class SessionFactory:
                 files[what] = self._outputs.open(f"{what} of {edge}", open_file, wait_s=wait_s)
         sinks += files.values()
         if config.ts is not None:
-            opens_stream = self._transport_stream(info, config.ts, stamp=stamp)
+            opens_stream = self._transport_stream(info, config.ts, stamp=stamp, surface=surface)
             sinks.append(self._outputs.open(f"MPEG-TS of {edge}", opens_stream, wait_s=wait_s))
         if self._cot is not None:
             address = self._still_address(info, files.get("stills"))
@@ -173,7 +174,7 @@ class SessionFactory:
             clock=self._clock,
             reports=reports,
             backlog_perception=make_backlog_perception(config, models, info=info),
-            surface=make_surface(config.terrain),
+            surface=surface,
         )
 
     def open_backlog(self, info: Info) -> BacklogRecording:
@@ -186,8 +187,9 @@ class SessionFactory:
         perception = make_backlog_perception(self._config, self._models, info=info)
         return BacklogRecording(info, sink=sink, perception=perception)
 
-    def _transport_stream(self, info: Info, target: str, *, stamp: str) -> Callable[[], SinkWriter[Event]]:
-        surface = make_surface(self._config.terrain)
+    def _transport_stream(
+        self, info: Info, target: str, *, stamp: str, surface: Surface
+    ) -> Callable[[], SinkWriter[Event]]:
         platform = Platform(info.edge, f"{info.session_id:016x}", info.view, surface)
         where = destination(target)
         if isinstance(where, Path):
@@ -248,13 +250,17 @@ class SessionFactory:
         )
 
 
-def make_surface(terrain: Path | None) -> Surface:
-    """What tracks stand on; `UserError` where the file is no elevation model."""
+def make_surfaces(terrain: Path | None) -> Callable[[str], Surface]:
+    """What makes the ground of one flight, by the name of whose it is.
+
+    The file is looked at once, here: `UserError` where it is no elevation model. One that goes later ends no flight.
+    """
     if terrain is None:
-        return FLAT_GROUND
+        return lambda _flight: FLAT_GROUND
     with needs_extra("'hvt[terrain]'"):
-        from hvt_ground.geolocation.terrain import Terrain  # noqa: PLC0415 - who has none needs no GDAL
-    return Terrain(terrain)
+        from hvt_ground.geolocation.elevation import ElevationModel  # noqa: PLC0415 - who has none needs no GDAL
+        from hvt_ground.geolocation.terrain import Terrain  # noqa: PLC0415 - as above
+    return partial(Terrain, ElevationModel(terrain))
 
 
 def _mcap_file() -> type[McapFile]:

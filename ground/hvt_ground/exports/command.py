@@ -18,7 +18,7 @@ from hvt_ground.exports.tables import write_csv, write_mot, write_parquet
 from hvt_ground.exports.video import CONTAINERS, write_video
 from hvt_ground.exports.whole import whole_file, whole_folder
 from hvt_ground.recordings.recorded import Recorded, RecordedStill, read_recordings
-from hvt_ground.wiring import make_surface
+from hvt_ground.wiring import make_surfaces
 
 __all__ = ["run"]
 
@@ -59,7 +59,8 @@ def run(argv: Sequence[str]) -> int:
     if given.burn_in and kind not in CONTAINERS:
         raise UserError(f"--burn-in draws into video, and --to is {kind}: give {', '.join(CONTAINERS)}")
     out = given.out or _beside(given.recordings[0], kind)
-    recorded = read_recordings(given.recordings, surface=make_surface(given.terrain))
+    surface = make_surfaces(given.terrain)(given.recordings[0].name)
+    recorded = read_recordings(given.recordings, surface=surface)
     if kind in _FOLDERS:
         with whole_folder(out) as part:
             _FOLDERS[kind](recorded, part)

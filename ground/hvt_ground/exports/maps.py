@@ -18,6 +18,7 @@ from typing import Any, Final
 from hvt_common.errors import UserError
 from hvt_common.geodesy import metres_per_degree, moved
 from hvt_common.units import SECOND_NS
+from hvt_ground.exports.ways import Fix, line, parts_of, turned_deg
 from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.palette import class_colour
 from hvt_ground.sinks.tracks_table import utc_text
@@ -26,7 +27,6 @@ __all__ = ["write_geojson", "write_kml"]
 
 _EVERY_NS: Final = SECOND_NS
 _ELLIPSE_CORNERS: Final = 24
-_DIGITS: Final = 7
 _KML: Final = "http://www.opengis.net/kml/2.2"
 _GX: Final = "http://www.google.com/kml/ext/2.2"
 ET.register_namespace("", _KML)
@@ -42,6 +42,11 @@ class _Spot:
     longitude_deg: float
     ellipse: tuple[float, float, float]
     """Half its axes in metres, and the longer one's direction."""
+
+    @property
+    def fix(self) -> Fix:
+        """Where and when."""
+        return Fix(self.capture_ns, self.longitude_deg, self.latitude_deg)
 
 
 @dataclass(slots=True)
@@ -69,7 +74,7 @@ class _Track:
         return any(
             math.hypot(
                 (one.latitude_deg - first.latitude_deg) * north_m,
-                (one.longitude_deg - first.longitude_deg) * east_m,
+                turned_deg(one.longitude_deg - first.longitude_deg) * east_m,
             )
             > reach_m
             for one in self.spots
@@ -81,9 +86,9 @@ def write_geojson(recorded: Recorded, path: Path) -> None:
     features = [_camera_feature(recorded)]
     for track_id, track in _tracks(recorded).items():
         spot = track.surest
-        geometry: dict[str, Any] = {"type": "Point", "coordinates": _position(spot)}
+        geometry: dict[str, Any] = {"type": "Point", "coordinates": spot.fix.position}
         if track.moved:
-            geometry = {"type": "LineString", "coordinates": [_position(one) for one in track.spots]}
+            geometry = line(parts_of([one.fix for one in track.spots]))
         properties = {
             "kind": "track",
             "id": track_id,
@@ -105,17 +110,16 @@ def write_kml(recorded: Recorded, path: Path) -> None:
     """Placemarks with times: the camera's way, and each track with its ellipse. `UserError` without a pose."""
     root = ET.Element(f"{{{_KML}}}kml")
     document = _with(root, "Document", name=recorded.edge)
-    camera = [
-        (one.capture_ns, one.pose.longitude_deg, one.pose.latitude_deg, one.pose.height_m)
-        for one in _poses(recorded)
-    ]
-    _timed_way(_with(document, "Placemark", name=recorded.edge), camera)
+    _timed_way(_with(document, "Placemark", name=recorded.edge), _camera_way(recorded))
     for track_id, track in _tracks(recorded).items():
         spot = track.surest
         place = _with(document, "Placemark", name=f"{track_id} {track.class_name}")
+        if not track.moved:  # a way has times of its own
+            first_ns = track.spots[0].capture_ns
+            _with(place, "TimeSpan", begin=utc_text(first_ns), end=utc_text(track.last_ns))
         red, green, blue = class_colour(track.class_name)
         style = _with(place, "Style")
-        for kind in ("LineStyle", "IconStyle"):
+        for kind in ("IconStyle", "LineStyle"):  # in the order of the schema
             _with(style, kind, color=f"ff{blue:02x}{green:02x}{red:02x}")
         _with(style, "PolyStyle", color=f"30{blue:02x}{green:02x}{red:02x}")
         facts = _with(place, "ExtendedData")
@@ -127,9 +131,7 @@ def write_kml(recorded: Recorded, path: Path) -> None:
             _with(_with(facts, "Data", {"name": name}), value=value)
         shapes = _with(place, "MultiGeometry")
         if track.moved:
-            _timed_way(
-                shapes, [(one.capture_ns, one.longitude_deg, one.latitude_deg, None) for one in track.spots]
-            )
+            _timed_way(shapes, [one.fix for one in track.spots])
         else:
             _with(_with(shapes, "Point"), coordinates=f"{spot.longitude_deg:.7f},{spot.latitude_deg:.7f}")
         ring = _with(_with(_with(shapes, "Polygon"), "outerBoundaryIs"), "LinearRing")
@@ -168,27 +170,27 @@ def _tracks(recorded: Recorded) -> dict[int, _Track]:
     return dict(sorted(tracks.items()))
 
 
+def _camera_way(recorded: Recorded) -> list[Fix]:
+    return [
+        Fix(one.capture_ns, one.pose.longitude_deg, one.pose.latitude_deg, one.pose.height_m)
+        for one in _poses(recorded)
+    ]
+
+
 def _camera_feature(recorded: Recorded) -> dict[str, Any]:
-    poses = _poses(recorded)
-    places = [_rounded(one.pose.longitude_deg, one.pose.latitude_deg) for one in poses]
-    still = all(one == places[0] for one in places)
-    geometry = {"type": "Point" if still else "LineString", "coordinates": places[0] if still else places}
+    """``utc`` and ``height_m`` have a value for each position, those of parts one after another."""
+    way = _camera_way(recorded)
+    still = all(one.position == way[0].position for one in way)
+    parts = [way] if still else parts_of(way)
     properties = {
         "kind": "camera",
         "edge": recorded.edge,
         "session": recorded.session,
-        "utc": [utc_text(one.capture_ns) for one in poses],
-        "height_m": [one.pose.height_m for one in poses],
+        "utc": [utc_text(one.capture_ns) for part in parts for one in part],
+        "height_m": [one.height_m for part in parts for one in part],
     }
+    geometry = {"type": "Point", "coordinates": way[0].position} if still else line(parts)
     return {"type": "Feature", "geometry": geometry, "properties": properties}
-
-
-def _position(spot: _Spot) -> list[float]:
-    return _rounded(spot.longitude_deg, spot.latitude_deg)
-
-
-def _rounded(*degrees: float) -> list[float]:
-    return [round(one, _DIGITS) for one in degrees]
 
 
 def _outline(spot: _Spot) -> list[tuple[float, float]]:
@@ -210,14 +212,15 @@ def _outline(spot: _Spot) -> list[tuple[float, float]]:
     return corners
 
 
-def _timed_way(parent: ET.Element, places: Sequence[tuple[int, float, float, float | None]]) -> None:
-    """A track with times; each place is capture time, longitude, latitude and height or None."""
-    way = ET.SubElement(parent, f"{{{_GX}}}Track")
-    _with(way, altitudeMode="clampToGround" if places[0][3] is None else "relativeToGround")
-    for capture_ns, *_ in places:
-        _with(way, when=utc_text(capture_ns))
-    for _, longitude, latitude, height_m in places:
-        ET.SubElement(way, f"{{{_GX}}}coord").text = f"{longitude:.7f} {latitude:.7f} {height_m or 0:.1f}"
+def _timed_way(parent: ET.Element, way: Sequence[Fix]) -> None:
+    """A track with times."""
+    element = ET.SubElement(parent, f"{{{_GX}}}Track")
+    _with(element, altitudeMode="clampToGround" if way[0].height_m is None else "relativeToGround")
+    for one in way:
+        _with(element, when=utc_text(one.capture_ns))
+    for one in way:
+        text = f"{one.longitude_deg:.7f} {one.latitude_deg:.7f} {one.height_m or 0:.1f}"
+        ET.SubElement(element, f"{{{_GX}}}coord").text = text
 
 
 def _with(

@@ -1,4 +1,4 @@
 """Where on the ground things are.
 
-`locate` is for sessions; `camera`, `footprint`, `trail`, `surface` and `terrain` are for others.
+`locate` is for sessions; `camera`, `footprint`, `trail`, `surface`, `terrain` and `elevation` are for others.
 """

@@ -11,8 +11,10 @@ import geojson
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import rasterio
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from mcap.reader import make_reader
+from rasterio.transform import from_origin
 
 import hvt_ground.cli
 from hvt_common.geodesy import metres_per_degree
@@ -23,18 +25,23 @@ from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs.rrd import Recording
 
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Use `@` matmul:PendingDeprecationWarning"
+)  # of rasterio's own
+
 FRAMES, SIZE, TRACKS = 60, (320, 192), 6
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 KML = "{http://www.opengis.net/kml/2.2}"
 GX = "{http://www.google.com/kml/ext/2.2}"
 
 
-def pose_at(frame: int) -> Pose:
-    """Eastwards at 8 m/s, 60 m above the ground, looking down."""
+def pose_at(frame: int, *, start_deg: float = 8.5, speed_mps: float = 8.0) -> Pose:
+    """Eastwards, 60 m above the ground, looking down."""
+    east_deg = start_deg + speed_mps * frame / 15 / metres_per_degree(47.0)[1]
     return Pose(
         START_NS + frame * STEP_NS,
         47.0,
-        8.5 + 8 * frame / 15 / metres_per_degree(47.0)[1],
+        (east_deg + 180) % 360 - 180,
         height_m=60.0,
         altitude_m=460.0,
         camera=Orientation(0, -90, 0),
@@ -45,22 +52,39 @@ def pose_at(frame: int) -> Pose:
     )
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Path:
+def recorded(path: Path, **way: float) -> Path:
     """As the ground writes it, with a pose a second."""
     drawn = drawn_frames(FRAMES, SIZE)
-    path = tmp_path_factory.mktemp("flight") / "flight.rrd"
     with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
         for event, _ in session(drawn, coded(drawn, kbps=300, keyint=20), tracks=TRACKS, total_kbps=500):
             if isinstance(event, Overlay):
                 frame = event.frame_index
-                places = places_of_boxes(pose_at(frame), event.boxes_base_px, view=VIEW)
+                places = places_of_boxes(pose_at(frame, **way), event.boxes_base_px, view=VIEW)
                 recorder.log(replace(event, places=places))
                 if frame % 15 == 0:
-                    recorder.log(PoseUpdate(frame, event.capture_ns, pose_at(frame), VIEW))
+                    recorder.log(PoseUpdate(frame, event.capture_ns, pose_at(frame, **way), VIEW))
             else:
                 recorder.log(event)
     return path
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    """At 8 m/s."""
+    return recorded(tmp_path_factory.mktemp("flight") / "flight.rrd")
+
+
+@pytest.fixture(scope="module")
+def crossing(tmp_path_factory) -> Path:
+    """The same over the antimeridian, after 2 of 4 seconds."""
+    start_deg = 180 - 2 * 8.0 / metres_per_degree(47.0)[1]
+    return recorded(tmp_path_factory.mktemp("crossing") / "flight.rrd", start_deg=start_deg + 2e-6)
+
+
+@pytest.fixture(scope="module")
+def hovering(tmp_path_factory) -> Path:
+    """There too: the third track trembles from one side to the other, by less than its error."""
+    return recorded(tmp_path_factory.mktemp("hovering") / "flight.rrd", start_deg=180.00002, speed_mps=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +148,71 @@ def test_kml_is_placemarks_with_times_and_ellipses(recording, tmp_path):
     corners = np.array([[float(v) for v in one.split(",")] for one in (ring.text or "").split()])
     assert corners[0] == pytest.approx(corners[-1])
     assert (np.ptp(corners, axis=0) > 0).all()
+
+
+def test_kml_of_what_stands_still_has_its_time_and_the_order_of_the_schema(hovering, tmp_path):
+    """The slider would not hide what came later, and a reader that checks the schema refuse the file."""
+    root = ET.fromstring(export(hovering, tmp_path / "map.kml").read_text(encoding="utf-8"))
+    marks = [one for one in root.findall(f".//{KML}Placemark") if one.find(f".//{KML}Point") is not None]
+    assert len(marks) >= 1
+    for mark in marks:
+        begin, end = (mark.findtext(f"{KML}TimeSpan/{KML}{name}") or "" for name in ("begin", "end"))
+        assert begin.startswith("2026-09-21T")
+        assert begin < end
+        tags = [one.tag.removeprefix(KML) for one in mark]
+        assert tags == ["name", "TimeSpan", "Style", "ExtendedData", "MultiGeometry"]
+        style = mark.find(f"{KML}Style")
+        assert style is not None
+        assert [one.tag.removeprefix(KML) for one in style] == ["IconStyle", "LineStyle", "PolyStyle"]
+
+
+def test_what_stands_still_at_the_antimeridian_did_not_move(hovering, tmp_path):
+    """It would be drawn as a way around the earth."""
+    _, *tracks = geojson.loads(export(hovering, tmp_path / "m.geojson").read_text(encoding="utf-8"))[
+        "features"
+    ]
+    assert {one["geometry"]["type"] for one in tracks} == {"Point"}
+    assert {one["geometry"]["coordinates"][0] > 0 for one in tracks} == {True, False}
+
+
+def test_ways_over_the_antimeridian_are_in_parts(crossing, tmp_path):
+    """QGIS would draw the flight around the earth."""
+    text = export(crossing, tmp_path / "m.geojson").read_text(encoding="utf-8")
+    found = geojson.loads(text)
+    assert found.is_valid, found.errors()
+    camera, *tracks = found["features"]
+    assert len(camera["geometry"]["coordinates"]) == 2
+    west, east = camera["geometry"]["coordinates"]
+    assert (west[-1][0], east[0][0]) == (180.0, -180.0)
+    assert west[-1][1] == east[0][1] == pytest.approx(47.0)
+    assert len(camera["properties"]["utc"]) == len(camera["properties"]["height_m"]) == len(west) + len(east)
+    assert camera["properties"]["utc"] == sorted(camera["properties"]["utc"])
+    assert {one["geometry"]["type"] for one in tracks} >= {"MultiLineString"}
+    for one in (camera, *tracks):
+        parts = one["geometry"]["coordinates"]
+        for part in parts if one["geometry"]["type"] == "MultiLineString" else [parts]:
+            assert np.ptp(np.array(part)[:, 0]) < 1
+
+
+def test_an_export_with_the_wrong_terrain_says_so(recording, tmp_path, caplog):
+    """The file would have no tracks, and nobody know why."""
+    model = tmp_path / "elsewhere.tif"
+    with rasterio.open(
+        *(model, "w"),
+        driver="GTiff",
+        width=50,
+        height=50,
+        count=1,
+        dtype="float32",
+        crs="EPSG:4326",
+        transform=from_origin(20.0, 10.0, 0.001, 0.001),
+    ) as file:
+        file.write(np.zeros((50, 50), np.float32), 1)
+    out = tmp_path / "m.geojson"
+    words = ["export", str(recording), "--out", str(out), "--terrain", str(model)]
+    assert hvt_ground.cli.main(words) == 0
+    assert [one["properties"]["kind"] for one in geojson.loads(out.read_text())["features"]] == ["camera"]
+    assert f"--terrain {model} has no ground below flight.rrd at 47.0" in caplog.text
 
 
 def test_tables_have_places_between_two_poses(recording, tmp_path):

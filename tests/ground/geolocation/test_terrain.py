@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +11,23 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.transform import from_origin
+from rasterio.warp import transform
 
 import hvt_ground.cli
 from hvt_common.errors import UserError
-from hvt_common.geodesy import metres_per_degree
+from hvt_common.geodesy import metres_per_degree, moved
+from hvt_common.protocol.clock_offset import ClockOffset
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import Orientation, Pose, View
+from hvt_ground.backlog.edge_backlog import EdgeBacklog
+from hvt_ground.config import GroundConfig, check
 from hvt_ground.geolocation.camera import ground_points, places_of_boxes
+from hvt_ground.geolocation.elevation import ElevationModel
 from hvt_ground.geolocation.terrain import Terrain
+from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.sinks import Outputs
+from hvt_ground.wiring import Models, SessionFactory, make_surfaces
+from rigs.messages import INFO
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning"),  # of rasterio's own
@@ -28,6 +40,9 @@ NORTH_M, EAST_M = metres_per_degree(47.0)
 POSE = Pose(0, 47.0, 8.0, altitude_m=600.0, camera=Orientation(0, -45, 0), hfov_deg=60.0)
 MIDDLE = np.array([[500.0, 250.0]])
 CELL = 1 / 3600
+BOX = np.array([[490, 240, 510, 260]], np.float32)
+MOON = "+proj=eqc +R=1737400 +units=m +no_defs"
+PLAN = 'LOCAL_CS["plan",UNIT["metre",1]]'
 
 
 def model(folder: Path, height_m, *, dtype: str = "float32", nodata: float | None = -9999) -> Path:
@@ -51,9 +66,34 @@ def model(folder: Path, height_m, *, dtype: str = "float32", nodata: float | Non
     return path
 
 
+def terrain_of(path: Path) -> Terrain:
+    return Terrain(ElevationModel(path), "uav-1")
+
+
+def flat_file(path: Path, corner: tuple[float, float], *, size=(200, 200), **profile) -> Path:
+    """500 m everywhere; ``corner`` is west and north, ``size`` columns and rows, cells 30 m or 0.001 degrees."""
+    cell = profile.pop("cell", 0.001 if profile["crs"] == "EPSG:4326" else 30)
+    with rasterio.open(
+        *(path, "w"),
+        driver="GTiff",
+        width=size[0],
+        height=size[1],
+        count=1,
+        **{"dtype": "float32", "transform": from_origin(*corner, cell, cell), **profile},
+    ) as file:
+        file.write(np.full(size[::-1], 500, np.float32), 1)
+    return path
+
+
+def ground_m(path: Path, latitude: float, longitude: float) -> float:
+    """The elevation below a camera there."""
+    tile = ElevationModel(path).around(latitude, longitude)
+    return float(tile.at(np.array([latitude]), np.array([longitude]))[0])
+
+
 def test_a_plain_is_as_flat_ground(tmp_path):
     """The two ways to find a place would disagree where they must not."""
-    terrain = Terrain(model(tmp_path, lambda north, east: 500.0))
+    terrain = terrain_of(model(tmp_path, lambda north, east: 500.0))
     points = np.array([[500.0, 250.0], [200.0, 300.0], [900.0, 480.0]])
     flat = ground_points(replace(POSE, height_m=100.0), points, size=SIZE)
     assert ground_points(POSE, points, size=SIZE, surface=terrain) == pytest.approx(flat, abs=0.5)
@@ -62,7 +102,7 @@ def test_a_plain_is_as_flat_ground(tmp_path):
 
 def test_a_slope_is_met_where_it_rises_to_the_ray(tmp_path):
     """Everything on a hillside would be placed behind the hill."""
-    terrain = Terrain(model(tmp_path, lambda north, east: 500 + 0.5 * north))
+    terrain = terrain_of(model(tmp_path, lambda north, east: 500 + 0.5 * north))
     # 100 - d = 0.5 d
     found = ground_points(POSE, MIDDLE, size=SIZE, surface=terrain)
     assert found[0] == pytest.approx((66.7, 0), abs=1.0)
@@ -70,7 +110,7 @@ def test_a_slope_is_met_where_it_rises_to_the_ray(tmp_path):
 
 def test_what_a_ridge_hides_is_not_seen_through_it(tmp_path):
     """A boat behind the headland would be reported in front of it, or the other way round."""
-    terrain = Terrain(model(tmp_path, lambda north, east: 500 + 80.0 * (np.abs(north - 1000) < 150)))
+    terrain = terrain_of(model(tmp_path, lambda north, east: 500 + 80.0 * (np.abs(north - 1000) < 150)))
     flat_camera = replace(POSE, camera=Orientation(0, -3.0, 0))  # over flat ground it would be 1,908 m
     found = ground_points(flat_camera, MIDDLE, size=SIZE, surface=terrain)
     assert 820 < found[0, 0] < 900
@@ -78,7 +118,7 @@ def test_what_a_ridge_hides_is_not_seen_through_it(tmp_path):
 
 def test_height_alone_counts_from_the_first_place(tmp_path):
     """Drones say how far above the take-off they are, and the take-off is not at sea level."""
-    terrain = Terrain(model(tmp_path, lambda north, east: 500 + 0.5 * north, dtype="int16"))
+    terrain = terrain_of(model(tmp_path, lambda north, east: 500 + 0.5 * north, dtype="int16"))
     above = replace(POSE, altitude_m=None, height_m=100.0)
     first = ground_points(above, MIDDLE, size=SIZE, surface=terrain) if terrain.usable(above) else None
     assert first is not None
@@ -91,20 +131,19 @@ def test_height_alone_counts_from_the_first_place(tmp_path):
 
 def test_outside_the_model_and_in_its_holes_nothing_is_placed(tmp_path):
     """A place would be invented where nobody knows the ground."""
-    holed = Terrain(model(tmp_path, lambda north, east: np.where(north > 40, -9999.0, 500.0)))
-    box = np.array([[490, 240, 510, 260]], np.float32)
-    places = places_of_boxes(POSE, box, view=VIEW, surface=holed)
+    holed = terrain_of(model(tmp_path, lambda north, east: np.where(north > 40, -9999.0, 500.0)))
+    places = places_of_boxes(POSE, BOX, view=VIEW, surface=holed)
     assert places is not None
     assert np.isnan(places.places_deg).all()
     elsewhere = replace(POSE, latitude_deg=-20.0)
     assert np.isnan(ground_points(elsewhere, MIDDLE, size=SIZE, surface=holed)).all()
     under = replace(POSE, altitude_m=400.0)
-    assert places_of_boxes(under, box, view=VIEW, surface=holed) is None
+    assert places_of_boxes(under, BOX, view=VIEW, surface=holed) is None
 
 
 def test_a_far_flight_loads_the_ground_that_it_comes_to(tmp_path):
     """The first 10 km of a flight would be the only ones with ground."""
-    terrain = Terrain(model(tmp_path, lambda north, east: 500.0))
+    terrain = terrain_of(model(tmp_path, lambda north, east: 500.0))
     for north in (0, 3000, 6000, 9000, 10_500):
         pose = replace(POSE, latitude_deg=47.0 + north / NORTH_M)
         assert ground_points(pose, MIDDLE, size=SIZE, surface=terrain)[0] == pytest.approx((100, 0), abs=1)
@@ -116,7 +155,7 @@ def test_a_wrong_file_is_refused_in_a_sentence(tmp_path, content, capsys):
     wrong = tmp_path / "wrong.tif"
     wrong.write_bytes(content)
     with pytest.raises(UserError, match="is no elevation model"):
-        Terrain(wrong)
+        ElevationModel(wrong)
     assert hvt_ground.cli.main(["--terrain", str(wrong), "--record", str(tmp_path / "f.rrd")]) == 2
     assert f"--terrain {wrong} is no elevation model" in capsys.readouterr().err
 
@@ -127,4 +166,180 @@ def test_a_picture_without_coordinates_is_refused(tmp_path):
     with rasterio.open(path, "w", driver="GTiff", width=8, height=8, count=1, dtype="float32") as file:
         file.write(np.zeros((8, 8), np.float32), 1)
     with pytest.raises(UserError, match="does not say where it lies"):
-        Terrain(path)
+        ElevationModel(path)
+
+
+@pytest.mark.parametrize("height_m", [0.5, 2.0, 3.0])
+@pytest.mark.parametrize("said", ["altitude", "height"])
+def test_a_camera_that_is_hardly_above_the_ground_ends_no_session(tmp_path, height_m, said):
+    """At each start and landing the session would end, for by its error the camera may be below the ground."""
+    terrain = terrain_of(model(tmp_path, lambda north, east: 500.0))
+    pose = replace(POSE, altitude_m=500 + height_m)
+    if said == "height":
+        pose = replace(POSE, altitude_m=None, height_m=height_m)
+    assert terrain.usable(pose)
+    places = places_of_boxes(pose, BOX, view=VIEW, surface=terrain)
+    assert places is not None
+    assert np.isnan(places.places_deg).all(), "how far it is nobody knows"
+    below = replace(pose, altitude_m=499.0)
+    assert np.isnan(terrain.meet(below, np.array([[1.0, 0.0, 1.0]]))).all()
+    assert terrain.below_m(below, np.zeros((1, 2)))[0] == pytest.approx(-1.0, abs=0.01)
+    silent = replace(pose, altitude_m=None, height_m=None)
+    assert not terrain.usable(silent)
+    assert np.isnan(terrain.meet(silent, np.array([[1.0, 0.0, 1.0]]))).all()
+    assert np.isnan(terrain.below_m(silent, np.zeros((1, 2)))).all()
+
+
+@pytest.mark.parametrize("profile", [{}, {"nodata": -9999}, {"nodata": -1.7e308, "dtype": "float64"}])
+def test_beside_a_model_there_is_no_sea(tmp_path, profile):
+    """A boat near the edge of the map would be placed on a plain at 0 m, hundreds of metres away."""
+    path = flat_file(tmp_path / "utm.tif", (700_000, 5_300_000), crs="EPSG:32632", **profile)
+    # 30 m beside, but between the meridians of its corners
+    (inside, beside), latitudes = transform(
+        "EPSG:32632", "EPSG:4326", [700_100, 699_970], [5_297_000, 5_296_000]
+    )
+    assert ground_m(path, latitudes[0], inside) == pytest.approx(500)
+    assert np.isnan(ground_m(path, latitudes[1], beside))
+
+
+def test_what_a_mask_leaves_out_is_a_hole(tmp_path):
+    """Some models say in a mask where they have nothing: there would be a plain."""
+    path = flat_file(tmp_path / "masked.tif", (8.0, 48.0), crs="EPSG:4326")
+    with rasterio.open(path, "r+") as file:
+        mask = np.full((200, 200), 255, np.uint8)
+        mask[:, :100] = 0
+        file.write_mask(mask)
+    assert np.isnan(ground_m(path, 47.9, 8.05))
+    assert ground_m(path, 47.9, 8.15) == pytest.approx(500)
+
+
+@pytest.mark.parametrize(
+    ("profile", "said"),
+    [
+        ({"crs": MOON}, "is no elevation model that can be read"),
+        ({"crs": PLAN}, "has neither degrees nor the coordinates of a map"),
+        ({"crs": "EPSG:4978"}, "has neither degrees nor the coordinates of a map"),
+        ({"crs": "EPSG:4326", "transform": rasterio.Affine.identity()}, "does not say where it lies"),
+    ],
+)
+def test_a_model_of_elsewhere_is_refused_before_the_flight(tmp_path, profile, said):
+    """The first pose would end the session, with a message of GDAL."""
+    path = flat_file(tmp_path / "elsewhere.tif", (0, 0), **profile)
+    with pytest.raises(UserError, match=said):
+        ElevationModel(path)
+
+
+def test_a_model_that_breaks_off_is_refused_before_the_flight(tmp_path):
+    """After a download that failed nothing would be placed, and nobody would know why."""
+    path = flat_file(tmp_path / "short.tif", (8.0, 48.0), crs="EPSG:4326")
+    path.write_bytes(path.read_bytes()[:40_000])
+    with pytest.raises(UserError, match="is no elevation model that can be read"):
+        ElevationModel(path)
+
+
+def test_a_fine_model_is_thinned_out_and_lies_where_it_did(tmp_path):
+    """A slope of a fine model would be shifted, and with it all that stands on it."""
+    path = tmp_path / "fine.tif"
+    columns = np.arange(9000)
+    with rasterio.open(
+        *(path, "w"),
+        driver="GTiff",
+        width=9000,
+        height=60,
+        count=1,
+        dtype="float32",
+        crs="EPSG:32632",
+        transform=from_origin(700_000, 5_300_000, 1, 1),
+    ) as file:
+        file.write(np.broadcast_to(columns + 0.5, (60, 9000)).astype(np.float32), 1)
+    for east_m in (1000.0, 4500.0, 8000.0):
+        (longitude,), (latitude,) = transform("EPSG:32632", "EPSG:4326", [700_000 + east_m], [5_299_970])
+        assert ground_m(path, latitude, longitude) == pytest.approx(east_m, abs=5)
+
+
+@pytest.mark.parametrize(
+    ("corner", "profile"),
+    [
+        ((179.8, -16.8), {"crs": "EPSG:4326", "size": (400, 200)}),
+        ((-180.2, -16.8), {"crs": "EPSG:4326", "size": (400, 200)}),
+        ((-180.0, 90.0), {"crs": "EPSG:4326", "size": (720, 360), "cell": 0.5}),
+        ((0.0, 90.0), {"crs": "EPSG:4326", "size": (720, 360), "cell": 0.5}),
+        ((800_000, 8_150_000), {"crs": "EPSG:32760", "size": (600, 600), "cell": 100}),
+    ],
+)
+def test_at_the_antimeridian_there_is_ground_on_both_sides(tmp_path, corner, profile):
+    """Off Fiji nothing would be placed."""
+    path = flat_file(tmp_path / "fiji.tif", corner, **profile)
+    terrain = terrain_of(path)
+    for longitude in (179.95, 179.9995, -179.9995, -179.95):
+        pose = replace(
+            POSE, latitude_deg=-16.9, longitude_deg=longitude, camera=Orientation(90.0, -45.0, 0.0)
+        )
+        assert terrain.usable(pose)
+        places = places_of_boxes(pose, BOX, view=VIEW, surface=terrain)
+        assert places is not None
+        truth = moved(-16.9, longitude, north_m=0.0, east_m=100.0)
+        assert places.places_deg[0] == pytest.approx(truth, abs=1e-4)
+    assert terrain.usable(replace(pose, longitude_deg=179.95)), "and back"
+
+
+@pytest.mark.parametrize("latitude", [-20.0, 47.15])
+def test_a_flight_outside_the_model_is_said_once(tmp_path, latitude, caplog):
+    """The operator would wait for places that cannot come: it is the wrong file."""
+    terrain = terrain_of(model(tmp_path, lambda north, east: 500.0))
+    for second in range(5):
+        outside = replace(POSE, latitude_deg=latitude, longitude_deg=8.0 + second / 1000)
+        assert places_of_boxes(outside, BOX, view=VIEW, surface=terrain) is None
+    (notice,) = caplog.records
+    assert notice.levelno == logging.WARNING
+    assert (
+        f"--terrain {tmp_path / 'dem.tif'} has no ground below uav-1 at {latitude:.5f}, 8.0" in notice.message
+    )
+
+
+def test_a_flight_inside_the_model_is_no_news(tmp_path, caplog):
+    """The log would cry wolf."""
+    terrain = terrain_of(model(tmp_path, lambda north, east: 500.0))
+    assert places_of_boxes(POSE, BOX, view=VIEW, surface=terrain) is not None
+    assert caplog.records == []
+
+
+def opened_factory(path: Path, folder: Path) -> tuple[SessionFactory, Outputs]:
+    config = check(GroundConfig(record=folder, terrain=path, detector="motion", classifier="none"))
+    outputs = Outputs(Failures(time.time_ns))
+    return SessionFactory(config, Models(config), clock=time.time_ns, outputs=outputs, view=None), outputs
+
+
+def test_a_model_that_goes_in_flight_ends_no_flight(tmp_path, caplog):
+    """A share that is gone would keep the ground from receiving anything of an edge that starts again."""
+    path = model(tmp_path, lambda north, east: 500.0)
+    factory, outputs = opened_factory(path, tmp_path)
+    try:
+        path.unlink()
+        reports = ReceiverReports(
+            lambda _report: None,
+            clock=time.time_ns,
+            clock_offset=ClockOffset(),
+            backlog=EdgeBacklog("uav-1", recordings=None),
+        )
+        session = factory.open_session(replace(INFO, edge="uav-1"), reports)
+        session.close()
+    finally:
+        outputs.close()
+    caplog.clear()
+    terrain = make_surfaces(model(tmp_path, lambda north, east: 500.0))("uav-1")
+    path.unlink()
+    assert not terrain.usable(POSE)
+    (notice,) = caplog.records
+    assert f"--terrain {path} cannot be read, and nothing of uav-1 is placed: " in notice.message
+
+
+def test_each_flight_has_a_ground_below_its_own_first_pose(tmp_path):
+    """The second drone's heights would count from where the first one took off."""
+    surface_of = make_surfaces(model(tmp_path, lambda north, east: 500 + 0.5 * north))
+    above = replace(POSE, altitude_m=None, height_m=100.0)
+    for flight, north in (("uav-1", 0.0), ("uav-2", 400.0)):
+        pose = replace(above, latitude_deg=47.0 + north / NORTH_M)
+        surface = surface_of(flight)
+        assert surface.usable(pose)
+        assert surface.below_m(pose, np.zeros((1, 2)))[0] == pytest.approx(100.0, abs=0.1)

@@ -126,7 +126,7 @@ class CotEvent:
         SubElement(detail, "contact", callsign=plain(self.callsign, most=_MOST_CALLSIGN))
         if self.motion is not None:
             motion = self.motion
-            SubElement(detail, "track", course=f"{motion.course_deg:.1f}", speed=f"{motion.speed_mps:.1f}")
+            SubElement(detail, "track", course=_azimuth(motion.course_deg), speed=f"{motion.speed_mps:.1f}")
         if self.sensor is not None:
             SubElement(detail, "sensor", _sensor(self.sensor))
         link = self._link()
@@ -162,9 +162,13 @@ def _metres(value: float | None) -> str:
     return f"{UNKNOWN_M:.1f}" if value is None or not math.isfinite(value) else f"{value:.1f}"
 
 
+def _azimuth(degrees: float) -> str:
+    """Clockwise from north, 0.0 up to 359.9: rounded first, for 359.97 is north."""
+    return f"{round(degrees, 1) % 360:.1f}"
+
+
 def _sensor(sensor: Sensor) -> dict[str, str]:
     shown = {
-        "azimuth": sensor.azimuth_deg % 360,
         "elevation": sensor.elevation_deg,
         "roll": sensor.roll_deg,
         "fov": sensor.hfov_deg,
@@ -172,4 +176,5 @@ def _sensor(sensor: Sensor) -> dict[str, str]:
         "range": sensor.range_m,
     }
     numbers = {name: f"{value:.1f}" for name, value in shown.items() if value is not None}
+    numbers["azimuth"] = _azimuth(sensor.azimuth_deg)
     return numbers | {"displayMagneticReference": "0", "fovAlpha": "0.3"}

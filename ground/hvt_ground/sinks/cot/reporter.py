@@ -86,7 +86,8 @@ class SessionReporter:
         self._platform_trail = MotionTrail()
         self._platform_ns: int | None = None
         """When it was reported."""
-        self._has_pose = False
+        self._pose: Pose | None = None
+        """The last one."""
         self._unplaced_ns: int | None = None
         """When the first tracks came, until some have a place."""
         self._noted = False
@@ -97,7 +98,7 @@ class SessionReporter:
             case MessageTiming(kind=Channel.BASE):
                 self._offset_ns = item.clock_offset_ns
             case PoseUpdate():
-                self._has_pose = True
+                self._pose = item.pose
                 self._report_platform(item)
             case Overlay(stored=False):
                 self._report_tracks(item)
@@ -186,11 +187,7 @@ class SessionReporter:
             self._unplaced_ns = now_ns
         elif now_ns - self._unplaced_ns > _NOTICE_NS:
             self._noted = True
-            why = (
-                "its pose says no height, direction or field of view"
-                if self._has_pose
-                else "it says no pose (hvt-edge --pose)"
-            )
+            why = _why_unplaced(self._pose)
             _log.warning("CoT of %s: its tracks are not reported, because %s", self._info.edge, why)
 
     def _send(self, event: CotEvent) -> None:
@@ -243,6 +240,34 @@ def sensor_of(pose: Pose, view: View) -> Sensor | None:
         vfov_deg=vfov_deg,
         range_m=range_m,
     )
+
+
+def _why_unplaced(pose: Pose | None) -> str:
+    """What keeps tracks from a place, by the last pose.
+
+    | the pose                                   | the reason                                     |
+    |--------------------------------------------|------------------------------------------------|
+    | never came                                 | that                                           |
+    | lacks height, direction or field of view   | what it lacks                                  |
+    | has only an altitude above the sea         | ``--terrain`` is missing, or has no ground     |
+    | says a height of 0 or less                 | that                                           |
+    | is whole                                   | horizon, age, or ``--terrain`` has no ground   |
+    """
+    if pose is None:
+        return "it says no pose (hvt-edge --pose)"
+    said = {
+        "height": pose.height_m is not None or pose.altitude_m is not None,
+        "direction": pose.camera is not None,
+        "field of view": pose.hfov_deg is not None,
+    }
+    missing = [name for name, known in said.items() if not known]
+    if missing:
+        return f"its pose says no {' and no '.join(missing)}"
+    if pose.height_m is None:
+        return "its pose says only how high it is above the sea, and hvt-ground has no --terrain there"
+    if pose.height_m <= 0:
+        return f"its pose says {pose.height_m:.1f} m above the ground"
+    return "they are at the horizon, or the pose is old, or --terrain has no ground below the camera"
 
 
 def _platform_remarks(pose: Pose) -> str:

@@ -97,6 +97,17 @@ def test_field_of_view_motion_and_link_are_where_atak_reads_them():
 
 
 @pytest.mark.parametrize(
+    ("degrees", "said"), [(359.97, "0.0"), (359.94, "359.9"), (0.0, "0.0"), (-0.03, "0.0")]
+)
+def test_north_is_0_and_never_360(degrees, said):
+    """A reader that takes 0 up to 360 would refuse the event of whoever goes north."""
+    sensor = Sensor(degrees, elevation_deg=-30, roll_deg=0, hfov_deg=45, vfov_deg=26, range_m=None)
+    detail = read(replace(EVENT, motion=Motion(degrees, 3.0), sensor=sensor)).find("detail")
+    assert detail.find("track").attrib["course"] == said
+    assert detail.find("sensor").attrib["azimuth"] == said
+
+
+@pytest.mark.parametrize(
     ("said", "read_as"),
     [
         ("<b a='&\"'>]]></remarks>", "<b a='&\"'>]]></remarks>"),

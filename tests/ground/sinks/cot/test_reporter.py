@@ -234,9 +234,20 @@ def test_only_what_has_a_place_and_is_not_doubted_is_reported():
     assert [one.attrib["uid"][-1] for one in Rig().says(shown)] == ["2", "3"]
 
 
-@pytest.mark.parametrize("pose", [None, replace(POSE, camera=None)])
-def test_without_places_there_is_one_notice(pose, caplog):
-    """The operator would stare at an empty map, or the log be full of it."""
+@pytest.mark.parametrize(
+    ("pose", "reason"),
+    [
+        (None, "it says no pose (hvt-edge --pose)"),
+        (replace(POSE, camera=None), "its pose says no direction"),
+        (replace(POSE, hfov_deg=None, camera=None), "its pose says no direction and no field of view"),
+        (replace(POSE, height_m=None, altitude_m=None), "its pose says no height"),
+        (replace(POSE, height_m=None), "its pose says only how high it is above the sea, and "),
+        (replace(POSE, height_m=-0.5), "its pose says -0.5 m above the ground"),
+        (POSE, "they are at the horizon, or the pose is old, or --terrain has no ground "),
+    ],
+)
+def test_without_places_there_is_one_notice(pose, reason, caplog):
+    """The operator would stare at an empty map, search for the wrong fault, or the log be full of it."""
     rig = Rig()
     for _ in range(60):
         rig.now_ns += SECOND_NS
@@ -245,8 +256,7 @@ def test_without_places_there_is_one_notice(pose, caplog):
         assert rig.says(overlay(rig.now_ns, places=False)) == []
     (notice,) = caplog.records
     assert notice.levelno == logging.WARNING
-    assert notice.message.startswith("CoT of uav-1: its tracks are not reported, because ")
-    assert ("--pose" in notice.message) == (pose is None)
+    assert notice.message.startswith(f"CoT of uav-1: its tracks are not reported, because {reason}")
 
 
 def test_a_flight_that_has_places_is_not_said_to_have_none(caplog):

@@ -1,0 +1,236 @@
+"""An elevation model as a file: a GeoTIFF of metres above mean sea level, of which a part is in memory at a time."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import rasterio
+from rasterio import Affine
+from rasterio._err import CPLE_BaseError  # what GDAL raises where rasterio does not translate it
+from rasterio.enums import Resampling
+from rasterio.errors import RasterioError
+from rasterio.transform import from_bounds
+from rasterio.warp import reproject, transform, transform_bounds
+from rasterio.windows import Window
+
+from hvt_common.errors import UserError
+from hvt_common.geodesy import metres_per_degree
+from hvt_ground.geolocation.surface import Points
+
+__all__ = ["TILE_M", "ElevationModel", "ModelError", "Tile", "turned_deg"]
+
+TILE_M: Final = 15_000.0
+"""Half the side of what is in memory at a time."""
+_MOST_SIDE: Final = 3000
+"""Cells on a side of it: a finer model is read more coarsely."""
+_WGS_84: Final = "EPSG:4326"
+_TURNS_DEG: Final = (0, 360, -360)
+"""A model may say 190 degrees for -170, and the other way round."""
+
+
+_ALONG: Final = 11
+"""Points on a side by which an area is found in a file."""
+_EDGE: Final = 2
+"""Cells around it, between which elevation is."""
+
+
+class ModelError(Exception):
+    """A model that cannot be read; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Area:
+    """Degrees, WGS 84. East is the larger one: beyond 180 where the area holds the antimeridian."""
+
+    west_deg: float
+    south_deg: float
+    east_deg: float
+    north_deg: float
+
+    def turned(self, degrees: float) -> _Area:
+        """The same with other numbers for its longitudes."""
+        return _Area(self.west_deg + degrees, self.south_deg, self.east_deg + degrees, self.north_deg)
+
+    def common(self, other: _Area) -> _Area | None:
+        """What lies in both."""
+        west, east = max(self.west_deg, other.west_deg), min(self.east_deg, other.east_deg)
+        south, north = max(self.south_deg, other.south_deg), min(self.north_deg, other.north_deg)
+        return _Area(west, south, east, north) if west < east and south < north else None
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """What is in memory: (H, W) float32 metres, NaN where the model has none, row 0 in the north."""
+
+    metres: npt.NDArray[np.float32]
+    area: _Area
+
+    @classmethod
+    def empty(cls) -> Tile:
+        """Nothing anywhere."""
+        return cls(np.full((1, 1), np.nan, np.float32), _Area(-180.0, -90.0, 180.0, 90.0))
+
+    def at(self, latitude_deg: Points, longitude_deg: Points) -> npt.NDArray[np.float64]:
+        """Elevation between the cells' centres; NaN outside. Arrays of any one shape, longitudes of any turn."""
+        high, wide = self.metres.shape
+        area = self.area
+        middle_deg = (area.west_deg + area.east_deg) / 2
+        east_deg = middle_deg + turned_deg(longitude_deg - middle_deg)
+        x = (east_deg - area.west_deg) / (area.east_deg - area.west_deg) * wide - 0.5
+        y = (area.north_deg - latitude_deg) / (area.north_deg - area.south_deg) * high - 0.5
+        inside = (x >= -0.5) & (x <= wide - 0.5) & (y >= -0.5) & (y <= high - 0.5)
+        left = np.clip(np.floor(x), 0, max(0, wide - 2)).astype(np.int64)
+        top = np.clip(np.floor(y), 0, max(0, high - 2)).astype(np.int64)
+        right, low = np.minimum(left + 1, wide - 1), np.minimum(top + 1, high - 1)
+        across, down = np.clip(x - left, 0, 1), np.clip(y - top, 0, 1)
+        upper = self.metres[top, left] * (1 - across) + self.metres[top, right] * across
+        lower = self.metres[low, left] * (1 - across) + self.metres[low, right] * across
+        return np.where(inside, upper * (1 - down) + lower * down, np.nan)
+
+
+class ElevationModel:
+    """A file, opened anew for each tile. For any thread.
+
+    Raises `UserError` where it is no model that can be used.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            with _errors(), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what is wrong with a file is said in a sentence
+                with rasterio.open(path) as file:
+                    placed = file.crs is not None and not file.transform.is_identity
+                    if placed:
+                        _cell_in_the_middle(file)
+        except ModelError as error:
+            raise UserError(f"--terrain {path} is no elevation model that can be read: {error}") from None
+        if not placed:
+            raise UserError(f"--terrain {path} does not say where it lies: give a GeoTIFF with coordinates")
+
+    def around(self, latitude_deg: float, longitude_deg: float) -> Tile:
+        """The ground within `TILE_M` of a place; raises `ModelError`."""
+        north_m, east_m = metres_per_degree(latitude_deg)
+        high, wide = TILE_M / north_m, min(180.0, TILE_M / max(east_m, 1e-6))
+        wanted = _Area(longitude_deg - wide, latitude_deg - high, longitude_deg + wide, latitude_deg + high)
+        with _errors(), rasterio.open(self.path) as file:
+            bounds = _bounds(file)
+            found = {turn: wanted.common(bounds.turned(turn)) for turn in _TURNS_DEG}
+            parts = {turn: part for turn, part in found.items() if part is not None}
+            if not parts:
+                return Tile.empty()
+            area = _Area(
+                min(one.west_deg for one in parts.values()),
+                min(one.south_deg for one in parts.values()),
+                max(one.east_deg for one in parts.values()),
+                max(one.north_deg for one in parts.values()),
+            )
+            shape = _shape(file, area)
+            metres = np.full(shape, np.nan, np.float32)
+            for turn in parts:
+                metres = np.where(np.isnan(metres), _read(file, area.turned(-turn), shape), metres)
+        return Tile(metres, area)
+
+
+def turned_deg(degrees: Points) -> Points:
+    """The same directions from -180 up to 180."""
+    return (degrees + 180) % 360 - 180
+
+
+@contextmanager
+def _errors() -> Iterator[None]:
+    try:
+        yield
+    except (RasterioError, CPLE_BaseError, ValueError) as error:
+        raise ModelError(" ".join(str(error).split())[:200]) from None
+
+
+def _bounds(file: Any) -> _Area:
+    """Of the whole file; longitudes as it says them where it has any."""
+    if file.crs.is_geographic:
+        return _Area(*file.bounds)
+    if not file.crs.is_projected:
+        raise ModelError("it has neither degrees nor the coordinates of a map")
+    west, south, east, north = transform_bounds(file.crs, _WGS_84, *file.bounds)
+    if not all(math.isfinite(one) for one in (west, south, east, north)):
+        raise ModelError(f"it lies nowhere on the earth, its coordinates are {tuple(file.bounds)}")
+    return _Area(west, south, east + 360 if east < west else east, north)
+
+
+def _cell_deg(file: Any, latitude_deg: float) -> tuple[float, float]:
+    """The sides of a cell, degrees of longitude and latitude."""
+    across, down = (abs(one) * file.crs.units_factor[1] for one in file.res)
+    if file.crs.is_geographic:
+        return math.degrees(across), math.degrees(down)
+    north_m, east_m = metres_per_degree(latitude_deg)
+    return across / max(east_m, 1e-6), down / north_m
+
+
+def _shape(file: Any, area: _Area) -> tuple[int, int]:
+    """Rows and columns to read it in."""
+    across, down = _cell_deg(file, (area.south_deg + area.north_deg) / 2)
+    cells = ((area.north_deg - area.south_deg) / down, (area.east_deg - area.west_deg) / across)
+    rows, columns = (max(1, min(_MOST_SIDE, round(one))) for one in cells)
+    return rows, columns
+
+
+def _cell_in_the_middle(file: Any) -> None:
+    """Read one, so that a model that cannot be read is refused before a flight."""
+    bounds = _bounds(file)
+    latitude, longitude = (
+        (bounds.south_deg + bounds.north_deg) / 2,
+        (bounds.west_deg + bounds.east_deg) / 2,
+    )
+    across, down = _cell_deg(file, latitude)
+    cell = _Area(longitude, latitude, longitude + across, latitude + down)
+    _read(file, cell, (1, 1))
+
+
+def _read(file: Any, area: _Area, shape: tuple[int, int]) -> npt.NDArray[np.float32]:
+    """The first band in cells of WGS 84, NaN where there is none.
+
+    A fine model is thinned out before it is warped: to warp all of it first takes most of a minute.
+    """
+    found = np.full(shape, np.nan, np.float32)
+    window = _window(file, area)
+    if window is None:
+        return found
+    rows, columns = min(_MOST_SIDE, window.height), min(_MOST_SIDE, window.width)
+    there = file.read(1, window=window, out_shape=(rows, columns), masked=True)
+    thinned = Affine.scale(window.width / columns, window.height / rows)
+    reproject(
+        np.asarray(there.astype(np.float64).filled(np.nan), np.float32),
+        found,
+        src_crs=file.crs,
+        src_transform=file.window_transform(window) * thinned,
+        src_nodata=np.nan,
+        dst_crs=_WGS_84,
+        dst_transform=from_bounds(area.west_deg, area.south_deg, area.east_deg, area.north_deg, *shape[::-1]),
+        dst_nodata=np.nan,
+        resampling=Resampling.bilinear,
+    )
+    return found
+
+
+def _window(file: Any, area: _Area) -> Window | None:
+    """The cells of the file that the area lies in; None where it has none."""
+    longitude, latitude = np.meshgrid(
+        np.linspace(area.west_deg, area.east_deg, _ALONG),
+        np.linspace(area.south_deg, area.north_deg, _ALONG),
+    )
+    x, y = (np.array(one) for one in transform(_WGS_84, file.crs, longitude.ravel(), latitude.ravel()))
+    known = np.isfinite(x) & np.isfinite(y)
+    if not known.any():
+        return None
+    column, row = ~file.transform * (x[known], y[known])
+    left, right = (int(one) for one in np.clip((column.min() - _EDGE, column.max() + _EDGE), 0, file.width))
+    top, low = (int(one) for one in np.clip((row.min() - _EDGE, row.max() + _EDGE), 0, file.height))
+    return Window(left, top, right - left, low - top) if left < right and top < low else None
