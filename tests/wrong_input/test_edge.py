@@ -104,6 +104,48 @@ def test_a_password_is_not_printed(edge, free_port):
     assert f"127.0.0.1:{free_port}" in sentence
 
 
+# Where the camera is
+
+
+@pytest.mark.parametrize(
+    ("pose", "told"),
+    [
+        ("mavlink:udpin:127.0.0.1:99999", "port 99999, accepted is 1 to 65535"),
+        ("mavlink:tcp:127.0.0.1:99999", "port 99999, accepted is 1 to 65535"),
+        ("mavlink:tcp:127.0.0.1:1", "cannot be opened: Connection refused"),
+        ("mavlink:/dev/nothing", "cannot be opened: No such file or directory"),
+        ("mavlink:smoke", "mavlink:udpin:HOST:PORT"),
+        ("x" * 5000, "accepted is FILE.csv"),
+        ("pictures", "accepted is FILE.csv"),
+        ("fixed:1,2,3", "fixed:LAT,LON,HEIGHT,AZIMUTH,TILT"),
+    ],
+)
+def test_a_pose_that_is_not_there(edge, pose, told):
+    """A flight would be lost to a typing mistake, with a traceback for an answer."""
+    if pose.startswith("mavlink:"):
+        pytest.importorskip("pymavlink")
+    sentence = edge("--pose", pose)
+    assert f"--pose {pose:.100}" in sentence
+    assert told in sentence
+    assert len(sentence) < 600
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "told"),
+    [
+        ("p.csv", f"time_s,latitude_deg,longitude_deg\n0,1,{'2' * 200_000}\n", "is no table"),
+        ("p.csv", "time_s,latitude_deg,longitude_deg,position_error_m\n0,1,2,-5\n", "position_error_m is -5"),
+        ("p.srt", f"1\n{'9' * 5000}:00:00,000 --> 00:00:01,000\n[latitude: 1] [longitude: 2]\n", "no row"),
+    ],
+)
+def test_a_file_of_poses_that_is_wrong(edge, here, file, text, told):
+    """The same for a damaged file."""
+    Path(file).write_text(text)
+    sentence = edge("--pose", file)
+    assert f"pose file {file}" in sentence
+    assert told in sentence
+
+
 # Numbers and words
 
 

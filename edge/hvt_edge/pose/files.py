@@ -19,6 +19,7 @@ from xml.etree import ElementTree as ET
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
+from hvt_edge.pose.angles import compass_deg
 from hvt_edge.pose.table import PoseTable
 
 __all__ = ["COLUMNS", "read_poses"]
@@ -39,13 +40,18 @@ _BOUNDS: Mapping[str, tuple[float, float]] = {
     "height_m": (-1000, 100_000),
     "altitude_m": (-1000, 100_000),
     "hfov_deg": (0.1, 179.9),
+    "position_error_m": (0.001, 100_000),
+    "height_error_m": (0.001, 100_000),
+    "angle_error_deg": (0.001, 180),
     "camera_pitch_deg": (-90, 90),
     "pitch_deg": (-90, 90),
 }
 _FAR = 1e6
+_OVERSHOT_DEG = 92.0
+"""So far a gimbal's pitch goes in DJI's subtitles where it means straight down or up."""
 _Values = Mapping[str, float]
-_TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
-_NAMED = re.compile(r"([A-Za-z_]+)\s*:\s*([+-]?\d+(?:\.\d+)?)")
+_TIMES = re.compile(r"(?<!\d)(\d{1,4}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_NAMED = re.compile(r"\b([A-Za-z_]{1,32})\s{0,4}:\s*([+-]?\d+(?:\.\d+)?)")
 _OLD_GPS = re.compile(r"GPS\s*\(\s*([+-]?[\d.]+)\s*,\s*([+-]?[\d.]+)\s*,")
 """GPS(longitude, latitude, satellites) of the first models."""
 _DJI = {
@@ -82,7 +88,12 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise UserError(f"pose file {path} cannot be read: {error.strerror}") from None
-    poses = [_pose(row, path, number) for number, row in enumerate(reader(text, path), 1)]
+    try:
+        poses = [_pose(row, path, number) for number, row in enumerate(reader(text, path), 1)]
+    except csv.Error as error:
+        raise UserError(
+            f"pose file {path} is no table: {error}; accepted are lines of values between commas"
+        ) from None
     if not poses:
         raise UserError(f"pose file {path} has no row with a time, a latitude and a longitude")
     poses = [one if one.hfov_deg is not None else replace(one, hfov_deg=hfov_deg) for one in poses]
@@ -114,7 +125,7 @@ def _orientation(row: _Values, prefix: str) -> Orientation | None:
     yaw, pitch = row.get(f"{prefix}yaw_deg"), row.get(f"{prefix}pitch_deg")
     if yaw is None or pitch is None:
         return None
-    return Orientation(yaw % 360, pitch, row.get(f"{prefix}roll_deg", 0.0))
+    return Orientation(compass_deg(yaw), pitch, row.get(f"{prefix}roll_deg", 0.0))
 
 
 def _table_rows(text: str, path: Path) -> Iterable[_Values]:
@@ -164,6 +175,9 @@ def _subtitle_rows(text: str, path: Path) -> Iterable[_Values]:
         if focal_mm >= 1:
             focal_mm = focal_mm / 10 if focal_mm > 200 else focal_mm  # some models write tenths: 240 is 24 mm
             row["hfov_deg"] = math.degrees(2 * math.atan(_FULL_FRAME_MM / 2 / focal_mm))
+        pitch = row.get("camera_pitch_deg", 0.0)
+        if 90 < abs(pitch) <= _OVERSHOT_DEG:
+            row["camera_pitch_deg"] = math.copysign(90.0, pitch)
         place = row.get("latitude_deg"), row.get("longitude_deg")
         if None not in place and any(place):  # both are 0 before there is a fix
             yield row

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from hvt_common.errors import UserError
 from hvt_common.values import Orientation, Pose
+from hvt_edge.pose.angles import compass_deg
 
 __all__ = ["FixedPose"]
 
@@ -34,17 +35,17 @@ class FixedPose:
         except ValueError:
             values = []
         if len(values) != len(_BOUNDS):
-            raise UserError(f"--pose fixed:{numbers} is not five numbers: {_ACCEPTED}")
+            raise UserError(f"--pose fixed:{numbers:.200} is not five numbers: {_ACCEPTED}")
         for value, (name, low, high) in zip(values, _BOUNDS, strict=True):
             if not low <= value <= high:
-                raise UserError(f"--pose fixed:{numbers} has the {name} {value:g}: {_ACCEPTED}")
+                raise UserError(f"--pose fixed:{numbers:.200} has the {name} {value:g}: {_ACCEPTED}")
         latitude, longitude, height, azimuth, tilt = values
         self._pose = Pose(
             0,
             latitude,
             longitude,
             height_m=height,
-            camera=Orientation(azimuth % 360, tilt, 0.0),
+            camera=Orientation(compass_deg(azimuth), tilt, 0.0),
             hfov_deg=hfov_deg,
         )
 

@@ -8,17 +8,16 @@ from GPS_RAW_INT. A value that is older than two seconds is not known any more.
 from __future__ import annotations
 
 import math
-import re
 import threading
-import time
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
-from pymavlink import mavutil
-
-from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
+from hvt_edge.pose.angles import compass_deg, euler_deg
+from hvt_edge.pose.mavlink_frames import FrameParser
+from hvt_edge.pose.mavlink_transport import Address, Connection
 
 __all__ = ["MavlinkPose"]
 
@@ -31,15 +30,13 @@ _MESSAGES = (
     "CAMERA_FOV_STATUS",
     "GPS_RAW_INT",
 )
-_YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME = 32, 64
-_KINDS = ("udpin", "tcp")
-_HOST_PORT = re.compile(r"[^:]+:\d{1,5}")
-_ACCEPTED = "give mavlink:udpin:HOST:PORT, mavlink:tcp:HOST:PORT or mavlink:/dev/DEVICE[,BAUD]"
-_POLL_S = 0.2
+_YAW_LOCK, _YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME = 16, 32, 64
+_JOIN_S = 4.0
+"""Longer than an attempt to connect takes."""
 
 
 class MavlinkPose:
-    """Reads in a thread of its own from a pymavlink address, such as ``udpin:127.0.0.1:14550``.
+    """Reads in a thread of its own from an address, such as ``udpin:127.0.0.1:14550``.
 
     Of several vehicles the first that says where it is counts. Raises `UserError` where it cannot be opened.
     """
@@ -53,16 +50,9 @@ class MavlinkPose:
         """By name, when it came and the message."""
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        kind, _, rest = address.partition(":")
-        if kind not in _KINDS and not address.startswith("/dev/"):
-            raise UserError(f"--pose mavlink:{address} is no address: {_ACCEPTED}")
-        if kind in _KINDS and not _HOST_PORT.fullmatch(rest):
-            raise UserError(f"--pose mavlink:{address} names no HOST:PORT: {_ACCEPTED}")
-        try:
-            self._link = mavutil.mavlink_connection(address, source_system=255, autoreconnect=True)
-        except (OSError, ValueError, IndexError) as error:
-            reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-            raise UserError(f"--pose mavlink:{address} cannot be opened: {reason}; {_ACCEPTED}") from None
+        where = Address.parse(address)
+        self._parser = FrameParser(is_stream=where.is_stream)
+        self._connection = Connection(where, stop=self._stop)
         self._thread = threading.Thread(target=self._read, name="--pose", daemon=True)
         self._thread.start()
 
@@ -72,9 +62,11 @@ class MavlinkPose:
         with self._lock:
             come = self._newest.get("GLOBAL_POSITION_INT")
         if come is None:
-            return f"no position has come on {self._address}"
+            return f"no position has come on {self._address}{self._lost()}"
         age_ns = self._clock() - come[0]
-        return f"the autopilot's last position is {age_ns / SECOND_NS:.0f} s old" if age_ns > _OLD_NS else ""
+        if age_ns <= _OLD_NS:
+            return ""
+        return f"the autopilot's last position is {age_ns / SECOND_NS:.0f} s old{self._lost()}"
 
     def at(self, media_ns: int, *, capture_ns: int) -> Pose | None:  # noqa: ARG002 - of now
         """The newest pose."""
@@ -111,26 +103,29 @@ class MavlinkPose:
         )
 
     def close(self) -> None:
-        """End the thread, and close the port."""
+        """End the thread, which closes the port."""
         self._stop.set()
-        self._thread.join(timeout=2.0)
-        self._link.close()
+        self._thread.join(timeout=_JOIN_S)
+
+    def _lost(self) -> str:
+        trouble = self._connection.trouble
+        return f" ({trouble})" if trouble else ""
 
     def _read(self) -> None:
-        while not self._stop.is_set():
-            try:
-                message = self._link.recv_match(type=list(_MESSAGES), blocking=True, timeout=_POLL_S)
-            except Exception:  # noqa: BLE001 - whatever a parser of foreign bytes raises ends no flight
-                time.sleep(_POLL_S)
-                continue
-            if message is None:
-                continue
-            name, system = message.get_type(), message.get_srcSystem()
-            with self._lock:
-                if self._system is None and name == "GLOBAL_POSITION_INT":
-                    self._system = system
-                if system == self._system:
-                    self._newest[name] = (self._clock(), message)
+        with closing(self._connection) as connection:
+            while not self._stop.is_set():
+                for message in self._parser.messages(connection.read()):
+                    self._take(message)
+
+    def _take(self, message: Any) -> None:
+        name, system = message.get_type(), message.get_srcSystem()
+        if name not in _MESSAGES:
+            return
+        with self._lock:
+            if self._system is None and name == "GLOBAL_POSITION_INT":
+                self._system = system
+            if system == self._system:
+                self._newest[name] = (self._clock(), message)
 
 
 def _attitude(message: Any) -> Orientation | None:
@@ -143,8 +138,8 @@ def _camera(known: dict[str, Any], platform: Orientation | None) -> Orientation 
     """Where the gimbal points; None where its yaw is the platform's and that is not known."""
     device = known.get("GIMBAL_DEVICE_ATTITUDE_STATUS")
     if device is not None:
-        yaw, pitch, roll = _angles_deg(*device.q)
-        if device.flags & _YAW_IN_EARTH_FRAME:
+        yaw, pitch, roll = euler_deg(*device.q)
+        if _is_of_the_earth(device.flags):
             return _orientation(yaw, pitch, roll)
         return None if platform is None else _orientation(yaw + platform.yaw_deg, pitch, roll)
     mount = known.get("MOUNT_ORIENTATION")
@@ -161,15 +156,12 @@ def _camera(known: dict[str, Any], platform: Orientation | None) -> Orientation 
 def _orientation(yaw: float, pitch: float, roll: float) -> Orientation | None:
     if not all(math.isfinite(one) for one in (yaw, pitch, roll)):
         return None
-    return Orientation(yaw % 360, max(-90.0, min(90.0, pitch)), (roll + 180) % 360 - 180)
+    return Orientation(compass_deg(yaw), max(-90.0, min(90.0, pitch)), (roll + 180) % 360 - 180)
 
 
-def _angles_deg(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Yaw, pitch and roll of the quaternion of a device in north-east-down (MAVLink, common.xml)."""
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    return math.degrees(yaw), math.degrees(pitch), math.degrees(roll)
+def _is_of_the_earth(flags: int) -> bool:
+    """Whether yaw counts from north: gimbals of before the two frame flags say so by their yaw lock (common.xml)."""
+    return bool(flags & _YAW_IN_EARTH_FRAME or (not flags & _YAW_IN_VEHICLE_FRAME and flags & _YAW_LOCK))
 
 
 def _clipped(metres: float) -> float:

@@ -25,9 +25,13 @@ def open_pose(spec: str, *, hfov_deg: float | None, clock: Callable[[], int]) ->
         with needs_extra("'hvt[mavlink]'"):
             from hvt_edge.pose.mavlink import MavlinkPose  # noqa: PLC0415 - who has no autopilot needs no MAVLink
         return MavlinkPose(rest, hfov_deg=hfov_deg, clock=clock)
-    if not Path(spec).exists():
+    try:
+        found, reason = Path(spec).is_file(), ""
+    except OSError as error:  # a name that is too long, or a folder that others may not read
+        found, reason = False, f" ({error.strerror})"
+    if not found:
         raise UserError(
-            f"--pose {spec} is no file; accepted is FILE.csv, FILE.srt (DJI), FILE.gpx, "
+            f"--pose {spec:.200} is no file{reason}; accepted is FILE.csv, FILE.srt (DJI), FILE.gpx, "
             "fixed:LAT,LON,HEIGHT,AZIMUTH,TILT, mavlink:udpin:HOST:PORT, or demo with --source demo"
         )
     return read_poses(Path(spec), hfov_deg=hfov_deg)

@@ -34,6 +34,7 @@ GPS(8.5417,47.3769,16) BAROMETER:80.1
 ISO:100 Shutter:1000
 """
 TABLE = "time_s,latitude_deg,longitude_deg,height_m\n0,1,2,3\n1,1,2,3\n"
+PLACE = "time_s,latitude_deg,longitude_deg"
 GPX = """<?xml version="1.0"?>
 <gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>
 <trkpt lat="47.3769" lon="8.5417"><ele>520.5</ele><time>2024-05-01T10:00:00Z</time></trkpt>
@@ -59,6 +60,43 @@ def test_subtitles_of_a_drone_give_place_height_gimbal_and_zoom(tmp_path):
     assert pose.camera.pitch_deg == pytest.approx(-46)
     assert pose.hfov_deg == pytest.approx(2 * math.degrees(math.atan(18 / 24)))
     assert pose.platform is None
+
+
+@pytest.mark.parametrize(("said", "means"), [("-90.4", -90), ("-92.0", -90), ("90.1", 90)])
+def test_a_gimbal_a_little_beyond_straight_down_points_straight_down(tmp_path, said, means):
+    """The noise of one frame would have the whole flight refused."""
+    file = tmp_path / "DJI_0001.SRT"
+    file.write_text(MINI.replace("gb_pitch: -45.0", f"gb_pitch: {said}"), encoding="utf-8")
+    assert at(file, 0.0).camera.pitch_deg == means
+
+
+@pytest.mark.timeout(60)
+def test_subtitles_with_a_long_word_are_read_as_any_others(tmp_path):
+    """A damaged file would hold the start for hours."""
+    file = tmp_path / "DJI_0001.SRT"
+    file.write_text(MINI.replace("[iso: 100]", "a" * 300_000), encoding="utf-8")
+    assert at(file, 0.0).latitude_deg == 47.3769
+
+
+def test_a_yaw_a_hair_below_north_is_north(tmp_path):
+    """The ground would refuse a report of 360 degrees."""
+    file = tmp_path / "north.csv"
+    file.write_text(
+        f"{PLACE},camera_yaw_deg,camera_pitch_deg,yaw_deg,pitch_deg\n0,1,2,-1e-17,-90,-1e-17,0\n",
+        encoding="utf-8",
+    )
+    pose = at(file, 0.0)
+    assert (pose.camera.yaw_deg, pose.platform.yaw_deg) == (0.0, 0.0)
+
+
+def test_errors_of_a_centimetre_are_taken(tmp_path):
+    """A receiver that is as good as that would count for no more than any other."""
+    file = tmp_path / "rtk.csv"
+    file.write_text(
+        f"{PLACE},position_error_m,height_error_m,angle_error_deg\n0,1,2,0.01,0.02,0.05\n", encoding="utf-8"
+    )
+    pose = at(file, 0.0)
+    assert (pose.position_error_m, pose.height_error_m, pose.angle_error_deg) == (0.01, 0.02, 0.05)
 
 
 def test_subtitles_of_the_first_models_give_the_place_alone(tmp_path):
@@ -123,6 +161,27 @@ def test_beyond_its_ends_and_in_a_gap_a_file_says_nothing(tmp_path):
         ("a.gpx", "<gpx>", "no GPX"),
         ("a.gpx", "<!DOCTYPE x [<!ENTITY a 'b'>]><gpx/>", "document type"),
         ("a.kml", "<kml/>", "none of .csv"),
+        ("a.csv", TABLE + f"2,1,2,{'3' * 200_000}\n", "is no table: field larger than"),
+        ("a.csv", f"{'n' * 200_000},latitude_deg\n", "is no table: field larger than"),
+        ("a.csv", f"{PLACE},position_error_m\n0,1,2,-5\n", "position_error_m is -5, accepted is 0.001 to"),
+        ("a.csv", f"{PLACE},height_error_m\n0,1,2,0\n", "height_error_m is 0, accepted is 0.001 to"),
+        ("a.csv", f"{PLACE},angle_error_deg\n0,1,2,-0.1\n", "angle_error_deg is -0.1, accepted is 0.001 to"),
+        (
+            "a.srt",
+            MINI.replace("00:00:00,000 -->", f"{'9' * 400}:00:00,000 -->", 1).split("2\n00:")[0],
+            "no row",
+        ),
+        (
+            "a.srt",
+            MINI.replace("00:00:00,000 -->", f"{'9' * 5000}:00:00,000 -->", 1).split("2\n00:")[0],
+            "no row",
+        ),
+        ("a.srt", MINI.replace("00:00:01,000 -->", "9999:00:01,000 -->"), "time_s is 3.59964e"),
+        (
+            "a.srt",
+            MINI.replace("gb_pitch: -45.0", "gb_pitch: -95.0"),
+            "camera_pitch_deg is -95, accepted is -90",
+        ),
     ],
 )
 def test_a_wrong_file_is_named_with_what_is_wrong(tmp_path, name, text, says):
@@ -143,9 +202,22 @@ def test_a_wrong_file_is_named_with_what_is_wrong(tmp_path, name, text, says):
         ("fixed:91,2,3,4,5", "latitude 91"),
         ("fixed:1,2,3,4,95", "tilt 95"),
         ("mavlink:nonsense:x", "no address: give mavlink:udpin:HOST:PORT"),
+        ("x" * 5000, "xx is no file .File name too long.; accepted is"),
+        ("fixed:" + "9" * 5000, "not five numbers"),
         ("mavlink:udpin:14550", "names no HOST:PORT"),
-        ("mavlink:tcp:127.0.0.1:1", "cannot be opened"),
-        ("mavlink:/dev/nothing", "cannot be opened"),
+        ("mavlink:udpin:127.0.0.1:99999", "has the port 99999, accepted is 1 to 65535"),
+        ("mavlink:udpin:127.0.0.1:0", "has the port 0, accepted is 1 to 65535"),
+        ("mavlink:udpin:127.0.0.1:\uff11\uff12", "names no HOST:PORT"),
+        ("mavlink:udpin:192.0.2.1:14550", "cannot be opened: Cannot assign requested address"),
+        (f"mavlink:tcp:{'ä' * 70}:14550", "cannot be opened: this is no name of a host"),
+        (f"mavlink:udpin:{'ä' * 70}:14550", "cannot be opened: this is no name of a host"),
+        ("mavlink:udpin:a\0b:14550", "names no HOST:PORT"),
+        ("mavlink:tcp:127.0.0.1:1", "cannot be opened: Connection refused"),
+        ("mavlink:tcp:127.0.0.1:99999", "has the port 99999, accepted is 1 to 65535"),
+        ("mavlink:/dev/nothing", "cannot be opened: No such file or directory; give"),
+        ("mavlink:/dev/null", "cannot be opened"),
+        ("mavlink:/dev/ttyACM0,fast", "has the baud rate 'fast', accepted is 50 to 4000000"),
+        ("mavlink:/dev/ttyACM0," + "9" * 5000, "accepted is 50 to 4000000"),
     ],
 )
 def test_what_is_no_pose_is_refused_in_a_sentence(spec, says):
@@ -156,6 +228,8 @@ def test_what_is_no_pose_is_refused_in_a_sentence(spec, says):
 
 def test_a_fixed_camera_is_where_it_was_put():
     """North and height would be mixed up."""
+    north = open_pose("fixed:1,2,3,-1e-17,-30", hfov_deg=80, clock=lambda: 0).at(0, capture_ns=5)
+    assert north.camera.yaw_deg == 0.0
     pose = open_pose("fixed:52.5,13.4,12,-90,-30", hfov_deg=80, clock=lambda: 0).at(0, capture_ns=5)
     assert pose is not None
     assert (pose.latitude_deg, pose.longitude_deg, pose.height_m, pose.hfov_deg) == (52.5, 13.4, 12, 80)

@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-import math
-import os
 import random
 import socket
 import time
 
 import pytest
 
-os.environ.setdefault("MAVLINK20", "1")
-mavutil = pytest.importorskip("pymavlink.mavutil")
+pytest.importorskip("pymavlink")
 
-from hvt_edge.pose.opening import open_pose  # noqa: E402 - MAVLink's version is a variable of the environment
-
-
-@pytest.fixture
-def port():
-    """A free one."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
+from hvt_edge.pose.opening import open_pose
 
 
 @pytest.fixture
@@ -32,59 +21,24 @@ def source(port):
     opened.close()
 
 
-@pytest.fixture
-def vehicle():
-    """Makes autopilots that send to a port."""
-    made = []
-
-    def make(port: int, *, system: int = 1):
-        made.append(
-            mavutil.mavlink_connection(f"udpout:127.0.0.1:{port}", source_system=system, source_component=1)
-        )
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
+def has_camera(pose) -> bool:
+    """Whether it says where the camera points."""
+    return pose is not None and pose.camera is not None
 
 
-def send(one, *, latitude: float = 47.1, gimbal: str = "") -> None:
-    """One round of what an autopilot sends several times a second."""
-    one.mav.global_position_int_send(
-        1000, round(latitude * 1e7), round(8.5 * 1e7), 550_000, 120_000, 0, 0, 0, 9000
-    )
-    one.mav.attitude_send(1000, math.radians(3), math.radians(-2), math.radians(80), 0, 0, 0)
-    if gimbal == "mount":
-        one.mav.mount_orientation_send(1000, 0.0, -60.0, 10.0, 0.0)
-    elif gimbal == "device":  # 90 degrees to the right of north and 30 down, in the frame of the earth
-        yaw, pitch = math.radians(90) / 2, math.radians(-30) / 2
-        q = (
-            math.cos(yaw) * math.cos(pitch),
-            -math.sin(yaw) * math.sin(pitch),
-            math.cos(yaw) * math.sin(pitch),
-            math.sin(yaw) * math.cos(pitch),
-        )
-        one.mav.gimbal_device_attitude_status_send(0, 0, 1000, 64, q, 0, 0, 0, 0)
+def has_platform(pose) -> bool:
+    """Whether it says where the vehicle points."""
+    return pose is not None and pose.platform is not None
 
 
-def wait_for(source, *, accept=lambda pose: pose is not None, limit_s: float = 5.0):
-    """The pose, once it is as wanted."""
-    until = time.monotonic() + limit_s
-    while time.monotonic() < until:
-        pose = source.at(0, capture_ns=11)
-        if accept(pose):
-            return pose
-        time.sleep(0.02)
-    raise AssertionError("no such pose came")
-
-
-def test_place_and_attitude_come_from_the_autopilot(source, port, vehicle):
+@pytest.mark.parametrize("version", [1, 2])
+def test_place_and_attitude_come_from_the_autopilot(source, send, autopilot, wait_for, version):
     """A drone's own position would have to be written down by hand."""
     assert source.at(0, capture_ns=0) is None
     assert "no position" in source.trouble
-    one = vehicle(port)
-    send(one)
-    pose = wait_for(source, accept=lambda pose: pose is not None and pose.platform is not None)
+    one = autopilot(version=version)
+    send(one.place(), one.attitude())
+    pose = wait_for(source, accept=has_platform)
     assert (pose.latitude_deg, pose.longitude_deg) == pytest.approx((47.1, 8.5))
     assert (pose.height_m, pose.altitude_m, pose.hfov_deg, pose.capture_ns) == (120.0, 550.0, 65.0, 11)
     assert (pose.platform.yaw_deg, pose.platform.pitch_deg, pose.platform.roll_deg) == pytest.approx(
@@ -94,51 +48,106 @@ def test_place_and_attitude_come_from_the_autopilot(source, port, vehicle):
     assert source.trouble == ""
 
 
-@pytest.mark.parametrize(("gimbal", "yaw", "pitch"), [("mount", 90.0, -60.0), ("device", 90.0, -30.0)])
-def test_the_gimbal_says_where_the_camera_points(source, port, vehicle, gimbal, yaw, pitch):
+def test_the_mount_says_where_the_camera_points(source, send, autopilot, wait_for):
     """Places would be computed as if the camera looked where the drone flies."""
-    one = vehicle(port)
-    send(one, gimbal=gimbal)
-    pose = wait_for(source, accept=lambda pose: pose is not None and pose.camera is not None)
-    assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((yaw, pitch), abs=0.01)
+    one = autopilot()
+    send(one.place(), one.attitude(), one.mount())
+    pose = wait_for(source, accept=has_camera)
+    assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((90, -60), abs=0.01)
 
 
-def test_a_second_vehicle_on_the_port_is_not_mixed_in(source, port, vehicle):
+@pytest.mark.parametrize(
+    ("flags", "yaw"),
+    [
+        (64, 90.0),  # yaw in the earth's frame
+        (64 | 16, 90.0),
+        (16, 90.0),  # a gimbal of before the two frames: locked means the earth's
+        (32, 140.0),  # in the vehicle's
+        (32 | 16, 140.0),
+        (0, 140.0),
+    ],
+)
+def test_the_gimbal_says_which_way_its_yaw_counts(source, send, autopilot, wait_for, flags, yaw):
+    """Everything would be placed beside where it is, by the angle at which the drone flies."""
+    one = autopilot()
+    send(one.place(), one.attitude(50), one.gimbal(90, -30, flags=flags))
+    pose = wait_for(source, accept=has_camera)
+    assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((yaw, -30), abs=0.01)
+
+
+@pytest.mark.parametrize("yaw", [33.0, 90.0, 200.0])
+def test_a_camera_that_looks_straight_down_still_has_a_direction(source, send, autopilot, wait_for, yaw):
+    """The survey flight, which looks straight down, would have its picture turned at random."""
+    one = autopilot()
+    send(one.place(), one.attitude(), one.gimbal(yaw, -90, flags=64))
+    pose = wait_for(source, accept=has_camera)
+    assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((yaw, -90), abs=0.01)
+
+
+def test_an_old_device_that_speaks_first_hides_nothing(source, send, autopilot, wait_for, monkeypatch):
+    """One part that speaks MAVLink 1 would take the gimbal away, whose message only MAVLink 2 has."""
+    monkeypatch.delenv("MAVLINK20", raising=False)
+    send(autopilot(system=255, version=1).heartbeat())
+    one = autopilot()
+    pose = wait_for(
+        source,
+        accept=has_camera,
+        say=lambda: send(one.place(), one.attitude(), one.gimbal(90, -30, flags=64)),
+    )
+    assert pose.camera.yaw_deg == pytest.approx(90, abs=0.01)
+
+
+def test_a_second_vehicle_on_the_port_is_not_mixed_in(source, send, autopilot, wait_for):
     """The camera would jump between two drones."""
-    first, second = vehicle(port), vehicle(port, system=2)
-    send(first)
+    first, second = autopilot(), autopilot(system=2)
+    send(first.place())
     wait_for(source)
     for _ in range(10):
-        send(second, latitude=-10.0)
-        send(first)
+        send(second.place(-10.0), first.place())
         time.sleep(0.01)
     assert wait_for(source).latitude_deg == pytest.approx(47.1)
 
 
-def test_noise_on_the_port_harms_nothing(source, port, vehicle):
+def test_noise_on_the_port_harms_nothing(source, send, autopilot, wait_for):
     """Anybody who reaches the port could end the flight."""
     noise = random.Random(1)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        for _ in range(300):
-            head = noise.choice([b"", b"\xfd", b"\xfe", b"\xfd\x1c\x00\x00"])
-            stranger.sendto(head + noise.randbytes(noise.randrange(1, 300)), ("127.0.0.1", port))
-    one = vehicle(port)
-    until = time.monotonic() + 5
-    while source.at(0, capture_ns=0) is None and time.monotonic() < until:
-        send(one)
-        time.sleep(0.05)
-    assert wait_for(source).latitude_deg == pytest.approx(47.1)
+    for _ in range(300):
+        head = noise.choice([b"", b"\xfd", b"\xfe", b"\xfd\x1c\x00\x00"])
+        send(head + noise.randbytes(noise.randrange(1, 300)))
+    pose = wait_for(source, say=lambda: send(autopilot().place()))
+    assert pose.latitude_deg == pytest.approx(47.1)
 
 
-def test_what_an_autopilot_said_long_ago_is_no_pose(vehicle):
-    """A lost autopilot would leave the camera hanging where it was."""
-    now = [time.time_ns()]
+def test_a_flood_leaves_no_queue_behind(source, send, autopilot, wait_for):
+    """A stranger would fill the memory, and the position would be that of minutes ago."""
+    flood = autopilot(system=9).heartbeat() * 2800
+    for _ in range(300):
+        send(flood)
+        time.sleep(0.003)
+    assert wait_for(source, say=lambda: send(autopilot().place())).latitude_deg == pytest.approx(47.1)
+
+
+def test_it_sends_the_autopilot_nothing(port, autopilot, wait_for):
+    """What is only to watch would take part in the control of a vehicle."""
+    source = open_pose(f"mavlink:udpin:127.0.0.1:{port}", hfov_deg=None, clock=time.time_ns)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
-        free = one.getsockname()[1]
-    source = open_pose(f"mavlink:udpin:127.0.0.1:{free}", hfov_deg=None, clock=lambda: now[0])
+        try:
+            one.sendto(autopilot().heartbeat() + autopilot().place(), ("127.0.0.1", port))
+            wait_for(source)
+        finally:
+            source.close()
+        one.settimeout(0.2)
+        with pytest.raises(TimeoutError):
+            one.recv(1)
+
+
+def test_what_an_autopilot_said_long_ago_is_no_pose(port, send, autopilot, wait_for):
+    """A lost autopilot would leave the camera hanging where it was."""
+    now = [time.time_ns()]
+    source = open_pose(f"mavlink:udpin:127.0.0.1:{port}", hfov_deg=None, clock=lambda: now[0])
     try:
-        send(vehicle(free))
+        send(autopilot().place())
         wait_for(source)
         now[0] += 3_000_000_000
         assert source.at(0, capture_ns=0) is None
