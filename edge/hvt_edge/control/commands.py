@@ -35,6 +35,8 @@ _MOST_REQUESTS = 32
 _REST_NS = 2 * SECOND_NS
 """Between two changes of the budget: each costs a keyframe and the opening of an encoder."""
 _MOST_BPS = 1_000_000_000
+_LEAST_CAMERA_BPS = 10_000
+"""With less the frame loop would wait for ``status`` alone."""
 _QUALITIES_PCT = (5, 95)
 _MOST_AGO_MS = 3_600_000
 _U32 = 2**32 - 1
@@ -203,14 +205,19 @@ class Commands:
     def _check_base(self, budget_bps: int, video_share: float | None) -> None:
         """As `hvt_edge.config.check_rate`, in words for whoever commands from afar."""
         config, size = self.config, self.base_size
-        fps = LEAST_FPS if config.auto_fps else config.nominal_fps
-        least_bps = least_base_bps(size, fps, edge_id=config.edge_id)
         share = FIRST_SHARE if video_share is None else video_share
         base_bps = base_rate_bps(budget_bps, share, metadata_bps=config.metadata_bps)
+        fps = LEAST_FPS if config.auto_fps else config.nominal_fps
+        least_bps, what = (
+            least_base_bps(size, fps, edge_id=config.edge_id),
+            f"{size[0]}x{size[1]} at {fps:g} fps",
+        )
+        if config.passes_through:  # what of a camera has no room is left out
+            least_bps, what = _LEAST_CAMERA_BPS, "a camera that is passed through"
         if base_bps < least_bps:
             raise RefusedError(
-                f"{bitrate_text(budget_bps)} would leave {bitrate_text(base_bps)} for video, and "
-                f"{size[0]}x{size[1]} at {fps:g} fps takes at least {bitrate_text(least_bps)}"
+                f"{bitrate_text(budget_bps)} would leave {bitrate_text(base_bps)} for video, and {what} takes at "
+                f"least {bitrate_text(least_bps)}"
             )
 
 

@@ -30,6 +30,7 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.loop.cpu import Cores, CpuMeter
 from hvt_edge.source.contract import Source
+from hvt_edge.source.opening import without_password
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.wiring import (
     as_the_camera_is,
@@ -101,6 +102,7 @@ class _Checks:
     def source(self) -> Finding:
         """Opens it, and looks for two seconds how many pictures it gives."""
         config = self._config
+        name = without_password(str(config.source))
         source = self._world.open_source(config)
         try:
             self._config = as_the_camera_is(config, source)
@@ -111,7 +113,7 @@ class _Checks:
         first = next(frames, None)
         if first is None:
             source.close()
-            raise UserError(f"--source {config.source} gives no picture: name another")
+            raise UserError(f"--source {name} gives no picture: name another")
         self._frames.append(first)
         began_s, count = time.monotonic(), 0
         while time.monotonic() - began_s < _SAMPLE_S and (source.live or count < _MOST_FRAMES):
@@ -123,7 +125,7 @@ class _Checks:
                 self._frames.append(frame)
         self._source = source
         size, base = source.view.source_size, source.view.base_size
-        found = f"{config.source}: {size[0]}x{size[1]}, sent as {base[0]}x{base[1]} at {source.fps:g} fps"
+        found = f"{name}: {size[0]}x{size[1]}, sent as {base[0]}x{base[1]} at {source.fps:g} fps"
         rate = count / (time.monotonic() - began_s)
         if source.live and rate < _SLOW * source.fps:
             return Finding(

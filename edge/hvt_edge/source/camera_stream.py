@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from dataclasses import replace
+from itertools import accumulate, pairwise
+from statistics import median
 from typing import Any
 
 import av
@@ -15,13 +17,37 @@ from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_edge.source.camera_units import CameraUnits
 from hvt_edge.source.contract import BaseSize, SeenUnit, check_shape
 
-__all__ = ["REENCODE", "CameraDecoder", "check_picture", "check_stream", "open_units", "rate_of"]
+__all__ = [
+    "LONG_STEP_S",
+    "REENCODE",
+    "CameraDecoder",
+    "check_picture",
+    "check_stream",
+    "open_units",
+    "rate_of",
+    "without_jumps",
+]
 
 REENCODE = "re-encode it with --encoder x265"
 _FORMATS = frozenset({"yuv420p", "yuvj420p"})
 """4:2:0 in 8 bits; the second is FFmpeg's name for the same in full range."""
+LONG_STEP_S, _LONG_STEPS = 1.0, 3
+"""From one frame to the next: more than both, in seconds and in usual steps, is a jump of the time stamps."""
 _OTHER_MATRICES = frozenset({4, 5, 6, 7, 9})
 """Of ITU-T H.273, table 4: BT.601 in its variants, SMPTE 240M and BT.2020. Who says nothing means BT.709."""
+
+
+def without_jumps(units: Sequence[SeenUnit]) -> tuple[SeenUnit, ...]:
+    """The units from time 0 on. A step back in time, or one that no frame takes, becomes the usual one (the median).
+
+    Such a step is a clock that was set or ran over, packets that were lost, or two recordings put together.
+    """
+    steps = [later.at_s - earlier.at_s for earlier, later in pairwise(units)]
+    usual_s = median([step for step in steps if step > 0] or [0.0])
+    most_s = max(LONG_STEP_S, _LONG_STEPS * usual_s)
+    mended = (step if 0 <= step <= most_s else usual_s for step in steps)
+    times = accumulate(mended, initial=0.0)
+    return tuple(replace(unit, at_s=at_s) for unit, at_s in zip(units, times, strict=True))
 
 
 def rate_of(name: str, units: Sequence[SeenUnit], *, said: float | None) -> float:
@@ -29,8 +55,8 @@ def rate_of(name: str, units: Sequence[SeenUnit], *, said: float | None) -> floa
 
     Raises `UserError` where they say nothing, or what no base stream can have.
     """
-    gaps = [later.at_s - earlier.at_s for earlier, later in pairwise(units) if later.at_s > earlier.at_s]
-    fps = (len(units) - 1) / sum(gaps) if gaps else said or 0.0
+    span_s = without_jumps(units)[-1].at_s
+    fps = (len(units) - 1) / span_s if span_s > 0 else said or 0.0
     if said and abs(fps / said - 1) < 0.02:
         fps = said
     if not 0.1 <= fps <= 240:
@@ -45,7 +71,7 @@ class CameraDecoder:
     """Takes packets in their order; gives each unit that can be sent with its picture. One thread.
 
     What does not hold is left out up to the next keyframe, as a ground would have to. With ``size`` (width, height) a
-    picture of another is not taken either.
+    picture of another is not taken either; where it is not known yet, `expect` says it later.
     """
 
     def __init__(self, units: CameraUnits, *, size: tuple[int, int] | None = None) -> None:
@@ -56,6 +82,10 @@ class CameraDecoder:
         """Whether all since a keyframe was decoded."""
         self.trouble = ""
         """What was wrong with the newest unit that was left out, in a few words."""
+
+    def expect(self, size: tuple[int, int]) -> None:
+        """From now on a picture of another size (width, height) is not taken."""
+        self._size = size
 
     def skip(self) -> None:
         """Packets are missing before the next."""

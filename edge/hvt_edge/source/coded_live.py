@@ -16,7 +16,14 @@ from typing import Any
 from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Fit, Frame, Image
-from hvt_edge.source.camera_stream import CameraDecoder, check_picture, check_stream, open_units, rate_of
+from hvt_edge.source.camera_stream import (
+    CameraDecoder,
+    check_picture,
+    check_stream,
+    open_units,
+    rate_of,
+    without_jumps,
+)
 from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit
 from hvt_edge.source.live import SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
 from hvt_edge.source.stream import StreamGrabber, camera_time_ns
@@ -167,6 +174,7 @@ class CodedLiveSource(LiveSource):
             if grabber.size is None:
                 self.warning = check_picture(grabber.name, picture.frame, size=size)
                 grabber.size = picture.size
+                packet.decoder.expect(picture.size)
             at_s = time.monotonic() - began_s if packet.at_s is None else packet.at_s
             seen.append(SeenUnit(at_s, len(unit.data), unit.keyframe))
         if grabber.size is None or len(seen) < 2:
@@ -175,5 +183,5 @@ class CodedLiveSource(LiveSource):
                 f"({trouble})"
             )
         self.fps = rate_of(grabber.name, seen, said=grabber.said_fps)
-        self.camera_stream = CameraStream(tuple(seen), self.fps)
+        self.camera_stream = CameraStream(without_jumps(seen), self.fps)
         return grabber.size

@@ -13,7 +13,15 @@ import av.error
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Fit, Frame
-from hvt_edge.source.camera_stream import CameraDecoder, check_picture, check_stream, open_units, rate_of
+from hvt_edge.source.camera_stream import (
+    LONG_STEP_S,
+    CameraDecoder,
+    check_picture,
+    check_stream,
+    open_units,
+    rate_of,
+    without_jumps,
+)
 from hvt_edge.source.camera_units import CameraUnits
 from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit, Source
 from hvt_edge.source.resample import Resizer
@@ -64,7 +72,7 @@ class CodedVideoSource(Source):
                 raise UserError(f"source {self._name!r} holds no keyframe that a ground could begin with")
             self.fps = rate_of(self._name, seen, said=said)
             self.frame_count = None if not stream.frames else min(stream.frames, max_frames or stream.frames)
-        self.camera_stream = CameraStream(tuple(seen), self.fps)
+        self.camera_stream = CameraStream(without_jumps(seen), self.fps)
         self._running: Generator[Frame, None, None] | None = None
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
@@ -131,6 +139,7 @@ def _timed(
 def _seen(packets: Iterator[tuple[float, bytes]], units: CameraUnits) -> list[SeenUnit]:
     """What the clip takes, without decoding it."""
     seen: list[SeenUnit] = []
+    surveyed_s = before_s = 0.0
     for at_s, packet in packets:
         try:
             unit = units.unit(packet)
@@ -138,7 +147,9 @@ def _seen(packets: Iterator[tuple[float, bytes]], units: CameraUnits) -> list[Se
             continue  # as in flight, where it is counted
         if seen or unit.keyframe:
             seen.append(SeenUnit(at_s, len(unit.data), unit.keyframe))
-        if len(seen) == _MOST_SURVEYED or (seen and at_s - seen[0].at_s > _MOST_SURVEY_S):
+        surveyed_s += min(LONG_STEP_S, max(0.0, at_s - before_s))  # a jump of the time stamps is no time
+        before_s = at_s
+        if len(seen) == _MOST_SURVEYED or surveyed_s > _MOST_SURVEY_S:
             break
     return seen
 

@@ -15,7 +15,7 @@ from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage, State
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeState
-from hvt_edge.video.encoders.contract import Encoder
+from hvt_edge.video.encoders.camera_rates import LeastLink
 from hvt_edge.video.encoders.passthrough import unit_of
 from hvt_edge.video.frame_decision import Action, FrameDecision
 from hvt_edge.video.local_copy import LocalCopy
@@ -82,8 +82,10 @@ class PassthroughStage:
     """Runs in the frame loop, in place of `BaseStage`: `decide` for each frame, `encode` and `send` what goes out.
 
     ``pause(ns)`` sleeps and returns the time; None in lockstep, where nothing is waited for. ``admits(now_ns)`` says
-    whether the link has room. ``reconfigure(decimation, now_ns)`` runs before each keyframe for the link, so that
-    another budget holds from there on. ``local_copy`` has all that the camera gave, sent or not.
+    whether the link has room. ``observe(unit)`` sees each unit. ``reconfigure(decimation, now_ns)`` runs before it is
+    asked whether a keyframe may go to the link, so that another budget holds from there on: one that was lowered too
+    far could never be raised again. ``least_link`` holds a keyframe that follows a break. ``local_copy`` has all that
+    the camera gave, sent or not.
     """
 
     keyframes: KeyframeRequests
@@ -91,7 +93,9 @@ class PassthroughStage:
     _: KW_ONLY
     failures: Failures
     local_copy: LocalCopy | None = None
-    reconfigure: Callable[[int, int], Encoder | None] | None = None
+    reconfigure: Callable[[int, int], object] = lambda _decimation, _now_ns: None
+    observe: Callable[[AccessUnit], None] = lambda _unit: None
+    least_link: LeastLink | None = None
     admits: Callable[[int], bool] = lambda _now_ns: True
     pause: Callable[[int], int] | None = None
     backlog: BacklogStage | None = None
@@ -109,13 +113,16 @@ class PassthroughStage:
         link = State.LIVE if backlog is None else backlog.state
         whole_store = backlog is not None and backlog.segment_open
         after_sent = self._sent_index == frame.index - 1
+        self.observe(unit)
+        if unit.keyframe and link is not State.OFFLINE:
+            self.reconfigure(1, now_ns)
         wanted = unit.keyframe or (after_sent if link is State.LIVE else link is State.OFFLINE)
         decision = decide_unit(
             UnitInputs(
                 keyframe=unit.keyframe,
                 after_sent=after_sent,
                 after_stored=whole_store and self._stored_index == frame.index - 1,
-                admitted=wanted and self._admitted(unit, now_ns, waits=link is State.LIVE),
+                admitted=wanted and self._admitted(unit, now_ns, live=link is State.LIVE),
                 link=link,
                 probe_due=backlog is not None and backlog.probe_due(now_ns),
             )
@@ -134,8 +141,6 @@ class PassthroughStage:
         self._copy(unit)
         if not decision.codes:
             return None
-        if decision.reconfigures and self.reconfigure is not None:
-            self.reconfigure(1, now_ns)
         if decision.to_store:
             self._stored_index = unit.frame_index
         else:
@@ -150,7 +155,9 @@ class PassthroughStage:
     def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> None:
         """Store the unit, or send it, or both; as of `BaseStage`."""
         if self.backlog is None or not decision.to_store:
-            self.transmitter.base(unit, now_ns=now_ns, announced=False)
+            line_bytes = self.transmitter.base(unit, now_ns=now_ns, announced=False)
+            if self.least_link is not None:
+                self.least_link.sent(line_bytes, now_ns=now_ns)
             return
         self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
         if decision.to_link:
@@ -158,15 +165,19 @@ class PassthroughStage:
         elif self.backlog.offline:
             self.transmitter.store_base(unit, now_ns=now_ns)
 
-    def _admitted(self, unit: AccessUnit, now_ns: int, *, waits: bool) -> bool:
-        until_ns = now_ns + (_PATIENCE_NS if waits else 0)
+    def _admitted(self, unit: AccessUnit, now_ns: int, *, live: bool) -> bool:
+        """Whether it may go now; where the link is ``live``, or a moment later."""
+        until_ns = now_ns + (_PATIENCE_NS if live else 0)
+        begins = live and self._sent_index != unit.frame_index - 1
         while True:
             wait_ns = self.transmitter.base_unit_wait_ns(unit, now_ns=now_ns)
             in_time = wait_ns is not None and now_ns + wait_ns <= until_ns
-            if in_time and self.admits(now_ns):
+            free = not begins or self.least_link is None or self.least_link.is_free(now_ns)
+            # The link is always asked: what is lost is given up there.
+            if self.admits(now_ns) and in_time and free:
                 return True
             if wait_ns is None or self.pause is None or now_ns + _POLL_NS > until_ns:
-                if waits:
+                if live:
                     self._note_left_out(unit, in_time=in_time)
                 return False
             now_ns = self.pause(_POLL_NS)

@@ -7,13 +7,18 @@ from dataclasses import replace
 from hvt_common.protocol.channels import DELIVERIES, Channel, Direction
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
+from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.operating.levers import LeverControl, LeverSettings
 from hvt_edge.operating.point import Operating
+from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder_settings import least_base_bps
+from hvt_edge.video.encoders.camera_rates import CameraRates, LeastLink, needed_bps
+from hvt_edge.video.encoders.passthrough import measure_camera
+from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.share import Split, SplitSettings
 
 _AUTO_STILL_SHARE = 0.15
@@ -83,8 +88,60 @@ def make_levers(config: EdgeConfig, operating: Operating) -> LeverControl | None
     return LeverControl(operating, LeverSettings(tracks_bps=config.metadata_bps))
 
 
-def make_pacer(config: EdgeConfig) -> Pacer | None:
-    """What tracks the link's rate; None where the budget is to stay as it is."""
+def make_pacer(config: EdgeConfig, stream: CameraStream | None) -> Pacer | None:
+    """What tracks the link's rate; None where the budget is to stay as it is.
+
+    Of a camera that is passed through (``stream``) the rate is never below what it was seen to make.
+    """
     if not config.adapts:
         return None
-    return Pacer(RateController(RateSettings(ceiling_bps=config.budget_bps, floor_bps=config.floor_bps)))
+    floor_bps = config.floor_bps
+    if stream is not None:
+        floor_bps = max(floor_bps, _camera_needs_bps(config, _surveyed_bytes(config, stream), config.share))
+    settings = RateSettings(ceiling_bps=config.budget_bps, floor_bps=min(config.budget_bps, floor_bps))
+    return Pacer(RateController(settings))
+
+
+def make_camera_rates(
+    config: EdgeConfig,
+    stream: CameraStream,
+    *,
+    reconfiguration: EncoderReconfiguration,
+    operating: Operating,
+    pacer: Pacer | None,
+) -> CameraRates:
+    """What runs at the keyframes of a camera that is passed through."""
+
+    def needed(window_bytes: int) -> int:
+        return _camera_needs_bps(config, window_bytes, operating.now.video_share or config.share)
+
+    return CameraRates(
+        reconfiguration,
+        operating=operating,
+        pacer=pacer,
+        needed=needed,
+        least_bps=config.min_budget_bps,
+        surveyed_bytes=_surveyed_bytes(config, stream),
+        window_ns=config.window_ns,
+        edge_id=config.edge_id,
+    )
+
+
+def make_least_link(config: EdgeConfig, *, pacer: Pacer | None, in_flight: BaseInFlight) -> LeastLink | None:
+    """What keeps a camera's units from a queue; None where nothing tracks the link."""
+    if pacer is None:
+        return None
+
+    def unreported_bytes() -> int:
+        return 0 if pacer.measured_round_trip_ns is None else in_flight.size_bytes
+
+    return LeastLink(config.floor_bps, unreported_bytes=unreported_bytes)
+
+
+def _camera_needs_bps(config: EdgeConfig, window_bytes: int, share: float) -> int:
+    """The budget that a camera needs whose fullest window has so many line bytes; ``share`` is the base's of it."""
+    return needed_bps(window_bytes, window_s=config.window, share=share, metadata_bps=config.metadata_bps)
+
+
+def _surveyed_bytes(config: EdgeConfig, stream: CameraStream) -> int:
+    return measure_camera(stream, window_s=config.window, edge_id=config.edge_id).window_bytes

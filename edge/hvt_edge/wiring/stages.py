@@ -37,7 +37,15 @@ from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.passthrough import PassthroughStage, VideoStage
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
-from hvt_edge.wiring.link import channels_of, make_budget, make_levers, make_pacer, make_split
+from hvt_edge.wiring.link import (
+    channels_of,
+    make_budget,
+    make_camera_rates,
+    make_least_link,
+    make_levers,
+    make_pacer,
+    make_split,
+)
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.stills import make_chooser, make_on_demand, make_still_maker
 from hvt_edge.wiring.storing import make_backlog
@@ -101,7 +109,7 @@ def build_stages(
         method=config.method,
         decimation=decimation,
     )
-    keyframes, pacer = make_keyframes(config, source), make_pacer(config)
+    keyframes, pacer = make_keyframes(config, source), make_pacer(config, source.camera_stream)
     open_encoder = partial(make_encoder, config, size=view.base_size, headroom=headroom)
     encoder = open_encoder(total_bps=config.budget_bps, base_bps=config.base_bps, decimation=decimation)
     budget = make_budget(config, decimation=decimation)
@@ -180,12 +188,22 @@ def build_stages(
         pose = PoseStage(pose_source, session_id=session_id, sender=transmitter, failures=failures)
     base: VideoStage
     if config.passes_through:
+        assert source.camera_stream is not None, "checked by as_the_camera_is"
+        rates = make_camera_rates(
+            config,
+            source.camera_stream,
+            reconfiguration=reconfiguration,
+            operating=operating,
+            pacer=pacer,
+        )
         base = PassthroughStage(
             keyframes,
             transmitter,
             failures=failures,
             local_copy=local_copy,
-            reconfigure=reconfiguration,
+            reconfigure=rates,
+            observe=rates.observe,
+            least_link=make_least_link(config, pacer=pacer, in_flight=in_flight),
             admits=link_control.admits,
             pause=None if lockstep else partial(_paused, clock, wait_until),
             backlog=backlog,

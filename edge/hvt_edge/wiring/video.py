@@ -185,17 +185,17 @@ def qualify_encoder(
 
 def as_the_camera_is(config: EdgeConfig, source: Source) -> EdgeConfig:
     """The settings with the camera's frame rate, where its own units are sent; `UserError` where they cannot be."""
-    stream = source.camera_stream
+    stream, name = source.camera_stream, without_password(str(config.source))
     if not config.passes_through:
         return config
     if stream is None:
         raise UserError(
-            f"source {config.source} gives no video that is coded already, which --encoder passthrough takes: "
+            f"source {name} gives no video that is coded already, which --encoder passthrough takes: "
             f"{REENCODE}"
         )
     if not config.auto_fps and abs(config.nominal_fps / stream.fps - 1) > _SAME_RATE:
         raise UserError(
-            f"source {config.source} gives {stream.fps:g} frames a second, --fps is {config.nominal_fps:g}, and "
+            f"source {name} gives {stream.fps:g} frames a second, --fps is {config.nominal_fps:g}, and "
             f"--encoder passthrough leaves none out: leave --fps out, or {REENCODE}"
         )
     return replace(config, fps=stream.fps)

@@ -199,6 +199,16 @@ def test_a_budget_that_x265_cannot_follow_is_refused_and_changes_nothing():
     assert not rig.ask("set-budget").accepted
 
 
+def test_what_x265_needs_binds_no_camera_that_is_passed_through():
+    """A camera that takes little would keep a link that got thin to itself, or have to land for it."""
+    rig = Rig("800kbps")
+    rig.commands.config = replace(rig.config, encoder="passthrough")
+    answer = rig.ask("set-budget", bps=10_000)
+    assert "would leave 8 kbps for video, and a camera that is passed through takes at least" in answer.reason
+    assert rig.ask("set-budget", bps=20_000).accepted
+    assert rig.operating.now.budget_bps == 20_000
+
+
 def test_the_budget_cannot_be_changed_all_the_time():
     """Each change costs a keyframe: a loop at a ground would leave no bits for anything else."""
     rig = Rig("800kbps")

@@ -11,6 +11,7 @@ import pytest
 from hvt_edge.cli import main
 from programs.fleet_keys import Fleet
 from programs.processes import Link, free_ports
+from programs.rtsp_camera import RtspCamera
 
 CHEAP = ("--size", "640x360", "--detector", "motion", "--preset", "ultrafast")
 
@@ -57,6 +58,17 @@ def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
     assert found["detector"]["state"] == found["processor"]["state"] == "unknown"
     assert found["link"]["state"] == "warning", "the ground may come later"
     assert "nobody listens" in found["link"]["found"] or "refused" in found["link"]["found"], found["link"]
+
+
+@pytest.mark.timeout(120)
+def test_the_cameras_password_is_not_printed(free_port, capsys):
+    """Whoever asks for help with the findings would give the camera away."""
+    with RtspCamera(free_port) as camera:
+        code = main(["doctor", "--source", camera.url.replace("://", "://admin:SECRET@"), *CHEAP])
+    said = capsys.readouterr()
+    assert code in (0, 2)
+    assert f"…@127.0.0.1:{free_port}/camera: 320x240" in said.out
+    assert "SECRET" not in said.out + said.err
 
 
 def test_keys_of_another_edge_are_found_out(tmp_path, capsys):

@@ -5,7 +5,9 @@ from __future__ import annotations
 import time
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
@@ -14,7 +16,13 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.video.annex_b import nal_kind, nal_units, parameter_sets
 from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.source.camera_stream import CameraDecoder, rate_of, without_jumps
+from hvt_edge.source.camera_units import CameraUnits
+from hvt_edge.source.coded_live import CodedLiveSource, CodedStreamGrabber
+from hvt_edge.source.contract import SeenUnit
+from hvt_edge.source.live import CameraPacket, Shot, SignalLost
 from hvt_edge.source.opening import open_source
+from hvt_edge.video.encoders.passthrough import measure_camera
 from media.clips import hard_pictures, smooth_pictures
 from media.hevc_camera import SIZE, packets_of, pictures_of, write_clip
 from programs.rtsp_camera import RtspCamera
@@ -119,6 +127,54 @@ def test_colours_that_grounds_show_a_little_off_are_told_of(tmp_path):
         assert source.warning == ""
 
 
+def jumping(clip: Path, *, ahead: bool) -> Path:
+    """The clip twice over; in the middle its time begins anew, or is ``ahead`` by a day."""
+    twice = clip.with_name("twice.ts" if not ahead else "twice.mkv")
+    if not ahead:
+        twice.write_bytes(2 * clip.read_bytes())
+        return twice
+    with av.open(str(twice), "w") as out:
+        for turn in range(2):
+            with av.open(str(clip)) as container:
+                stream = (
+                    out.streams.video[0] if turn else out.add_stream_from_template(container.streams.video[0])
+                )
+                for packet in container.demux(video=0):
+                    if packet.size:
+                        packet.pts = packet.dts = packet.pts + turn * round(86_400 / packet.time_base)
+                        packet.stream = stream
+                        out.mux(packet)
+    return twice
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_time_stamps_that_jump_change_neither_rate_nor_window(tmp_path, ahead):
+    """A camera would be refused for a window that it never fills, or said to make one keyframe a day."""
+    clip = write_clip(tmp_path / "a.ts")
+    once, both = (coded(path).camera_stream for path in (clip, jumping(clip, ahead=ahead)))
+    assert len(both.units) == 2 * len(once.units), "all of it is looked at"
+    assert both.fps == once.fps
+    assert both.keyframe_s == pytest.approx(once.keyframe_s, abs=0.01)
+    fullest = [measure_camera(one, window_s=1.0, edge_id="edge-1").window_bytes for one in (once, both)]
+    assert fullest[1] == pytest.approx(fullest[0], rel=0.2)
+
+
+@pytest.mark.parametrize("jump_s", [2.0, 95_443.7, -1.5, -95_443.7])
+@pytest.mark.parametrize(("said", "fps"), [(None, 25.0), (25.0, 25.0), (5.0, 25.0)])
+def test_the_rate_is_that_between_the_jumps(jump_s, said, fps):
+    """A clock that runs over in the first seconds would be a camera of one frame an hour."""
+    seen = [SeenUnit(index / 25 + jump_s * (index > 50), 3000, index % 50 == 0) for index in range(100)]
+    assert rate_of("cam", seen, said=said) == pytest.approx(fps)
+    mended = without_jumps(seen)
+    assert [one.at_s for one in mended] == pytest.approx([index / 25 for index in range(100)])
+
+
+def test_a_slow_camera_has_no_jumps():
+    """One frame each two seconds would be taken for something else."""
+    seen = [SeenUnit(2.0 * index, 3000, keyframe=True) for index in range(10)]
+    assert rate_of("cam", seen, said=None) == 0.5
+
+
 @pytest.fixture(scope="module")
 def units(tmp_path_factory) -> list[bytes]:
     """Two seconds of a camera at 25 fps."""
@@ -196,3 +252,49 @@ def test_a_camera_that_restarts_goes_on_with_a_keyframe_and_one_that_changed_is_
         assert (part.part, part.working) == ("source", True)
     finally:
         camera.close()
+
+
+class Turning(CodedStreamGrabber):
+    """A camera that has another picture size from some packet on, within one connection."""
+
+    def __init__(self, packets: list[bytes]) -> None:
+        self.name, self.said_fps = "cam", 25.0
+        self._left, self._decoder = iter(enumerate(packets)), CameraDecoder(CameraUnits(b""))
+
+    def open(self) -> None:
+        """It is open."""
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+    def grab(self) -> Shot:
+        """One each 40 ms."""
+        time.sleep(0.04)
+        number, packet = next(self._left, (0, b""))
+        if not packet:
+            raise SignalLost("it ended")
+        return Shot(partial(np.zeros, (2, 2, 3)), None, CameraPacket(packet, number / 25, self._decoder))
+
+    def restart(self) -> None:
+        """It does not come back."""
+        raise SignalLost("it is gone")
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("other", [(384, 256), (192, 128)])
+def test_a_picture_size_that_changes_within_the_first_connection_is_told_of(units, tmp_path, other):
+    """The ground would get pictures of a size that it does not take, and boxes that belong nowhere."""
+    turned = packets_of(write_clip(tmp_path / "a.hevc", hard_pictures(25, size=other), fps=25))
+    failures = Failures(time.time_ns)
+    grabber, told = Turning([*units, *units, *turned]), False
+    decoder, shown = BaseDecoder(), []
+    with CodedLiveSource(grabber, size=lambda size: size, fit="letterbox", failures=failures) as source:
+        for frame in source.steps(start_ns=0):
+            shown += [] if frame is None else [decoder.decode(frame.camera_unit.data)]
+            said = [one.reason for one in failures.parts]
+            told = told or any(f"a picture has {other[0]}x{other[1]} pixels" in one for one in said)
+            if told or any("it ended" in one or "it is gone" in one for one in said):
+                break
+    assert len(shown) > 10
+    assert {picture.shape for picture in shown} == {(SIZE[1], SIZE[0], 3)}
+    assert told

@@ -1,12 +1,17 @@
-"""The size of the base stream where nobody gives one."""
+"""The size of the base stream where nobody gives one, and a camera that is passed through."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
 from hvt_common.config import load
+from hvt_common.errors import UserError
 from hvt_edge.config import EdgeConfig
-from hvt_edge.wiring import base_size, default_size
+from hvt_edge.source.opening import open_source
+from hvt_edge.wiring import as_the_camera_is, base_size, default_size
+from media.hevc_camera import SIZE, write_clip
 
 
 @pytest.mark.parametrize(
@@ -38,3 +43,17 @@ def test_a_size_that_is_given_holds(flags, size):
     config, _ = load(EdgeConfig, ["--source", "x.mp4", *flags], program="hvt-edge", description="")
     found = base_size(config)
     assert (found((360, 240)) if callable(found) else found) == size
+
+
+@pytest.mark.parametrize(("coded", "says"), [(True, "--fps is 5"), (False, "no video that is coded already")])
+def test_no_refusal_says_the_cameras_password(tmp_path: Path, coded, says):
+    """It would stand in a log that everybody reads."""
+    config = EdgeConfig(source="rtsp://admin:SECRET@10.0.0.5/s", encoder="passthrough", fps=5.0)
+    clip = write_clip(tmp_path / "a.mp4")
+    with (
+        open_source(str(clip), size=SIZE, fps=15, coded=coded) as source,
+        pytest.raises(UserError, match=says) as caught,
+    ):
+        as_the_camera_is(config, source)
+    assert "SECRET" not in str(caught.value)
+    assert "10.0.0.5" in str(caught.value)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 
 from hvt_common.errors import UserError
-from hvt_common.units import bitrate_text
+from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.source.contract import CameraStream
+from hvt_edge.video.encoders.camera_rates import FullestWindow
 from hvt_edge.video.encoders.qualification import Allowed, Measured, line_bytes
 from hvt_edge.video.regions import Region
 
@@ -40,17 +40,12 @@ def unit_of(frame: Frame) -> AccessUnit:
 
 def measure_camera(stream: CameraStream, *, window_s: float, edge_id: str) -> Measured:
     """The fullest window of what was seen of the camera by its own times, and its largest keyframe; line bytes."""
-    inside: deque[tuple[float, int]] = deque()
-    held = fullest = largest = 0
+    window, largest = FullestWindow(round(window_s * SECOND_NS)), 0
     for unit in stream.units:
         size = line_bytes(unit.size_bytes, edge_id)
-        inside.append((unit.at_s, size))
-        held += size
-        while inside[0][0] <= unit.at_s - window_s:
-            held -= inside.popleft()[1]
-        fullest = max(fullest, held)
+        window.add(size, at_ns=round(unit.at_s * SECOND_NS))
         largest = max(largest, size if unit.keyframe else 0)
-    return Measured(fullest, largest)
+    return Measured(window.most_bytes, largest)
 
 
 def check_camera(name: str, stream: CameraStream, limit: Allowed, *, budget_bps: int, edge_id: str) -> str:
