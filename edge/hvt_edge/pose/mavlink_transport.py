@@ -198,8 +198,8 @@ class _SerialDevice:
 
     def read(self) -> bytes:
         first = self._port.read(1)
-        waiting = min(self._port.in_waiting, _READ_BYTES) if first else 0
-        return bytes(first + self._port.read(waiting) if waiting else first)
+        more = min(self._port.in_waiting, _READ_BYTES) if first else 0
+        return bytes(first + self._port.read(more) if more else first)
 
     def close(self) -> None:
         self._port.close()

@@ -42,8 +42,8 @@ _MOST_LAST_JOBS = 8
 _JOB_STEP_S = 0.1
 """On a machine that never comes to rest jobs still get one step in so long."""
 _STEP_LAG = 2
-"""In lockstep a step, or a pose, counts from so many frames on. It is sent right before the next access unit, which may
-overtake it by microseconds: this is what makes the order the same in every run."""
+"""In lockstep a step, or a pose, counts from so many frames on. It is sent right before the next access unit, which
+may overtake it by microseconds: this is what makes the order the same in every run."""
 _AHEAD = 2
 
 Analyze = Callable[[DecodedFrame, bool], None]

@@ -432,7 +432,7 @@ def test_interrupting_a_subscriber_ends_it(endpoint):
 
 def longer(header: bytes, payload: bytes) -> bytes:
     """The header as a later minor version may send it: MessagePack's long array, with fields that nobody knows."""
-    body = msgpack.packb([*msgpack.unpackb(header)[:-1], *range(10)] + [2**32 - 1])[:-5]
+    body = msgpack.packb([*msgpack.unpackb(header)[:-1], *range(10), 2**32 - 1])[:-5]
     return body + b"\xce" + zlib.crc32(body, zlib.crc32(payload)).to_bytes(4, "big")
 
 

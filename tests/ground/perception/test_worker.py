@@ -103,7 +103,7 @@ def test_in_lockstep_a_pose_counts_from_the_same_frame_on_however_long_perceptio
     """The same flight received again would place the same tracks elsewhere."""
     done: list[Any] = []
 
-    def analyze(one: DecodedFrame, _hurry: bool) -> None:
+    def analyze(one: DecodedFrame, _hurry: object) -> None:
         time.sleep(0.03 * slow)
         done.append(one.frame_index)
 
