@@ -68,24 +68,24 @@ class LeastLink:
     def __init__(self, least_bps: int, *, unreported_bytes: Callable[[], int]) -> None:
         self._least_bps = least_bps
         self._unreported_bytes = unreported_bytes
-        self._waiting_bytes = 0.0
+        self._queued_bytes = 0.0
         """What such a link would still hold."""
         self._drained_ns = 0
 
     def sent(self, size_bytes: int, *, now_ns: int) -> None:
         """So many line bytes go out."""
         self._drain(now_ns)
-        self._waiting_bytes += size_bytes
+        self._queued_bytes += size_bytes
 
     def is_free(self, now_ns: int) -> bool:
         """Whether nothing of it is on its way any more."""
         self._drain(now_ns)
-        return self._waiting_bytes <= 0
+        return self._queued_bytes <= 0
 
     def _drain(self, now_ns: int) -> None:
-        carried = self._least_bps * max(0, now_ns - self._drained_ns) / 8 / SECOND_NS
+        drained = self._least_bps * max(0, now_ns - self._drained_ns) / 8 / SECOND_NS
         self._drained_ns = max(self._drained_ns, now_ns)
-        self._waiting_bytes = min(max(0.0, self._waiting_bytes - carried), self._unreported_bytes())
+        self._queued_bytes = min(max(0.0, self._queued_bytes - drained), self._unreported_bytes())
 
 
 class CameraRates:
