@@ -2,15 +2,16 @@
 
 Fewer frames get more bits each. How many are best depends on how hard the scene is to code, which shows in the
 quantiser that x265 needs at the given rate: `MeasuredFrameSkip` holds it in a band (see rate_model). The rate changes
-at keyframes only, because the encoder is opened anew for it, and not more often than once in ``rest_frames``.
+at keyframes only, because the encoder is opened anew for it, and seldom.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 
-from hvt_edge.video.rate_model import better_decimation
+from hvt_edge.video.rate_model import SPARING, QuantiserBand, better_decimation
 
 __all__ = ["FrameSkip", "LimitedFrameSkip", "MeasuredFrameSkip"]
 
@@ -41,20 +42,40 @@ class FrameSkip:
         del index
         return self.decimation
 
+    def wants_keyframe(self, index: int) -> bool:
+        """Whether another rate is worth a keyframe of its own after this frame."""
+        del index
+        return False
+
 
 class MeasuredFrameSkip(FrameSkip):
-    """``--fps auto``: decided anew at keyframes, from the mean quantiser of the frames since the last decision.
+    """``--fps auto``: decided anew at keyframes, from the mean quantiser of the newest ``window_frames``.
 
-    Depends on the coded frames alone, so that in lockstep the same input gives the same bytes.
+    With ``first_frames`` another rate is worth a keyframe of its own, at first after so many source frames, then
+    after ``rest_frames`` each. All of it depends on the coded frames alone, so that in lockstep the same input gives
+    the same bytes.
     """
 
-    def __init__(self, decimation: int = 1, *, most_decimation: int, rest_frames: int) -> None:
+    def __init__(
+        self,
+        decimation: int = 1,
+        *,
+        most_decimation: int,
+        rest_frames: int,
+        window_frames: int,
+        band: QuantiserBand = SPARING,
+        first_frames: int | None = None,
+    ) -> None:
         super().__init__(decimation)
         self._most_decimation = most_decimation
         self._rest_frames = rest_frames
+        self._window_frames = window_frames
+        self._band = band
+        self._first_frames = first_frames
+        self._wait_frames = rest_frames if first_frames is None else first_frames
         self._decided_index: int | None = None
-        self._qp_sum = 0.0
-        self._frames = 0
+        self._quantisers: deque[tuple[int, float]] = deque()
+        """(index, mean quantiser) of the newest frames."""
 
     def coded(self, index: int, *, keyframe: bool, mean_qp: float) -> None:
         """See `FrameSkip`. Keyframes are coarser by nature and tell nothing."""
@@ -62,19 +83,36 @@ class MeasuredFrameSkip(FrameSkip):
         if self._decided_index is None:
             self._decided_index = index
         if not keyframe and math.isfinite(mean_qp):
-            self._qp_sum += mean_qp
-            self._frames += 1
+            self._quantisers.append((index, mean_qp))
+        while self._quantisers and self._quantisers[0][0] <= index - self._window_frames:
+            self._quantisers.popleft()
 
     def at_keyframe(self, index: int) -> int:
         """See `FrameSkip`."""
-        decided = self._decided_index
-        if decided is None or index - decided < self._rest_frames or not self._frames:
+        if not self._may_decide(index):
             return self.decimation
-        self.decimation = better_decimation(
-            self.decimation, mean_qp=self._qp_sum / self._frames, most_decimation=self._most_decimation
-        )
-        self._decided_index, self._qp_sum, self._frames = index, 0.0, 0
+        self.decimation = self._better()
+        self._decided_index, self._wait_frames = index, self._rest_frames
+        self._quantisers.clear()
         return self.decimation
+
+    def wants_keyframe(self, index: int) -> bool:
+        """See `FrameSkip`."""
+        return (
+            self._first_frames is not None and self._may_decide(index) and self._better() != self.decimation
+        )
+
+    def _may_decide(self, index: int) -> bool:
+        decided = self._decided_index
+        return decided is not None and index - decided >= self._wait_frames and bool(self._quantisers)
+
+    def _better(self) -> int:
+        return better_decimation(
+            self.decimation,
+            mean_qp=sum(qp for _, qp in self._quantisers) / len(self._quantisers),
+            most_decimation=self._most_decimation,
+            band=self._band,
+        )
 
 
 class LimitedFrameSkip(FrameSkip):
@@ -94,3 +132,7 @@ class LimitedFrameSkip(FrameSkip):
         """See `FrameSkip`."""
         self.decimation = max(self._preferred.at_keyframe(index), self._least_decimation())
         return self.decimation
+
+    def wants_keyframe(self, index: int) -> bool:
+        """See `FrameSkip`."""
+        return self._preferred.wants_keyframe(index)

@@ -107,6 +107,10 @@ class PassthroughStage:
         self.left_out = 0
         """Units that were neither sent nor stored."""
 
+    def wants_keyframe(self, index: int) -> bool:  # noqa: ARG002 - as of `BaseStage`
+        """Never: the camera makes its own."""
+        return False
+
     def decide(self, frame: Frame, *, now_ns: int) -> FrameDecision:
         """Decide on this frame's unit; once for each, in order. Waits for a moment where there is no room now."""
         unit, backlog = unit_of(frame), self.backlog

@@ -9,10 +9,20 @@ lose more objects than their bits win, so the size falls last.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from hvt_common.errors import UserError
 
-__all__ = ["SIZES", "better_decimation", "choose_base", "most_decimation", "sizes_of"]
+__all__ = [
+    "PROMPT",
+    "SIZES",
+    "SPARING",
+    "QuantiserBand",
+    "better_decimation",
+    "choose_base",
+    "most_decimation",
+    "sizes_of",
+]
 
 SIZES = ((1280, 720), (960, 540), (640, 360), (480, 270), (320, 180))
 """The ladder of ``--size auto`` for a source of 16:9; others keep its areas and their own aspect ratio. It ends where
@@ -27,9 +37,27 @@ _LEAST_SIDE_PX = 64
 # Bits for each pixel of a coded frame: from where a size is worth its pixels, and a frame its place.
 _SIZE_BITS_PER_PX = 0.020
 _RATE_BITS_PER_PX = 0.040
-_QP_FAR_TOO_COARSE = 36.0
-_QP_TOO_COARSE = 32.0
-_QP_FINE = 25.0
+
+
+@dataclass(frozen=True, slots=True)
+class QuantiserBand:
+    """Mean quantisers (0…51) at which frames are worth their bits."""
+
+    fine: float
+    """Below it more frames are coded, …"""
+    coarse: float
+    """… above it fewer, …"""
+    far: float
+    """… and above this two steps fewer."""
+
+
+SPARING = QuantiserBand(fine=25.0, coarse=32.0, far=36.0)
+"""For whoever asks for the frame rate that shows most, whatever the delay. 7 wide: a step of the ladder moved the
+quantiser by 1 to 2.5, two together by 4 at most, so that the choice settles."""
+PROMPT = QuantiserBand(fine=28.0, coarse=33.5, far=51.0)
+"""Between 15 and 7.5 frames a second, for whoever wants pictures early too. Measured at 200 and 300 kbps on drawn
+scenes and on pictures under a virtual camera (docs/design-notes/auto.md): 7.5 named more where 15 needed 34 and more,
+and less where 15 needed 30."""
 
 
 def choose_base(
@@ -58,16 +86,15 @@ def choose_base(
     return size, fitting[0] if fitting else max(n for n in _STEPS if n <= most_n)
 
 
-def better_decimation(decimation: int, *, mean_qp: float, most_decimation: int) -> int:
-    """One step of the ladder, or two, towards the band of the quantiser (0…51) in which frames are worth their bits.
-
-    The band is 7 wide; a step moved the quantiser by 1 to 2.5, two together by 4 at most: the choice settles.
-    """
+def better_decimation(
+    decimation: int, *, mean_qp: float, most_decimation: int, band: QuantiserBand = SPARING
+) -> int:
+    """One step of the ladder, or two, towards the band in which frames are worth their bits."""
     steps = [n for n in _STEPS if n <= most_decimation]
     at = max((index for index, n in enumerate(steps) if n <= decimation), default=0)
-    if mean_qp > _QP_TOO_COARSE:
-        at += 2 if mean_qp > _QP_FAR_TOO_COARSE else 1
-    elif mean_qp < _QP_FINE:
+    if mean_qp > band.coarse:
+        at += 2 if mean_qp > band.far else 1
+    elif mean_qp < band.fine:
         at -= 1
     return steps[min(len(steps) - 1, max(0, at))]
 

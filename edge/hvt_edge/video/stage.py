@@ -122,6 +122,10 @@ class BaseStage:
             self._keyframe_bytes = line_bytes
             self.keyframes.note_cost(self.transmitter.takes_ns(line_bytes))
 
+    def wants_keyframe(self, index: int) -> bool:
+        """Whether another frame rate is worth a keyframe of its own after this frame; about once a second."""
+        return self._frame_skip.wants_keyframe(index)
+
     def _recover(self, error: Exception, *, now_ns: int) -> None:
         assert self.open_again is not None, "checked"
         assert self.failures is not None, "goes with it"

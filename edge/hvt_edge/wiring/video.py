@@ -24,7 +24,7 @@ from hvt_edge.video.encoders.qualification import allowed, headroom_of, run_fram
 from hvt_edge.video.encoders.registry import X265, open_encoder
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.keyframes import keyframe_interval_s
-from hvt_edge.video.rate_model import choose_base, most_decimation
+from hvt_edge.video.rate_model import PROMPT, SPARING, choose_base, most_decimation
 from hvt_edge.video.reconfigure import ReconfigurationSettings
 from hvt_edge.video.regions import TrackRegions
 
@@ -39,6 +39,8 @@ _SAME_RATE = 0.02
 """What a camera's rate may differ from --fps: 29.97 is 30."""
 _REST_S = 10.0
 """How often ``--fps auto`` may think again."""
+_AUTO_FIRST_S, _AUTO_WINDOW_S = 2.0, 1.0
+"""With ``--profile auto`` it decides so soon, by the last second: by then the first keyframe is worked off."""
 
 
 def base_size(config: EdgeConfig) -> BaseSize:
@@ -96,7 +98,12 @@ def make_frame_skip(config: EdgeConfig, decimation: int) -> FrameSkip:
         return FrameSkip(decimation)
     most = most_decimation(config.nominal_fps, least_fps=_least_fps(config))
     return MeasuredFrameSkip(
-        decimation, most_decimation=most, rest_frames=round(_REST_S * config.nominal_fps)
+        decimation,
+        most_decimation=most,
+        rest_frames=round(_REST_S * config.nominal_fps),
+        window_frames=round((_AUTO_WINDOW_S if config.measures else _REST_S) * config.nominal_fps),
+        band=PROMPT if config.measures else SPARING,
+        first_frames=round(_AUTO_FIRST_S * config.nominal_fps) if config.measures else None,
     )
 
 

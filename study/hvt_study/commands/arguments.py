@@ -28,7 +28,7 @@ from hvt_study.matrix.plan import StudyPlan, parse_regimes
 from hvt_study.matrix.pools import dask_pool, local_pool
 from hvt_study.matrix.tuning import tuned_methods
 from hvt_study.runs.joint_classes import joint_classes
-from hvt_study.runs.methods import METHODS, chosen_methods
+from hvt_study.runs.methods import METHODS, Kind, chosen_methods, chosen_names
 from hvt_study.runs.spec import ModelChoice
 
 __all__ = [
@@ -106,6 +106,12 @@ def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True,
     every = ",".join(METHODS)
     if methods:
         parser.add_argument("--methods", default=every, metavar="NAME,…", help="which to fly")
+        parser.add_argument(
+            "--matched-to",
+            default=argparse.SUPPRESS,
+            metavar="NAME,…",
+            help="methods at whose totals video is coded again (default: each of --methods that is not video)",
+        )
         parser.add_argument(
             "--tune",
             action="append",
@@ -223,9 +229,20 @@ def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequenc
         max_frames=frames,
         detect_every=arguments.detect_every,
         tune=_tune(arguments),
+        matched_to=_matched_to(arguments),
     )
     _check_classes(plan, sequences)
     return plan
+
+
+def _matched_to(arguments: argparse.Namespace) -> tuple[str, ...] | None:
+    if not hasattr(arguments, "matched_to"):
+        return None
+    return chosen_names(
+        arguments.matched_to,
+        [one.name for one in chosen_methods(arguments.methods) if one.kind is not Kind.VIDEO],
+        flag="--matched-to",
+    )
 
 
 def open_pool(arguments: argparse.Namespace) -> tuple[AbstractContextManager[Any], int]:

@@ -57,11 +57,14 @@ def estimate(plan: StudyPlan, sequences: tuple[Sequence, ...], *, frame_s: float
     others = [method for method in plan.methods if method.kind is not Kind.VIDEO]
     hybrids = each * sum(_variants(one, plan) for one in others)
     at_budget = each * sum(_variants(one, plan) * _flights(one) for one in plan.methods)
-    matched = hybrids * sum(_flights(one) for one in video)
+    at_totals = each * sum(
+        _variants(one, plan) for one in others if plan.matched_to is None or one.name in plan.matched_to
+    )
+    matched = at_totals * sum(_flights(one) for one in video)
     labelled = plan.labels == "reference"
     flights = at_budget + matched * (1 + _USUAL_WEIGHTS * _WEIGHT_SHARE) + labelled * len(plan.models)
     detections = (at_budget + matched) / plan.detect_every + labelled * len(plan.models)
-    runs = len(sequences) * (hybrids + each * len(video) + hybrids * len(video))
+    runs = len(sequences) * (hybrids + each * len(video) + at_totals * len(video))
     return Estimate(
         sequences=len(sequences),
         frames=frames,

@@ -41,6 +41,14 @@ class StudyPlan:
     detect_every: int = 5
     tune: Mapping[str, tuple[str, ...]] | None = None
     """Parameters by method."""
+    matched_to: tuple[str, ...] | None = None
+    """Methods at whose totals video is coded again; None: each that is not video itself."""
+
+    def is_matched(self, spec: RunSpec) -> bool:
+        """Whether video is coded again at the total of this run, if it does not fail."""
+        if spec.target is not None or METHODS[spec.method].kind is Kind.VIDEO:
+            return False
+        return self.matched_to is None or spec.method in self.matched_to
 
 
 def parse_regimes(text: str) -> tuple[Regime, ...]:
@@ -74,8 +82,8 @@ def first_runs(plan: StudyPlan) -> Iterator[RunSpec]:
 
 
 def matched_runs(plan: StudyPlan, spec: RunSpec, row: Mapping[str, Any]) -> Iterator[RunSpec]:
-    """Video at the total that this run really spent; nothing for a run that failed, or is video itself."""
-    if METHODS[spec.method].kind is Kind.VIDEO or row["failed"] or not row["total_bps"]:
+    """Video at the total that this run really spent; nothing for a run that failed, or at whose total none is."""
+    if not plan.is_matched(spec) or row["failed"] or not row["total_bps"]:
         return
     target = Target(spec.method, spec.still_codec, int(row["total_bps"]))
     for method in plan.methods:

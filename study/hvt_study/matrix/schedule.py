@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from hvt_study.matrix.plan import StudyPlan, first_runs, matched_runs
 from hvt_study.runs.match_total import grid_target
-from hvt_study.runs.methods import METHODS, Kind
+from hvt_study.runs.methods import Kind
 from hvt_study.runs.spec import RunSpec
 
 __all__ = ["Pool", "RunRow", "in_order", "run_all"]
@@ -113,8 +113,7 @@ class _Agenda:
 
     def _expected(self, spec: RunSpec) -> int:
         """How many runs follow from one, if it does not fail."""
-        is_matched = spec.target is None and METHODS[spec.method].kind is not Kind.VIDEO
-        return self._video if is_matched else 0
+        return self._video if self._plan.is_matched(spec) else 0
 
 
 def _flight(spec: RunSpec) -> tuple[object, ...]:

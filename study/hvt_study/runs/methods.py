@@ -112,12 +112,12 @@ def chosen_methods(names: str) -> tuple[Method, ...]:
     return tuple(METHODS[name] for name in chosen_names(names, METHODS))
 
 
-def chosen_names(text: str, known: Iterable[str]) -> tuple[str, ...]:
-    """Those of ``known`` that ``--methods`` names, in that order; `UserError` for another name."""
+def chosen_names(text: str, known: Iterable[str], *, flag: str = "--methods") -> tuple[str, ...]:
+    """Those of ``known`` that ``flag`` names, in that order; `UserError` for another name."""
     names = {name.casefold(): name for name in known}
     wanted: set[str] = set()
     for word in (part.strip() for part in text.split(",")):
         if word.casefold() not in names:
-            raise UserError(f"--methods {word!r} is not known: choose from {','.join(names.values())}")
+            raise UserError(f"{flag} {word!r} is not known: choose from {','.join(names.values())}")
         wanted.add(names[word.casefold()])
     return tuple(name for name in names.values() if name in wanted)

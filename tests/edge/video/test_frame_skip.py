@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
+from hvt_edge.video.rate_model import PROMPT
 
 
 def coded(frame_skip: FrameSkip, frames, *, keyframes=(), qp=40.0) -> list[int]:
@@ -52,7 +54,7 @@ def test_the_rate_is_kept_whatever_is_missed(decimation, frames):
 
 def measured(decimation: int = 1) -> MeasuredFrameSkip:
     """As at 15 frames a second."""
-    return MeasuredFrameSkip(decimation, most_decimation=7, rest_frames=150)
+    return MeasuredFrameSkip(decimation, most_decimation=7, rest_frames=150, window_frames=150)
 
 
 def test_a_starved_stream_gets_fewer_frames_and_a_rich_one_more():
@@ -106,3 +108,30 @@ def test_the_same_frames_give_the_same_rates():
         )
     assert runs[0] == runs[1]
     assert len(runs[0]) < 900
+
+
+def prompt(decimation: int) -> MeasuredFrameSkip:
+    """As ``--profile auto`` at 15 frames a second."""
+    return MeasuredFrameSkip(
+        decimation, most_decimation=2, rest_frames=150, window_frames=15, band=PROMPT, first_frames=30
+    )
+
+
+@pytest.mark.parametrize(
+    ("decimation", "later_qp", "other"), [(2, 26.0, 1), (1, 37.0, 2), (2, 31.0, 2), (1, 31.0, 1)]
+)
+def test_auto_asks_for_a_keyframe_of_its_own_for_another_rate(decimation, later_qp, other):
+    """An easy scene would be shown at half its rate until somebody asks for a keyframe, a minute on a thin link."""
+    frame_skip = prompt(decimation)
+
+    def qp(index: int) -> float:  # the first frames after a keyframe are coarse
+        return 45.0 if index < 12 else later_qp
+
+    coded(frame_skip, range(29), keyframes=(0,), qp=qp)
+    assert not frame_skip.wants_keyframe(28)
+    coded(frame_skip, range(29, 32), qp=qp)
+    assert frame_skip.wants_keyframe(31) == (other != decimation)
+    assert frame_skip.at_keyframe(32) == other
+    coded(frame_skip, range(32, 120), keyframes=(32,), qp=50.0)
+    assert not frame_skip.wants_keyframe(119), "it rests"
+    assert not measured(2).wants_keyframe(1000), "--fps auto alone waits for one that comes"

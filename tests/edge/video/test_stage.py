@@ -127,7 +127,7 @@ def test_a_keyframe_on_demand_does_not_wait_for_its_turn():
 
 def starving() -> MeasuredFrameSkip:
     """Decides after a second; the clip below never reaches a fine quantiser."""
-    return MeasuredFrameSkip(1, most_decimation=5, rest_frames=15)
+    return MeasuredFrameSkip(1, most_decimation=5, rest_frames=15, window_frames=15)
 
 
 def test_the_rate_changes_with_a_keyframe_and_every_decoder_follows():

@@ -111,9 +111,20 @@ def test_one_line_is_for_plan_and_run(tmp_path, capsys):
         (("--jobs", "0"), "--jobs 0"),
         (("--dask", "tcp://127.0.0.1:1"), "--jobs 3 has no say with --dask"),
         (("--tune", "M6:again=2"), "--tune of M6 has no say: it is not among --methods M0,M5"),
+        (("--matched-to", "M0"), "--matched-to 'M0' is not known: choose from M5"),
     ):
         assert main([*words, *more]) == 2
         assert wanted in capsys.readouterr().err
+
+
+def test_video_is_coded_again_for_those_that_are_named():
+    """A matrix in which one method is compared with video would take five times as long."""
+    plan = plan_of("M0,M5,auto", matched_to=("auto",))
+    matched = {
+        one.method: list(matched_runs(plan, one, {"failed": "", "total_bps": 250_000}))
+        for one in first_runs(plan)
+    }
+    assert {name: len(runs) for name, runs in matched.items()} == {"M0": 0, "M5": 0, "auto": 1}
 
 
 def test_parameters_are_those_of_the_runs(tmp_path):
