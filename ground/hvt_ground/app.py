@@ -29,9 +29,10 @@ from hvt_ground.link.group import GroundGroup
 from hvt_ground.perception.models import stills_calibrated
 from hvt_ground.recordings.folder import RecordingsFolder
 from hvt_ground.recordings.retention import Retention
+from hvt_ground.session.edge_port import EdgePort
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
-from hvt_ground.session.subscribe import EdgePort, GroundLink
+from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.state import GroundState, StateMaker

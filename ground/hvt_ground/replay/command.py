@@ -32,9 +32,9 @@ from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.models import Models
 from hvt_ground.recordings.recorded import read_recordings
 from hvt_ground.replay.from_recording import messages_of
+from hvt_ground.session.edge_port import InfoAnswer
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
-from hvt_ground.session.subscribe import InfoAnswer
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.message_log import read_log
 from hvt_ground.sinks.rerun.live_view import LiveView

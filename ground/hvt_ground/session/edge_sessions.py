@@ -28,10 +28,10 @@ from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.link.other_sessions import PreSessionBuffer
 from hvt_ground.link.packets import BasePacket, Packet
 from hvt_ground.link.reassemble import StreamCounters
+from hvt_ground.session.edge_port import EdgePort, InfoAnswer
 from hvt_ground.session.receiver import Receiver
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
-from hvt_ground.session.subscribe import EdgePort, InfoAnswer
 
 __all__ = ["EdgeSessions", "EdgeThread"]
 

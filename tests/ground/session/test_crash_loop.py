@@ -19,9 +19,10 @@ from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig, check
+from hvt_ground.session.edge_port import EdgePort
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
-from hvt_ground.session.subscribe import EdgePort, GroundLink
+from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs
 from hvt_ground.state import StateMaker
 from hvt_ground.status import status_text, summary

@@ -1,0 +1,209 @@
+"""One edge on the ground's link: what came from it, and a way to ask and tell it something. Knows no frames."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+
+import zenoh
+
+from hvt_common.protocol.channels import Channel, EdgeKeys
+from hvt_common.protocol.messages import (
+    WIRE_VERSION,
+    Command,
+    ControlRequest,
+    Feedback,
+    Info,
+    InfoRequest,
+    UnknownVersionError,
+    WireError,
+    wire_version,
+)
+from hvt_common.transport.doctor.diagnose import control_unanswered
+from hvt_common.transport.flood import FloodWatch
+from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.transport.session import declare_publisher, query_later
+
+__all__ = ["EdgePort", "InfoAnswer"]
+
+_log = logging.getLogger(__name__)
+
+_INBOX_MESSAGES = 1024
+_INBOX_SHARE = 0.75
+"""Of the inbox for one row: reports by the thousand do not keep pictures out."""
+_MOST_PER_S = 2000
+"""Messages of one row from one edge. A camera has 240 pictures a second at the very most."""
+_ANSWER_S = 1.0
+_MOST_ANSWERS, _MOST_ERRORS = 4, 16
+_UNANSWERED = 3
+"""So many questions on control in a row without an answer are no accident."""
+
+InfoAnswer = tuple[Info, int, int]
+"""A session's facts with the times of asking and hearing, ns."""
+
+
+class EdgePort:
+    """One edge as the link knows it: its messages in order of arrival, its presence, and a way to talk to it.
+
+    ``put`` is for Zenoh's callbacks, all else for the edge's thread, which gets their errors by `raise_error`.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        edge: str,
+        *,
+        clock: Callable[[], int],
+        log: Callable[[Received], None] | None = None,
+        still_codecs: tuple[str, ...] = (),
+    ) -> None:
+        self.edge = edge
+        self._still_codecs = still_codecs
+        self._requester_id = secrets.randbits(64)
+        self._clock = clock
+        self._log = log
+        self.inbox = Inbox(capacity=_INBOX_MESSAGES, overflow="newest", share=_INBOX_SHARE)
+        self._flood = FloodWatch(most_per_s=_MOST_PER_S)
+        self.present = threading.Event()
+        """Set while the edge's liveliness token is there."""
+        self.used = threading.Event()
+        """Set once there is more to this edge than messages under its name: a session."""
+        self._unanswered = 0
+        self._version_said = False
+        self._session = session
+        self._keys = EdgeKeys(edge)
+        self._feedback: zenoh.Publisher | None = None
+        self._errors: deque[Exception] = deque(maxlen=_MOST_ERRORS)
+        self._answers: deque[InfoAnswer] = deque(maxlen=_MOST_ANSWERS)
+
+    def query_info(self, session_id: int) -> InfoAnswer | None:
+        """Wait for the facts of that session, of another edge of this id none; None without an answer in time."""
+        found: deque[InfoAnswer] = deque()
+        over = threading.Event()
+        self._query_info(session_id, found, on_end=over.set)
+        over.wait(2 * _ANSWER_S)
+        return found[0] if found else None
+
+    def request_info(self, session_id: int) -> None:
+        """As `query_info`, without waiting: `take_info` has the answer, if one comes."""
+        self._query_info(session_id, self._answers, on_end=lambda: None)
+
+    def take_info(self) -> InfoAnswer | None:
+        """An answer to `request_info`, once."""
+        return self._answers.popleft() if self._answers else None
+
+    def _query_info(self, session_id: int, found: deque[InfoAnswer], *, on_end: Callable[[], None]) -> None:
+        requested_ns = self._clock()
+
+        def note(data: bytes) -> None:
+            answered_ns = self._clock()
+            if self._log is not None:
+                self._log(Received(self._keys.key(Channel.INFO), data, b"", "", answered_ns))
+            try:
+                info = Info.parse(data)
+            except UnknownVersionError as error:
+                self._say_version(error.between(f"edge {self.edge}", "this ground"))
+                return
+            except WireError as error:
+                _log.warning("%s: its answer to info cannot be used: %s", self.edge, error)
+                return
+            if (version := wire_version(data)) != WIRE_VERSION:
+                self._say_version(
+                    f"edge {self.edge} speaks wire version {version}: it is shown, but reads no report and no "
+                    f"request of this ground, which speaks {WIRE_VERSION}: update the edge"
+                )
+            if info.session_id == session_id:
+                found.append((info, requested_ns, answered_ns))
+                on_end()
+
+        request = InfoRequest(requester_id=self._requester_id, still_codecs=self._still_codecs)
+        self._query(Channel.INFO, request.pack(), on_answer=note, on_end=on_end)
+
+    def _say_version(self, sentence: str) -> None:
+        """Once: it is asked again and again."""
+        if not self._version_said:
+            self._version_said = True
+            _log.warning("%s", sentence)
+
+    def fail(self, error: Exception) -> None:
+        """Hand over what went wrong in a callback."""
+        self._errors.append(error)
+
+    def raise_error(self) -> None:
+        """Raise what went wrong in a callback, once."""
+        if self._errors:
+            raise self._errors.popleft()
+
+    def put(self, item: Received, row: Channel) -> None:
+        """Take a message in; what finds no room is dropped."""
+        if self._log is not None:
+            self._log(item)
+        self.inbox.put(item)
+        if self._flood.note(row, now_ns=item.received_ns) is not None:
+            _log.warning(
+                "%s: more than %d messages a second on %s, far more than an edge sends: somebody else publishes "
+                "in its name (docs/security.md has keys against that); what finds no room is dropped",
+                self.edge,
+                _MOST_PER_S,
+                row,
+            )
+
+    def request_keyframe(self) -> None:
+        """Ask for a keyframe; does not wait for the answer, which is the keyframe."""
+        request = ControlRequest(session_id=0, command=Command.KEYFRAME, arguments={})
+        answered = threading.Event()
+        self._query(
+            Channel.CONTROL,
+            request.pack(),
+            on_answer=lambda _answer: answered.set(),
+            on_end=lambda: self._note_control(answered=answered.is_set()),
+        )
+
+    def _query(
+        self, row: Channel, question: bytes, *, on_answer: Callable[[bytes], None], on_end: Callable[[], None]
+    ) -> None:
+        def take(data: bytes) -> None:
+            try:
+                on_answer(data)
+            except Exception as error:  # noqa: BLE001 - for the edge's thread
+                self.fail(error)
+
+        try:
+            query_later(
+                self._session,
+                row,
+                keys=self._keys,
+                question=question,
+                timeout_s=_ANSWER_S,
+                on_answer=take,
+                on_end=on_end,
+            )
+        except zenoh.ZError as error:
+            _log.debug("%s: nothing was asked on %s: %s", self.edge, row, error)
+            on_end()
+
+    def _note_control(self, *, answered: bool) -> None:
+        """Say once that nothing is answered: a question without the right to ask is dropped in silence."""
+        self._unanswered = 0 if answered else self._unanswered + 1
+        if self._unanswered == _UNANSWERED and self.present.is_set():
+            _log.warning("%s", control_unanswered(self.edge))
+
+    def report(self, feedback: Feedback) -> None:
+        """Publish a receiver report."""
+        try:
+            if self._feedback is None:
+                self._feedback = declare_publisher(self._session, Channel.FEEDBACK, keys=self._keys)
+            self._feedback.put(feedback.pack())
+        except zenoh.ZError as error:
+            _log.debug("%s: feedback not sent: %s", self.edge, error)
+
+    def close(self) -> None:
+        """No more comes, and nothing goes out."""
+        self.inbox.close()
+        if self._feedback is not None:
+            with suppress(zenoh.ZError):  # the session may be closed
+                self._feedback.undeclare()  # type: ignore[no-untyped-call]

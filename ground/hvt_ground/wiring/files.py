@@ -1,0 +1,81 @@
+"""Where files go, and whether they can: each session gets names of its own."""
+
+from __future__ import annotations
+
+from itertools import chain
+from itertools import count as count_from
+from pathlib import Path
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.reporting import check_writable
+from hvt_ground.config import GroundConfig
+from hvt_ground.sinks.transport_stream.destination import check_destination
+
+__all__ = ["backlog_path", "check_outputs", "free_path", "make_record_folder", "output_path"]
+
+
+def check_outputs(config: GroundConfig) -> None:
+    """Refuse files that cannot be written, before anything is received; `UserError`."""
+    check_writable(config.summary, name="--summary")
+    check_writable(config.timing, name="--timing")
+    check_writable(config.log, name="--log")
+    check_destination(config.ts)
+    for path, suffix, name in (
+        (config.tracks, ".csv", "--tracks"),
+        (config.mcap, ".mcap", "--mcap"),
+        (config.record, ".rrd", "--record"),
+    ):
+        if path is not None and path.suffix == suffix and not path.is_dir():
+            check_writable(path, name=name)
+    record = config.record
+    if record is not None and record.suffix != ".rrd" and record.exists() and not record.is_dir():
+        raise UserError(f"--record {record} is neither a folder nor named .rrd: give FILE.rrd or a folder")
+
+
+def make_record_folder(config: GroundConfig) -> None:
+    """Comes after all that may be refused: a failed start leaves nothing behind."""
+    record = config.record
+    if record is None or record.suffix == ".rrd":
+        return
+    try:
+        record.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
+        ) from None
+
+
+def output_path(target: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path]) -> Path:
+    """Where a file of one session goes, and note it in ``taken``.
+
+    ``target`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. A named file
+    is written anew, but each session of this process gets one of its own: the first takes the name, others have the
+    edge's id in it. A file that nobody named is never overwritten.
+    """
+    if target is None or target.is_dir() or target.suffix != suffix:
+        first = further = (target or Path()) / f"hvt-{edge}-{stamp}{suffix}"
+    else:
+        first, further = target, target.with_name(f"{target.stem}-{edge}{suffix}")
+    names = [first] if further == first else [first, further]
+    return free_path(names, taken, number=len(names), may_exist=target)
+
+
+def backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
+    """Where the backlog of a session that is over goes, beside the recording of the one that is open.
+
+    Never over another file: its edge has forgotten what is in there.
+    """
+    if target is not None and target.suffix == ".rrd" and not target.is_dir():
+        return free_path([target.with_name(f"{target.stem}-{edge}-backlog.rrd")], taken, number=2)
+    return free_path([(target or Path()) / f"hvt-{edge}-{stamp}-backlog.rrd"], taken, number=2)
+
+
+def free_path(names: list[Path], taken: set[Path], *, number: int, may_exist: Path | None = None) -> Path:
+    """The first that is free of the names and of the last one with a number from ``number`` on; it is taken."""
+    last = names[-1]
+    numbered = (last.with_name(f"{last.stem}-{count}{last.suffix}") for count in count_from(number))
+    path = next(
+        one for one in chain(names, numbered) if one not in taken and (one == may_exist or not one.exists())
+    )
+    taken.add(path)
+    return path

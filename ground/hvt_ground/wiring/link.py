@@ -1,0 +1,20 @@
+"""The ground's end of the link, from the settings."""
+
+from __future__ import annotations
+
+from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_ground.config import GroundConfig
+
+__all__ = ["make_link_settings"]
+
+
+def make_link_settings(config: GroundConfig) -> LinkSettings:
+    """How the ground takes part in Zenoh."""
+    return LinkSettings(
+        role="ground",
+        listen=config.listen,
+        connect=config.connect,
+        zenoh_config=config.zenoh_config,
+        insecure=config.insecure,
+        links=2 if config.links == 2 else 1,
+    )

@@ -1,0 +1,85 @@
+"""What a session sees with: pipeline, tracker and reader of stills, from the settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, cast
+
+from hvt_common.inference.classify import Classifier
+from hvt_common.inference.detect import Detector, detect_every
+from hvt_common.protocol.messages import Info
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_ground.backlog.perception import BacklogPerception
+from hvt_ground.config import DETECTOR, GroundConfig
+from hvt_ground.events import Event
+from hvt_ground.perception.fusion.camera_path import CameraPath
+from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.models import Models, stills_calibrated, track_confidence
+from hvt_ground.perception.pipeline import Pipeline, PipelineParts
+from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader
+from hvt_ground.perception.stills.refine import Refiner
+from hvt_ground.perception.stills.vocabulary import Vocabulary
+
+__all__ = ["make_backlog_perception", "make_pipeline"]
+
+
+def make_pipeline(
+    config: GroundConfig, models: Models, *, info: Info, emit: Callable[[Event], None]
+) -> Pipeline:
+    """The pipeline of one session."""
+    detector, classifier = models.take()
+    reader = _reader(config, detector, classifier, info=info)
+    names, edge_classes = unified_names(detector.class_names, info.class_names)
+    vocabulary = Vocabulary(names, reader.class_names, kinds=config.refine == "replace")
+    path = CameraPath(ahead_frames=max(1, round(info.fps)))
+    parts = PipelineParts(
+        detector=detector,
+        tracker=_tracker(config, info),
+        reader=reader,
+        refiner=Refiner(
+            cast('Literal["replace", "fuse"]', config.refine),
+            fps=info.fps,
+            vocabulary=vocabulary,
+            calibrated=stills_calibrated(config),
+        ),
+        vocabulary=vocabulary,
+        fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path),
+        path=path,
+        # In lockstep the same input gives the same detections, however long they take.
+        turns=None if info.pace == "lockstep" else models.turns,
+    )
+    return Pipeline(
+        parts,
+        view=info.view,
+        fps=info.fps,
+        detect_every=detect_every(config.detect_every, fps=info.fps),
+        emit=emit,
+        wants_base=isinstance(reader, Redetection),
+    )
+
+
+def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info) -> BacklogPerception:
+    """What analyzes the stored video and stills of a session."""
+    return BacklogPerception(
+        info,
+        take_models=models.take,
+        tracker_of=lambda: _tracker(config, info),
+        reader_of=lambda detector, classifier: _reader(config, detector, classifier, info=info),
+        detect_every=detect_every(config.detect_every, fps=info.fps),
+    )
+
+
+def _tracker(config: GroundConfig, info: Info) -> ByteTracker:
+    motion = cast('Literal["off", "flow"]', config.camera_motion)
+    confidence = track_confidence(config)
+    return ByteTracker(TrackerSettings.starting_at(confidence, camera_motion=motion), fps=info.fps)
+
+
+def _reader(
+    config: GroundConfig, detector: Detector, classifier: Classifier | None, *, info: Info
+) -> StillReader:
+    if classifier is not None:
+        return CropReader(classifier, view=info.view)
+    if config.classifier == DETECTOR:
+        return Redetection(detector, view=info.view)
+    return NoReader()

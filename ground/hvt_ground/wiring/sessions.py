@@ -1,0 +1,229 @@
+"""What is made for each session of an edge, and for recordings of former ones, as one tree."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from hvt_common.protocol.messages import Info
+from hvt_common.transport.inbox import Received
+from hvt_common.units import Limit, bitrate_text
+from hvt_ground.backlog.recordings import BacklogRecording
+from hvt_ground.config import GroundConfig
+from hvt_ground.events import Event, Refinement
+from hvt_ground.geolocation.surface import Surface
+from hvt_ground.perception.models import Models
+from hvt_ground.recordings.row import RecordingRow
+from hvt_ground.recordings.session_files import SessionFiles
+from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
+from hvt_ground.sinks.cot.reporter import StillAddress
+from hvt_ground.sinks.message_log import MessageLog
+from hvt_ground.sinks.rerun.live_view import LiveView
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.still_files import StillFiles, picture_of
+from hvt_ground.sinks.timing import SessionTiming, timing_table
+from hvt_ground.sinks.tracks_table import TrackTable
+from hvt_ground.sinks.transport_stream.destination import Addresses, destination
+from hvt_ground.sinks.transport_stream.stream import live_stream, stream_file
+from hvt_ground.sinks.transport_stream.uas import Platform
+from hvt_ground.wiring.extras import make_cot, make_surfaces, mcap_file
+from hvt_ground.wiring.files import backlog_path, free_path, output_path
+from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline
+
+if TYPE_CHECKING:  # who serves no page needs no web server, nor protobuf who writes no MCAP
+    from hvt_ground.web import WebPage
+
+__all__ = ["OpenSink", "SessionFactory"]
+
+S = TypeVar("S", bound=SinkWriter[Any])
+
+OpenSink = Callable[[Info], Callable[[], SinkWriter[Event]]]
+"""What opens a sink for a session."""
+
+_LOCKSTEP_WAIT_S = 10.0
+
+
+class SessionFactory:
+    """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
+
+    All that they write to is of ``outputs``; ``view`` is a viewer and ``page`` the page for browsers, None shows
+    nothing live; ``index`` learns of the recordings, and ``program`` opens a sink of another program.
+    """
+
+    def __init__(
+        self,
+        config: GroundConfig,
+        models: Models,
+        *,
+        clock: Callable[[], int],
+        outputs: Outputs,
+        view: LiveView | None,
+        page: WebPage | None = None,
+        index: Sink[RecordingRow] | None = None,
+        program: OpenSink | None = None,
+    ) -> None:
+        self._config = config
+        self._models = models
+        self._clock = clock
+        self._outputs = outputs
+        self._view = view
+        self._page = page
+        self._index = index
+        self._program = program
+        self.records = program is None or config.record is not None
+        """Whether there are recordings: a program takes their place unless they are asked for."""
+        self._paths: set[Path] = set()
+        """Taken by this process."""
+        self._addresses = Addresses()
+        self._naming = threading.Lock()
+        if config.mcap is not None:
+            mcap_file()  # that it is there
+        self._surface_of = make_surfaces(config.terrain)
+        self._cot = make_cot(config, outputs)
+        self._timing: QueuedSink[str] | None = None
+        if config.timing is not None:
+            names = partial(free_path, [config.timing], number=2, may_exist=config.timing)
+            self._timing = outputs.open("timing table", partial(self._opened, timing_table, names))
+        self.message_log: Callable[[Received], None] | None = None
+        """Takes all that comes from edges."""
+        if config.log is not None:
+            names = partial(free_path, [config.log], number=2, may_exist=config.log)
+            make_log = partial(MessageLog, most_bytes=config.log_size)
+            self.message_log = outputs.open("message log", partial(self._opened, make_log, names)).log
+
+    def open_session(self, info: Info, reports: ReceiverReports) -> GroundSession:
+        """A session with its perception and its sinks."""
+        config, models, edge = self._config, self._models, info.edge
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        settings = self._recorder_settings(info)
+        surface = self._surface_of(edge)
+        # In lockstep the edge waits, so that nothing need be lost to a slow disk.
+        wait_s = _LOCKSTEP_WAIT_S if info.pace == "lockstep" else 0.0
+        sinks: list[Sink[Event]] = []
+        if self.records:
+            names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp)
+            open_recording = partial(self._opened, self._files(settings, split=config.split), names)
+            part = f"recording of {edge}"
+            sinks.append(self._outputs.open(part, open_recording, wait_s=wait_s, for_backlog=True))
+        if self._program is not None:
+            part, opens = f"program of {edge}", self._program(info)
+            sinks.append(self._outputs.open(part, opens, wait_s=wait_s, for_backlog=not self.records))
+        if self._view is not None:
+            open_live = partial(_live_recorder, settings, self._view)
+            sinks.append(self._outputs.open(f"live view of {edge}", open_live))
+        if self._page is not None:
+            sinks.append(self._outputs.open(f"web page of {edge}", self._page.feed(info)))
+        files: dict[str, QueuedSink[Event]] = {}
+        for target, what, suffix, make in (
+            (config.tracks, "tracks table", ".csv", TrackTable),
+            (config.mcap, "MCAP file", ".mcap", lambda path: mcap_file()(path, edge=edge)),
+            (config.stills, "stills", ".csv", StillFiles),
+        ):
+            if target is not None:
+                names = partial(output_path, target, suffix=suffix, edge=edge, stamp=stamp)
+                open_file = partial(self._opened, make, names)
+                files[what] = self._outputs.open(f"{what} of {edge}", open_file, wait_s=wait_s)
+        sinks += files.values()
+        if config.ts is not None:
+            opens_stream = self._transport_stream(info, config.ts, stamp=stamp, surface=surface)
+            sinks.append(self._outputs.open(f"MPEG-TS of {edge}", opens_stream, wait_s=wait_s))
+        if self._cot is not None:
+            address = self._still_address(info, files.get("stills"))
+            open_reporter = partial(self._cot, info, clock=self._clock, still_address=address)
+            sinks.append(self._outputs.open(f"CoT of {edge}", open_reporter))
+        if self._timing is not None:
+            sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
+        return GroundSession(
+            info,
+            sinks=sinks,
+            pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit),
+            clock=self._clock,
+            reports=reports,
+            backlog_perception=make_backlog_perception(config, models, info=info),
+            surface=surface,
+        )
+
+    def open_backlog(self, info: Info) -> BacklogRecording:
+        """The recording of a session that is over; not shown live, for the viewer shows what is now."""
+        settings = replace(self._recorder_settings(info), clocked=False)
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        names = partial(backlog_path, self._config.record, edge=info.edge, stamp=stamp)
+        part = f"backlog recording of {info.edge}"
+        sink = self._outputs.open(part, partial(self._opened, self._files(settings, backlog=True), names))
+        perception = make_backlog_perception(self._config, self._models, info=info)
+        return BacklogRecording(info, sink=sink, perception=perception)
+
+    def _transport_stream(
+        self, info: Info, target: str, *, stamp: str, surface: Surface
+    ) -> Callable[[], SinkWriter[Event]]:
+        platform = Platform(info.edge, f"{info.session_id:016x}", info.view, surface)
+        where = destination(target)
+        if isinstance(where, Path):
+            make = partial(stream_file, platform=platform, fps=info.fps)
+            names = partial(output_path, where, suffix=".ts", edge=info.edge, stamp=stamp)
+            return partial(self._opened, make, names)
+        address = where.of_edge(info.edge)
+        return partial(live_stream, address, platform=platform, fps=info.fps, addresses=self._addresses)
+
+    def _still_address(self, info: Info, files: QueuedSink[Event] | None) -> StillAddress:
+        """Where the picture of a still is: on the page, else in the folder of ``--stills``, else nowhere."""
+        page = self._page
+
+        def address(still: Refinement) -> str:
+            if page is not None:
+                return page.still_address(info, still)
+            if files is None or not files.files or still.still_bgr is None or still.crop_base_px is None:
+                return ""
+            return str(picture_of(still, files.files[-1].resolve()))
+
+        return address
+
+    def _files(
+        self, settings: RecorderSettings, *, split: Limit | None = None, backlog: bool = False
+    ) -> Callable[[Path], SessionFiles]:
+        return lambda path: SessionFiles(
+            replace(settings, path=path), split=split, index=self._index, backlog=backlog
+        )
+
+    def _opened(self, make: Callable[[Path], S], name: Callable[..., Path]) -> S:
+        """A sink with a file; a name that could not be used is free again."""
+        with self._naming:
+            path = name(taken=self._paths)
+        with ExitStack() as undo:
+            undo.callback(self._paths.discard, path)
+            sink = make(path)
+            undo.pop_all()
+        return sink
+
+    def _recorder_settings(self, info: Info) -> RecorderSettings:
+        config = self._config
+        return RecorderSettings(
+            path=None,
+            edge_id=info.edge,
+            session=f"{info.session_id:016x}",
+            base_size=info.base_size,
+            fps=info.fps,
+            budget_bps=info.budget_bps,
+            facts={
+                "method": info.method,
+                "budget": f"{bitrate_text(info.budget_bps)}, {bitrate_text(info.base_bps)} of it for video",
+                "source": f"{info.source_size[0]}x{info.source_size[1]}",
+                "detector": Path(config.detector).name,
+                "classifier": Path(config.classifier or "none").name,
+            },
+            info=info.pack(),
+            clocked=info.pace == "realtime",
+        )
+
+
+def _live_recorder(settings: RecorderSettings, view: LiveView) -> Recorder:
+    view.start_again()
+    return Recorder(replace(settings, live_url=view.url))

@@ -1,0 +1,188 @@
+"""Vectors that are sessions: reports of tracks and poses that build on each other, some damaged, some missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from hvt_common.protocol.messages import (
+    PoseDecoder,
+    PoseEncoder,
+    PoseReport,
+    TrackStep,
+    TrackStepEncoder,
+    WireError,
+)
+from hvt_common.protocol.messages.track_boxes import CodedTrack, read_tracks
+from hvt_common.values import Orientation, Pose, Tracks
+
+__all__ = ["poses", "track_steps"]
+
+_TRACK = (
+    "id",
+    "class",
+    "confidence",
+    "x",
+    "y",
+    "width",
+    "height",
+    "vx",
+    "vy",
+    "scale_x",
+    "scale_y",
+    "missed",
+)
+
+
+def track_steps() -> Iterator[dict[str, Any]]:
+    """Sessions of steps, each with the list that it leaves; damaged ones leave that of the step before."""
+    for name, count, steps in (("three cars", 3, 8), ("a crowd", 60, 6), ("nobody", 0, 3)):
+        yield {"session": name, "steps": list(_session(count, steps))}
+    yield {"session": "damaged steps", "steps": list(_damaged())}
+
+
+def _session(count: int, steps: int) -> Iterator[dict[str, Any]]:
+    encoder = TrackStepEncoder(session_id=2**63 + 5, refresh_ns=1_500_000_000)
+    state: list[CodedTrack] = []
+    frame = -1
+    for number in range(steps):
+        step = encoder.encode(_tracks(count, number), capture_ns=10**18 + number * 333_333_333)
+        state = _read(step, state, before=frame)
+        frame = step.frame_index
+        yield {"hex": step.pack().hex(), "tracks": _rows(state)}
+
+
+def _tracks(count: int, number: int) -> Tracks:
+    """Objects that move, turn up, are missed for some steps, change their class and leave."""
+    ids = [one for one in range(1, count + 1) if (one + number) % 4 or one % 3]
+    ids += [10_000 + number] if count else []
+    rng = np.random.default_rng(number)
+    rows = np.array(ids, np.float64).reshape(-1, 1)
+    corner = np.hstack([rows * 37 % 1200, rows * 23 % 680]) + number * np.hstack([rows % 5 - 2, rows % 3])
+    corner += rng.normal(0, 0.5, corner.shape)
+    side = np.hstack([8 + rows % 40, 6 + rows % 25])
+    return Tracks(
+        frame_index=number * 5,
+        ids=np.array(ids, np.int64),
+        boxes_xyxy_px=np.hstack([corner, corner + side]).astype(np.float32),
+        confidences=(0.3 + rows[:, 0] * 7 % 10 / 15).astype(np.float32),
+        class_ids=((rows[:, 0] + (number > 3)) % 4).astype(np.int32),
+        born_frames=np.zeros(len(ids), np.int64),
+        seen_frames=np.full(len(ids), number * 5, np.int64),
+        started=np.zeros(len(ids), np.bool_),
+    )
+
+
+def _damaged() -> Iterator[dict[str, Any]]:
+    encoder = TrackStepEncoder(session_id=1)
+    first = encoder.encode(_tracks(5, 0), capture_ns=10**18)
+    second = encoder.encode(_tracks(5, 1), capture_ns=10**18 + 333_333_333)
+    state = _read(first, [], before=-1)
+    yield {"hex": first.pack().hex(), "tracks": _rows(state)}
+    for boxes in (second.boxes[:-6], second.boxes + b"\0\0", bytes(40), b"\xff" * 40):
+        step = replace(second, boxes=boxes)
+        try:
+            _read(step, state, before=first.frame_index)
+        except WireError:
+            yield {"hex": step.pack().hex(), "damaged": True}
+    yield {"hex": replace(second, frame_index=0).pack().hex(), "damaged": True}
+    yield {"hex": replace(second, sequence=9, reference=8).pack().hex(), "skipped": True}
+    yield {"hex": first.pack().hex(), "skipped": True}
+    yield {"hex": second.pack().hex(), "tracks": _rows(_read(second, state, before=first.frame_index))}
+
+
+def _read(step: TrackStep, state: list[CodedTrack], *, before: int) -> list[CodedTrack]:
+    reference = None if step.reference < 0 else state
+    return read_tracks(step.boxes, reference=reference, frames=step.frame_index - before)
+
+
+def _rows(state: list[CodedTrack]) -> list[dict[str, int]]:
+    return [
+        dict(
+            zip(
+                _TRACK,
+                (
+                    *(one.track_id, one.class_id, one.confidence, one.x, one.y, one.width, one.height),
+                    *(one.velocity_x, one.velocity_y, one.scale_x, one.scale_y, one.missed),
+                ),
+                strict=True,
+            )
+        )
+        for one in state
+    ]
+
+
+def poses() -> Iterator[dict[str, Any]]:
+    """Sessions of reports; one that builds on a report that never came is skipped, a damaged one changes nothing."""
+    camera = [Orientation(359.5 + second, -60.0 - second, 2.0 * second) for second in range(6)]
+    flight = [
+        Pose(
+            (1_000 + second * 1_037) * 1_000_000,
+            48.137 + 3e-5 * second,
+            179.99997 + 1e-5 * second - (360 if second > 2 else 0),
+            height_m=120.0 + second,
+            altitude_m=640.5,
+            camera=camera[second],
+            platform=Orientation(350.0 + 4 * second, -3.0, 1.0),
+            hfov_deg=65.0,
+            position_error_m=3.0 if second < 4 else 8.0,
+        )
+        for second in range(6)
+    ]
+    place = [Pose((5_000 + 1_000 * second) * 1_000_000, -33.8568, 151.2153) for second in range(3)]
+    encoder = PoseEncoder(session_id=9)
+    reports = [encoder.encode(one)(7) for one in flight]
+    yield {"session": "across the antimeridian and north", "reports": list(_read_poses(reports))}
+    encoder = PoseEncoder(session_id=9)
+    places = [encoder.encode(one)(7) for one in place]
+    yield {"session": "a place and no more", "reports": list(_read_poses(places))}
+    encoder = PoseEncoder(session_id=9, refresh_ns=2_500_000_000)
+    reports = [encoder.encode(one)(7) for one in flight]
+    damaged = [
+        replace(reports[1], coded=reports[1].coded[:-2]),
+        replace(reports[1], coded=reports[1].coded + b"\0"),
+        replace(reports[1], coded=b""),
+    ]
+    holes = [reports[1], reports[0], *damaged, reports[1], reports[1], *reports[3:]]
+    yield {"session": "holes, damage, and one that stands by itself", "reports": list(_read_poses(holes))}
+
+
+def _read_poses(reports: list[PoseReport]) -> Iterator[dict[str, Any]]:
+    decoder = PoseDecoder()
+    for report in reports:
+        found: dict[str, Any] = {"hex": report.pack().hex()}
+        try:
+            pose = decoder.decode(report)
+        except WireError:
+            yield found | {"damaged": True}
+            continue
+        yield found | ({"skipped": True} if pose is None else {"pose": _pose_numbers(pose)})
+
+
+def _pose_numbers(pose: Pose) -> dict[str, Any]:
+    """As they are coded; what is not there is null."""
+
+    def tenths(*values: float) -> list[int]:
+        return [round(10 * one) for one in values]
+
+    angles = [
+        None if one is None else tenths(one.yaw_deg, one.pitch_deg, one.roll_deg)
+        for one in (pose.camera, pose.platform)
+    ]
+    parts = [
+        None if one is None else tenths(one)[0] for one in (pose.height_m, pose.altitude_m, pose.hfov_deg)
+    ]
+    errors = (pose.position_error_m, pose.height_error_m, pose.angle_error_deg)
+    return {
+        "time_ms": pose.capture_ns // 1_000_000,
+        "place": [round(1e7 * pose.latitude_deg), round(1e7 * pose.longitude_deg)],
+        "height": parts[0],
+        "altitude": parts[1],
+        "camera": angles[0],
+        "platform": angles[1],
+        "field": parts[2],
+        "errors": [round(2 * np.log2(10 * one)) for one in errors],
+    }
