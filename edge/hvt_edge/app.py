@@ -41,6 +41,7 @@ from hvt_edge.wiring import (
     check_store,
     qualify_encoder,
     track_confidence,
+    tried_decimation,
 )
 from hvt_edge.world import World
 
@@ -103,6 +104,7 @@ class Edge:
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
             headroom = qualify_encoder(config, source, clock=world.clock, stop=self._stop)
+            decimation = tried_decimation(config, source, clock=world.clock, stop=self._stop)
             background = (lambda call: call()) if self._lockstep else with_lower_priority
             opened = background(lambda: world.open_detector(config))
             background(lambda: world.warm_up(config, opened, source))
@@ -131,6 +133,7 @@ class Edge:
                 clock=world.clock,
                 loop_clock=self._loop_clock,
                 wait_until=self._wait_until,
+                decimation=decimation,
                 headroom=headroom,
             )
             heartbeat = Heartbeat(self._state_maker(stages, link, source.view), clock=world.clock)

@@ -51,9 +51,8 @@ class FrameSkip:
 class MeasuredFrameSkip(FrameSkip):
     """``--fps auto``: decided anew at keyframes, from the mean quantiser of the newest ``window_frames``.
 
-    With ``first_frames`` another rate is worth a keyframe of its own, at first after so many source frames, then
-    after ``rest_frames`` each. All of it depends on the coded frames alone, so that in lockstep the same input gives
-    the same bytes.
+    With ``own_keyframes`` another rate is worth one. All of it depends on the coded frames alone, so that in lockstep
+    the same input gives the same bytes.
     """
 
     def __init__(
@@ -64,15 +63,14 @@ class MeasuredFrameSkip(FrameSkip):
         rest_frames: int,
         window_frames: int,
         band: QuantiserBand = SPARING,
-        first_frames: int | None = None,
+        own_keyframes: bool = False,
     ) -> None:
         super().__init__(decimation)
         self._most_decimation = most_decimation
         self._rest_frames = rest_frames
         self._window_frames = window_frames
         self._band = band
-        self._first_frames = first_frames
-        self._wait_frames = rest_frames if first_frames is None else first_frames
+        self._own_keyframes = own_keyframes
         self._decided_index: int | None = None
         self._quantisers: deque[tuple[int, float]] = deque()
         """(index, mean quantiser) of the newest frames."""
@@ -92,19 +90,17 @@ class MeasuredFrameSkip(FrameSkip):
         if not self._may_decide(index):
             return self.decimation
         self.decimation = self._better()
-        self._decided_index, self._wait_frames = index, self._rest_frames
+        self._decided_index = index
         self._quantisers.clear()
         return self.decimation
 
     def wants_keyframe(self, index: int) -> bool:
         """See `FrameSkip`."""
-        return (
-            self._first_frames is not None and self._may_decide(index) and self._better() != self.decimation
-        )
+        return self._own_keyframes and self._may_decide(index) and self._better() != self.decimation
 
     def _may_decide(self, index: int) -> bool:
         decided = self._decided_index
-        return decided is not None and index - decided >= self._wait_frames and bool(self._quantisers)
+        return decided is not None and index - decided >= self._rest_frames and bool(self._quantisers)
 
     def _better(self) -> int:
         return better_decimation(

@@ -12,6 +12,7 @@ from hvt_edge.wiring.video import (
     first_decimation,
     make_encoder,
     qualify_encoder,
+    tried_decimation,
 )
 
 __all__ = [
@@ -30,5 +31,6 @@ __all__ = [
     "qualify_encoder",
     "store_folder",
     "track_confidence",
+    "tried_decimation",
     "warm_up_for",
 ]

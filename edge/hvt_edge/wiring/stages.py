@@ -50,7 +50,6 @@ from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.stills import make_chooser, make_on_demand, make_still_maker
 from hvt_edge.wiring.storing import make_backlog
 from hvt_edge.wiring.video import (
-    first_decimation,
     make_encoder,
     make_frame_skip,
     make_keyframes,
@@ -92,16 +91,17 @@ def build_stages(
     clock: Callable[[], int],
     loop_clock: LoopClock,
     wait_until: Callable[[int], None],
+    decimation: int,
     headroom: float = 1.0,
 ) -> Stages:
     """Build every part once, each with all that it needs; files and threads end with ``stack``.
 
+    Each ``decimation``-th source frame is coded at the start (`tried_decimation`).
     ``headroom`` is what of its rate the encoder is asked for (`qualify_encoder`).
     Raises `UserError` where the encoder does not take the settings, or a file cannot be written.
     """
     view, class_names = source.view, detector.class_names
     lockstep = config.pace == "lockstep"
-    decimation = first_decimation(config, view.base_size)
     operating = Operating(
         budget_bps=config.budget_bps,
         video_share=config.fixed_share,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
 from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, without_password
-from hvt_edge.video.encoder_settings import encoder_settings, payload_bps
+from hvt_edge.video.encoder_settings import encoder_settings, least_base_bps, payload_bps
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
 from hvt_edge.video.encoders.qualification import allowed, headroom_of, run_frames
@@ -27,6 +28,7 @@ from hvt_edge.video.keyframes import keyframe_interval_s
 from hvt_edge.video.rate_model import PROMPT, SPARING, choose_base, most_decimation
 from hvt_edge.video.reconfigure import ReconfigurationSettings
 from hvt_edge.video.regions import TrackRegions
+from hvt_edge.video.trial import TRIAL_FRAMES, trial_quantiser
 
 _log = logging.getLogger(__name__)
 
@@ -39,12 +41,14 @@ _SAME_RATE = 0.02
 """What a camera's rate may differ from --fps: 29.97 is 30."""
 _REST_S = 10.0
 """How often ``--fps auto`` may think again."""
-_AUTO_FIRST_S, _AUTO_WINDOW_S = 2.0, 1.0
-"""With ``--profile auto`` it decides so soon, by the last second: by then the first keyframe is worked off."""
+_AUTO_WINDOW_S = 1.0
+"""With ``--profile auto`` it goes by the last second."""
+_TRIAL_FINE = 33.5
+"""Of `trial_quantiser` at the lowest rate: below it all frames are coded. Measured as `PROMPT` was."""
 
 
 def base_size(config: EdgeConfig) -> BaseSize:
-    """The base stream's size, or how it follows from the source's."""
+    """The base stream's size, or how it keeps_up from the source's."""
     if config.fixed_size is not None:
         return config.fixed_size
     if config.passes_through:
@@ -66,6 +70,26 @@ def default_size(source_size: tuple[int, int], *, fit: Fit) -> tuple[int, int]:
 def first_decimation(config: EdgeConfig, size: tuple[int, int]) -> int:
     """Each n-th source frame is coded at the start."""
     return _chosen(config, size, size=size)[1]
+
+
+def tried_decimation(
+    config: EdgeConfig, source: Source, *, clock: Callable[[], int], stop: threading.Event
+) -> int:
+    """As `first_decimation`; with ``--profile auto`` the first second of the scene decides, which is coded for it."""
+    size = source.view.base_size
+    decimation = first_decimation(config, size)
+    slowest = most_decimation(config.nominal_fps, least_fps=_AUTO_LEAST_FPS)
+    keeps_up = config.base_bps >= least_base_bps(size, config.nominal_fps, edge_id=config.edge_id)
+    if not (config.measures and config.auto_fps and keeps_up) or config.encoder != X265:
+        return decimation
+    rates = {"total_bps": config.budget_bps, "base_bps": config.base_bps}
+    quantiser = trial_quantiser(
+        make_encoder(config, size=size, decimation=slowest, **rates),
+        _scene(source, decimation=slowest, count=TRIAL_FRAMES, clock=clock, stop=stop),
+    )
+    if math.isnan(quantiser):
+        return decimation
+    return 1 if quantiser < _TRIAL_FINE else slowest
 
 
 def _chosen(
@@ -103,7 +127,7 @@ def make_frame_skip(config: EdgeConfig, decimation: int) -> FrameSkip:
         rest_frames=round(_REST_S * config.nominal_fps),
         window_frames=round((_AUTO_WINDOW_S if config.measures else _REST_S) * config.nominal_fps),
         band=PROMPT if config.measures else SPARING,
-        first_frames=round(_AUTO_FIRST_S * config.nominal_fps) if config.measures else None,
+        own_keyframes=config.measures,
     )
 
 
@@ -165,20 +189,10 @@ def qualify_encoder(
     )
     count = run_frames(fps, limit)
 
-    def scene() -> Iterator[Frame]:
-        silent = coded = 0
-        for frame in source.steps(start_ns=clock()):
-            silent += frame is None
-            if frame is not None and frame.index % decimation == 0:
-                coded += 1
-                yield frame
-            if stop.is_set() or coded == count or silent > _MOST_SILENT_S:
-                return
-
     headroom = headroom_of(
         config.encoder,
         open_at=lambda share: make_encoder(config, size=size, decimation=decimation, headroom=share, **rates),
-        scene=scene,
+        scene=lambda: _scene(source, decimation=decimation, count=count, clock=clock, stop=stop),
         frames=count,
         limit=limit,
         edge_id=config.edge_id,
@@ -188,6 +202,20 @@ def qualify_encoder(
             "encoder %s overshoots: it is asked for %.0f %% of its rate", config.encoder, 100 * headroom
         )
     return headroom
+
+
+def _scene(
+    source: Source, *, decimation: int, count: int, clock: Callable[[], int], stop: threading.Event
+) -> Iterator[Frame]:
+    """The first ``count`` of each n-th frame, to try an encoder on. A clip begins anew after it."""
+    silent = coded = 0
+    for frame in source.steps(start_ns=clock()):
+        silent += frame is None
+        if frame is not None and frame.index % decimation == 0:
+            coded += 1
+            yield frame
+        if stop.is_set() or coded == count or silent > _MOST_SILENT_S:
+            return
 
 
 def as_the_camera_is(config: EdgeConfig, source: Source) -> EdgeConfig:

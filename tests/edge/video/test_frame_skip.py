@@ -113,7 +113,7 @@ def test_the_same_frames_give_the_same_rates():
 def prompt(decimation: int) -> MeasuredFrameSkip:
     """As ``--profile auto`` at 15 frames a second."""
     return MeasuredFrameSkip(
-        decimation, most_decimation=2, rest_frames=150, window_frames=15, band=PROMPT, first_frames=30
+        decimation, most_decimation=2, rest_frames=150, window_frames=15, band=PROMPT, own_keyframes=True
     )
 
 
@@ -124,14 +124,14 @@ def test_auto_asks_for_a_keyframe_of_its_own_for_another_rate(decimation, later_
     """An easy scene would be shown at half its rate until somebody asks for a keyframe, a minute on a thin link."""
     frame_skip = prompt(decimation)
 
-    def qp(index: int) -> float:  # the first frames after a keyframe are coarse
-        return 45.0 if index < 12 else later_qp
+    def qp(index: int) -> float:  # what is long ago does not count
+        return 45.0 if index < 100 else later_qp
 
-    coded(frame_skip, range(29), keyframes=(0,), qp=qp)
-    assert not frame_skip.wants_keyframe(28)
-    coded(frame_skip, range(29, 32), qp=qp)
-    assert frame_skip.wants_keyframe(31) == (other != decimation)
-    assert frame_skip.at_keyframe(32) == other
-    coded(frame_skip, range(32, 120), keyframes=(32,), qp=50.0)
-    assert not frame_skip.wants_keyframe(119), "it rests"
+    coded(frame_skip, range(149), keyframes=(0,), qp=qp)
+    assert not frame_skip.wants_keyframe(148)
+    coded(frame_skip, range(149, 152), qp=qp)
+    assert frame_skip.wants_keyframe(151) == (other != decimation)
+    assert frame_skip.at_keyframe(152) == other
+    coded(frame_skip, range(152, 290), keyframes=(152,), qp=50.0)
+    assert not frame_skip.wants_keyframe(289), "it rests"
     assert not measured(2).wants_keyframe(1000), "--fps auto alone waits for one that comes"
