@@ -48,7 +48,7 @@ _TRIAL_FINE = 33.5
 
 
 def base_size(config: EdgeConfig) -> BaseSize:
-    """The base stream's size, or how it keeps_up from the source's."""
+    """The base stream's size, or how it feasible from the source's."""
     if config.fixed_size is not None:
         return config.fixed_size
     if config.passes_through:
@@ -79,8 +79,8 @@ def tried_decimation(
     size = source.view.base_size
     decimation = first_decimation(config, size)
     slowest = most_decimation(config.nominal_fps, least_fps=_AUTO_LEAST_FPS)
-    keeps_up = config.base_bps >= least_base_bps(size, config.nominal_fps, edge_id=config.edge_id)
-    if not (config.measures and config.auto_fps and keeps_up) or config.encoder != X265:
+    feasible = config.base_bps >= least_base_bps(size, config.nominal_fps, edge_id=config.edge_id)
+    if not (config.measures and config.auto_fps and feasible) or config.encoder != X265:
         return decimation
     rates = {"total_bps": config.budget_bps, "base_bps": config.base_bps}
     quantiser = trial_quantiser(
