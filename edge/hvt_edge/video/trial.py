@@ -11,7 +11,7 @@ from hvt_edge.video.encoders.contract import Encoder
 __all__ = ["TRIAL_FRAMES", "trial_quantiser"]
 
 TRIAL_FRAMES = 7
-_SETTLED = 3
+_LAST = 3
 """The last so many count: those before still pay for the keyframe."""
 
 
@@ -21,4 +21,4 @@ def trial_quantiser(encoder: Encoder, scene: Iterable[Frame]) -> float:
     for number, frame in enumerate(scene):
         encoder.encode(frame, keyframe=number == 0)
         quantisers.append(encoder.mean_qp)
-    return sum(quantisers[-_SETTLED:]) / _SETTLED if len(quantisers) == TRIAL_FRAMES else math.nan
+    return sum(quantisers[-_LAST:]) / _LAST if len(quantisers) == TRIAL_FRAMES else math.nan

@@ -245,6 +245,9 @@ class _SteppedSource(FrameSource):
         self._flight = flight
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
+        if self._flight.ground is None:  # the edge tries the scene before it begins
+            yield from super().frames(start_ns=start_ns)
+            return
         for frame in super().frames(start_ns=start_ns):
             began_s = self._flight.before_frame(frame)
             yield frame
@@ -300,7 +303,8 @@ class Flight:
         )
         self._next_frame = 0
         self._cpu_s = 0.0
-        self.ground: Any
+        self.ground: Any = None
+        """From the moment at which the edge answers grounds."""
 
     def run(self) -> None:
         """Fly to the end of the clip.
