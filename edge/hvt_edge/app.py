@@ -204,8 +204,8 @@ class Edge:
                     self._reached |= link.has_subscriber(Channel.BASE)
                     if heartbeat.state is not None:
                         line.show(status_text(heartbeat.state, paused_s=self._counts.paused_ns / SECOND_NS))
-                    another_rate = stages.base.wants_keyframe(self._counts.last_index)
-                    if another_rate or stages.reconfiguration.wants_keyframe(now_ns):
+                    more_frames = stages.base.wants_keyframe(self._counts.last_index)
+                    if more_frames or stages.reconfiguration.wants_keyframe(now_ns):
                         stages.keyframes.require(now_ns)
                 heartbeat.turn("running")  # in lockstep a second of the stream may take longer
         if not source.live:

@@ -43,7 +43,7 @@ class FrameSkip:
         return self.decimation
 
     def wants_keyframe(self, index: int) -> bool:
-        """Whether another rate is worth a keyframe of its own after this frame."""
+        """Whether more frames are worth a keyframe of their own after this one."""
         del index
         return False
 
@@ -51,8 +51,8 @@ class FrameSkip:
 class MeasuredFrameSkip(FrameSkip):
     """``--fps auto``: decided anew at keyframes, from the mean quantiser of the newest ``window_frames``.
 
-    With ``own_keyframes`` another rate is worth one. All of it depends on the coded frames alone, so that in lockstep
-    the same input gives the same bytes.
+    With ``own_keyframes`` more frames are worth one; fewer wait for a keyframe that comes anyway. All of it depends
+    on the coded frames alone, so that in lockstep the same input gives the same bytes.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class MeasuredFrameSkip(FrameSkip):
 
     def wants_keyframe(self, index: int) -> bool:
         """See `FrameSkip`."""
-        return self._own_keyframes and self._may_decide(index) and self._better() != self.decimation
+        return self._own_keyframes and self._may_decide(index) and self._better() < self.decimation
 
     def _may_decide(self, index: int) -> bool:
         decided = self._decided_index

@@ -123,7 +123,7 @@ class BaseStage:
             self.keyframes.note_cost(self.transmitter.takes_ns(line_bytes))
 
     def wants_keyframe(self, index: int) -> bool:
-        """Whether another frame rate is worth a keyframe of its own after this frame; about once a second."""
+        """Whether more frames are worth a keyframe of their own after this one; about once a second."""
         return self._frame_skip.wants_keyframe(index)
 
     def _recover(self, error: Exception, *, now_ns: int) -> None:

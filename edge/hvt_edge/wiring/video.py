@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -75,21 +74,20 @@ def first_decimation(config: EdgeConfig, size: tuple[int, int]) -> int:
 def tried_decimation(
     config: EdgeConfig, source: Source, *, clock: Callable[[], int], stop: threading.Event
 ) -> int:
-    """As `first_decimation`; with ``--profile auto`` the first second of the scene decides, which is coded for it."""
+    """As `first_decimation`; ``--profile auto`` codes the first second of the scene to see whether all frames fit."""
     size = source.view.base_size
     decimation = first_decimation(config, size)
     slowest = most_decimation(config.nominal_fps, least_fps=_AUTO_LEAST_FPS)
     feasible = config.base_bps >= least_base_bps(size, config.nominal_fps, edge_id=config.edge_id)
-    if not (config.measures and config.auto_fps and feasible) or config.encoder != X265:
+    tries = config.measures and config.auto_fps and decimation > 1
+    if not (tries and feasible) or config.encoder != X265:
         return decimation
     rates = {"total_bps": config.budget_bps, "base_bps": config.base_bps}
     quantiser = trial_quantiser(
         make_encoder(config, size=size, decimation=slowest, **rates),
         _scene(source, decimation=slowest, count=TRIAL_FRAMES, clock=clock, stop=stop),
     )
-    if math.isnan(quantiser):
-        return decimation
-    return 1 if quantiser < _TRIAL_FINE else slowest
+    return 1 if quantiser < _TRIAL_FINE else decimation
 
 
 def _chosen(

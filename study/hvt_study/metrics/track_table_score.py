@@ -18,6 +18,8 @@ from hvt_study.metrics.frames import NO_ID, FrameLabels, FrameView, LabelledFram
 
 __all__ = ["Labelled", "Score", "read_tracks", "read_truth", "score"]
 
+_MOST_HELD, _LEAST_GAPS = 15, 10
+"""Frames; and so many distances have to be known before any counts as usual."""
 SMALL_SHARE = 0.0012
 """Objects of less than this share of the frame count as small: about 33x33 pixels of 1280x720."""
 _LEAST_VISIBLE = 0.5
@@ -56,7 +58,10 @@ class Score:
 
 
 def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
-    """Read a tracks table of the ground by frame (from 1); ``column`` is ``class`` or ``base_class``."""
+    """Read a tracks table of the ground by frame (from 1); ``column`` is ``class`` or ``base_class``.
+
+    Where the edge codes each n-th frame, those between show the list of the one before.
+    """
     rows: dict[int, list[tuple[list[float], str]]] = defaultdict(list)
     try:
         with path.open(encoding="utf-8", newline="") as file:
@@ -67,7 +72,7 @@ def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
         raise UserError(
             f"{path} is not a table of tracks as hvt-ground --tracks writes it ({error})"
         ) from None
-    return {frame: _labelled(found) for frame, found in rows.items()}
+    return _held({frame: _labelled(found) for frame, found in rows.items()})
 
 
 def read_truth(path: Path, *, class_names: Sequence[str]) -> dict[int, Labelled]:
@@ -113,6 +118,19 @@ def score(
         named_f1=one.named_f1,
         false_per_frame=_or_zero(one.false_per_frame),
     )
+
+
+def _held(tracks: dict[int, Labelled]) -> dict[int, Labelled]:
+    """With lists for frames between two of the table, where these are as far apart as nine in ten of them are."""
+    frames = sorted(tracks)
+    gaps = np.diff(frames)
+    usual = min(_MOST_HELD, int(np.quantile(gaps, 0.9, method="lower"))) if len(gaps) >= _LEAST_GAPS else 1
+    between = {
+        frame + step: tracks[frame]
+        for frame, gap in zip(frames, [*gaps, usual], strict=True)
+        for step in range(1, min(int(gap), usual))
+    }
+    return tracks | between
 
 
 def _frame(wanted: Labelled, found: Labelled) -> LabelledFrame:

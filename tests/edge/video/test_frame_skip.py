@@ -130,7 +130,7 @@ def test_auto_asks_for_a_keyframe_of_its_own_for_another_rate(decimation, later_
     coded(frame_skip, range(149), keyframes=(0,), qp=qp)
     assert not frame_skip.wants_keyframe(148)
     coded(frame_skip, range(149, 152), qp=qp)
-    assert frame_skip.wants_keyframe(151) == (other != decimation)
+    assert frame_skip.wants_keyframe(151) == (other < decimation), "fewer frames wait for one that comes"
     assert frame_skip.at_keyframe(152) == other
     coded(frame_skip, range(152, 290), keyframes=(152,), qp=50.0)
     assert not frame_skip.wants_keyframe(289), "it rests"

@@ -128,3 +128,20 @@ def test_wrong_files_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixt
         read_truth(junk, class_names=("car",))
     assert main(["score", str(junk), "--truth", str(junk)]) == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("frames", "shown"),
+    [
+        ([*range(1, 24, 2)], {*range(1, 25)}),
+        ([1, 2, 3, 6, 7, 8, 9, 10, 11, 12, 13, 14], {1, 2, 3, 6, 7, 8, 9, 10, 11, 12, 13, 14}),
+        ([1, 5], {1, 5}),
+    ],
+)
+def test_between_two_coded_frames_the_list_stands(tmp_path, frames, shown):
+    """An edge that codes each second frame would be said to know nothing half of the time."""
+    table = tmp_path / "tracks.csv"
+    table.write_text("frame,x,y,w,h,class\n" + "".join(f"{one},{one},2,3,4,car\n" for one in frames))
+    tracks = read_tracks(table)
+    assert set(tracks) == shown
+    assert all(tracks[one].boxes_xyxy_px[0, 0] == max(f for f in frames if f <= one) for one in shown)
