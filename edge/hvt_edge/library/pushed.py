@@ -26,6 +26,8 @@ from hvt_edge.world import World
 __all__ = ["PushedEdge", "open_edge"]
 
 _NAME = "pushed frames"
+_LEAVE_S = 30.0
+"""Python aborts where it ends while a thread is in a native library (`hvt_common.runtime.process.leave`)."""
 _PATIENCE_S = 5.0
 """A program that pushes nothing for so long is said to be away, as a camera is."""
 
@@ -195,6 +197,7 @@ class _PushedWorld(World):
     def __init__(self, grabber: _PushGrabber) -> None:
         super().__init__()
         self._grabber = grabber
+        self.leave_s = _LEAVE_S
 
     def open_source(self, config: EdgeConfig) -> Source:
         return _PushedSource(self._grabber, config, self)
