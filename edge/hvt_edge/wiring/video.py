@@ -47,7 +47,7 @@ _TRIAL_FINE = 33.5
 
 
 def base_size(config: EdgeConfig) -> BaseSize:
-    """The base stream's size, or how it feasible from the source's."""
+    """The base stream's size, or how it follows from the source's."""
     if config.fixed_size is not None:
         return config.fixed_size
     if config.passes_through:
