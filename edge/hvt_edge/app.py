@@ -248,7 +248,6 @@ class Edge:
             stop=self._stop,
             failures=self._failures,
             before_frame=stages.link_control.before_frame,
-            leave_s=self._world.leave_s,
         )
 
     def _wait_until(self, at_ns: int) -> None:

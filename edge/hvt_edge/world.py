@@ -35,8 +35,6 @@ class World:
         """Which parts have failed in flight."""
         self.inbox = FeedbackInbox()
         """What grounds have answered."""
-        self.leave_s = 1.0
-        """How long the end waits for a detection that is in hand; a process that ends by `leave` need not."""
         self.executor: Executor | None = None
         """Runs perception in lockstep; None: a thread of its own."""
 

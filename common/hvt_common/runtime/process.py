@@ -8,17 +8,20 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
+import functools
 import os
 import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import NoReturn, TypeVar
 
 __all__ = [
     "STOP_SIGNALS",
+    "join_threads_at_exit",
     "leave",
     "limit_malloc_arenas",
     "lower_priority",
@@ -31,6 +34,9 @@ T = TypeVar("T")
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _NICENESS = 10
+_ZENOH_CALLBACK = "(pyo3-closure)"
+"""Zenoh's Python package runs each callback in a thread of such a name, and joins none."""
+_JOIN_WITHIN_S = 30.0
 
 # Parameters of mallopt, glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
@@ -81,6 +87,22 @@ def leave(code: int) -> NoReturn:
         with contextlib.suppress(OSError):  # whoever read it is gone
             stream.flush()
     os._exit(code)
+
+
+@functools.cache
+def join_threads_at_exit() -> None:
+    """Have the program wait, before Python finalizes, for the threads that this project and Zenoh have started.
+
+    For a program that is not ours and cannot end by `leave`. Those of a session end soon after it is closed.
+    """
+    atexit.register(_join_threads)
+
+
+def _join_threads() -> None:
+    until_s = time.monotonic() + _JOIN_WITHIN_S
+    for thread in threading.enumerate():
+        if thread.name.startswith(("hvt-", "zenoh-")) or thread.name.endswith(_ZENOH_CALLBACK):
+            thread.join(max(0.0, until_s - time.monotonic()))
 
 
 def lower_priority() -> None:

@@ -6,6 +6,7 @@ taken replaces it.
 
 from __future__ import annotations
 
+import atexit
 import operator
 import threading
 import time
@@ -15,6 +16,7 @@ import numpy as np
 
 from hvt_common.config import load, settings_words
 from hvt_common.errors import UserError
+from hvt_common.runtime.process import join_threads_at_exit
 from hvt_common.values import Fit, Image
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
@@ -26,10 +28,10 @@ from hvt_edge.world import World
 __all__ = ["PushedEdge", "open_edge"]
 
 _NAME = "pushed frames"
-_LEAVE_S = 30.0
-"""Python aborts where it ends while a thread is in a native library (`hvt_common.runtime.process.leave`)."""
 _PATIENCE_S = 5.0
 """A program that pushes nothing for so long is said to be away, as a camera is."""
+
+join_threads_at_exit()
 
 
 def open_edge(**settings: object) -> PushedEdge:
@@ -62,6 +64,7 @@ class PushedEdge:
         self._edge = Edge(config, stop=self._stop, world=_PushedWorld(self._grabber))
         self._thread = threading.Thread(target=self._run, name="hvt-edge", daemon=True)
         self._thread.start()
+        atexit.register(self._stop_and_join)
 
     def push(self, frame_bgr: Image, *, capture_ns: int | None = None) -> None:
         """Hand over a frame: (height, width, 3) uint8 BGR, copied. The first one says how large the source is.
@@ -85,9 +88,8 @@ class PushedEdge:
 
     def close(self) -> None:
         """Send what is left, say goodbye, and wait for the end; raises what ended the edge before."""
-        self._stop.set()
-        self._grabber.cancel_opening()
-        self._thread.join()
+        self._stop_and_join()
+        atexit.unregister(self._stop_and_join)
         if self._error is not None:
             raise self._error
 
@@ -100,6 +102,11 @@ class PushedEdge:
         except Exception:
             if kind is None:  # else what the program raised goes first
                 raise
+
+    def _stop_and_join(self) -> None:
+        self._stop.set()
+        self._grabber.cancel_opening()
+        self._thread.join()
 
     def _run(self) -> None:
         try:
@@ -197,7 +204,6 @@ class _PushedWorld(World):
     def __init__(self, grabber: _PushGrabber) -> None:
         super().__init__()
         self._grabber = grabber
-        self.leave_s = _LEAVE_S
 
     def open_source(self, config: EdgeConfig) -> Source:
         return _PushedSource(self._grabber, config, self)

@@ -52,8 +52,6 @@ class RealtimePace:
     stop: threading.Event
     failures: Failures
     before_frame: Callable[[int], None] = lambda _now_ns: None
-    leave_s: float = 1.0
-    """How long the end waits for a detection that is in hand."""
 
     def __post_init__(self) -> None:
         self._missed: int | None = None
@@ -63,11 +61,7 @@ class RealtimePace:
         self._link_bound = False
         """Sending the last frame took longer than coding it."""
         self._worker = StillWorker(
-            self.stills,
-            results=self.inbox.take,
-            failures=self.failures,
-            clock=self.clock,
-            leave_s=self.leave_s,
+            self.stills, results=self.inbox.take, failures=self.failures, clock=self.clock
         )
 
     def step(self, frame: Frame | None, *, missed: int = 0) -> None:

@@ -53,7 +53,7 @@ class MavlinkPose:
         where = Address.parse(address)
         self._parser = FrameParser(is_stream=where.is_stream)
         self._connection = Connection(where, stop=self._stop)
-        self._thread = threading.Thread(target=self._read, name="--pose", daemon=True)
+        self._thread = threading.Thread(target=self._read, name="hvt-pose", daemon=True)
         self._thread.start()
 
     @property

@@ -48,7 +48,6 @@ class StillWorker:
     length: int = 16
     max_bytes: int = MAX_QUEUE_BYTES
     finish_s: float = 1.0
-    leave_s: float = 1.0
     pause: RetryPause | None = None
 
     def __post_init__(self) -> None:
@@ -86,13 +85,13 @@ class StillWorker:
         return True
 
     def close(self) -> None:
-        """Let the thread finish what it has, at most for ``finish_s``; then what is in hand, for ``leave_s``."""
+        """Let the thread finish what it has, at most for ``finish_s``, then leave the rest; join it."""
         until_s = time.monotonic() + self.finish_s
         with contextlib.suppress(queue.Full):
             self._frames.put(None, timeout=self.finish_s)
         self._thread.join(timeout=max(0.0, until_s - time.monotonic()))
         self._given_up.set()
-        self._thread.join(timeout=self.leave_s)
+        self._thread.join(timeout=self.finish_s)
 
     def __enter__(self) -> Self:
         return self

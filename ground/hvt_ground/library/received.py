@@ -6,6 +6,7 @@ holds nobody else; in lockstep the edge waits for it.
 
 from __future__ import annotations
 
+import atexit
 import queue
 import threading
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from typing import Any, Self
 
 from hvt_common.config import load, settings_words
 from hvt_common.protocol.messages import Info
+from hvt_common.runtime.process import join_threads_at_exit
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.app import Ground
@@ -50,6 +52,9 @@ class Received:
     event: Picture | Overlay | PoseUpdate | Refinement | Traffic | Notice
 
 
+join_threads_at_exit()
+
+
 def listen(**settings: object) -> Listening:
     """A ground with the settings of ``hvt-ground`` (docs/options.md), such as ``listen="tcp/0.0.0.0:7447"``.
 
@@ -76,6 +81,7 @@ class Listening:
         self._ground = Ground(config, stop=self._stop, program=self._sink_of)
         self._thread = threading.Thread(target=self._run, name="hvt-ground", daemon=True)
         self._thread.start()
+        atexit.register(self.close)
 
     def __iter__(self) -> Iterator[Received]:
         return self
@@ -95,6 +101,7 @@ class Listening:
 
     def close(self) -> None:
         """End the ground; what it has given out by then can still be taken."""
+        atexit.unregister(self.close)
         self._stop.set()
         self._thread.join()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 
@@ -128,3 +130,58 @@ def test_an_edge_that_never_got_a_frame_ends_quietly():
     with hvt_edge.open(connect="tcp/127.0.0.1:9", detector="motion") as edge:
         pass
     assert edge.summary == {}
+
+
+ENDING = """
+import gc, sys, threading, time
+import {library}
+from hvt_common.transport.session import LinkSettings, open_session
+
+heard = threading.Event()
+
+def receive(sample):
+    heard.set()
+    time.sleep(1)
+
+def fly():
+    with open_session(LinkSettings("edge", (), (sys.argv[1],))) as session:
+        subscriber = session.declare_subscriber("a", receive)
+        session.put("a", b"")
+        heard.wait(30)
+
+flight = threading.Thread(target=fly, daemon=True)
+flight.start()
+flight.join()
+gc.callbacks.append(lambda *_: time.sleep(1))  # Python's end takes longer than the callback
+"""
+
+
+@pytest.mark.parametrize("library", ["hvt_edge.library.pushed", "hvt_ground.library.received"])
+def test_a_program_ends_while_zenoh_calls(library):
+    """Python ends a thread that comes back from a callback as it finalizes, and Zenoh's library aborts."""
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    done = subprocess.run(
+        [sys.executable, "-c", ENDING.format(library=library), endpoint],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_program_that_forgets_to_close_ends():
+    """It would abort, or hang."""
+    program = """
+import sys, time
+import numpy as np
+import hvt_edge
+edge = hvt_edge.open(listen=sys.argv[1], detector="motion", size="320x192")
+edge.push(np.zeros((192, 320, 3), np.uint8))
+time.sleep(1)
+"""
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    done = subprocess.run(
+        [sys.executable, "-c", program, endpoint], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
