@@ -124,7 +124,12 @@ class BacklogPerception:
             Refiner("fuse", fps=info.fps, vocabulary=vocabulary),
             vocabulary=vocabulary,
             history=History(),
-            fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=CameraPath(ahead_frames=1)),
+            fusion=Fusion(
+                fps=info.fps,
+                edge_classes=edge_classes,
+                path=CameraPath(ahead_frames=1),
+                base_per_source=info.view.scale,
+            ),
             view=info.view,
             wants_base=False,
             gap_frames=1,

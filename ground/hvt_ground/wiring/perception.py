@@ -43,7 +43,7 @@ def make_pipeline(
             calibrated=stills_calibrated(config),
         ),
         vocabulary=vocabulary,
-        fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path),
+        fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path, base_per_source=info.view.scale),
         path=path,
         # In lockstep the same input gives the same detections, however long they take.
         turns=None if info.pace == "lockstep" else models.turns,

@@ -222,6 +222,16 @@ def test_the_class_is_that_of_the_surer_side():
     np.testing.assert_allclose(fused.tracks.confidences, [0.6, 0.95])
 
 
+def test_who_saw_it_larger_counts_for_more():
+    """A truck of ten pixels in the base is surely a car, and would be called one whatever the edge has seen."""
+    ground = Ground(base_per_source=1 / 3)
+    ours, theirs = tracks_at(0, {1: A}), tracks_at(0, {70: A}, class_id=1)
+    ours.confidences[:], theirs.confidences[:] = 0.95, 0.6
+    ground.fusion.take_own(ours)
+    ground.fusion.take_step(theirs, own=ours)
+    assert [ground.names[i] for i in ground.fusion.listed(ours).tracks.class_ids] == ["bus"]
+
+
 def test_names_that_only_the_edge_has_are_added():
     """A class of the edge's detector would be shown under the name of another."""
     names, places = unified_names(("car", "bus"), ("Bus ", "truck", "car", "truck"))
