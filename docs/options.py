@@ -19,7 +19,7 @@ You can set every option below as a flag or as a TOML key of `--config FILE`; a 
 `make docs` writes this page from the code.
 
     hvt-edge --help                              # the common options
-    hvt-edge --config edge.toml --print-config   # all settings, with the defaults filled in, as TOML
+    hvt-edge --config edge.toml --print-config   # the settings, but those that the start works out, as TOML
 
 | kind | written as |
 |---|---|

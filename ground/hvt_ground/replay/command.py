@@ -70,7 +70,9 @@ def run(argv: Sequence[str]) -> int:
     parser.add_argument("--help", "-h", action="store_true")
     given, words = parser.parse_known_args(list(argv))
     files = [Path(one) for one in takewhile(lambda one: not one.startswith("-"), words)]
-    if given.help or not files:
+    if given.help:
+        load(GroundConfig, ["--help"], program=f"{parser.prog} FILE … [--speed 1]", description=str(__doc__))
+    if not files:
         raise UserError(
             "give the files first: hvt-ground replay FILE.hvtlog|FILE.rrd … [--speed 1] [settings of hvt-ground]"
         )

@@ -63,7 +63,7 @@ class EdgeRequests:
             self._client()[edge].keyframe()
 
     def set(self, edge: str, body: Mapping[str, Any]) -> None:
-        """Set the total budget (``kbps``) or who gets a still (``method``), from the next keyframe on."""
+        """Set the total budget (``kbps``), from the next keyframe on, or who gets a still (``method``), at once."""
         match body:
             case {"kbps": int() | float() as kbps} if not isinstance(kbps, bool) and 1 <= kbps < 1e6:
                 with _one_of(self._free):
