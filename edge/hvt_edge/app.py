@@ -276,7 +276,6 @@ class Edge:
 
     def _status_reporter(self, stages: Stages, heartbeat: Heartbeat) -> StatusReporter:
         return StatusReporter(
-            self._config,
             heartbeat=heartbeat,
             operating=stages.operating,
             session_id=self._world.session_id,

@@ -76,12 +76,10 @@ class InfoReporter:
         return info.pack()
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class StatusReporter:
     """Sends ``status`` and makes the status line, from the state that it has made; in the frame loop."""
 
-    config: EdgeConfig
-    _: KW_ONLY
     heartbeat: Heartbeat
     operating: Operating
     session_id: int

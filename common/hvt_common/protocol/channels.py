@@ -69,50 +69,25 @@ class Delivery:
     """How one channel crosses the link."""
 
     direction: Direction
-    carries: str
     priority: str
     """Name of a Zenoh priority. BLOCK and DROP channels never share one: on one priority they disturb each other."""
     congestion: str
     """``BLOCK`` where the application owns a bounded queue of its own, ``DROP`` where the latest value wins."""
     encoding: str = MSGPACK_ENCODING
-    reliability: str = "RELIABLE"
-    express: bool = False
-    """Always False: sending without batching makes loss worse on a saturated link."""
 
 
 DELIVERIES: Mapping[Channel, Delivery] = MappingProxyType(
     {
-        Channel.BASE: Delivery(
-            Direction.EDGE_TO_GROUND,
-            "one HEVC access unit, Annex B; attachment BaseHeader",
-            "DATA_HIGH",
-            "BLOCK",
-            encoding="video/h265",
-        ),
-        Channel.ROI: Delivery(
-            Direction.EDGE_TO_GROUND,
-            "one coded still; attachment RoiHeader",
-            "BACKGROUND",
-            "BLOCK",
-            encoding="image/jpeg",
-        ),
-        Channel.TRACKS: Delivery(Direction.EDGE_TO_GROUND, "TrackStep", "DATA_LOW", "DROP"),
-        Channel.POSE: Delivery(Direction.EDGE_TO_GROUND, "PoseReport", "DATA_LOW", "DROP"),
-        Channel.BACKLOG: Delivery(
-            Direction.EDGE_TO_GROUND,
-            "a chunk of what was stored while the link was down; attachment BacklogHeader",
-            "BACKGROUND",
-            "BLOCK",
-        ),
-        Channel.STATUS: Delivery(Direction.EDGE_TO_GROUND, "Status", "INTERACTIVE_LOW", "DROP"),
-        Channel.INFO: Delivery(
-            Direction.GROUND_QUERIES, "InfoRequest or nothing, Info", "INTERACTIVE_HIGH", "BLOCK"
-        ),
-        Channel.CONTROL: Delivery(
-            Direction.GROUND_QUERIES, "ControlRequest, ControlAnswer", "INTERACTIVE_HIGH", "BLOCK"
-        ),
-        Channel.FEEDBACK: Delivery(Direction.GROUND_TO_EDGE, "Feedback", "INTERACTIVE_LOW", "DROP"),
-        Channel.ALIVE: Delivery(Direction.PRESENCE, "nothing", "DATA", "BLOCK"),
+        Channel.BASE: Delivery(Direction.EDGE_TO_GROUND, "DATA_HIGH", "BLOCK", encoding="video/h265"),
+        Channel.ROI: Delivery(Direction.EDGE_TO_GROUND, "BACKGROUND", "BLOCK", encoding="image/jpeg"),
+        Channel.TRACKS: Delivery(Direction.EDGE_TO_GROUND, "DATA_LOW", "DROP"),
+        Channel.POSE: Delivery(Direction.EDGE_TO_GROUND, "DATA_LOW", "DROP"),
+        Channel.BACKLOG: Delivery(Direction.EDGE_TO_GROUND, "BACKGROUND", "BLOCK"),
+        Channel.STATUS: Delivery(Direction.EDGE_TO_GROUND, "INTERACTIVE_LOW", "DROP"),
+        Channel.INFO: Delivery(Direction.GROUND_QUERIES, "INTERACTIVE_HIGH", "BLOCK"),
+        Channel.CONTROL: Delivery(Direction.GROUND_QUERIES, "INTERACTIVE_HIGH", "BLOCK"),
+        Channel.FEEDBACK: Delivery(Direction.GROUND_TO_EDGE, "INTERACTIVE_LOW", "DROP"),
+        Channel.ALIVE: Delivery(Direction.PRESENCE, "DATA", "BLOCK"),
     }
 )
 """The one table. The encoding of `Channel.ROI` is that of the default codec; another still codec says its own."""

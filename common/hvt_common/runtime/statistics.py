@@ -26,37 +26,21 @@ class LatencyStats:
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS, np.int64)
         self._count = 0
-        self._negative = 0
         self._min_ms = math.inf
         self._max_ms = -math.inf
 
     def __len__(self) -> int:
         return self._count
 
-    @property
-    def negative(self) -> int:
-        """How many were below zero: a sign that the two clocks disagree. They count as 0 ms."""
-        return self._negative
-
     def add(self, latency_ms: float) -> None:
         """Count one latency in milliseconds; ``ValueError`` unless it is a finite number."""
         if not math.isfinite(latency_ms):
             raise ValueError(f"a latency must be a finite number of milliseconds, not {latency_ms!r}")
-        if latency_ms < 0:
-            self._negative += 1
-            latency_ms = 0.0
+        latency_ms = max(0.0, latency_ms)  # below zero the two clocks disagree
         self._counts[_bin(latency_ms)] += 1
         self._count += 1
         self._min_ms = min(self._min_ms, latency_ms)
         self._max_ms = max(self._max_ms, latency_ms)
-
-    def merge(self, other: LatencyStats) -> None:
-        """Add all that ``other`` has counted, as if each had been added here."""
-        self._counts += other._counts
-        self._count += other._count
-        self._negative += other._negative
-        self._min_ms = min(self._min_ms, other._min_ms)
-        self._max_ms = max(self._max_ms, other._max_ms)
 
     def percentile(self, percent: float) -> float | None:
         """The ``percent`` (0…100) percentile in milliseconds, linear between ranks; None when empty."""

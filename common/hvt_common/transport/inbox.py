@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 __all__ = ["CAPACITY_BYTES", "Inbox", "Received", "ReceivedQueue"]
 
@@ -41,26 +41,16 @@ class ReceivedQueue(Protocol):
 class Inbox:
     """A bounded queue between Zenoh's callbacks and one of our threads; putting never blocks.
 
-    It is bounded in messages and in bytes: a payload may have megabytes. ``overflow`` says what is dropped when it is
-    full: ``newest`` for the base stream (what is queued stays whole up to a gap), ``oldest`` where the latest value
-    wins. A message that is larger than the whole inbox never enters. With a ``share`` below 1 no key may take more
-    than that of it: a flood under one does not keep the others out.
+    It is bounded in messages and in bytes: a payload may have megabytes. What does not fit is dropped, so that what
+    is queued stays whole up to a gap. With a ``share`` below 1 no key may take more than that of it: a flood under
+    one does not keep the others out.
     """
 
-    def __init__(
-        self,
-        *,
-        capacity: int,
-        overflow: Literal["newest", "oldest"],
-        capacity_bytes: int = CAPACITY_BYTES,
-        share: float = 1.0,
-    ) -> None:
-        assert share == 1.0 or overflow == "newest", "with a share the newest message is dropped"
+    def __init__(self, *, capacity: int, capacity_bytes: int = CAPACITY_BYTES, share: float = 1.0) -> None:
         self._items: deque[Received] = deque()
         self._bytes = 0
         self._capacity = capacity
         self._capacity_bytes = capacity_bytes
-        self._overflow = overflow
         self._share = share
         self._by_key: dict[str, tuple[int, int]] = {}
         """Messages and bytes of each key that has any."""
@@ -70,13 +60,11 @@ class Inbox:
         """Messages that did not fit."""
 
     def put(self, item: Received) -> None:
-        """Add a message, or drop one."""
+        """Add a message, or drop it."""
         with self._changed:
-            while not self._fits(item):
+            if not self._fits(item):
                 self.dropped += 1
-                if self._overflow == "newest" or not self._items:
-                    return
-                self._take()
+                return
             self._items.append(item)
             self._account(item, 1)
             self._changed.notify()

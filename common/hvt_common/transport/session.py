@@ -69,8 +69,8 @@ def declare_publisher(session: zenoh.Session, channel: Channel, *, keys: EdgeKey
         encoding=delivery.encoding,
         congestion_control=getattr(zenoh.CongestionControl, delivery.congestion),
         priority=getattr(zenoh.Priority, delivery.priority),
-        express=delivery.express,
-        reliability=getattr(zenoh.Reliability, delivery.reliability),
+        express=False,  # sending without batching makes loss worse on a saturated link
+        reliability=zenoh.Reliability.RELIABLE,
     )
 
 

@@ -25,7 +25,6 @@ __all__ = [
     "Progress",
     "RateController",
     "RateSettings",
-    "ReconfigurationSettings",
     "ReconfigurationTrigger",
 ]
 
@@ -37,6 +36,14 @@ _SOME_LOSS = 0.02
 _GRAVE, _GRAVE_SPAN_NS = 2.5, 150 * _MS
 _LOSS_EVERY_NS = 3 * SECOND_NS
 """Loss is counted over some seconds: a lower rate shows as late."""
+_MUCH_LESS, _MUCH_MORE = 0.8, 1.25
+"""By so much the base's rate may be off before x265 is opened anew at once."""
+_SOME_OFF, _SOME_NS = 0.08, 3 * SECOND_NS
+"""And by so much for so long."""
+_LITTLE_OFF = 0.02
+"""At the ceiling, where the rate will stay."""
+_REST_NS = 1_500 * _MS
+"""Between two openings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,43 +320,27 @@ def _arrival_bps(first: Progress, last: Progress) -> float:
     return 0.0 if span_ns <= 0 else 8e9 * max(0, last.arrived_bytes - first.arrived_bytes) / span_ns
 
 
-@dataclass(frozen=True, slots=True)
-class ReconfigurationSettings:
-    """By how much the base's rate must be off, and for how long, before x265 is opened anew."""
-
-    much_less: float = 0.8
-    much_more: float = 1.25
-    some: float = 0.08
-    little: float = 0.02
-    """At the ceiling, where the rate will stay."""
-    rest_ns: int = 1_500 * _MS
-    some_ns: int = 3 * SECOND_NS
-    """So long it must be off by `some`."""
-
-
 class ReconfigurationTrigger:
     """Whether it is worth a keyframe and some 35 ms to open x265 at another rate. Time is an argument.
 
     Until then a base stream that is too fast takes from the stills, and then drops frames.
     """
 
-    def __init__(self, settings: ReconfigurationSettings = ReconfigurationSettings()) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self._done_ns: int | None = None
         self._off_ns: int | None = None
 
     def wants(self, wanted_bps: float, base_bps: float, *, at_ceiling: bool, now_ns: int) -> bool:
         """``base_bps`` is what x265 is opened for; ``at_ceiling``: the wanted rate is the one that will stay."""
-        settings = self._settings
         ratio = wanted_bps / base_bps
-        if abs(ratio - 1) <= (settings.little if at_ceiling else settings.some):
+        if abs(ratio - 1) <= (_LITTLE_OFF if at_ceiling else _SOME_OFF):
             self._off_ns = None
             return False
         self._off_ns = now_ns if self._off_ns is None else self._off_ns
-        if self._done_ns is not None and now_ns - self._done_ns < settings.rest_ns:
+        if self._done_ns is not None and now_ns - self._done_ns < _REST_NS:
             return False
-        much = ratio <= settings.much_less or ratio >= settings.much_more
-        return much or now_ns - self._off_ns >= settings.some_ns
+        much = not _MUCH_LESS < ratio < _MUCH_MORE
+        return much or now_ns - self._off_ns >= _SOME_NS
 
     def done(self, now_ns: int) -> None:
         """x265 was opened anew."""

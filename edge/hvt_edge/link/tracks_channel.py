@@ -9,12 +9,12 @@ from typing import Final, Protocol
 import numpy as np
 
 from hvt_common.protocol.messages import TrackStepEncoder
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Tracks
 from hvt_edge.perception.analyzer import AnalyzedFrame
 
 __all__ = ["TrackReportSettings", "TrackReporter", "TrackSender"]
 
-_SECOND_NS: Final = 1_000_000_000
 _EARLY: Final = 0.95
 """Steps come a little early or late: one that is due nearly is due."""
 
@@ -29,7 +29,7 @@ class TrackReportSettings:
     """Payload bits a second at most: in a crowd steps come less often."""
     fresh_frames: int = 5
     """A track whose last detection is older than so many source frames is left out."""
-    refresh_ns: int = _SECOND_NS
+    refresh_ns: int = SECOND_NS
     """So often, in capture time, a step stands by itself: a lost one hurts no longer."""
 
 
@@ -79,7 +79,7 @@ class TrackReporter:
         if self._last_ns is None:
             return True
         pause_s = max(1 / self._settings.most_per_s, 8 * self._last_bytes / self._settings.most_bps)
-        return capture_ns - self._last_ns >= _SECOND_NS * pause_s * _EARLY
+        return capture_ns - self._last_ns >= SECOND_NS * pause_s * _EARLY
 
 
 def _fresh(tracks: Tracks, *, most_frames: int) -> Tracks:

@@ -17,11 +17,10 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
+from hvt_common.units import SECOND_NS
 from hvt_edge.operating.point import Levers, Operating
 
 __all__ = ["LeverControl", "LeverSettings"]
-
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +45,7 @@ class LeverSettings:
     """So many of the newest count."""
     least_changed: float = 0.1
     """The share of stills that must change something."""
-    pause_ns: int = 20 * _SECOND_NS
+    pause_ns: int = 20 * SECOND_NS
     """How long stills pause before some are tried again; twice as long after each vain try, up to 8 times."""
     most_pauses: int = 8
     load_samples: int = 8

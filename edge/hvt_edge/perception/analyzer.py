@@ -36,17 +36,12 @@ class AnalyzedFrame:
 
     frame: Frame
     base_bgr: Image | None
-    """The decoded base frame: what the ground has. None where the frame is not coded."""
+    """The decoded base frame: what the ground has. None where the frame is not coded: no still applies to it then."""
     tracks: Tracks
     detected: bool
     """A decision step: the detector ran on this frame."""
     picture: YuvPicture | None = None
     """The same as `base_bgr`, as it was decoded: what a still may build on."""
-
-    @property
-    def coded(self) -> bool:
-        """Whether the base stream shows this frame. Only then can the ground apply a still to its picture."""
-        return self.base_bgr is not None
 
 
 class _Decoder(Protocol):

@@ -28,12 +28,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
 from hvt_edge.perception.analyzer import AnalyzedFrame
 
 __all__ = ["Shadow", "ShadowGround", "ShadowSettings"]
 
-_SECOND_NS = 1_000_000_000
 _THUMBNAIL = (32, 18)
 _BASE_NAMES = 1 / 3
 """Where base and source name an object differently, how often the base's name is right."""
@@ -45,16 +45,16 @@ class ShadowSettings:
 
     confidence: float
     """From where a detection starts a track, at the edge and at the ground."""
-    rest_ns: int = _SECOND_NS
+    rest_ns: int = SECOND_NS
     """Capture time from one comparison to the next, at least. On a slow machine more: see ``most_share``."""
-    quick_rest_ns: int = _SECOND_NS // 3
+    quick_rest_ns: int = SECOND_NS // 3
     quick_comparisons: float = 2.5
     """At first so few comparisons are made in quick order, because nothing is known."""
     most_share: float = 0.15
     """Of a processor core, for comparisons; in lockstep, where no clock may decide, only ``rest_ns`` counts."""
     memory_s: float = 8.0
     """Time constant with which former comparisons fade."""
-    lost_ns: int = 2 * _SECOND_NS
+    lost_ns: int = 2 * SECOND_NS
     """So long the ground's tracker lists what its detector sees no more."""
     scene_correlation: float = 0.3
     """Two pictures a third of a second apart that correlate less, as thumbnails, are of two scenes."""
@@ -205,7 +205,7 @@ class ShadowGround:
     def _take(self, one: Shadow, capture_ns: int) -> None:
         weight = 0.0
         if self._last_ns is not None:
-            weight = math.exp(-max(0, capture_ns - self._last_ns) / _SECOND_NS / self._settings.memory_s)
+            weight = math.exp(-max(0, capture_ns - self._last_ns) / SECOND_NS / self._settings.memory_s)
         self._last_ns = capture_ns
         worth = weight * self.now.comparisons + 1
         means = {

@@ -3,7 +3,7 @@
 A request only crops (`OnDemand.request`, in the link's callback); coding and sending are the stills' thread's, under
 the same budget as every other still. What the base shows of the place does not matter: whoever requests has a reason.
 It is coded at the requested quality as soon as the budget allows it; where the budget never does, or not within
-`OnDemandSettings.patience_ns`, at the largest size, then the best quality, that it allows. While one is pending, no
+`_PATIENCE_NS`, at the largest size, then the best quality, that it allows. While one is pending, no
 other still is sent.
 """
 
@@ -31,7 +31,7 @@ from hvt_edge.stills.on_demand_crop import (
 )
 from hvt_edge.stills.outbox import Outbox, OutboxStill
 
-__all__ = ["REQUEST_PARAMETER", "OnDemand", "OnDemandSettings", "OnDemandStill"]
+__all__ = ["REQUEST_PARAMETER", "OnDemand", "OnDemandStill"]
 
 REQUEST_PARAMETER = "ask"
 """The parameter that carries its number."""
@@ -45,20 +45,15 @@ _FLOOR_PCT = 20
 """Below it a smaller picture of better quality shows more."""
 _NO_LIMIT_BYTES = 2**31
 _OUTCOMES = 64
+_MAX_PENDING = 4
+_PATIENCE_NS = 2_000_000_000
+"""For so long the first waits for its full size."""
+_RETRY_NS = 250_000_000
+"""Between two tries to fit one that is too large: each codes it several times."""
 _REFUSALS = {
     "stale": "in 10 s the budget had no room for it",
     "ended": "the session ended before there was room for it",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class OnDemandSettings:
-    """Bounds: how many are pending, how long the first of them waits for its full size, and when a fit is tried."""
-
-    max_pending: int = 4
-    patience_ns: int = 2_000_000_000
-    retry_ns: int = 250_000_000
-    """Between two tries to fit one that is too large: each codes it several times."""
 
 
 @dataclass(slots=True, eq=False)
@@ -88,7 +83,6 @@ class OnDemand:
     view: View
     class_names: tuple[str, ...]
     most_bytes: Callable[[], int]
-    settings: OnDemandSettings = OnDemandSettings()
 
     def __post_init__(self) -> None:
         self._maker = replace(
@@ -177,10 +171,10 @@ class OnDemand:
         limit_bytes = allowance(full)
         if len(full.data) <= limit_bytes:
             return full
-        patient = now_ns - pending.first_ns < self.settings.patience_ns
+        patient = now_ns - pending.first_ns < _PATIENCE_NS
         if patient and limit_bytes < _FULL_SHARE * self.most_bytes():
             return None
-        if pending.tried_ns is not None and now_ns - pending.tried_ns < self.settings.retry_ns:
+        if pending.tried_ns is not None and now_ns - pending.tried_ns < _RETRY_NS:
             return None
         pending.tried_ns = now_ns
         for shrink in _SHRINKS:  # the largest picture of which some quality fits
@@ -200,7 +194,7 @@ class OnDemand:
 
     def _check_queue(self) -> None:
         pending = self.outbox.on_demand_pending
-        if pending >= self.settings.max_pending:
+        if pending >= _MAX_PENDING:
             raise RefusedError(f"{pending} stills that were asked for wait already: ask again later")
 
     def _note(self, number: int, refusal: str) -> None:

@@ -220,7 +220,7 @@ class RemoteEdge:
         until_s = time.monotonic() + timeout_s
         self._check_may_command()
         info = self.info()
-        inbox = Inbox(capacity=_INBOX_MESSAGES, overflow="newest")
+        inbox = Inbox(capacity=_INBOX_MESSAGES)
         subscriber = subscribe(self._session, self._keys.key(Channel.ROI), inbox=inbox)
         try:
             answer = self.command(Command.STILL, arguments)

@@ -66,7 +66,7 @@ class EdgePort:
         self._requester_id = secrets.randbits(64)
         self._clock = clock
         self._log = log
-        self.inbox = Inbox(capacity=_INBOX_MESSAGES, overflow="newest", share=_INBOX_SHARE)
+        self.inbox = Inbox(capacity=_INBOX_MESSAGES, share=_INBOX_SHARE)
         self._flood = FloodWatch(most_per_s=_MOST_PER_S)
         self.present = threading.Event()
         """Set while the edge's liveliness token is there."""

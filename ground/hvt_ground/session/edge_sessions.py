@@ -23,6 +23,7 @@ from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.runtime.log import log_fields
 from hvt_common.transport.inbox import Received
+from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.link.other_sessions import PreSessionBuffer
@@ -37,11 +38,10 @@ __all__ = ["EdgeSessions", "EdgeThread"]
 
 _log = logging.getLogger(__name__)
 
-_SECOND_NS = 1_000_000_000
 _INFO_TRIES = 3
-_BACKLOG_PAUSE_NS = 3 * _SECOND_NS
+_BACKLOG_PAUSE_NS = 3 * SECOND_NS
 """After so long without another chunk the recording says how much of the backlog came."""
-_CLOCK_EVERY_NS = 20 * _SECOND_NS
+_CLOCK_EVERY_NS = 20 * SECOND_NS
 """So often the edge is asked for its time."""
 
 
@@ -78,8 +78,8 @@ class EdgeSessions:
         self.port = port
         self._open_session = open_session
         self._on_ended = on_ended
-        self._patience_ns = round(patience_s * _SECOND_NS)
-        self._ended_patience_ns = round(ended_patience_s * _SECOND_NS)
+        self._patience_ns = round(patience_s * SECOND_NS)
+        self._ended_patience_ns = round(ended_patience_s * SECOND_NS)
         self._clock = clock or SteadyClock()
         self._pause = pause or RetryPause()
         self.failures = Failures(self._clock)
@@ -119,7 +119,7 @@ class EdgeSessions:
     @property
     def silent_s(self) -> float:
         """For how long nothing has come."""
-        return self._receiver.silent_ns / _SECOND_NS
+        return self._receiver.silent_ns / SECOND_NS
 
     def work(self, item: Received | None, *, pending: bool) -> None:
         """Take one message, if there is one, and do what is due; ``pending``: more wait. It never raises."""
@@ -351,7 +351,7 @@ class EdgeThread:
 
     def __init__(self, sessions: EdgeSessions, *, drain_s: float = 1.0) -> None:
         self.sessions = sessions
-        self._drain_ns = round(drain_s * _SECOND_NS)
+        self._drain_ns = round(drain_s * SECOND_NS)
         self.error: BaseException | None = None
         """What ended the thread."""
         self._inbox = sessions.port.inbox

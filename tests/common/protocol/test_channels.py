@@ -97,7 +97,6 @@ def test_the_table_is_whole_and_its_names_are_zenohs():
     for delivery in DELIVERIES.values():
         assert hasattr(zenoh.Priority, delivery.priority)
         assert hasattr(zenoh.CongestionControl, delivery.congestion)
-        assert hasattr(zenoh.Reliability, delivery.reliability)
 
 
 def test_no_priority_carries_both_blocking_and_dropping_rows():

@@ -28,7 +28,7 @@ def test_a_flood_is_told_of_once_a_minute_and_never_where_there_is_none():
 
 def test_one_row_does_not_keep_the_others_out_of_the_inbox():
     """Reports by the thousand would take the place of every picture."""
-    inbox = Inbox(capacity=8, overflow="newest", share=0.75)
+    inbox = Inbox(capacity=8, share=0.75)
     for _ in range(50):
         inbox.put(replace(ITEM, key="hvt/uav-1/status"))
     assert (len(inbox), inbox.dropped) == (6, 44)
@@ -45,7 +45,7 @@ def test_one_row_does_not_keep_the_others_out_of_the_inbox():
 
 def test_one_row_does_not_take_all_bytes_of_the_inbox():
     """A few huge messages would do what thousands of small ones may not."""
-    inbox = Inbox(capacity=100, overflow="newest", capacity_bytes=1000, share=0.5)
+    inbox = Inbox(capacity=100, capacity_bytes=1000, share=0.5)
     for _ in range(9):
         inbox.put(ITEM)
     inbox.put(replace(ITEM, key="hvt/uav-1/roi"))

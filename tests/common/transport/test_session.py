@@ -70,7 +70,7 @@ def edge(endpoint: str) -> LinkSettings:
 
 def test_messages_cross_with_attachment_and_encoding(endpoint):
     """Nothing would arrive, or without what HVT knows about it."""
-    inbox = Inbox(capacity=8, overflow="newest")
+    inbox = Inbox(capacity=8)
     with open_session(ground(endpoint)) as listener, open_session(edge(endpoint)) as connector:
         subscriber = subscribe(listener, selector(Channel.BASE, edges="uav-*"), inbox=inbox)
         publisher = declare_publisher(connector, Channel.BASE, keys=KEYS)
@@ -95,7 +95,7 @@ def test_the_edge_may_start_first(endpoint):
     with open_session(edge(endpoint)) as connector:
         publisher = declare_publisher(connector, Channel.BASE, keys=KEYS)
         publisher.put(b"nobody hears this")
-        inbox = Inbox(capacity=8, overflow="newest")
+        inbox = Inbox(capacity=8)
         for _ in range(2):  # and the ground may come and go
             with open_session(ground(endpoint)) as listener:
                 subscriber = subscribe(listener, selector(Channel.BASE), inbox=inbox)
@@ -119,20 +119,19 @@ def test_questions_are_answered_and_silence_ends(endpoint):
         queryable.undeclare()
 
 
-@pytest.mark.parametrize(("overflow", "left"), [("newest", [0, 1, 2]), ("oldest", [2, 3, 4])])
-def test_a_full_inbox_drops_what_was_declared(overflow, left):
+def test_a_full_inbox_drops_what_comes():
     """Memory would grow with a slow consumer, or Zenoh's callback would stall every other stream."""
-    inbox = Inbox(capacity=3, overflow=overflow)
+    inbox = Inbox(capacity=3)
     for number in range(5):
         inbox.put(item(number))
     assert (len(inbox), inbox.dropped) == (3, 2)
-    assert [inbox.get(timeout_s=0).received_ns for _ in range(3)] == left
+    assert [inbox.get(timeout_s=0).received_ns for _ in range(3)] == [0, 1, 2]
     assert inbox.get(timeout_s=0) is None
 
 
 def test_closing_an_inbox_wakes_its_reader():
     """The process would hang at its end."""
-    inbox = Inbox(capacity=3, overflow="newest")
+    inbox = Inbox(capacity=3)
     got = []
     reader = threading.Thread(target=lambda: got.append(inbox.get(timeout_s=60)))
     reader.start()
@@ -217,7 +216,7 @@ def test_tls_links_do_not_hide_seconds_of_video_in_the_kernel():
 def test_two_links_to_one_port_carry_all_rows_each_by_its_priority(endpoint):
     """Answers would wait behind pictures although two links were asked for, or a row would be lost between them."""
     with open_session(ground(endpoint)) as listener:
-        inbox = Inbox(capacity=64, overflow="newest")
+        inbox = Inbox(capacity=64)
         subscriber = subscribe(listener, "hvt/uav-1/*", inbox=inbox)
         with open_session(LinkSettings("edge", connect=(endpoint,), links=2)) as connector:
             queryable = serve(connector, Channel.INFO, keys=KEYS, answer=lambda question: question)
@@ -352,7 +351,7 @@ LISTENER = """
     from hvt_common.transport.session import *
     from hvt_common.protocol.channels import *
     with open_session(LinkSettings("ground", listen=(sys.argv[1],))) as session:
-        inbox = Inbox(capacity=8, overflow="oldest")
+        inbox = Inbox(capacity=8)
         subscriber = subscribe(session, selector(Channel.BASE), inbox=inbox)
         print("up", flush=True)
         time.sleep(120)

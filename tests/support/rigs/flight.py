@@ -277,7 +277,7 @@ class Port:
 
     def __init__(self) -> None:
         self.edge = "uav-1"
-        self.inbox = Inbox(capacity=1024, overflow="newest")
+        self.inbox = Inbox(capacity=1024)
         self.present = threading.Event()
         self.present.set()
         self.used = threading.Event()

@@ -14,7 +14,7 @@ class WatchedInbox(Inbox):
     """An edge's inbox with one thread that takes: it has done with an item when it asks for the next."""
 
     def __init__(self) -> None:
-        super().__init__(capacity=1024, overflow="newest")
+        super().__init__(capacity=1024)
         self._handled = True
         self._watch = threading.Lock()
 
