@@ -21,7 +21,7 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import embedded_models
-from hvt_common.values import Detections, Image
+from hvt_common.values import Detections, Image, iou
 
 DATA = Path(os.environ.get("HVT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
 MODELS = (
@@ -123,17 +123,13 @@ def _matches(expected: Detections, found: Detections) -> int:
     free = np.ones(len(expected), bool)
     count = 0
     for box, class_id in zip(found.boxes_xyxy_px, found.class_ids, strict=True):
-        overlap = np.where(free & (expected.class_ids == class_id), _iou(box, expected.boxes_xyxy_px), 0)
+        overlap = np.where(
+            free & (expected.class_ids == class_id), iou(box[None], expected.boxes_xyxy_px)[0], 0
+        )
         if overlap.size and overlap.max() >= 0.5:
             free[overlap.argmax()] = False
             count += 1
     return count
-
-
-def _iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    low, high = np.maximum(box[:2], boxes[:, :2]), np.minimum(box[2:], boxes[:, 2:])
-    shared = np.prod(np.maximum(high - low, 0), axis=1)
-    return shared / (np.prod(box[2:] - box[:2]) + np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) - shared)
 
 
 if __name__ == "__main__":

@@ -15,10 +15,11 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from hvt_common.units import SECOND_NS
+
 __all__ = ["Arrival", "LinkReport", "SerialLink"]
 
 _T = TypeVar("_T")
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -69,7 +70,7 @@ class SerialLink(Generic[_T]):
         """``rate_bps``: line bits a second, above 0."""
         if not rate_bps > 0:
             raise ValueError(f"rate_bps is {rate_bps}, must be above 0")
-        self._byte_ns = 8 * _SECOND_NS / rate_bps
+        self._byte_ns = 8 * SECOND_NS / rate_bps
         self._queued: dict[bool, list[_Queued[_T]]] = {True: [], False: []}
         self._under_way: deque[Arrival[_T]] = deque()
         self._free_ns = 0.0

@@ -11,7 +11,8 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
-from hvt_study.datasets.mot_files import LAST_FRAME, detections_by_frame, read_mot, rows_of_tracks, write_mot
+from hvt_study.datasets.annotation_rows import LAST_FRAME
+from hvt_study.datasets.mot_files import detections_by_frame, read_mot, rows_of_tracks, write_mot
 
 __all__ = ["add_arguments", "run"]
 

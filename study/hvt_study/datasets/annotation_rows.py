@@ -1,4 +1,4 @@
-"""Annotation files: lines of numbers between commas. What is wrong is said with the file and the line."""
+"""Annotations and detections as lines of numbers between commas. What is wrong is said with the file and the line."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_study.datasets.mot_files import LAST_FRAME
 
-__all__ = ["Rows", "read_rows"]
+__all__ = ["LAST_FRAME", "Rows", "read_rows"]
 
+LAST_FRAME = 10_000_000
+"""Over 90 hours at 30 fps; a higher frame number is a mistake."""
 _LARGEST = 1e9
 """Beyond it no pixel and no id lies; ids stay exact in floats."""
 _SHOWN_CHARS = 60
@@ -94,9 +95,9 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        raise UserError(f"annotations {path} are not text; accepted are lines of numbers") from None
+        raise UserError(f"{path} is not a text file; accepted are lines of numbers") from None
     except OSError as error:
-        raise UserError(f"annotations {path} cannot be read: {error.strerror or error}") from None
+        raise UserError(f"{path} cannot be read: {error.strerror or error}") from None
 
 
 def _numbers(lines: tuple[str, ...], count: int) -> npt.NDArray[np.float64]:

@@ -5,22 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.values import Detections, Tracks
+from hvt_study.datasets.annotation_rows import read_rows
 
-__all__ = ["LAST_FRAME", "MotRows", "detections_by_frame", "read_mot", "rows_of_tracks", "write_mot"]
-
-LAST_FRAME: Final = 10_000_000
-"""Over 90 hours at 30 fps; a higher frame number is a mistake."""
-
-_COLUMNS: Final = 7
-_LARGEST: Final = 1e15
-_SHOWN_CHARS: Final = 60
+__all__ = ["MotRows", "detections_by_frame", "read_mot", "rows_of_tracks", "write_mot"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,23 +38,12 @@ def read_mot(path: Path) -> MotRows:
 
     A `UserError` names the file that cannot be read, or the first line that is malformed.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise UserError(f"{path} is not a text file; accepted are lines of frame,id,x,y,w,h,score") from None
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror or error}") from None
-    values = [
-        _numbers(line, path=path, number=number)
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip()
-    ]
-    table = np.array(values, np.float64).reshape(-1, _COLUMNS)
+    rows = read_rows(path, columns="frame,id,x,y,w,h,score", least=7)
     return MotRows(
-        frames=table[:, 0].astype(np.int64),
-        ids=table[:, 1].astype(np.int64),
-        boxes_xywh_px=table[:, 2:6],
-        scores=table[:, 6],
+        frames=rows["frame"].astype(np.int64),
+        ids=rows["id"].astype(np.int64),
+        boxes_xywh_px=rows.table[:, 2:6],
+        scores=rows["score"],
     )
 
 
@@ -114,21 +96,3 @@ def write_mot(path: Path, rows: MotRows) -> None:
         path.write_text("".join(lines), encoding="utf-8")
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror or error}") from None
-
-
-def _numbers(line: str, *, path: Path, number: int) -> list[float]:
-    """The first seven numbers of a line, checked."""
-    cells = line.split(",")
-    try:
-        values = [float(cell) for cell in cells[:_COLUMNS]]
-    except ValueError:
-        values = []
-    good = len(values) == _COLUMNS and all(abs(value) < _LARGEST for value in values)  # false for NaN
-    if good and values[0].is_integer() and 0 <= values[0] <= LAST_FRAME:
-        return values
-    shown = line.strip()
-    shown = shown if len(shown) <= _SHOWN_CHARS else shown[:_SHOWN_CHARS] + "…"
-    raise UserError(
-        f"{path}, line {number} is {shown!r}; accepted are finite numbers frame,id,x,y,w,h,score "
-        f"with a whole frame number from 0 to {LAST_FRAME}"
-    )

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from rerun.chunk import RrdReader
 
 from hvt_common.errors import UserError
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
+from hvt_ground.recordings.recorded import read_recordings
 from hvt_study.metrics.track_table_score import Labelled, read_tracks
 
 __all__ = ["Flown", "FlownStill", "read_flown"]
@@ -73,24 +72,8 @@ def _only(folder: Path, pattern: str) -> Path:
 
 
 def _pictures(path: Path) -> dict[int, Image]:
-    samples: dict[int, bytes] = {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that there is no footer
-        reader = RrdReader(path)
-    for chunk in reader.stream():
-        batch = chunk.to_record_batch()
-        if chunk.entity_path != "/base/video" or "frame" not in batch.schema.names:
-            continue
-        (place,) = (
-            number
-            for number, field in enumerate(batch.schema)
-            if (field.metadata or {}).get(b"rerun:component") == b"VideoStream:sample"
-        )
-        values = batch.column(place).to_pylist()
-        for frame, value in zip(batch.column("frame").to_pylist(), values, strict=True):
-            samples[frame] = bytes(value[0])
     decoder = BaseDecoder()
-    decoded = ((frame, decoder.decode(data)) for frame, data in sorted(samples.items()))
+    decoded = ((one.frame_index, decoder.decode(one.data)) for one in read_recordings([path]).video)
     return {frame + 1: picture for frame, picture in decoded if picture is not None}
 
 

@@ -30,6 +30,7 @@ from hvt_common.protocol.ledger import LedgerSummary, overhead_bytes
 from hvt_common.protocol.messages import BaseHeader, Info, RoiHeader, Status, StillResult, TrackStep
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.transport.inbox import Received
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Fit, Frame
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig
@@ -50,7 +51,6 @@ __all__ = ["Flight", "FlightPlan", "FlightReport", "coded_frames", "dry_run", "f
 
 _START_NS = 1_700_000_000_000_000_000
 _SESSION = 1 << 40  # as many bytes on the wire as a random one
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -361,14 +361,14 @@ class Flight:
         """The source did not give the frames before this one."""
         for frame_index in range(self._next_frame, until_frame):
             self.ground.pass_over(
-                frame_index, capture_ns=_START_NS + round(frame_index * _SECOND_NS / NOMINAL_FPS)
+                frame_index, capture_ns=_START_NS + round(frame_index * SECOND_NS / NOMINAL_FPS)
             )
         self._next_frame = max(self._next_frame, until_frame)
 
     def _picture_age_p95_ms(self) -> float:
         """Over the frames from the first picture on."""
         shown = np.array(self.ground.shown_ns, np.int64).reshape(-1, 2)
-        at_ns = _START_NS + np.round(np.arange(self.plan.clip.frame_count) * _SECOND_NS / NOMINAL_FPS).astype(
+        at_ns = _START_NS + np.round(np.arange(self.plan.clip.frame_count) * SECOND_NS / NOMINAL_FPS).astype(
             np.int64
         )
         at_ns = at_ns[at_ns >= shown[0, 0]]

@@ -39,7 +39,6 @@ _STALE_MS = 500
 class Verdict:
     """Of one budget."""
 
-    rate_kbps: float
     sentence: str
     command: str
     """Empty where nothing is worth flying."""
@@ -87,7 +86,7 @@ def _verdict(plan: ComparePlan, rate_kbps: float, rows: Mapping[str, CompareRow]
     most = max(worth.values())
     begins = f"At {rate_kbps:g} kbps"
     if not most:
-        return Verdict(rate_kbps, f"{begins} no method shows anything right ({name} .000).", "")
+        return Verdict(f"{begins} no method shows anything right ({name} .000).", "")
     chosen = next(method for method in SIMPLEST_FIRST if method in worth and most - worth[method] < NOISE)
     row = rows[chosen]
     said = f"{begins} fly {_named(row)}: {name} {_share(worth[chosen])}"
@@ -97,7 +96,7 @@ def _verdict(plan: ComparePlan, rate_kbps: float, rows: Mapping[str, CompareRow]
     age_ms = row["picture_age_p95_ms"] or 0
     if age_ms > _STALE_MS:
         said += f" Its newest picture is up to {age_ms / 1e3:.1f} s old."
-    return Verdict(rate_kbps, said, command_of(plan, row))
+    return Verdict(said, command_of(plan, row))
 
 
 def _against(chosen: str, value: float, others: Mapping[str, float]) -> str:

@@ -2,7 +2,7 @@
 
 Sizes are line bytes (payload, metadata and transport) as the ledger counts them. They are divided by the processed
 span. The pilot's notebooks divided the bytes of the 300 frames that they processed by the length of the whole clip;
-``accounting="pilot"`` does the same, for comparison with its printed table and for nothing else.
+the accounting ``pilot`` does the same, for comparison with its printed table and for nothing else.
 """
 
 from __future__ import annotations
@@ -50,25 +50,18 @@ class StillCounts:
     """Distinct tracks of the ground on whose class a still has spoken."""
 
 
-def bit_split(
-    row_bytes: Mapping[str, int],
-    *,
-    processed_s: float,
-    clip_s: float | None = None,
-    accounting: Accounting = "span",
-) -> BitSplit:
+def bit_split(row_bytes: Mapping[str, int], *, seconds: float) -> BitSplit:
     """Line bits a second by row of the key table.
 
     Args:
         row_bytes: line bytes of each row that sent anything (``FlightReport.line_bytes``).
-        processed_s: media time from the first processed frame to the end of the last.
-        clip_s: length of the whole clip; needed for the pilot's accounting.
-        accounting: what to divide by.
+        seconds: what to divide by: the media time from the first processed frame to the end of the last, or, as the
+            pilot did, the length of the whole clip.
 
     Raises:
-        ValueError: the time to divide by is missing or not above 0.
+        ValueError: the time is not above 0.
     """
-    seconds = _seconds(processed_s, clip_s, accounting)
+    _check(seconds)
     known = {row: 8 * row_bytes.get(row, 0) / seconds for row in (Channel.BASE, Channel.ROI, Channel.TRACKS)}
     return BitSplit(
         base_bps=known[Channel.BASE],
@@ -82,12 +75,10 @@ def still_counts(
     stills: Sequence[StillArrival],
     refined: Sequence[RefinedObject],
     *,
-    processed_s: float,
-    clip_s: float | None = None,
-    accounting: Accounting = "span",
+    seconds: float,
 ) -> StillCounts:
-    """Count what arrived; times as in `bit_split`."""
-    seconds = _seconds(processed_s, clip_s, accounting)
+    """Count what arrived; ``seconds`` as in `bit_split`."""
+    _check(seconds)
     sizes = [one.size_bytes for one in stills]
     return StillCounts(
         stills=len(sizes),
@@ -97,8 +88,6 @@ def still_counts(
     )
 
 
-def _seconds(processed_s: float, clip_s: float | None, accounting: Accounting) -> float:
-    seconds = clip_s if accounting == "pilot" else processed_s
-    if seconds is None or not seconds > 0:
-        raise ValueError(f"the {accounting} accounting divides by {seconds} s, must be above 0")
-    return seconds
+def _check(seconds: float) -> None:
+    if not seconds > 0:
+        raise ValueError(f"rates are divided by {seconds} s, must be above 0")

@@ -27,7 +27,6 @@ from hvt_study.metrics.judged import LARGEST_PX2, LIMITS_PX2, SIZES, Judged, Siz
 __all__ = ["AveragePrecision", "DetectionScore", "detection_score"]
 
 _MOST_BOXES: Final = 500
-_ANY: Final = "object"
 _Precision = npt.NDArray[np.float64]
 
 
@@ -51,11 +50,6 @@ class DetectionScore:
     """Of each class that has labels."""
     by_size: Mapping[Size, AveragePrecision]
     """Mean over classes, of labels of one size; boxes of other sizes that match nothing do not count."""
-    agnostic: AveragePrecision
-    """All classes taken as one."""
-    labels: int
-    boxes: int
-    """Both as judged, over all frames."""
 
 
 def detection_score(
@@ -63,7 +57,6 @@ def detection_score(
     *,
     word: Callable[[str], str] = str,
     classes: Collection[str] | None = None,
-    limits_px2: tuple[float, float] = LIMITS_PX2,
 ) -> DetectionScore:
     """Average precision of the boxes and class names that are shown, ranked by confidence.
 
@@ -73,46 +66,35 @@ def detection_score(
         labelled: the frames that were detected on.
         word: see `judged.judged`.
         classes: likewise.
-        limits_px2: areas in source pixels between small and medium, and between medium and large.
     """
     frames = judged(labelled, word=word, classes=classes)
     names = sorted({name for one in frames for name in one.class_names})
-    labels, boxes = sum(len(one.ids) for one in frames), sum(len(one.view) for one in frames)
-    if not labels:
+    if not names:
         nothing = AveragePrecision()
-        return DetectionScore(nothing, {}, dict.fromkeys(SIZES, nothing), nothing, 0, boxes)
-    by_name = _precision(frames, names, lambda name: name, limits_px2)
-    as_one = _precision(frames, [_ANY], lambda _: _ANY, limits_px2)
+        return DetectionScore(nothing, {}, dict.fromkeys(SIZES, nothing))
+    by_name = _precision(frames, names)
     return DetectionScore(
         mean=_mean(by_name[:, :, :, 0]),
         by_class={name: _mean(by_name[:, :, k, 0]) for k, name in enumerate(names)},
         by_size={size: _mean(by_name[:, :, :, a]) for a, size in enumerate(SIZES, start=1)},
-        agnostic=_mean(as_one[:, :, :, 0]),
-        labels=labels,
-        boxes=boxes,
     )
 
 
-def _precision(
-    frames: Sequence[Judged],
-    names: Sequence[str],
-    name_as: Callable[[str], str],
-    limits_px2: tuple[float, float],
-) -> _Precision:
+def _precision(frames: Sequence[Judged], names: Sequence[str]) -> _Precision:
     """(10 IoUs, 101 recalls, classes, 4 sizes with all of them first); -1 where there is no label."""
     category = {name: number for number, name in enumerate(names, start=1)}
     truth = _dataset(category, len(frames))
     truth["annotations"] = [
-        _annotation(number, frame, box, category[name_as(name)])
+        _annotation(number, frame, box, category[name])
         for number, (frame, box, name) in enumerate(_labels(frames), start=1)
     ]
     found = _dataset(category, len(frames))
     found["annotations"] = [
-        _annotation(number, frame, box, category[name_as(name)]) | {"score": confidence}
+        _annotation(number, frame, box, category[name]) | {"score": confidence}
         for number, (frame, box, name, confidence) in enumerate(_boxes(frames), start=1)
-        if name_as(name) in category
+        if name in category
     ]
-    small, large = limits_px2
+    small, large = LIMITS_PX2
     ranges = {"small": [0.0, small], "medium": [small, large], "large": [large, LARGEST_PX2]}
     run = COCOeval_faster(COCO(truth), COCO(found), "bbox", ranges=ranges)
     run.params.maxDets = [_MOST_BOXES]

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Boxes
-from hvt_study.metrics.frames import NO_ID, FrameLabels, FrameView, LabelledFrame
+from hvt_study.metrics.frames import FrameLabels, FrameView, LabelledFrame
 from hvt_study.metrics.stills import RefinedObject, StillArrival
 
 __all__ = [
@@ -95,8 +95,6 @@ def arrivals(lists: Iterable[ObservedFrame]) -> list[StillArrival]:
     return [still for one in lists for still in one.stills]
 
 
-def refined_objects(lists: Iterable[ObservedFrame], *, track_id: int | None = None) -> list[RefinedObject]:
-    """All objects that stills named, in order; only those of one of the ground's tracks where it is given."""
-    every = [done for one in lists for done in one.refined]
-    assert track_id != NO_ID, "no track has many objects"
-    return [done for done in every if track_id in (None, done.track_id)]
+def refined_objects(lists: Iterable[ObservedFrame]) -> list[RefinedObject]:
+    """All objects that stills named, in order."""
+    return [done for one in lists for done in one.refined]

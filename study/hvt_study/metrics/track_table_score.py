@@ -100,13 +100,10 @@ def score(
     truth: Mapping[int, Labelled],
     *,
     frame_area_px: float,
-    frames: Sequence[int] = (),
 ) -> Score:
-    """Match tracks to objects frame by frame and count; ``frames`` limits it to some (default: all of the truth)."""
+    """Match tracks to objects on every frame of the truth and count."""
     nothing = _labelled([])
-    labelled = [
-        _frame(truth.get(frame, nothing), tracks.get(frame, nothing)) for frame in frames or sorted(truth)
-    ]
+    labelled = [_frame(truth[frame], tracks.get(frame, nothing)) for frame in sorted(truth)]
     one = class_score(labelled, limits_px2=(SMALL_SHARE * frame_area_px, math.inf))
     return Score(
         objects=one.counts.labels,

@@ -75,16 +75,6 @@ class TrackingScore:
         """See `Hota.hota`; NaN where no track was labelled."""
         return self.higher_order.hota
 
-    @property
-    def deta(self) -> float:
-        """See `Hota.deta`."""
-        return self.higher_order.deta
-
-    @property
-    def assa(self) -> float:
-        """See `Hota.assa`."""
-        return self.higher_order.assa
-
 
 def tracking_score(
     labelled: LabelledFrames,

@@ -20,6 +20,7 @@ from itertools import groupby
 import numpy as np
 
 from hvt_common.inference.detect import Detector
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame
 from hvt_edge.link.budget import RollingBudget
 from hvt_edge.source.resample import Resizer
@@ -34,7 +35,6 @@ from hvt_study.serial_link import LinkReport
 __all__ = ["DdsSettings", "fly_dds"]
 
 _START_NS = 1_700_000_000_000_000_000
-_SECOND_NS = 1_000_000_000
 _LONGEST_TAIL_S = 30
 """How long after the clip the last second pass may take."""
 
@@ -106,7 +106,7 @@ def _by_frame(source: FrameSource, frames: int) -> Generator[tuple[int, Frame | 
 
 
 def _frame_ns(frame_index: int) -> int:
-    return _START_NS + round(frame_index * _SECOND_NS / NOMINAL_FPS)
+    return _START_NS + round(frame_index * SECOND_NS / NOMINAL_FPS)
 
 
 def _report(frames: int, *, edge: DdsEdge, ground: DdsGround, line: Line) -> FlightReport:

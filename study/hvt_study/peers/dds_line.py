@@ -11,18 +11,16 @@ from dataclasses import dataclass
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import BaseHeader, Flags
+from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import RollingBudget
 from hvt_study.serial_link import Arrival, SerialLink
 
-__all__ = ["HEADER_BYTES", "PASS_ROWS", "Line", "UnitMessage", "header_bps"]
+__all__ = ["HEADER_BYTES", "Line", "UnitMessage", "header_bps"]
 
 HEADER_BYTES = 48
 """What a `BaseHeader` takes at most."""
-PASS_ROWS = (Channel.BASE, Channel.ROI)
-"""The rows of the first and of the second pass."""
 _SESSION = 1 << 40  # as many bytes on the wire as a random one
-_SECOND_NS = 1_000_000_000
 _CHANNELS = {Channel.BASE: Account.BASE, Channel.ROI: Account.ROI, Channel.CONTROL: Account.META}
 _VIDEO = DELIVERIES[Channel.BASE].encoding
 _FURTHER = struct.Struct(">II")
@@ -109,7 +107,7 @@ class Line:
         at_ns = self.budget.earliest_ns(size_bytes, now_ns=now_ns)
         self._count(Channel.CONTROL, payload, b"", encoding=DELIVERIES[Channel.CONTROL].encoding, at_ns=at_ns)
         self.budget.record_metadata(size_bytes, now_ns=at_ns)
-        return at_ns + round(size_bytes * 8 * _SECOND_NS / self._link_bps)
+        return at_ns + round(size_bytes * 8 * SECOND_NS / self._link_bps)
 
     def arrived(self, now_ns: int) -> list[Arrival[UnitMessage]]:
         """What the ground has got by now."""

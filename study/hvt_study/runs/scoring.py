@@ -8,7 +8,7 @@ from typing import Any
 from hvt_common.protocol.channels import Channel
 from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.flights.flight import FlightReport
-from hvt_study.metrics.bits import Accounting, bit_split, still_counts
+from hvt_study.metrics.bits import bit_split, still_counts
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.first_correct import first_correct
@@ -48,31 +48,21 @@ def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:
 
 def _bits(report: FlightReport, context: RunContext) -> dict[str, Any]:
     stills, refined = arrivals(report.lists), refined_objects(report.lists)
-
-    def split(accounting: Accounting) -> tuple[float, ...]:
-        one = bit_split(
-            report.line_bytes,
-            processed_s=report.duration_s,
-            clip_s=context.sequence.duration_s,
-            accounting=accounting,
-        )
-        return one.total_bps, one.base_bps, one.roi_bps, one.track_bps, one.other_bps
-
-    counts = still_counts(stills, refined, processed_s=report.duration_s)
-    total, base, roi, tracks, other = map(round, split("span"))
-    pilot = tuple(map(round, split("pilot")))
+    counts = still_counts(stills, refined, seconds=report.duration_s)
+    span = bit_split(report.line_bytes, seconds=report.duration_s)
+    pilot = bit_split(report.line_bytes, seconds=context.sequence.duration_s)
     return {
         "duration_s": report.duration_s,
         "clip_s": context.sequence.duration_s,
-        "total_bps": total,
-        "base_bps": base,
-        "roi_bps": roi,
-        "track_bps": tracks,
-        "other_bps": other,
+        "total_bps": round(span.total_bps),
+        "base_bps": round(span.base_bps),
+        "roi_bps": round(span.roi_bps),
+        "track_bps": round(span.track_bps),
+        "other_bps": round(span.other_bps),
         "back_bps": round(8 * _back_bytes(report) / report.duration_s),
-        "total_bps_pilot": pilot[0],
-        "base_bps_pilot": pilot[1],
-        "roi_bps_pilot": pilot[2],
+        "total_bps_pilot": round(pilot.total_bps),
+        "base_bps_pilot": round(pilot.base_bps),
+        "roi_bps_pilot": round(pilot.roi_bps),
         "fps": report.messages.get("base", 0) / report.duration_s,
         "stills": counts.stills,
         "stills_per_min": counts.stills_per_min,

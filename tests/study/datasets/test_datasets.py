@@ -162,7 +162,7 @@ def test_a_bad_annotation_is_named_with_file_and_line(tmp_path, row, line):
             "cannot be read as an image",
         ),
         (lambda root: (root / "annotations" / "a.txt").write_text(""), "are empty"),
-        (lambda root: (root / "annotations" / "a.txt").write_bytes(b"\xff\xfe\x00"), "are not text"),
+        (lambda root: (root / "annotations" / "a.txt").write_bytes(b"\xff\xfe\x00"), "is not a text file"),
         (lambda root: [file.unlink() for file in (root / "sequences" / "a").iterdir()], "holds no images"),
         (lambda root: (root / "sequences").rename(root / "images"), "use still:"),
         (shutil.rmtree, "does not exist"),

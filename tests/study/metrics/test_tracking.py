@@ -45,7 +45,9 @@ def test_published_figures(data):
 def test_hota_is_that_of_its_authors(data):
     """TrackEval 1.3.0 gives these for the same files, each sequence and both pooled."""
     scores = [compare_tracks(tud(data, name)) for name in SEQUENCES]
-    figures = [(one.hota, one.deta, one.assa) for one in (*scores, scores[0] + scores[1])]
+    figures = [
+        (one.hota, one.higher_order.deta, one.higher_order.assa) for one in (*scores, scores[0] + scores[1])
+    ]
     expected = [
         (0.39139743784511377, 0.418047030142763, 0.36912068120832836),
         (0.3978490169927877, 0.3922675723693166, 0.40884075181129964),
@@ -59,9 +61,9 @@ def test_hota_by_hand():
     there = np.array([1]), np.array([square(0)])
     frames = [(there, (np.array([10 + k // 2]), np.array([square(0)]))) for k in range(4)]
     score = compare_tracks(frames)
-    assert score.deta == 1.0
+    assert score.higher_order.deta == 1.0
     # Each hit c: TPA 2, FNA 2, FPA 0, so A(c) is 1/2.
-    assert score.assa == pytest.approx(0.5)
+    assert score.higher_order.assa == pytest.approx(0.5)
     assert score.hota == pytest.approx(math.sqrt(0.5))
     assert (score.switches, score.mota) == (1, 0.75)
     assert score.idf1 == pytest.approx(2 * 2 / (4 + 4))
@@ -109,7 +111,8 @@ def test_nothing():
     """Reference labels know no tracks: no figure is better than a wrong one."""
     for frames in ([], [(labels((square(0), "car")), FrameView())], [(labels(), view())]):
         score = tracking_score(frames)
-        assert all(math.isnan(each) for each in (score.mota, score.idf1, score.hota, score.deta, score.assa))
+        parts = score.higher_order
+        assert all(math.isnan(each) for each in (score.mota, score.idf1, score.hota, parts.deta, parts.assa))
     ghosts = tracking_score([(labels(), view((square(0), "car", 1)))])
     assert (ghosts.false_positives, math.isnan(ghosts.mota)) == (1, True)
     blind = tracking_score([(labels((square(0), "car", 1)), FrameView())] * 2)
