@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
 
 from hvt_common.values import Orientation, Pose
 
-__all__ = ["between", "metres_per_degree", "moved"]
+__all__ = ["between", "metres_per_degree", "moved", "turned_deg"]
 
 _EQUATOR_M = 6_378_137.0
 _ECCENTRICITY2 = 6.69437999014e-3
 """First eccentricity of WGS 84 squared (NGA.STND.0036)."""
+_Degrees = TypeVar("_Degrees", float, npt.NDArray[np.float64])
+
+
+def turned_deg(degrees: _Degrees) -> _Degrees:
+    """The same direction from -180 up to 180; of a difference the shorter way round."""
+    return (degrees + 180) % 360 - 180
 
 
 def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
@@ -30,7 +40,7 @@ def moved(latitude_deg: float, longitude_deg: float, *, north_m: float, east_m: 
     """Latitude and longitude of a place so many metres away, degrees; longitude from -180 up to 180."""
     north, east = metres_per_degree(latitude_deg)
     longitude = longitude_deg + east_m / max(east, 1e-6)
-    return latitude_deg + north_m / north, (longitude + 180) % 360 - 180
+    return latitude_deg + north_m / north, turned_deg(longitude)
 
 
 def between(first: Pose, second: Pose, capture_ns: int) -> Pose:
@@ -48,18 +58,18 @@ def between(first: Pose, second: Pose, capture_ns: int) -> Pose:
             return None
         pitch = one.pitch_deg + (other.pitch_deg - one.pitch_deg) * share
         return Orientation(
-            (one.yaw_deg + _turned(one.yaw_deg, other.yaw_deg) * share) % 360,
+            (one.yaw_deg + turned_deg(other.yaw_deg - one.yaw_deg) * share) % 360,
             max(-90.0, min(90.0, pitch)),
-            _turned(0.0, one.roll_deg + _turned(one.roll_deg, other.roll_deg) * share),
+            turned_deg(one.roll_deg + turned_deg(other.roll_deg - one.roll_deg) * share),
         )
 
     latitude = first.latitude_deg + (second.latitude_deg - first.latitude_deg) * share
-    longitude = first.longitude_deg + _turned(first.longitude_deg, second.longitude_deg) * share
+    longitude = first.longitude_deg + turned_deg(second.longitude_deg - first.longitude_deg) * share
     return replace(
         first,
         capture_ns=capture_ns,
         latitude_deg=max(-90.0, min(90.0, latitude)),
-        longitude_deg=_turned(0.0, longitude),
+        longitude_deg=turned_deg(longitude),
         height_m=line(first.height_m, second.height_m),
         altitude_m=line(first.altitude_m, second.altitude_m),
         camera=turn(first.camera, second.camera),
@@ -69,8 +79,3 @@ def between(first: Pose, second: Pose, capture_ns: int) -> Pose:
         height_error_m=max(first.height_error_m, second.height_error_m),
         angle_error_deg=max(first.angle_error_deg, second.angle_error_deg),
     )
-
-
-def _turned(first_deg: float, second_deg: float) -> float:
-    """From the first angle to the second the shorter way, -180 up to 180."""
-    return (second_deg - first_deg + 180) % 360 - 180

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable
 from typing import Any
 
 from hvt_common.runtime.failures import FailedPart, Failures
-from hvt_common.units import SECOND_NS, bitrate_text, counts_text
+from hvt_common.units import bitrate_text, counts_text
 from hvt_ground.events import Event
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink, Sink
+from hvt_ground.sinks.tracks_table import utc_text
 from hvt_ground.state import EdgeState, GroundState
 
 __all__ = ["completed", "status_text", "summary", "table"]
@@ -139,8 +139,8 @@ def completed(
                 "part": one.part,
                 "reason": one.reason,
                 "count": one.count,
-                "since": _utc(one.since_ns),
-                "last": _utc(one.failed_ns),
+                "since": utc_text(one.since_ns, milliseconds=False),
+                "last": utc_text(one.failed_ns, milliseconds=False),
                 "working": one.working,
             }
             for one in failed
@@ -203,14 +203,10 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
 
 def failed_text(one: FailedPart) -> str:
     """What does not work, since when."""
-    return f"{one.part} FAILED at {_utc(one.since_ns)[11:19]} UTC"
+    return f"{one.part} FAILED at {utc_text(one.since_ns)[11:19] or '?'} UTC"
 
 
 def _concerns(part: str, edge: str) -> bool:
     """Whether a part is this edge's, or nobody's: ``recording of uav-1``, ``timing table``."""
     _, of, whose = part.rpartition(" of ")
     return not of or whose == edge
-
-
-def _utc(unix_ns: int) -> str:
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(unix_ns // SECOND_NS))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from hvt_common.geodesy import between, metres_per_degree, moved
+from hvt_common.geodesy import between, metres_per_degree, moved, turned_deg
 from hvt_common.values import Orientation, Pose
 
 
@@ -30,6 +31,8 @@ def test_longitudes_go_round():
     assert moved(0.0, 179.9999, north_m=0, east_m=100)[1] == pytest.approx(-179.9992, abs=1e-4)
     first, second = Pose(0, 0.0, 179.9998), Pose(10, 0.0, -179.9998)
     assert abs(between(first, second, 5).longitude_deg) == pytest.approx(180.0, abs=1e-9)
+    assert [turned_deg(one) for one in (-190.0, 179.0, 180.0, 540.0)] == [170.0, 179.0, -180.0, -180.0]
+    assert turned_deg(np.array([-190.0, 0.0, 180.0])).tolist() == [170.0, 0.0, -180.0]
 
 
 def test_angles_turn_the_shorter_way():

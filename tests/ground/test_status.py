@@ -112,6 +112,11 @@ def test_what_could_not_be_written_is_named_of_the_edge_it_concerns(ground):
     rows = [text for name, text in table(content) if name in ("failed", "missing")]
     assert any("second recording of uav-1" in row and "did not work again" in row for row in rows)
     assert any("events in second recording of uav-1" in row for row in rows)
+    absurd = Failures(lambda: 2**90)
+    absurd.failed("timing table", "gone")
+    failed = completed(summary(ground.ended[0]), ground.sessions, failures=absurd)["failed"]
+    assert [(one["part"], one["since"], one["last"]) for one in failed] == [("timing table", "", "")]
+    assert status_text(StateMaker(time.time_ns, failures=absurd).make([])) == "timing table FAILED at ? UTC"
 
 
 def test_the_state_says_what_is_known_and_nothing_else(ground):

@@ -75,8 +75,6 @@ class BacklogAssembly:
         self._done: OrderedDict[ObjectKey, int] = OrderedDict()
         self._refusals: OrderedDict[ObjectKey, int] = OrderedDict()
         self._unreported: OrderedDict[ObjectKey, int] = OrderedDict()
-        self.refused = 0
-        """Objects that were complete and unusable."""
 
     @property
     def size_bytes(self) -> int:
@@ -124,7 +122,6 @@ class BacklogAssembly:
         if entry is None or not entry.handed:
             return
         del self._open[key]
-        self.refused += not usable
         if usable:
             self._finish(key, entry.total_bytes)
             return

@@ -59,11 +59,6 @@ class EdgeBacklog:
         return () if self._recordings is None else tuple(self._recordings.paths)
 
     @property
-    def refused(self) -> int:
-        """Objects that came whole and were unusable."""
-        return self._assembly.refused
-
-    @property
     def working(self) -> int:
         """How many objects have come and are not where they belong yet."""
         return self._working

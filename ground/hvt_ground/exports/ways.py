@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final
 
-__all__ = ["Fix", "line", "parts_of", "turned_deg"]
+from hvt_common.geodesy import turned_deg
+
+__all__ = ["Fix", "line", "parts_of"]
 
 _DIGITS: Final = 7
 """Of degrees: a centimetre."""
@@ -65,8 +67,3 @@ def _crossing(before: Fix, after: Fix, side_deg: float) -> Fix:
         before.latitude_deg + share * (after.latitude_deg - before.latitude_deg),
         None if heights[0] is None or heights[1] is None else heights[0] + share * (heights[1] - heights[0]),
     )
-
-
-def turned_deg(degrees: float) -> float:
-    """The same turn the shorter way."""
-    return (degrees + 180) % 360 - 180

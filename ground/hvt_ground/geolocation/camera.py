@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.geodesy import metres_per_degree
+from hvt_common.geodesy import metres_per_degree, turned_deg
 from hvt_common.values import Boxes, Pose, View
 from hvt_ground.events import Places
 from hvt_ground.geolocation.surface import FLAT_GROUND, Points, Rays, Surface
@@ -88,7 +88,7 @@ def places_of_boxes(
     places = np.stack(
         (
             pose.latitude_deg + metres[:, 0] / north_m,
-            (pose.longitude_deg + metres[:, 1] / max(east_m, 1e-6) + 180) % 360 - 180,
+            turned_deg(pose.longitude_deg + metres[:, 1] / max(east_m, 1e-6)),
         ),
         axis=1,
     )

@@ -22,10 +22,10 @@ from rasterio.warp import reproject, transform, transform_bounds
 from rasterio.windows import Window
 
 from hvt_common.errors import UserError
-from hvt_common.geodesy import metres_per_degree
+from hvt_common.geodesy import metres_per_degree, turned_deg
 from hvt_ground.geolocation.surface import Points
 
-__all__ = ["TILE_M", "ElevationModel", "ModelError", "Tile", "turned_deg"]
+__all__ = ["TILE_M", "ElevationModel", "ModelError", "Tile"]
 
 TILE_M: Final = 15_000.0
 """Half the side of what is in memory at a time."""
@@ -138,11 +138,6 @@ class ElevationModel:
             for turn in parts:
                 metres = np.where(np.isnan(metres), _read(file, area.turned(-turn), shape), metres)
         return Tile(metres, area)
-
-
-def turned_deg(degrees: Points) -> Points:
-    """The same directions from -180 up to 180."""
-    return (degrees + 180) % 360 - 180
 
 
 @contextmanager

@@ -10,9 +10,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.geodesy import metres_per_degree
+from hvt_common.geodesy import metres_per_degree, turned_deg
 from hvt_common.values import Pose
-from hvt_ground.geolocation.elevation import TILE_M, ElevationModel, ModelError, Tile, turned_deg
+from hvt_ground.geolocation.elevation import TILE_M, ElevationModel, ModelError, Tile
 from hvt_ground.geolocation.surface import LEAST_DEPRESSION_DEG, Points, Rays
 
 __all__ = ["Terrain"]
@@ -112,8 +112,8 @@ class Terrain:
         failure = None
         with self._lock:
             north_m, east_m = metres_per_degree(pose.latitude_deg)
-            east_deg = turned_deg(np.array(pose.longitude_deg - self._middle[1])) if self._tile else math.inf
-            off_m = math.hypot((pose.latitude_deg - self._middle[0]) * north_m, float(east_deg) * east_m)
+            east_deg = turned_deg(pose.longitude_deg - self._middle[1]) if self._tile else math.inf
+            off_m = math.hypot((pose.latitude_deg - self._middle[0]) * north_m, east_deg * east_m)
             if self._tile is None or not off_m <= TILE_M - _REACH_M:
                 self._middle = (pose.latitude_deg, pose.longitude_deg)
                 try:

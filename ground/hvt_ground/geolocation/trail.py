@@ -7,7 +7,7 @@ from bisect import bisect_right
 from dataclasses import replace
 from typing import Final
 
-from hvt_common.geodesy import between, metres_per_degree
+from hvt_common.geodesy import between, metres_per_degree, turned_deg
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
 
@@ -83,7 +83,7 @@ def _continued(before: Pose, last: Pose, capture_ns: int) -> Pose:
     north_m, east_m = metres_per_degree(last.latitude_deg)
     way_m = math.hypot(
         (last.latitude_deg - before.latitude_deg) * north_m,
-        ((last.longitude_deg - before.longitude_deg + 180) % 360 - 180) * east_m,
+        turned_deg(last.longitude_deg - before.longitude_deg) * east_m,
     )
     climbed_m = abs((last.height_m or 0.0) - (before.height_m or 0.0))
     return replace(
@@ -106,8 +106,8 @@ def _turn_deg(first: Orientation | None, second: Orientation | None) -> float:
     if first is None or second is None:
         return 0.0
     changes = (
-        (second.yaw_deg - first.yaw_deg + 180) % 360 - 180,
+        turned_deg(second.yaw_deg - first.yaw_deg),
         second.pitch_deg - first.pitch_deg,
-        (second.roll_deg - first.roll_deg + 180) % 360 - 180,
+        turned_deg(second.roll_deg - first.roll_deg),
     )
     return max(abs(one) for one in changes)

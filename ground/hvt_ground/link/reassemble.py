@@ -52,14 +52,6 @@ FRAME_SLACK = 4096  # after an outage a backlog comes at once, with holes for th
 _WINDOW_MASK = (1 << SEQUENCE_SLACK) - 1
 _REMEMBERED_SESSIONS = 16
 _REQUEST_INTERVALS_NS = (300_000_000, 300_000_000, 600_000_000, 1_000_000_000)
-_COUNTER_OF: dict[Verdict, str] = {
-    "decode": "decodable",
-    "skip": "skipped",
-    "duplicate": "duplicates",
-    "stale": "replayed",
-    "foreign": "foreign",
-    "implausible": "implausible",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +75,8 @@ class Arrival:
 
 @dataclass(slots=True)
 class StreamCounters:
-    """Totals since the start, over all sessions. Units still waiting behind a hole are in ``received`` only."""
+    """Totals since the start, over all sessions."""
 
-    received: int = 0
-    decodable: int = 0
-    skipped: int = 0
     gaps: int = 0
     """Holes in the sequence that were given up."""
     lost: int = 0
@@ -95,12 +84,8 @@ class StreamCounters:
     duplicates: int = 0
     replayed: int = 0
     """Verdict stale: late or replayed."""
-    foreign: int = 0
-    implausible: int = 0
     corrupt: int = 0
     """Reported by the caller: the header could not be read, or the CRC was wrong."""
-    sessions: int = 0
-    """Adopted; one that starts afresh after implausible numbers counts again."""
     keyframe_requests: int = 0
 
     def since(self, before: StreamCounters) -> StreamCounters:
@@ -138,19 +123,8 @@ class Reassembler:
         self._requested_ns: int | None = None
         self._requests_in_gap = 0
 
-    @property
-    def held(self) -> int:
-        """How many units wait behind a hole."""
-        return len(self._held)
-
-    @property
-    def session_id(self) -> int | None:
-        """Of the session that is shown; None before the first keyframe. Stills of others are not wanted."""
-        return self._session
-
     def accept(self, header: BaseHeader, payload: bytes, *, now_ns: int) -> list[Arrival]:
         """Take one access unit whose CRC is right; return all that is now settled, in order."""
-        self.counters.received += 1
         unit = Arrival("decode", header, payload, now_ns)
         if header.session_id in self._disowned:
             return [self._judged(unit, "foreign")]
@@ -328,7 +302,6 @@ class Reassembler:
         self._interval_ns, self._progress_ns = 0, now_ns
         self._first = self._next = header.sequence
         self._last_frame, self._recent = header.frame_index - 1, 0
-        self.counters.sessions += 1
 
     def _judged(
         self,
@@ -340,8 +313,8 @@ class Reassembler:
         duplicate: bool = False,
     ) -> Arrival:
         """The unit with its verdict, counted."""
-        name = _COUNTER_OF[verdict]
-        setattr(self.counters, name, getattr(self.counters, name) + 1)
+        self.counters.duplicates += verdict == "duplicate"
+        self.counters.replayed += verdict == "stale"
         starts_run = verdict == "decode" and not self._synced
         if verdict == "decode":
             self._synced = True

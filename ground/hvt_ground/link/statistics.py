@@ -116,12 +116,8 @@ class ReceptionStatistics:
             since_ns = now_ns - self._reported_ns
             return since_ns >= _MOST_NS or (self._news and since_ns >= self._interval_ns(now_ns))
 
-    def interval_ns(self, now_ns: int) -> int:
-        """Between two reports while messages arrive."""
-        with self._lock:
-            return self._interval_ns(now_ns)
-
     def _interval_ns(self, now_ns: int) -> int:
+        """Between two reports while messages arrive."""
         if self._lockstep:
             return _MOST_NS
         self._forget(now_ns)

@@ -153,12 +153,12 @@ class Pipeline:
     @property
     def refined(self) -> int:
         """Distinct tracks that a still has refined."""
-        return self._parts.refiner.counters.tracks_refined
+        return self._parts.refiner.tracks_refined
 
     @property
     def class_changes(self) -> int:
         """Stills after which the class that is shown was another."""
-        return self._parts.refiner.counters.class_changes
+        return self._parts.refiner.class_changes
 
     @property
     def stills_dropped(self) -> Counter[str]:

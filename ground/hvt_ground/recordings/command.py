@@ -15,6 +15,7 @@ from hvt_common.runtime.reporting import say
 from hvt_common.units import SECOND_NS, parse_limit
 from hvt_ground.recordings.database import read_index
 from hvt_ground.recordings.row import RecordingRow
+from hvt_ground.sinks.tracks_table import utc_text
 
 __all__ = ["run"]
 
@@ -98,12 +99,7 @@ def _as_json(row: RecordingRow, folder: Path) -> dict[str, object]:
 
 
 def _utc(unix_ns: int | None) -> str:
-    if unix_ns is None:
-        return ""
-    try:
-        return datetime.fromtimestamp(unix_ns // SECOND_NS, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    except (ValueError, OverflowError, OSError):
-        return ""
+    return "" if unix_ns is None else utc_text(unix_ns, milliseconds=False)
 
 
 def _parser() -> argparse.ArgumentParser:

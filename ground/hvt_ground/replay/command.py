@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -82,11 +82,7 @@ def run(argv: Sequence[str]) -> int:
     config, loaded = load(
         GroundConfig, words[len(files) :], program="hvt-ground replay", description=str(__doc__)
     )
-    for name in _OF_A_LINK:
-        if name in loaded.values:
-            raise UserError(f"--{name.replace('_', '-')} is not accepted: a replay has no link")
-    if "cot" in loaded.values:
-        raise UserError("--cot is not accepted: others would take what is replayed for what is there now")
+    _check_given(loaded.values)
     if config.provider == "auto":  # by its speed it may choose one this time and another the next
         config = replace(config, provider="cpu")
     sessions = _Replay(check(config), messages, speed=given.speed).run()
@@ -97,6 +93,15 @@ def run(argv: Sequence[str]) -> int:
     if config.summary is not None:
         write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions)
     return 0
+
+
+def _check_given(settings: Container[str]) -> None:
+    """`UserError` for a setting that means nothing here, or too much."""
+    for name in _OF_A_LINK:
+        if name in settings:
+            raise UserError(f"--{name.replace('_', '-')} is not accepted: a replay has no link")
+    if "cot" in settings:
+        raise UserError("--cot is not accepted: others would take what is replayed for what is there now")
 
 
 class _ReplayPort:

@@ -82,10 +82,11 @@ def _place_texts(places: Places | None, row: int) -> tuple[str, str, str]:
     return f"{latitude:.7f}", f"{longitude:.7f}", f"{places.ellipses[row, 0]:.1f}"
 
 
-def utc_text(unix_ns: int) -> str:
-    """``2026-11-22T13:01:02.345Z``; empty where no calendar has the time, which comes from the wire."""
+def utc_text(unix_ns: int, *, milliseconds: bool = True) -> str:
+    """``2026-11-22T13:01:02.345Z``; empty where no calendar has the time, which may come from the wire."""
     try:
         time = datetime.fromtimestamp(unix_ns // SECOND_NS, UTC)
     except (ValueError, OverflowError, OSError):
         return ""
-    return time.strftime("%Y-%m-%dT%H:%M:%S.") + f"{unix_ns // 1_000_000 % 1000:03d}Z"
+    rest = f".{unix_ns // 1_000_000 % 1000:03d}" if milliseconds else ""
+    return time.strftime("%Y-%m-%dT%H:%M:%S") + rest + "Z"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hvt_common.video.annex_b import nal_units
 from hvt_common.video.still_codecs import (
     BaseMissingError,
     StillError,
@@ -13,7 +14,7 @@ from hvt_common.video.still_codecs import (
     still_codec,
 )
 from hvt_common.video.still_codecs.av_still import decoded
-from hvt_common.video.still_codecs.bits import BitReader, BitWriter, escaped, nal_units, unescaped
+from hvt_common.video.still_codecs.bits import BitReader, BitWriter, escaped, unescaped
 from hvt_common.video.still_codecs.h264_syntax import parameter_sets, verbatim_picture
 from hvt_common.video.still_codecs.residual import CHECKSUM
 from hvt_common.video.still_codecs.yuv420 import difference_bgr, filled_outside, to_bgr, to_planar

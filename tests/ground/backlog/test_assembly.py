@@ -154,7 +154,6 @@ def test_an_unusable_object_is_asked_for_again_but_not_for_ever():
     assert assembly.chunk(header(), TEN) == TEN
     assembly.settle(KEY, usable=False)
     assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 10),)
-    assert assembly.refused == 3
 
 
 def test_what_cannot_be_taken_now_comes_again():

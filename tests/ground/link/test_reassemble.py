@@ -44,10 +44,12 @@ class Ground:
         self.core: Reassembler = Reassembler()
         self.now_ns = 5_000_000_000
         self.out: list[Arrival] = []
+        self._sent = 0
 
     def send(self, sequence, *, key=False, session=1, frame=None, after_ns=FRAME_NS):
         """Let one unit arrive ``after_ns`` later; (verdict, sequence) of all that is settled by it."""
         self.now_ns += after_ns
+        self._sent += 1
         header = Header(session, sequence, sequence * 2 if frame is None else frame, key)
         resolved = self.core.accept(header, b"%d/%d" % (session, sequence), now_ns=self.now_ns)
         self.out += resolved
@@ -56,6 +58,14 @@ class Ground:
     def decoded(self):
         """The sequence numbers that went to the decoder."""
         return [unit.header.sequence for unit in self.out if unit.verdict == "decode"]
+
+    def held(self):
+        """How many units have no verdict yet."""
+        return self._sent - len(self.out)
+
+    def sessions(self):
+        """How many were adopted; one that starts afresh counts again."""
+        return sum(unit.starts_session for unit in self.out)
 
     def wants(self):
         """Whether a keyframe is wanted now."""
@@ -92,21 +102,12 @@ def assert_decodable(out):
         previous = unit
 
 
-def assert_counted(core):
-    """Every unit that came has exactly one verdict, or waits."""
-    total = core.counters
-    resolved = total.decodable + total.skipped + total.duplicates + total.replayed
-    resolved += total.foreign + total.implausible
-    assert total.received == resolved + core.held
-
-
 def test_a_whole_stream_is_decoded_whole(running):
     """A clean link would lose frames, or the payload would not reach the decoder as it was."""
     assert running.decoded() == [0, 1, 2, 3]
     assert [unit.payload for unit in running.out] == [b"1/0", b"1/1", b"1/2", b"1/3"]
     assert [unit.starts_run for unit in running.out] == [True, False, False, False]
     assert running.out[0].starts_session
-    assert running.core.session_id == 1
     assert not running.wants()
 
 
@@ -137,8 +138,9 @@ def test_a_gap_skips_to_the_next_keyframe(running):
     assert running.out[4].lost_before == 1
     assert running.out[-2].starts_run
     assert not running.out[-2].starts_session
+    assert running.decoded() == [0, 1, 2, 3, 9, 10]
     counters = running.core.counters
-    assert (counters.gaps, counters.lost, counters.skipped, counters.decodable) == (1, 1, 4, 6)
+    assert (counters.gaps, counters.lost) == (1, 1)
 
 
 def test_a_unit_that_comes_late_but_in_time_loses_nothing(running):
@@ -210,11 +212,10 @@ def test_a_restarted_edge_is_shown_from_its_keyframe_and_its_past_is_not(running
     running.now_ns += SILENCE_NS + ADOPTION_INTERVAL_NS
     assert running.send(0, key=True, session=2) == [("decode", 0)]
     assert running.out[-1].starts_session
-    assert running.core.session_id == 2
     assert running.send(4, session=1) == [("foreign", 4)]
     assert running.send(2, session=1) == [("stale", 2)]
     assert running.send(1, session=2) == [("decode", 1)]
-    assert running.core.counters.sessions == 2
+    assert running.sessions() == 2
 
 
 def test_a_quick_restart_is_asked_for_a_second_keyframe(running):
@@ -232,7 +233,7 @@ def test_two_edges_of_one_name_do_not_thrash(running):
         running.send(sequence, after_ns=FRAME_NS // 2)
         running.send(sequence - 4, session=2, key=sequence % 5 == 4, after_ns=FRAME_NS // 2)
     assert running.decoded() == list(range(100))
-    assert running.core.counters.foreign == 96
+    assert [unit.verdict for unit in running.out].count("foreign") == 96
     assert not running.wants()
 
 
@@ -318,7 +319,7 @@ def test_a_long_outage_is_one_gap_of_one_session(running):
     assert running.send(304, after_ns=20_000 * MS) == []
     assert running.send(305, key=True) == [("skip", 304), ("decode", 305)]
     assert running.core.counters.lost == 300
-    assert running.core.counters.sessions == 1
+    assert running.sessions() == 1
 
 
 def test_a_backlog_with_many_dropped_frames_is_decoded(running):
@@ -384,21 +385,20 @@ def test_no_pattern_of_loss_and_reordering_reaches_the_decoder(pattern, copies_l
             arrivals += [(sequence + late + copies_late * n, sequence, key) for n in range(1, copies + 1)]
     for _, sequence, key in sorted(arrivals, key=lambda arrival: arrival[0]):
         ground.send(sequence, key=key, after_ns=step_ms * MS)
-        assert ground.core.held <= REORDER_UNITS
+        assert 0 <= ground.held() <= REORDER_UNITS, "each unit has one verdict, or waits"
     assert_decodable(ground.out)
-    assert_counted(ground.core)
 
     end = len(pattern)
     ground.now_ns += RESTART_SILENCE_NS  # whatever was delayed has come
     tail = [ground.send(end + n, key=n == 0) for n in range(3)]
     assert [resolved[-1] for resolved in tail] == [("decode", end + n) for n in range(3)]
     assert_decodable(ground.out)
-    assert_counted(ground.core)
+    assert ground.held() == 0
     distinct = {sequence for _, sequence, _ in arrivals}
-    total = ground.core.counters
-    if distinct and ground.core.counters.sessions == 1:
+    if distinct and ground.sessions() == 1:
         first = next(unit for unit in ground.out if unit.starts_session).header.sequence
-        assert total.lost >= sum(sequence >= first and p[1] for sequence, p in enumerate(pattern))
+        lost = ground.core.counters.lost
+        assert lost >= sum(sequence >= first and p[1] for sequence, p in enumerate(pattern))
 
 
 hostile = st.tuples(
@@ -419,10 +419,9 @@ def test_forged_headers_neither_grow_memory_nor_end_the_picture(messages):
         ground.send(sequence, key=key, session=session, frame=frame, after_ns=after_ms * MS)
         if ground.wants():
             ground.core.keyframe_requested(ground.now_ns)
-        assert ground.core.held <= REORDER_UNITS
+        assert 0 <= ground.held() <= REORDER_UNITS, "each unit has one verdict, or waits"
         assert footprint_bytes(ground.core) < 40_000
     assert_decodable(ground.out)
-    assert_counted(ground.core)
 
     sequence = 0  # the true edge, of a session nobody has forged, answers requests with keyframes
     while sequence < 60:
@@ -431,9 +430,8 @@ def test_forged_headers_neither_grow_memory_nor_end_the_picture(messages):
             ground.core.keyframe_requested(ground.now_ns)
         ground.send(sequence, key=key, session=-1)
         sequence += 1
-    assert ground.core.session_id == -1
-    assert ground.out[-1].verdict == "decode"
-    assert ground.out[-1].header.sequence == 59
+    last = ground.out[-1]
+    assert (last.verdict, last.header.session_id, last.header.sequence) == ("decode", -1, 59)
 
 
 @settings(deadline=None, max_examples=50)
@@ -446,7 +444,7 @@ def test_a_flood_of_invented_sessions_does_not_disturb_a_live_one(sessions, keys
         ground.send(0, key=keys, session=session, after_ns=0)
         ground.send(sequence)
     assert ground.decoded() == list(range(len(sessions) + 1))
-    assert ground.core.counters.sessions == 1
+    assert ground.sessions() == 1
     assert not ground.wants()
 
 
@@ -466,10 +464,10 @@ def test_the_picture_comes_back_after_somebody_has_counted_on_in_the_edges_name(
         ground.send(sequence, key=key)
     assert ground.decoded()[-1] == 150
     assert_decodable(ground.out)
-    assert ground.core.counters.sessions == 2
+    assert ground.sessions() == 2
 
 
 def test_a_replayed_keyframe_of_a_moment_ago_does_not_start_the_picture_afresh(running):
     """Whoever repeats the last keyframe while the link is down would show the operator an old scene as the new."""
     assert running.send(0, key=True, after_ns=3 * RESTART_SILENCE_NS) == [("duplicate", 0)]
-    assert running.core.counters.sessions == 1
+    assert running.sessions() == 1

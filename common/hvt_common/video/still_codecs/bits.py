@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["BitReader", "BitWriter", "escaped", "nal_units", "unescaped"]
+__all__ = ["BitReader", "BitWriter", "escaped", "unescaped"]
 
-_START_CODE = re.compile(rb"\x00\x00\x00?\x01")
 _NEEDS_ESCAPE = re.compile(rb"\x00\x00(?=[\x00-\x03])")
 
 
@@ -69,11 +68,6 @@ class BitReader:
     def next_byte(self) -> int:
         """The index of the first byte that is not begun."""
         return -(-self.position // 8)
-
-
-def nal_units(stream: bytes) -> list[bytes]:
-    """The units of an Annex B stream, without start codes."""
-    return [unit for unit in _START_CODE.split(stream) if unit]
 
 
 def unescaped(unit: bytes) -> bytes:

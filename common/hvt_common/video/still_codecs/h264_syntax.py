@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hvt_common.video.still_codecs.bits import BitReader, BitWriter, escaped, nal_units, unescaped
+from hvt_common.video.annex_b import nal_units
+from hvt_common.video.still_codecs.bits import BitReader, BitWriter, escaped, unescaped
 from hvt_common.video.still_codecs.yuv420 import BLOCK_PX, Planar
 
 __all__ = ["CHROMA_QP_OFFSET", "cabac_data", "coded_slice", "parameter_sets", "verbatim_picture"]

@@ -15,9 +15,8 @@ the box is their mean, weighted by confidence and by age: the weight halves ever
 seen, and the edge's counts `EDGE_BOX_WEIGHT` times.
 
 **What it is.** Each side has one vote, the class that its own tracker has settled on, and the confidence, smoothed
-over some detections, is its weight; the edge's counts `EDGE_CLASS_WEIGHT` times, and as often more as its source is finer
-than the base. A still's opinion comes after, in
-`refine`, and stands above both.
+over some detections, is its weight; the edge's counts `EDGE_CLASS_WEIGHT` times, and as often more as its source is
+finer than the base. A still's opinion comes after, in `refine`, and stands above both.
 
 **How long.** The edge's knowledge ends when two steps in a row do not list the track, or nothing has been reported of
 it for `PATIENCE_S`; what only a still has shown ends so long after the still.
@@ -110,11 +109,6 @@ class Fusion:
         self._next_id = 1
         self._stepped = -1
         self._merged: list[tuple[int, int]] = []
-
-    @property
-    def knows_from_afar(self) -> bool:
-        """Whether there is anything to be moved along with the camera."""
-        return any(entity.afar is not None for entity in self._entities)
 
     def known_as(self, edge_track_id: int) -> int | None:
         """The id that a track of the edge is listed under; None while it is not."""

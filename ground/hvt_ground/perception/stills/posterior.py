@@ -49,12 +49,11 @@ _Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ClassEstimate:
-    """A class with its probability and the entropy of the distribution it comes from."""
+    """A class with its probability."""
 
     class_id: int
     """Of `Vocabulary.names`."""
     confidence: float
-    entropy_nats: float
     sure: bool = False
     """The newest still alone and all of them together give the class more than `SURE`: many stills of one object err
     alike, and their product says more than they know."""
@@ -93,7 +92,7 @@ class TrackPosterior:
         if said.probabilities[class_id] >= said.probabilities[best]:
             best = class_id
         sure = self._clear and said.confidence > SURE
-        return ClassEstimate(best, said.confidence, said.entropy_nats, sure=sure)
+        return ClassEstimate(best, said.confidence, sure=sure)
 
     def fused(self, vocabulary: Vocabulary, *, class_id: int, confidence: float) -> ClassEstimate:
         """All stills together with the detector's present vote (its class and confidence on the base)."""
@@ -107,10 +106,9 @@ class TrackPosterior:
         best = int(probabilities.argmax())
         if probabilities[best] <= probabilities[class_id] + MARGIN:
             best = class_id
-        entropy_nats = max(0.0, -float(probabilities @ logs))
         now = float(probabilities[best])
         sure = self._clear and min(now, float(said.probabilities[best])) > SURE
-        return ClassEstimate(best, now, entropy_nats, sure=sure)
+        return ClassEstimate(best, now, sure=sure)
 
     def _said(self) -> Posterior:
         if self._newest is None:

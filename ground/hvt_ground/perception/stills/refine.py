@@ -35,7 +35,6 @@ from hvt_ground.perception.stills.vocabulary import Vocabulary
 __all__ = [
     "Mode",
     "Outcome",
-    "RefinementCounters",
     "Refiner",
     "ResolvedStill",
     "ShownClasses",
@@ -48,24 +47,6 @@ Mode = Literal["replace", "fuse"]
 MAX_HELD = 256
 MAX_TRACK_POSTERIORS = 1024
 _REMEMBERED_STILLS = 4096
-
-
-@dataclass(slots=True)
-class RefinementCounters:
-    """Totals of one session."""
-
-    offered: int = 0
-    replayed: int = 0
-    """Offered again under a sequence number that was here before, and ignored."""
-    matched: int = 0
-    """Including those superseded."""
-    unmatched: int = 0
-    late: int = 0
-    """Among the unmatched: those whose outcome is late."""
-    tracks_refined: int = 0
-    """Distinct tracks of the ground that a still has refined."""
-    class_changes: int = 0
-    """Stills after which the class shown was another than before."""
 
 
 def _unknown(_edge_track_id: int) -> None:
@@ -101,7 +82,10 @@ class Refiner:
         forget_s: float = 10.0,
         iou: float = 0.5,
     ) -> None:
-        self.counters = RefinementCounters()
+        self.tracks_refined = 0
+        """Distinct tracks of the ground that a still has refined."""
+        self.class_changes = 0
+        """Stills after which the class shown was another than before."""
         self._mode = mode
         self._vocabulary = vocabulary
         self._calibrated = calibrated
@@ -121,9 +105,7 @@ class Refiner:
         ``now_frame`` is the newest frame that was decoded. A part of a still that was here before is ignored.
         """
         if still.key in self._seen:
-            self.counters.replayed += 1
             return []
-        self.counters.offered += 1
         self._seen[still.key] = None
         if len(self._seen) > _REMEMBERED_STILLS:
             self._seen.popitem(last=False)
@@ -281,7 +263,7 @@ class Refiner:
         if class_posterior is None:
             before = int(tracks.class_ids[row])
             class_posterior = self._track_posteriors[track_id] = TrackPosterior(tracks.frame_index)
-            self.counters.tracks_refined += 1
+            self.tracks_refined += 1
             if len(self._track_posteriors) > MAX_TRACK_POSTERIORS:
                 self._track_posteriors.popitem(last=False)
         else:
@@ -294,8 +276,7 @@ class Refiner:
         )
         self._touch(track_id, class_posterior, still.frame_index)
         after = self._read(class_posterior, tracks, row)
-        self.counters.matched += 1
-        self.counters.class_changes += after.class_id != before
+        self.class_changes += after.class_id != before
         names = self._vocabulary.names
         return ResolvedStill(
             still=still,
@@ -304,14 +285,11 @@ class Refiner:
             class_before=names[before],
             class_after=names[after.class_id],
             confidence=after.confidence,
-            entropy_nats=after.entropy_nats,
             doubted=after.class_id == self._vocabulary.nothing,
             sure=self._is_sure(after),
         )
 
     def _unmatched(self, still: StillSeen, outcome: Outcome) -> ResolvedStill:
-        self.counters.unmatched += 1
-        self.counters.late += outcome == "late"
         said = still.posterior
         return ResolvedStill(
             still=still,
@@ -320,7 +298,6 @@ class Refiner:
             class_before=still.class_name,
             class_after=said.class_name,
             confidence=said.confidence,
-            entropy_nats=said.entropy_nats,
             doubted=self._vocabulary.says_nothing(said.class_name),
         )
 

@@ -95,8 +95,6 @@ class ResolvedStill:
     """The class that is shown from now on; without a track what the still alone says."""
     confidence: float
     """Of ``class_after``, 0…1."""
-    entropy_nats: float
-    """Of the distribution that ``class_after`` was taken from."""
     doubted: bool = False
     """``class_after`` is nothing of mine."""
     sure: bool = False

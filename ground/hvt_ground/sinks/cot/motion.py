@@ -6,7 +6,7 @@ import math
 from collections import deque
 from typing import Final
 
-from hvt_common.geodesy import metres_per_degree
+from hvt_common.geodesy import metres_per_degree, turned_deg
 from hvt_common.units import SECOND_NS
 from hvt_ground.sinks.cot.event import Motion
 
@@ -48,5 +48,5 @@ class MotionTrail:
 def metres_between(first: Place, second: Place) -> tuple[float, float]:
     """Metres north and east from one to the other, some kilometres at the most."""
     north, east = metres_per_degree(first[0])
-    turned = (second[1] - first[1] + 180) % 360 - 180
+    turned = turned_deg(second[1] - first[1])
     return (second[0] - first[0]) * north, turned * east

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.geodesy import turned_deg
 from hvt_common.values import Orientation, Pose, View
 from hvt_ground.events import Overlay
 from hvt_ground.geolocation.footprint import Footprint, fields_of_view, footprint
@@ -143,7 +144,7 @@ def _ground_items(pose: Pose, ground: Footprint) -> Iterator[tuple[int, bytes]]:
         yield 25, _altitude(pose.altitude_m - ground.below_m)
     if ground.corners is None:
         return
-    offsets = [(north - latitude, (east - longitude + 180) % 360 - 180) for north, east in ground.corners]
+    offsets = [(north - latitude, turned_deg(east - longitude)) for north, east in ground.corners]
     if all(abs(one) <= _CORNER_DEG for offset in offsets for one in offset):
         for number, offset in enumerate(offsets):
             yield 26 + 2 * number, signed(offset[0], _CORNER_DEG, size=2)

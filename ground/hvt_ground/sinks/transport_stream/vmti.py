@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from hvt_common.geodesy import turned_deg
 from hvt_ground.events import Overlay
 from hvt_ground.sinks.transport_stream.klv import ber_length, ber_oid, imapb, item, whole
 
@@ -76,7 +77,7 @@ def _target(
     ]
     if centre is not None and overlay.places is not None:
         latitude, longitude = overlay.places.places_deg[row].tolist()
-        across = (longitude - centre[1] + 180) % 360 - 180
+        across = turned_deg(longitude - centre[1])
         offsets = [imapb(one, -_OFFSET_DEG, _OFFSET_DEG, size=3) for one in (latitude - centre[0], across)]
         if all(offsets):
             items += [item(10, offsets[0]), item(11, offsets[1])]
