@@ -29,7 +29,7 @@ class LeverSettings:
 
     tracks_bps: int
     """Line bits a second that tracks take of the budget."""
-    on_gain: float = 0.035
+    on_gain: float = 0.05
     """From so much net gain on tracks are sent …"""
     off_gain: float = 0.02
     """… until it falls below this: what is taken for hidden is in part what the detector alone sees."""

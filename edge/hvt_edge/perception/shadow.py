@@ -12,9 +12,10 @@ confidences p):
     true    = sum of p over source boxes + sum of p over base-only boxes
     base    = 2 (sum of p over source boxes that the base shows, w of it where it bears another class there)
                 / (shown + base-only + true)
-    sent    = 2 (sum of p over all source boxes, 1 - w of it where the base bears another class)
-                / (all + base-only + true)
+    sent    = 2 (sum of p over shown and hidden boxes, 1 - w of it where the base bears another class)
+                / (shown + hidden + base-only + true)
 
+``hidden`` are the source boxes that the base does not show and the ground would list: from `ALONE_CONFIDENCE` on.
 ``w`` is 1/3: of two names for one object that of the finer picture is right twice as often (our choice).
 """
 
@@ -28,6 +29,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.tracking.bytetrack import ALONE_CONFIDENCE
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
 from hvt_edge.perception.analyzer import AnalyzedFrame
@@ -54,8 +56,6 @@ class ShadowSettings:
     """Of a processor core, for comparisons; in lockstep, where no clock may decide, only ``rest_ns`` counts."""
     memory_s: float = 8.0
     """Time constant with which former comparisons fade."""
-    lost_ns: int = 2 * SECOND_NS
-    """So long the ground's tracker lists what its detector sees no more."""
     scene_correlation: float = 0.3
     """Two pictures a third of a second apart that correlate less, as thumbnails, are of two scenes."""
     match_iou: float = 0.3
@@ -68,13 +68,14 @@ class Shadow:
 
     comparisons: float = 0.0
     """How many comparisons the means are worth."""
-    source: float = 0.0
-    """Boxes of the source."""
     source_p: float = 0.0
-    """Sum of their confidences."""
+    """Sum of the confidences of all boxes of the source."""
     shown: float = 0.0
-    """Of these, the boxes that the base shows too."""
+    """Those of them that the base shows too."""
     shown_p: float = 0.0
+    hidden: float = 0.0
+    """Those that the base does not show and the ground would list."""
+    hidden_p: float = 0.0
     misnamed: float = 0.0
     """Of the shown, those that bear another class on the base."""
     misnamed_p: float = 0.0
@@ -83,24 +84,20 @@ class Shadow:
     false_p: float = 0.0
 
     @property
-    def hidden(self) -> float:
-        """Objects a picture that the base does not show."""
-        return self.source - self.shown
-
-    @property
     def misnamed_share(self) -> float:
         """Of the objects that the base shows, those that it shows under another class."""
         return self.misnamed / self.shown if self.shown else 0.0
 
     @property
     def gain(self) -> float:
-        """How much expected named F1 the ground's list gains by being sent every source box; 0 at first."""
+        """How much expected named F1 the ground's list gains by being sent the source's boxes; 0 at first."""
         true = self.source_p + self.false_p
         if not true:
             return 0.0
         named_p = self.shown_p - (1 - _BASE_NAMES) * self.misnamed_p
-        sent_p = self.source_p - _BASE_NAMES * self.misnamed_p
-        return 2 * sent_p / (self.source + self.false + true) - 2 * named_p / (self.shown + self.false + true)
+        sent_p = self.shown_p + self.hidden_p - _BASE_NAMES * self.misnamed_p
+        listed = self.shown + self.false
+        return 2 * sent_p / (listed + self.hidden + true) - 2 * named_p / (listed + true)
 
 
 class ShadowGround:
@@ -122,8 +119,8 @@ class ShadowGround:
         self._spent_ns = spent_ns
         self._next_ns = 0
         self._last_ns: int | None = None
-        self._shown_ns: dict[int, int] = {}
-        """Track id → when the base showed it last."""
+        self._shown_ids = np.empty(0, np.int64)
+        """Tracks that the base showed at the comparison before."""
         self._thumbnail: tuple[int, npt.NDArray[np.float32]] | None = None
         self.scene_changes = 0
         """How often another scene began."""
@@ -165,7 +162,8 @@ class ShadowGround:
     def _forget(self) -> None:
         """Another scene: what was measured says nothing of it."""
         self.scene_changes += 1
-        self.now, self._last_ns, self._next_ns, self._shown_ns = Shadow(), None, 0, {}
+        self.now, self._last_ns, self._next_ns = Shadow(), None, 0
+        self._shown_ids = np.empty(0, np.int64)
 
     def _compared(self, seen: AnalyzedFrame, found: Detections) -> Shadow:
         tracks, least = seen.tracks, self._settings.confidence
@@ -174,33 +172,28 @@ class ShadowGround:
         # A track that has begun goes on with weak detections too, so that they show an object.
         overlaps = iou(found.boxes_xyxy_px, boxes)
         same = overlaps >= self._settings.match_iou
-        shown = same.any(axis=0)
-        ids = tracks.ids[rows]
-        self._note_shown(ids[shown].tolist(), seen.frame.capture_ns)
-        shown |= np.isin(ids, list(self._shown_ns))
-        alone = (found.confidences >= least) & ~same.any(axis=1)
+        strong = found.confidences >= least
+        began = np.isin(tracks.ids[rows], self._shown_ids)
+        shown = (same & (strong[:, None] | began)).any(axis=0)
+        self._shown_ids = tracks.ids[rows][shown]
+        hidden = ~shown & (p >= ALONE_CONFIDENCE)
+        alone = strong & ~same.any(axis=1)
         misnamed = np.zeros(len(rows), bool)
-        matched = same.any(axis=0)
-        if matched.any():
-            best = overlaps[:, matched].argmax(axis=0)
-            misnamed[matched] = found.class_ids[best] != tracks.class_ids[rows][matched]
+        if shown.any():
+            best = overlaps[:, shown].argmax(axis=0)
+            misnamed[shown] = found.class_ids[best] != tracks.class_ids[rows][shown]
         return Shadow(
             comparisons=1,
-            source=len(rows),
             source_p=float(p.sum()),
             shown=int(shown.sum()),
             shown_p=float(p[shown].sum()),
+            hidden=int(hidden.sum()),
+            hidden_p=float(p[hidden].sum()),
             misnamed=int(misnamed.sum()),
             misnamed_p=float(p[misnamed].sum()),
             false=int(alone.sum()),
             false_p=float(found.confidences[alone].sum()),
         )
-
-    def _note_shown(self, ids: list[int], capture_ns: int) -> None:
-        """These tracks are shown now. The ground's tracker carries a track on for a while, so they stay shown."""
-        since_ns = capture_ns - self._settings.lost_ns
-        recent = {track_id: at_ns for track_id, at_ns in self._shown_ns.items() if at_ns >= since_ns}
-        self._shown_ns = recent | dict.fromkeys(ids, capture_ns)
 
     def _take(self, one: Shadow, capture_ns: int) -> None:
         weight = 0.0

@@ -68,9 +68,9 @@ def test_the_gain_is_that_of_the_formula():
     """Levers would be moved by a number that means something else than the docs say."""
     shadow = compared(found(0, 5), confidences={0: 0.9, 1: 0.5, 2: 0.7})
     true = 0.9 + 0.5 + 0.7 + 0.8
-    base, sent = 2 * 0.9 / (1 + 1 + true), 2 * 2.1 / (3 + 1 + true)
+    base, sent = 2 * 0.9 / (1 + 1 + true), 2 * 1.6 / (2 + 1 + true)  # at .5 it would not be listed
     assert shadow.now.gain == pytest.approx(sent - base, abs=1e-6)
-    assert (shadow.now.hidden, shadow.now.false) == (2, 1)
+    assert (shadow.now.hidden, shadow.now.false) == (1, 1)
 
 
 def test_a_box_that_is_hardly_real_gains_nothing():
@@ -79,7 +79,7 @@ def test_a_box_that_is_hardly_real_gains_nothing():
         compared(found(0, 1), confidences={0: 0.95, 1: 0.95, 2: doubt}).now.gain for doubt in (0.95, 0.6, 0.2)
     ]
     assert gains == sorted(gains, reverse=True)
-    assert gains[0] > 0 > gains[-1]
+    assert gains[0] > 0 == gains[-1]
 
 
 def test_a_name_that_the_base_gets_wrong_counts():
@@ -90,12 +90,12 @@ def test_a_name_that_the_base_gets_wrong_counts():
     assert (wrong.misnamed_share, wrong.gain) == (1.0, pytest.approx(2 * 0.9 / 3 / 1.9, abs=1e-6))
 
 
-def test_what_the_tracker_carries_on_is_not_hidden():
-    """The ground lists an object for two seconds more; each flicker of the detector would count as a loss."""
-    flickers = compared(found(0), found(), confidences={0: 0.9}, every=15)
-    gone = compared(found(0), found(), confidences={0: 0.9}, every=45)
-    assert flickers.now.hidden == 0
-    assert gone.now.hidden > 0
+def test_a_weak_detection_shows_what_a_strong_one_has_shown():
+    """The ground's tracker lists nothing that never was sure, and goes on with what was."""
+    weak = found(0, confidence=0.2)
+    assert compared(weak, weak, confidences={0: 0.9}).now.hidden == 1
+    assert compared(found(0), weak, weak, confidences={0: 0.9}).now.hidden == 0
+    assert compared(found(0), found(), weak, confidences={0: 0.9}).now.hidden > 0.5
 
 
 def test_another_scene_forgets_and_a_moving_camera_does_not():
@@ -153,5 +153,5 @@ def _measured(size: tuple[int, int], kbps: int) -> float:
         for frame in source.frames(start_ns=0):
             shadow.compare(analyzer.analyze(frame, encoder.encode(frame)))
     assert shadow.now.comparisons > 1
-    assert shadow.now.source > 5, "there is something to see"
+    assert shadow.now.source_p > 5, "there is something to see"
     return shadow.now.gain

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.tracking.bytetrack import ALONE_CONFIDENCE
 from hvt_common.values import Tracks, iou
 from hvt_ground.events import Origin
 from hvt_ground.perception.fusion.camera_path import CameraPath
@@ -22,8 +23,6 @@ SAME_IOU = 0.5
 TWIN_IOU = 0.85
 EDGE_BOX_WEIGHT = 4.0
 """A box from the source overlaps the truth better than ours on a base of 200 kbit/s even when it is 0.5 s old."""
-ALONE_CONFIDENCE = 0.3
-"""Of what the edge alone reports at less, one in two is nothing."""
 CORRECTION_WEIGHT = 0.5
 """A still's box stands against one box of ours at that frame, and each is off by a little."""
 
