@@ -180,8 +180,8 @@ def closed_and_used() -> Use:
 
 def stays(before: Use, after: Use) -> None:
     """Memory, threads and files are what they were."""
-    grown = after.rss_bytes - before.rss_bytes
-    assert grown < MOST_GROWTH_BYTES, f"{grown / 2**20:.1f} MiB"
+    most = before.rss_bytes + MOST_GROWTH_BYTES  # on a busy machine what was in hand goes a little later
+    eventually(lambda: Use(after.pid).rss_bytes < most, within_s=20, what="memory is given back")
     eventually(lambda: Use(after.pid).threads <= before.threads + 2, within_s=20, what="threads have ended")
     eventually(lambda: Use(after.pid).files <= before.files + 2, within_s=20, what="files are closed")
 
