@@ -41,7 +41,7 @@ from hvt_edge.wiring import (
     check_store,
     qualify_encoder,
     track_confidence,
-    tried_decimation,
+    try_scene,
 )
 from hvt_edge.world import World
 
@@ -104,7 +104,6 @@ class Edge:
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
             headroom = qualify_encoder(config, source, clock=world.clock, stop=self._stop)
-            decimation = tried_decimation(config, source, clock=world.clock, stop=self._stop)
             background = (lambda call: call()) if self._lockstep else with_lower_priority
             opened = background(lambda: world.open_detector(config))
             background(lambda: world.warm_up(config, opened, source))
@@ -117,6 +116,7 @@ class Edge:
                     clock=world.clock,
                     hint=FewFoundHint(config.detector, confidence=track_confidence(config)),
                 )
+            beginning = try_scene(config, source, detector=detector, clock=world.clock, stop=self._stop)
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             link = world.open_link(stack, config)
             stages = build_stages(
@@ -133,7 +133,7 @@ class Edge:
                 clock=world.clock,
                 loop_clock=self._loop_clock,
                 wait_until=self._wait_until,
-                decimation=decimation,
+                beginning=beginning,
                 headroom=headroom,
             )
             heartbeat = Heartbeat(self._state_maker(stages, link, source.view), clock=world.clock)

@@ -29,10 +29,10 @@ class LeverSettings:
 
     tracks_bps: int
     """Line bits a second that tracks take of the budget."""
-    on_gain: float = 0.05
+    on_gain: float = 0.02
     """From so much net gain on tracks are sent …"""
-    off_gain: float = 0.02
-    """… until it falls below this: what is taken for hidden is in part what the detector alone sees."""
+    off_gain: float = 0.01
+    """… until it falls below this."""
     gain_per_doubling: float = 0.07
     """What twice the bits give video: .05 to .11 between 100 and 400 kbps (docs/design-notes/compare.md)."""
     least_comparisons: float = 1.5
@@ -52,6 +52,18 @@ class LeverSettings:
     """Seconds over which the machine is judged."""
     least_analyzed: float = 0.03
     """The share of frames that perception must have time for: two pictures in five seconds."""
+
+    def net_gain(self, gain: float, *, total_bps: int) -> float:
+        """Of tracks, less what the video would gain by their bits."""
+        share = min(0.9, self.tracks_bps / total_bps)
+        return gain - self.gain_per_doubling * math.log2(1 / (1 - share))
+
+    def tracks_pay(self, gain: float, *, comparisons: float, total_bps: int, sent: bool = False) -> bool:
+        """Whether tracks are to be sent, by the gain of so many comparisons; ``sent``: they are being sent."""
+        net_gain = self.net_gain(gain, total_bps=total_bps)
+        if comparisons < self.least_comparisons:
+            return comparisons > 0 and net_gain >= self.plain_gain
+        return net_gain >= (self.off_gain if sent else self.on_gain)
 
 
 class LeverControl:
@@ -120,18 +132,11 @@ class LeverControl:
             self._operating.pull(levers)
         return levers
 
-    @property
-    def net_gain(self) -> float:
-        """Of the tracks, less what the video would gain by their bits."""
-        settings, total_bps = self._settings, self._operating.now.total_bps
-        share = min(0.9, settings.tracks_bps / total_bps)
-        return self._gain - settings.gain_per_doubling * math.log2(1 / (1 - share))
-
     def _tracks(self, sent: bool) -> bool:  # noqa: FBT001 - the state before
-        settings, net_gain = self._settings, self.net_gain
-        if self._comparisons < settings.least_comparisons:
-            return self._comparisons > 0 and net_gain >= settings.plain_gain
-        return net_gain >= (settings.off_gain if sent else settings.on_gain)
+        total_bps = self._operating.now.total_bps
+        return self._settings.tracks_pay(
+            self._gain, comparisons=self._comparisons, total_bps=total_bps, sent=sent
+        )
 
     def _stills(self, now_ns: int) -> bool:
         settings = self._settings

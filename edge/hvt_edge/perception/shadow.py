@@ -15,7 +15,8 @@ confidences p):
     sent    = 2 (sum of p over shown and hidden boxes, 1 - w of it where the base bears another class)
                 / (shown + hidden + base-only + true)
 
-``hidden`` are the source boxes that the base does not show and the ground would list: from `ALONE_CONFIDENCE` on.
+``hidden`` are the source boxes that the base does not show and the ground would list: from `ALONE_CONFIDENCE` on. Of
+hidden and misnamed ones only those count that are sure, n - sqrt(n) of n.
 ``w`` is 1/3: of two names for one object that of the finer picture is right twice as often (our choice).
 """
 
@@ -34,7 +35,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
 from hvt_edge.perception.analyzer import AnalyzedFrame
 
-__all__ = ["Shadow", "ShadowGround", "ShadowSettings"]
+__all__ = ["UNMEASURED", "Shadow", "ShadowGround", "ShadowSettings"]
 
 _THUMBNAIL = (32, 18)
 _BASE_NAMES = 1 / 3
@@ -90,14 +91,31 @@ class Shadow:
 
     @property
     def gain(self) -> float:
-        """How much expected named F1 the ground's list gains by being sent the source's boxes; 0 at first."""
+        """How much expected named F1 the ground's list gains by being sent the source's boxes; 0 at first.
+
+        By what is sure: hidden and misnamed objects count less one standard error of such a count (Poisson), for two
+        pictures of one second show the same objects, and of two or three the detector may just be wrong.
+        """
         true = self.source_p + self.false_p
         if not true:
             return 0.0
-        named_p = self.shown_p - (1 - _BASE_NAMES) * self.misnamed_p
-        sent_p = self.shown_p + self.hidden_p - _BASE_NAMES * self.misnamed_p
+        hidden, misnamed_p = _sure(self.hidden), _sure(self.misnamed) * _per(self.misnamed_p, self.misnamed)
+        hidden_p = hidden * _per(self.hidden_p, self.hidden)
+        named_p = self.shown_p - (1 - _BASE_NAMES) * misnamed_p
+        sent_p = self.shown_p + hidden_p - _BASE_NAMES * misnamed_p
         listed = self.shown + self.false
-        return 2 * sent_p / (listed + self.hidden + true) - 2 * named_p / (listed + true)
+        return 2 * sent_p / (listed + hidden + true) - 2 * named_p / (listed + true)
+
+
+def _sure(count: float) -> float:
+    return max(0.0, count - math.sqrt(count))
+
+
+def _per(total: float, count: float) -> float:
+    return total / count if count else 0.0
+
+
+UNMEASURED = Shadow()
 
 
 class ShadowGround:
@@ -105,6 +123,7 @@ class ShadowGround:
 
     ``detect`` is the detector on a whole picture, as the ground runs it; None of it while it does not work.
     ``spent_ns`` is a clock in nanoseconds by which the cost of a comparison is measured; None in lockstep.
+    It goes on from what was measured of the scene ``before``.
     """
 
     def __init__(
@@ -113,6 +132,7 @@ class ShadowGround:
         *,
         settings: ShadowSettings,
         spent_ns: Callable[[], int] | None = None,
+        before: Shadow = UNMEASURED,
     ) -> None:
         self._detect = detect
         self._settings = settings
@@ -124,7 +144,7 @@ class ShadowGround:
         self._thumbnail: tuple[int, npt.NDArray[np.float32]] | None = None
         self.scene_changes = 0
         """How often another scene began."""
-        self.now = Shadow()
+        self.now = before
 
     def compare(self, seen: AnalyzedFrame) -> bool:
         """Compare, if this is a decision step on a coded frame and one is due; tell whether it was done."""
@@ -135,6 +155,7 @@ class ShadowGround:
             return False
         if not self._next_ns:  # the first picture of a stream is coarser than any other
             self._next_ns = capture_ns + self._settings.quick_rest_ns
+            self._last_ns = capture_ns  # what was measured before is no older
             return False
         began_ns = self._spent_ns() if self._spent_ns else 0
         found = self._detect(seen.base_bgr)
@@ -162,7 +183,7 @@ class ShadowGround:
     def _forget(self) -> None:
         """Another scene: what was measured says nothing of it."""
         self.scene_changes += 1
-        self.now, self._last_ns, self._next_ns = Shadow(), None, 0
+        self.now, self._last_ns, self._next_ns = UNMEASURED, None, 0
         self._shown_ids = np.empty(0, np.int64)
 
     def _compared(self, seen: AnalyzedFrame, found: Detections) -> Shadow:

@@ -1,24 +1,36 @@
-"""What quantiser a scene needs: its first second is coded once before the flight."""
+"""What a scene needs: its first second is coded once before the flight, and looked at."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
-from hvt_common.values import Frame
+from hvt_common.values import AccessUnit, Frame
 from hvt_edge.video.encoders.contract import Encoder
 
-__all__ = ["TRIAL_FRAMES", "trial_quantiser"]
+__all__ = ["trial_frames", "trial_quantiser"]
 
-TRIAL_FRAMES = 7
+_TRIAL_S = 0.85
+"""As long as two comparisons of the shadow ground take."""
 _LAST = 3
 """The last so many count: those before still pay for the keyframe."""
 
 
-def trial_quantiser(encoder: Encoder, scene: Iterable[Frame]) -> float:
-    """Mean quantiser (0…51) of the last of `TRIAL_FRAMES`; NaN for a shorter scene, or an encoder that tells none."""
+def trial_frames(fps: float) -> int:
+    """How many frames are coded, at so many a second; as many as count, at least."""
+    return max(_LAST, 1 + math.floor(_TRIAL_S * fps))
+
+
+def trial_quantiser(
+    encoder: Encoder, scene: Iterable[Frame], *, count: int, look: Callable[[Frame, AccessUnit], object]
+) -> float:
+    """Mean quantiser (0…51) of the last of ``count`` frames; NaN for a shorter scene, or an encoder that tells none.
+
+    ``look`` takes each frame with its unit.
+    """
     quantisers = []
     for number, frame in enumerate(scene):
-        encoder.encode(frame, keyframe=number == 0)
+        unit = encoder.encode(frame, keyframe=number == 0)
         quantisers.append(encoder.mean_qp)
-    return sum(quantisers[-_LAST:]) / _LAST if len(quantisers) == TRIAL_FRAMES else math.nan
+        look(frame, unit)
+    return sum(quantisers[-_LAST:]) / _LAST if len(quantisers) == count else math.nan

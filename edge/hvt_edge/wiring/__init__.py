@@ -5,6 +5,7 @@ from hvt_edge.wiring.perception import make_detector, track_confidence, warm_up_
 from hvt_edge.wiring.stages import Stages, build_stages
 from hvt_edge.wiring.stills import check_codecs
 from hvt_edge.wiring.storing import check_files, check_store, store_folder
+from hvt_edge.wiring.trial import Beginning, try_scene
 from hvt_edge.wiring.video import (
     as_the_camera_is,
     base_size,
@@ -12,10 +13,10 @@ from hvt_edge.wiring.video import (
     first_decimation,
     make_encoder,
     qualify_encoder,
-    tried_decimation,
 )
 
 __all__ = [
+    "Beginning",
     "Stages",
     "as_the_camera_is",
     "base_size",
@@ -31,6 +32,6 @@ __all__ = [
     "qualify_encoder",
     "store_folder",
     "track_confidence",
-    "tried_decimation",
+    "try_scene",
     "warm_up_for",
 ]

@@ -51,12 +51,12 @@ def channels_of(config: EdgeConfig, *, live: bool) -> tuple[Channel, ...]:
     return tuple(one for one in sent if optional.get(one, True))
 
 
-def make_budget(config: EdgeConfig, *, decimation: int) -> RollingBudget:
+def make_budget(config: EdgeConfig, *, base_bps: int, decimation: int) -> RollingBudget:
     """B_tot and B_v over the rolling window."""
     return RollingBudget(
         BudgetSettings(
             total_bps=config.budget_bps,
-            base_bps=config.base_bps,
+            base_bps=base_bps,
             fps=config.nominal_fps / decimation,
             window_ns=round(config.window * SECOND_NS),
             metadata_bps=config.metadata_bps,
@@ -65,8 +65,8 @@ def make_budget(config: EdgeConfig, *, decimation: int) -> RollingBudget:
     )
 
 
-def make_split(config: EdgeConfig, size: tuple[int, int]) -> Split | None:
-    """Who moves the base's share of the budget; None where it is fixed."""
+def make_split(config: EdgeConfig, size: tuple[int, int], *, first_share: float) -> Split | None:
+    """Who moves the base's share of the budget, from the first on; None where it is fixed."""
     if not isinstance(config.video_share, str):
         return None
     fps = LEAST_FPS if config.auto_fps else config.nominal_fps
@@ -77,15 +77,19 @@ def make_split(config: EdgeConfig, size: tuple[int, int]) -> Split | None:
     )
     if config.measures:  # stills have to earn more
         settings = replace(settings, most_still_share=_AUTO_STILL_SHARE, own_rest_s=_AUTO_REST_S)
-        return Split(settings, first_share=config.share)
-    return Split(settings)
+    return Split(settings, first_share=first_share)
 
 
 def make_levers(config: EdgeConfig, operating: Operating) -> LeverControl | None:
     """Who decides what is sent beside the video; None where the settings do."""
     if not config.measures:
         return None
-    return LeverControl(operating, LeverSettings(tracks_bps=config.metadata_bps))
+    return LeverControl(operating, lever_settings(config))
+
+
+def lever_settings(config: EdgeConfig) -> LeverSettings:
+    """What tracks and stills must give."""
+    return LeverSettings(tracks_bps=config.metadata_bps)
 
 
 def make_pacer(config: EdgeConfig, stream: CameraStream | None) -> Pacer | None:

@@ -15,7 +15,7 @@ from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings, FailingDetector
 from hvt_edge.perception.guarded_detector import GuardedDetector
-from hvt_edge.perception.shadow import ShadowGround, ShadowSettings
+from hvt_edge.perception.shadow import UNMEASURED, Shadow, ShadowGround, ShadowSettings
 
 _log = logging.getLogger(__name__)
 
@@ -60,8 +60,12 @@ def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) 
     )
 
 
-def make_shadow(config: EdgeConfig, detector: FailingDetector) -> ShadowGround | None:
+def make_shadow(
+    config: EdgeConfig, detector: FailingDetector, *, before: Shadow = UNMEASURED
+) -> ShadowGround | None:
     """What measures how much of the source the base stream shows; None where nothing depends on it.
+
+    It goes on from what was measured ``before``.
 
     `MOTION` remembers the pictures of one stream, and those of the base are another.
     """
@@ -75,6 +79,7 @@ def make_shadow(config: EdgeConfig, detector: FailingDetector) -> ShadowGround |
     return ShadowGround(
         whole,
         settings=ShadowSettings(confidence=track_confidence(config)),
+        before=before,
         spent_ns=None if config.pace == "lockstep" else time.thread_time_ns,
     )
 

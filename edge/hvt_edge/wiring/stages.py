@@ -22,7 +22,7 @@ from hvt_edge.link.still_readers import StillReaders
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.point import LoopClock, Operating
+from hvt_edge.operating.point import LoopClock, Operating, base_rate_bps
 from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.pose.contract import PoseSource
 from hvt_edge.pose.stage import PoseStage
@@ -49,6 +49,7 @@ from hvt_edge.wiring.link import (
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.stills import make_chooser, make_on_demand, make_still_maker
 from hvt_edge.wiring.storing import make_backlog
+from hvt_edge.wiring.trial import Beginning
 from hvt_edge.wiring.video import (
     make_encoder,
     make_frame_skip,
@@ -91,28 +92,29 @@ def build_stages(
     clock: Callable[[], int],
     loop_clock: LoopClock,
     wait_until: Callable[[int], None],
-    decimation: int,
+    beginning: Beginning,
     headroom: float = 1.0,
 ) -> Stages:
     """Build every part once, each with all that it needs; files and threads end with ``stack``.
 
-    Each ``decimation``-th source frame is coded at the start (`tried_decimation`).
+    ``beginning`` is what `try_scene` found.
     ``headroom`` is what of its rate the encoder is asked for (`qualify_encoder`).
     Raises `UserError` where the encoder does not take the settings, or a file cannot be written.
     """
-    view, class_names = source.view, detector.class_names
+    view, class_names, decimation = source.view, detector.class_names, beginning.decimation
     lockstep = config.pace == "lockstep"
+    base_bps = base_rate_bps(config.budget_bps, beginning.share, metadata_bps=config.metadata_bps)
     operating = Operating(
         budget_bps=config.budget_bps,
         video_share=config.fixed_share,
-        base_bps=config.base_bps,
+        base_bps=base_bps,
         method=config.method,
         decimation=decimation,
     )
     keyframes, pacer = make_keyframes(config, source), make_pacer(config, source.camera_stream)
     open_encoder = partial(make_encoder, config, size=view.base_size, headroom=headroom)
-    encoder = open_encoder(total_bps=config.budget_bps, base_bps=config.base_bps, decimation=decimation)
-    budget = make_budget(config, decimation=decimation)
+    encoder = open_encoder(total_bps=config.budget_bps, base_bps=base_bps, decimation=decimation)
+    budget = make_budget(config, base_bps=base_bps, decimation=decimation)
     # Files come after all that may be refused: a failed start leaves nothing behind.
     write_truth_of(source, config.truth, fps=config.nominal_fps)
     local_copy = None
@@ -135,7 +137,7 @@ def build_stages(
         reconfiguration_settings(config, view.base_size),
         open_encoder=open_encoder,
         transmitter=transmitter,
-        split=make_split(config, view.base_size),
+        split=make_split(config, view.base_size, first_share=beginning.share),
         pacer=pacer,
     )
     still_readers = StillReaders(clock)
@@ -215,10 +217,10 @@ def build_stages(
             keyframes=keyframes,
             transmitter=transmitter,
             local_copy=local_copy,
-            first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
+            first_keyframe_bytes=base_bps // 40,  # a fifth of a second: what the VBV lets through
             regions=make_regions(config, view.base_size),
             frame_skip=LimitedFrameSkip(
-                make_frame_skip(config, decimation), reconfiguration.least_decimation
+                make_frame_skip(config, decimation, size=view.base_size), reconfiguration.least_decimation
             ),
             reconfigure=reconfiguration,
             admits=link_control.admits,
@@ -253,7 +255,7 @@ def build_stages(
         transmitter=transmitter,
         keyframes=keyframes,
         reporter=TrackReporter(transmitter, session_id=session_id) if config.send_tracks else None,
-        shadow=make_shadow(config, detector),
+        shadow=make_shadow(config, detector, before=beginning.shadow),
         levers=make_levers(config, operating),
     )
     commands = Commands(

@@ -17,7 +17,7 @@ from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
 from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, without_password
-from hvt_edge.video.encoder_settings import encoder_settings, least_base_bps, payload_bps
+from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_bytes, payload_bps
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
 from hvt_edge.video.encoders.qualification import allowed, headroom_of, run_frames
@@ -27,13 +27,13 @@ from hvt_edge.video.keyframes import keyframe_interval_s
 from hvt_edge.video.rate_model import PROMPT, SPARING, choose_base, most_decimation
 from hvt_edge.video.reconfigure import ReconfigurationSettings
 from hvt_edge.video.regions import TrackRegions
-from hvt_edge.video.trial import TRIAL_FRAMES, trial_quantiser
 
 _log = logging.getLogger(__name__)
 
 _MOST_ENCODER_THREADS = 4  # a 720p picture has twelve rows of blocks, each some steps behind the one above
 _AUTO_LEAST_FPS = 7.5
-"""With ``--profile auto``: frames that are larger arrive later, and nobody asked for delay."""
+"""With ``--profile auto``: frames that are larger arrive later, and nobody asked for delay. Fewer only where a frame
+then still takes less time than a keyframe."""
 _MOST_SILENT_S = 10
 """A live source that gives no frame for so many seconds has no scene to try an encoder on."""
 _SAME_RATE = 0.02
@@ -42,8 +42,6 @@ _REST_S = 10.0
 """How often ``--fps auto`` may think again."""
 _AUTO_WINDOW_S = 1.0
 """With ``--profile auto`` it goes by the last second."""
-_TRIAL_FINE = 33.5
-"""Of `trial_quantiser` at the lowest rate: below it all frames are coded. Measured as `PROMPT` was."""
 
 
 def base_size(config: EdgeConfig) -> BaseSize:
@@ -71,31 +69,13 @@ def first_decimation(config: EdgeConfig, size: tuple[int, int]) -> int:
     return _chosen(config, size, size=size)[1]
 
 
-def tried_decimation(
-    config: EdgeConfig, source: Source, *, clock: Callable[[], int], stop: threading.Event
-) -> int:
-    """As `first_decimation`; ``--profile auto`` codes the first second of the scene to see whether all frames fit."""
-    size = source.view.base_size
-    decimation = first_decimation(config, size)
-    slowest = most_decimation(config.nominal_fps, least_fps=_AUTO_LEAST_FPS)
-    feasible = config.base_bps >= least_base_bps(size, config.nominal_fps, edge_id=config.edge_id)
-    tries = config.measures and config.auto_fps and decimation > 1
-    if not (tries and feasible) or config.encoder != X265:
-        return decimation
-    rates = {"total_bps": config.budget_bps, "base_bps": config.base_bps}
-    quantiser = trial_quantiser(
-        make_encoder(config, size=size, decimation=slowest, **rates),
-        _scene(source, decimation=slowest, count=TRIAL_FRAMES, clock=clock, stop=stop),
-    )
-    return 1 if quantiser < _TRIAL_FINE else decimation
-
-
 def _chosen(
     config: EdgeConfig, source_size: tuple[int, int], *, size: tuple[int, int] | None
 ) -> tuple[tuple[int, int], int]:
+    likely_size = size or min(source_size, DEFAULT_SIZE)
     rate_bps = payload_bps(
         config.base_bps,
-        size=size or min(source_size, DEFAULT_SIZE),
+        size=likely_size,
         fps=config.nominal_fps,
         edge_id=config.edge_id,
     )
@@ -105,20 +85,23 @@ def _chosen(
         size=size,
         fps=None if config.auto_fps else config.nominal_fps,
         most_fps=config.nominal_fps,
-        least_fps=_least_fps(config),
+        least_fps=_least_fps(config, likely_size),
     )
 
 
-def _least_fps(config: EdgeConfig) -> float:
+def _least_fps(config: EdgeConfig, size: tuple[int, int]) -> float:
     """The lowest rate of coded frames that is chosen; a thin link may enforce less."""
-    return _AUTO_LEAST_FPS if config.measures else LEAST_FPS
+    if not config.measures:
+        return LEAST_FPS
+    keyframes_fps = config.budget_bps / (8 * keyframe_floor_bytes(size))
+    return max(LEAST_FPS, min(_AUTO_LEAST_FPS, keyframes_fps))
 
 
-def make_frame_skip(config: EdgeConfig, decimation: int) -> FrameSkip:
+def make_frame_skip(config: EdgeConfig, decimation: int, *, size: tuple[int, int]) -> FrameSkip:
     """Which source frames are coded."""
     if not config.auto_fps:
         return FrameSkip(decimation)
-    most = most_decimation(config.nominal_fps, least_fps=_least_fps(config))
+    most = most_decimation(config.nominal_fps, least_fps=_least_fps(config, size))
     return MeasuredFrameSkip(
         decimation,
         most_decimation=most,
@@ -190,7 +173,7 @@ def qualify_encoder(
     headroom = headroom_of(
         config.encoder,
         open_at=lambda share: make_encoder(config, size=size, decimation=decimation, headroom=share, **rates),
-        scene=lambda: _scene(source, decimation=decimation, count=count, clock=clock, stop=stop),
+        scene=lambda: scene(source, decimation=decimation, count=count, clock=clock, stop=stop),
         frames=count,
         limit=limit,
         edge_id=config.edge_id,
@@ -202,7 +185,7 @@ def qualify_encoder(
     return headroom
 
 
-def _scene(
+def scene(
     source: Source, *, decimation: int, count: int, clock: Callable[[], int], stop: threading.Event
 ) -> Iterator[Frame]:
     """The first ``count`` of each n-th frame, to try an encoder on. A clip begins anew after it."""

@@ -66,17 +66,41 @@ def compared(*answers: Detections, confidences: dict[int, float], every: int = 3
 
 def test_the_gain_is_that_of_the_formula():
     """Levers would be moved by a number that means something else than the docs say."""
-    shadow = compared(found(0, 5), confidences={0: 0.9, 1: 0.5, 2: 0.7})
-    true = 0.9 + 0.5 + 0.7 + 0.8
-    base, sent = 2 * 0.9 / (1 + 1 + true), 2 * 1.6 / (2 + 1 + true)  # at .5 it would not be listed
+    shadow = compared(found(0, 9), confidences={0: 0.9, 1: 0.5, **dict.fromkeys(range(2, 6), 0.7)})
+    true = 0.9 + 0.5 + 4 * 0.7 + 0.8
+    sure = 4 - 2  # of four hidden; at .5 it would not be listed
+    base, sent = 2 * 0.9 / (1 + 1 + true), 2 * (0.9 + sure * 0.7) / (1 + sure + 1 + true)
     assert shadow.now.gain == pytest.approx(sent - base, abs=1e-6)
-    assert (shadow.now.hidden, shadow.now.false) == (1, 1)
+    assert (shadow.now.hidden, shadow.now.false) == (4, 1)
+
+
+def test_two_that_are_hidden_tell_less_than_twenty():
+    """One object that the detector imagines in a calm scene would bring tracks, and with them more of its kind."""
+    few, many = (
+        compared(found(*range(shown)), confidences=dict.fromkeys(range(shown + hidden), 0.9)).now.gain
+        for shown, hidden in ((4, 1), (40, 10))
+    )
+    assert few == 0
+    assert many > 0.05
+
+
+def test_what_was_measured_before_the_flight_counts():
+    """Else the first comparison in flight alone would move the levers."""
+    before = compared(found(0), found(0), confidences={0: 0.9, 1: 0.9}).now
+    assert before.hidden == 1
+    shadow = ShadowGround(lambda _image: found(0, 1), settings=SETTINGS, before=before)
+    assert not shadow.compare(seen(0, {0: 0.9, 1: 0.9}))
+    assert shadow.now == before
+    assert shadow.compare(seen(6, {0: 0.9, 1: 0.9}))
+    assert shadow.now.comparisons == pytest.approx(before.comparisons + 1, rel=0.05)
+    assert shadow.now.hidden == pytest.approx(2 / 3, rel=0.1)
 
 
 def test_a_box_that_is_hardly_real_gains_nothing():
     """The ground would be sent of everything that the detector half believes."""
     gains = [
-        compared(found(0, 1), confidences={0: 0.95, 1: 0.95, 2: doubt}).now.gain for doubt in (0.95, 0.6, 0.2)
+        compared(found(0, 1), confidences={0: 0.95, 1: 0.95, **dict.fromkeys(range(2, 6), doubt)}).now.gain
+        for doubt in (0.95, 0.6, 0.2)
     ]
     assert gains == sorted(gains, reverse=True)
     assert gains[0] > 0 == gains[-1]
@@ -84,10 +108,12 @@ def test_a_box_that_is_hardly_real_gains_nothing():
 
 def test_a_name_that_the_base_gets_wrong_counts():
     """A pickup that the base shows as a car is found and not named."""
-    right = compared(found(0), confidences={0: 0.9}).now
-    wrong = compared(found(0, class_id=1), confidences={0: 0.9}).now
+    four = dict.fromkeys(range(4), 0.9)
+    right = compared(found(0, 1, 2, 3), confidences=four).now
+    wrong = compared(found(0, 1, 2, 3, class_id=1), confidences=four).now
     assert right.gain == pytest.approx(0)
-    assert (wrong.misnamed_share, wrong.gain) == (1.0, pytest.approx(2 * 0.9 / 3 / 1.9, abs=1e-6))
+    sure = (4 - 2) * 0.9
+    assert (wrong.misnamed_share, wrong.gain) == (1.0, pytest.approx(2 * sure / 3 / (4 + 3.6), abs=1e-6))
 
 
 def test_a_weak_detection_shows_what_a_strong_one_has_shown():

@@ -73,7 +73,7 @@ class Flight:
         self.transmitter = Transmitter(
             self,
             ledger=self.ledger,
-            budget=make_budget(config, decimation=1),
+            budget=make_budget(config, base_bps=config.base_bps, decimation=1),
             edge_id=config.edge_id,
             session_id=1,
             lockstep=False,

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
 from hvt_common.config import load
 from hvt_common.errors import UserError
-from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.config import EdgeConfig
 from hvt_edge.source.opening import open_source
-from hvt_edge.wiring import as_the_camera_is, base_size, default_size, tried_decimation
+from hvt_edge.wiring import as_the_camera_is, base_size, default_size
 from media.hevc_camera import SIZE, write_clip
 
 
@@ -61,37 +57,3 @@ def test_no_refusal_says_the_cameras_password(tmp_path: Path, coded, says):
         as_the_camera_is(config, source)
     assert "SECRET" not in str(caught.value)
     assert "10.0.0.5" in str(caught.value)
-
-
-def moving(folder: Path, *, coarse: int, frames: int) -> Path:
-    """A landscape that moves by three pixels a frame; the coarser its grain, the easier it is to code."""
-    rng = np.random.default_rng(1)
-    grain = rng.integers(0, 255, (420 // coarse, 720 // coarse, 3), np.uint8)
-    ground = cv2.resize(grain, (720, 420), interpolation=cv2.INTER_CUBIC)
-    for index in range(frames):
-        cv2.imwrite(str(folder / f"{index:03}.png"), ground[30:390, 3 * index : 3 * index + 640])
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("coarse", "frames", "flags", "decimation"),
-    [
-        (60, 15, (), 1),
-        (3, 15, (), 2),
-        (60, 5, (), 2),  # too short to tell: by the bits for each pixel
-        (60, 15, ("--fps", "15"), 1),
-        (3, 15, ("--fps", "15"), 1),
-    ],
-)
-def test_auto_begins_with_the_frame_rate_that_the_scene_needs(tmp_path, coarse, frames, flags, decimation):
-    """An easy scene would be shown at half its rate, and a hard one in mud."""
-    words = ["--source", str(moving(tmp_path, coarse=coarse, frames=frames)), "--pace", "lockstep", *flags]
-    words += ["--budget", "100kbps", "--size", "640x360", "--preset", "ultrafast"]
-    loaded, given = load(EdgeConfig, words, program="hvt-edge", description="")
-    config = check(with_profile(loaded, given=given.values))
-    with open_source(str(tmp_path), size=(640, 360), fps=15) as source:
-        stop = threading.Event()
-        assert tried_decimation(config, source, clock=time.time_ns, stop=stop) == decimation
-        first = next(iter(source.steps(start_ns=0)))
-        assert first is not None
-        assert first.index == 0, "the clip begins anew"

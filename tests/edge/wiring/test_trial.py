@@ -1,0 +1,77 @@
+"""``--profile auto`` looks at the first second of a scene before it flies: real x265, the embedded detector."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hvt_common.config import load
+from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.source.contract import Source
+from hvt_edge.source.opening import open_source
+from hvt_edge.wiring import Beginning, make_detector, try_scene
+
+
+def settings(source: str, budget: str, *flags: str) -> EdgeConfig:
+    words = ["--source", source, "--pace", "lockstep", "--budget", budget, "--size", "640x360"]
+    words += ["--preset", "ultrafast", *flags]
+    loaded, given = load(EdgeConfig, words, program="hvt-edge", description="")
+    return check(with_profile(loaded, given=given.values))
+
+
+def tried(config: EdgeConfig, source: Source) -> Beginning:
+    detector = make_detector(config)
+    return try_scene(config, source, detector=detector, clock=time.time_ns, stop=threading.Event())
+
+
+def moving(folder: Path, *, coarse: int, frames: int) -> Path:
+    """A landscape that moves by three pixels a frame; the coarser its grain, the easier it is to code."""
+    rng = np.random.default_rng(1)
+    grain = rng.integers(0, 255, (420 // coarse, 720 // coarse, 3), np.uint8)
+    ground = cv2.resize(grain, (720, 420), interpolation=cv2.INTER_CUBIC)
+    for index in range(frames):
+        cv2.imwrite(str(folder / f"{index:03}.png"), ground[30:390, 3 * index : 3 * index + 640])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("coarse", "frames", "flags", "decimation"),
+    [
+        (60, 15, (), 1),
+        (3, 15, (), 3),
+        (60, 5, (), 3),  # too short to tell: by the bits for each pixel
+        (60, 15, ("--fps", "15"), 1),
+        (3, 15, ("--fps", "15"), 1),
+    ],
+)
+def test_auto_begins_with_the_frame_rate_that_the_scene_needs(tmp_path, coarse, frames, flags, decimation):
+    """An easy scene would be shown at half its rate, and a hard one in mud."""
+    config = settings(str(moving(tmp_path, coarse=coarse, frames=frames)), "100kbps", *flags)
+    with open_source(str(tmp_path), size=(640, 360), fps=15) as source:
+        assert tried(config, source).decimation == decimation
+        first = next(iter(source.steps(start_ns=0)))
+        assert first is not None
+        assert first.index == 0, "the clip begins anew"
+
+
+@pytest.mark.parametrize(("budget", "hides"), [("100kbps", True), ("8000kbps", False)])
+def test_auto_begins_with_what_the_base_hides(budget, hides):
+    """Else the first second of a thin flight is without the objects that only the edge sees, and without stills."""
+    config = settings("demo", budget)
+    with open_source("demo", size=(640, 360), fps=15) as source:
+        beginning = tried(config, source)
+    assert 1.5 < beginning.shadow.comparisons < 3
+    assert (beginning.shadow.gain > 0.02) == hides
+    assert (beginning.share < config.share) == hides
+
+
+@pytest.mark.parametrize("flags", [("--profile", "thin"), ("--detector", "motion")])
+def test_nothing_is_measured_where_nothing_depends_on_it(flags):
+    """Nor by a detector that remembers the pictures of one stream: there the settings decide alone."""
+    with open_source("demo", size=(640, 360), fps=15) as source:
+        assert tried(settings("demo", "100kbps", *flags), source).shadow.comparisons == 0
