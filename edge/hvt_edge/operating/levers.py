@@ -31,7 +31,7 @@ class LeverSettings:
     """Line bits a second that tracks take of the budget."""
     on_gain: float = 0.02
     """From so much net gain on tracks are sent …"""
-    off_gain: float = 0.01
+    off_gain: float = 0.0
     """… until it falls below this."""
     gain_per_doubling: float = 0.07
     """What twice the bits give video: .05 to .11 between 100 and 400 kbps (docs/design-notes/compare.md)."""
@@ -91,7 +91,7 @@ class LeverControl:
         )
 
     def take_answer(self, *, changed: bool) -> None:
-        """A ground has inspected a still; ``changed``: it now shows another class, or an object that it had not."""
+        """A ground has inspected a still; ``changed``: it now names the object otherwise than the edge does."""
         self._changed.append(changed)
 
     def take_load(self, captured: int, unanalyzed: int, *, now_ns: int) -> None:

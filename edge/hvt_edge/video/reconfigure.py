@@ -118,8 +118,11 @@ class EncoderReconfiguration:
         now = self.operating.now
         if self._commanded != (now.budget_bps, now.video_share):  # it came while a keyframe was being made
             return True
+        if self.split is None or not self._moving:
+            return False
         with self._lock:
-            return self._moving and self.split is not None and self.split.wants_keyframe(now_ns)
+            self.split.set_beside(metadata_bps=self._metadata_bps, stills=now.levers.stills)
+            return self.split.wants_keyframe(now_ns)
 
     def open_again(self) -> Encoder:
         """Return another encoder for what the last was opened for."""

@@ -1,4 +1,4 @@
-"""What a scene needs: its first second is coded once before the flight, and looked at."""
+"""What a scene needs: its first second is coded once before the flight."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ def trial_frames(fps: float) -> int:
 
 
 def trial_quantiser(
-    encoder: Encoder, scene: Iterable[Frame], *, count: int, look: Callable[[Frame, AccessUnit], object]
+    encoder: Encoder, scene: Iterable[Frame], *, count: int, on_unit: Callable[[Frame, AccessUnit], object]
 ) -> float:
     """Mean quantiser (0…51) of the last of ``count`` frames; NaN for a shorter scene, or an encoder that tells none.
 
-    ``look`` takes each frame with its unit.
+    ``on_unit`` takes each frame with its unit.
     """
     quantisers = []
     for number, frame in enumerate(scene):
         unit = encoder.encode(frame, keyframe=number == 0)
         quantisers.append(encoder.mean_qp)
-        look(frame, unit)
+        on_unit(frame, unit)
     return sum(quantisers[-_LAST:]) / _LAST if len(quantisers) == count else math.nan

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.config import EdgeConfig
 from hvt_edge.perception.analyzer import FailingDetector
@@ -24,6 +25,8 @@ __all__ = ["Beginning", "try_scene"]
 
 _FINE = 33.5
 """Of `trial_quantiser`: below it all frames are coded. Measured as `PROMPT` was."""
+_MOST_NS = 3 * SECOND_NS
+"""On a slow machine comparing ends after so long: a flight is not to wait for its detector."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +57,13 @@ def try_scene(
     if not (config.measures and feasible) or config.encoder != X265:
         return Beginning(decimation, config.share)
     count = trial_frames(fps)
-    analyzer, shadow = (
-        make_analyzer(config, detector=detector, view=source.view),
-        make_shadow(config, detector),
-    )
+    analyzer = make_analyzer(config, detector=detector, view=source.view)
+    shadow = make_shadow(config, detector)
 
-    def look(frame: Frame, unit: AccessUnit) -> None:
-        if shadow is not None:
+    until_ns = None if config.pace == "lockstep" else clock() + _MOST_NS
+
+    def compare(frame: Frame, unit: AccessUnit) -> None:
+        if shadow is not None and (until_ns is None or clock() < until_ns):
             shadow.compare(analyzer.analyze(frame, unit))
 
     quantiser = trial_quantiser(
@@ -69,7 +72,7 @@ def try_scene(
         ),
         scene(source, decimation=decimation, count=count, clock=clock, stop=stop),
         count=count,
-        look=look,
+        on_unit=compare,
     )
     if config.auto_fps and quantiser < _FINE:
         decimation = _most_frames(config, size, decimation)
@@ -90,5 +93,5 @@ def _share(config: EdgeConfig, seen: Shadow) -> float:
     pay = lever_settings(config).tracks_pay(
         seen.gain, comparisons=seen.comparisons, total_bps=config.budget_bps
     )
-    follows = isinstance(config.video_share, str) and not method(config.method).video_only
-    return FIRST_SHARE if pay and follows else config.share
+    moves = isinstance(config.video_share, str) and not method(config.method).video_only
+    return FIRST_SHARE if pay and moves else config.share

@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hvt_edge.operating.point import Levers, Operating
 from hvt_edge.perception.base_loss import BaseLoss
 from hvt_edge.perception.candidates import Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import Step
 from hvt_edge.stills.policy.cost import CostEstimate
+from hvt_edge.video.reconfigure import EncoderReconfiguration, ReconfigurationSettings
 from hvt_edge.video.share import FIRST_SHARE, Split, SplitSettings
 
 SECOND = 1_000_000_000
@@ -171,3 +173,24 @@ def test_a_scene_that_has_changed_is_worth_a_keyframe_of_its_own_now_and_then():
     for number in range(60):
         one.observe([], moment(1 + number / 3, from_source=True))
     assert one.wants_keyframe(40 * SECOND), "the crowd has gone"
+
+
+def test_what_stills_leave_while_they_pause_goes_back_to_the_base():
+    """A tenth of a thin link would lie idle until the next scheduled keyframe, up to a minute later."""
+    operating = Operating(budget_bps=300_000, video_share=None, base_bps=255_000, method="M6", decimation=2)
+    bounds = ReconfigurationSettings(
+        size=(1280, 720), nominal_fps=15, least_fps=2, edge_id="e", metadata_bps=8_000, min_budget_bps=50_000
+    )
+    reconfiguration = EncoderReconfiguration(
+        operating,
+        bounds,
+        open_encoder=lambda **_rates: pytest.fail("only a keyframe opens it"),
+        transmitter=None,
+        split=split(300_000, metadata_bps=8_000),
+    )
+    crowd = [car(number, lost=0.9, side=90) for number in range(1, 9)]
+    for number in range(60):
+        reconfiguration.observe(crowd, moment(number / 3, from_source=True))
+    assert not reconfiguration.wants_keyframe(30 * SECOND)
+    operating.pull(Levers(stills=False))
+    assert reconfiguration.wants_keyframe(30 * SECOND)
