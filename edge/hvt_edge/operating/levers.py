@@ -20,7 +20,23 @@ from dataclasses import dataclass
 from hvt_common.units import SECOND_NS
 from hvt_edge.operating.point import Levers, Operating
 
-__all__ = ["LeverControl", "LeverSettings"]
+__all__ = ["LeverControl", "LeverSettings", "Measured"]
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What the shadow ground says of tracks (see `hvt_edge.perception`); nothing at first. Gains are of F1, 0…1."""
+
+    comparisons: float = 0.0
+    """How many comparisons it comes of."""
+    gain: float = 0.0
+    """Of sending tracks."""
+    sure_gain: float = 0.0
+    """The same where of few objects hardly any count."""
+    hidden: float = 0.0
+    """Objects a picture that the base does not show."""
+    misnamed_share: float = 0.0
+    """Of those that it shows, those that bear another class there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +46,7 @@ class LeverSettings:
     tracks_bps: int
     """Line bits a second that tracks take of the budget."""
     on_gain: float = 0.02
-    """From so much net gain on tracks are sent …"""
+    """From so much net gain on that is sure tracks are sent …"""
     off_gain: float = 0.0
     """… until it falls below this."""
     gain_per_doubling: float = 0.07
@@ -38,7 +54,7 @@ class LeverSettings:
     least_comparisons: float = 1.5
     """Before so many comparisons no tracks are sent, for a single picture may be an exception, unless …"""
     plain_gain: float = 0.2
-    """… it is as plain as this."""
+    """… the net gain is as plain as this; so too where hardly any of it is sure, of the only object there is."""
     least_answers: int = 12
     """So many stills must have been answered before they may pause."""
     most_answers: int = 40
@@ -58,12 +74,13 @@ class LeverSettings:
         share = min(0.9, self.tracks_bps / total_bps)
         return gain - self.gain_per_doubling * math.log2(1 / (1 - share))
 
-    def tracks_pay(self, gain: float, *, comparisons: float, total_bps: int, sent: bool = False) -> bool:
-        """Whether tracks are to be sent, by the gain of so many comparisons; ``sent``: they are being sent."""
-        net_gain = self.net_gain(gain, total_bps=total_bps)
-        if comparisons < self.least_comparisons:
-            return comparisons > 0 and net_gain >= self.plain_gain
-        return net_gain >= (self.off_gain if sent else self.on_gain)
+    def tracks_pay(self, measured: Measured, *, total_bps: int, sent: bool = False) -> bool:
+        """Whether tracks are to be sent, by what was measured; ``sent``: they are being sent."""
+        if measured.comparisons and self.net_gain(measured.gain, total_bps=total_bps) >= self.plain_gain:
+            return True
+        least = self.off_gain if sent else self.on_gain
+        enough = measured.comparisons >= self.least_comparisons
+        return enough and self.net_gain(measured.sure_gain, total_bps=total_bps) >= least
 
 
 class LeverControl:
@@ -73,7 +90,7 @@ class LeverControl:
         self._operating = operating
         self._settings = settings
         self._lock = threading.Lock()
-        self._gain = self._hidden = self._misnamed = self._comparisons = 0.0
+        self._measured = Measured()
         self._changed: deque[bool] = deque(maxlen=settings.most_answers)
         self._paused_until_ns: int | None = None
         self._pauses = 1
@@ -81,14 +98,9 @@ class LeverControl:
         operating.pull(Levers(tracks=False))
         self._loads: deque[tuple[int, int]] = deque(maxlen=settings.load_samples)
 
-    def take_shadow(self, *, gain: float, hidden: float, misnamed_share: float, comparisons: float) -> None:
-        """What the shadow ground measured, see `hvt_edge.perception.shadow.Shadow`; ``hidden`` objects a picture."""
-        self._gain, self._hidden, self._misnamed, self._comparisons = (
-            gain,
-            hidden,
-            misnamed_share,
-            comparisons,
-        )
+    def take_shadow(self, measured: Measured) -> None:
+        """What the shadow ground measured."""
+        self._measured = measured
 
     def take_answer(self, *, changed: bool) -> None:
         """A ground has inspected a still; ``changed``: it now names the object otherwise than the edge does."""
@@ -112,7 +124,7 @@ class LeverControl:
 
     def forget(self) -> None:
         """Another scene: what was measured says nothing of it."""
-        self._comparisons = 0.0
+        self._measured = Measured()
         self._changed.clear()
         self._paused_until_ns, self._pauses = None, 1
 
@@ -125,7 +137,7 @@ class LeverControl:
         before = self._operating.now.levers
         tracks = self._tracks(before.tracks) and not self._too_slow
         # Tracks tell classes too; without them a still is what corrects one.
-        named = tracks or self._misnamed < self._settings.least_changed
+        named = tracks or self._measured.misnamed_share < self._settings.least_changed
         stills = (self._stills(now_ns) or not named) and not self._too_slow
         levers = Levers(tracks, stills, self._says(tracks=tracks, stills=stills))
         if levers != before:
@@ -133,10 +145,7 @@ class LeverControl:
         return levers
 
     def _tracks(self, sent: bool) -> bool:  # noqa: FBT001 - the state before
-        total_bps = self._operating.now.total_bps
-        return self._settings.tracks_pay(
-            self._gain, comparisons=self._comparisons, total_bps=total_bps, sent=sent
-        )
+        return self._settings.tracks_pay(self._measured, total_bps=self._operating.now.total_bps, sent=sent)
 
     def _stills(self, now_ns: int) -> bool:
         settings = self._settings
@@ -159,10 +168,10 @@ class LeverControl:
         """One line for people."""
         if self._too_slow:
             return "video alone: this machine is too slow for the detector"
-        hidden = f"{self._hidden:.0f} objects the base does not show"
+        hidden = f"{self._measured.hidden:.0f} objects the base does not show"
         of_tracks = (
             f"{'tracks' if tracks else 'no tracks'}: {hidden}"
-            if self._comparisons
+            if self._measured.comparisons
             else "no tracks: not measured"
         )
         changed = f"changed {sum(self._changed)} of {len(self._changed)}"

@@ -15,8 +15,7 @@ confidences p):
     sent    = 2 (sum of p over shown and hidden boxes, 1 - w of it where the base bears another class)
                 / (shown + hidden + base-only + true)
 
-``hidden`` are the source boxes that the base does not show and the ground would list: from `ALONE_CONFIDENCE` on. Of
-hidden and misnamed ones only those count that are sure, n - sqrt(n) of n.
+``hidden`` are the source boxes that the base does not show and the ground would list: from `ALONE_CONFIDENCE` on.
 ``w`` is 1/3: of two names for one object that of the finer picture is right twice as often (our choice).
 """
 
@@ -33,6 +32,7 @@ import numpy.typing as npt
 from hvt_common.tracking.bytetrack import ALONE_CONFIDENCE
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
+from hvt_edge.operating.levers import Measured
 from hvt_edge.perception.analyzer import AnalyzedFrame
 
 __all__ = ["UNMEASURED", "Shadow", "ShadowGround", "ShadowSettings"]
@@ -91,16 +91,28 @@ class Shadow:
 
     @property
     def gain(self) -> float:
-        """How much expected named F1 the ground's list gains by being sent the source's boxes; 0 at first.
+        """How much expected named F1 the ground's list gains by being sent the source's boxes; 0 at first."""
+        return self._gain(self.hidden, self.misnamed)
 
-        By what is sure: hidden and misnamed objects count less one standard error of such a count (Poisson), for two
-        pictures of one second show the same objects, and of two or three the detector may just be wrong.
+    @property
+    def sure_gain(self) -> float:
+        """The same where hidden and misnamed objects count less one standard error of such a count (Poisson).
+
+        Pictures of one second show the same objects, and of two or three the detector may just be wrong.
         """
+        return self._gain(_sure(self.hidden), _sure(self.misnamed))
+
+    @property
+    def measured(self) -> Measured:
+        """What decides on tracks."""
+        return Measured(self.comparisons, self.gain, self.sure_gain, self.hidden, self.misnamed_share)
+
+    def _gain(self, hidden: float, misnamed: float) -> float:
         true = self.source_p + self.false_p
         if not true:
             return 0.0
-        hidden, misnamed_p = _sure(self.hidden), _sure(self.misnamed) * _per(self.misnamed_p, self.misnamed)
         hidden_p = hidden * _per(self.hidden_p, self.hidden)
+        misnamed_p = misnamed * _per(self.misnamed_p, self.misnamed)
         named_p = self.shown_p - (1 - _BASE_NAMES) * misnamed_p
         sent_p = self.shown_p + hidden_p - _BASE_NAMES * misnamed_p
         listed = self.shown + self.false

@@ -146,13 +146,7 @@ class StillStage:
             if self.shadow.scene_changes != self._scene_changes:
                 self._scene_changes = self.shadow.scene_changes
                 self.levers.forget()
-            seen = self.shadow.now
-            self.levers.take_shadow(
-                gain=seen.gain,
-                hidden=seen.hidden,
-                misnamed_share=seen.misnamed_share,
-                comparisons=seen.comparisons,
-            )
+            self.levers.take_shadow(self.shadow.now.measured)
         return self.levers.decide(now_ns)
 
     def _note_change(self, result: StillResult) -> None:

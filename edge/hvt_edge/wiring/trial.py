@@ -90,8 +90,6 @@ def _most_frames(config: EdgeConfig, size: tuple[int, int], decimation: int) -> 
 
 def _share(config: EdgeConfig, seen: Shadow) -> float:
     """Where the base hides objects, stills find more of them than the video would by the same bits."""
-    pay = lever_settings(config).tracks_pay(
-        seen.gain, comparisons=seen.comparisons, total_bps=config.budget_bps
-    )
+    pay = lever_settings(config).tracks_pay(seen.measured, total_bps=config.budget_bps)
     moves = isinstance(config.video_share, str) and not method(config.method).video_only
     return FIRST_SHARE if pay and moves else config.share

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hvt_edge.operating.levers import LeverControl, LeverSettings
+from hvt_edge.operating.levers import LeverControl, LeverSettings, Measured
 from hvt_edge.operating.point import Operating
 
 SECOND_NS = 1_000_000_000
@@ -21,9 +21,17 @@ class Rig:
         self.control = LeverControl(self.operating, SETTINGS)
         self.at_s = 0
 
-    def tracks(self, gain: float, *, comparisons: float = 3.0, misnamed_share: float = 0.0) -> bool:
+    def tracks(
+        self,
+        gain: float,
+        *,
+        comparisons: float = 3.0,
+        misnamed_share: float = 0.0,
+        sure_gain: float | None = None,
+    ) -> bool:
         """Whether tracks are sent after a second in which this was measured."""
-        self.control.take_shadow(gain=gain, hidden=4, misnamed_share=misnamed_share, comparisons=comparisons)
+        sure_gain = gain if sure_gain is None else sure_gain
+        self.control.take_shadow(Measured(comparisons, gain, sure_gain, 4, misnamed_share))
         return self.second().tracks
 
     def answers(self, count: int, *, changed: int = 0) -> bool:
@@ -53,6 +61,12 @@ def test_one_picture_is_no_measurement_unless_it_is_plain():
     assert not rig.tracks(0.0, comparisons=0.0), "nothing was measured yet"
     assert not rig.tracks(0.1, comparisons=1.0)
     assert rig.tracks(0.3, comparisons=1.0)
+
+
+def test_what_is_not_sure_brings_no_tracks_unless_it_is_plain():
+    """One object that the detector imagines among many would; the only one there is must."""
+    assert not Rig().tracks(0.1, sure_gain=0.0)
+    assert Rig().tracks(0.8, sure_gain=0.0)
 
 
 def test_on_a_thinner_link_tracks_must_give_more():

@@ -68,16 +68,19 @@ def test_the_gain_is_that_of_the_formula():
     """Levers would be moved by a number that means something else than the docs say."""
     shadow = compared(found(0, 9), confidences={0: 0.9, 1: 0.5, **dict.fromkeys(range(2, 6), 0.7)})
     true = 0.9 + 0.5 + 4 * 0.7 + 0.8
-    sure = 4 - 2  # of four hidden; at .5 it would not be listed
-    base, sent = 2 * 0.9 / (1 + 1 + true), 2 * (0.9 + sure * 0.7) / (1 + sure + 1 + true)
-    assert shadow.now.gain == pytest.approx(sent - base, abs=1e-6)
+    base = 2 * 0.9 / (1 + 1 + true)
+    four, sure = (
+        2 * (0.9 + n * 0.7) / (1 + n + 1 + true) for n in (4, 4 - 2)
+    )  # at .5 it would not be listed
+    assert shadow.now.gain == pytest.approx(four - base, abs=1e-6)
+    assert shadow.now.sure_gain == pytest.approx(sure - base, abs=1e-6)
     assert (shadow.now.hidden, shadow.now.false) == (4, 1)
 
 
 def test_two_that_are_hidden_tell_less_than_twenty():
     """One object that the detector imagines in a calm scene would bring tracks, and with them more of its kind."""
     few, many = (
-        compared(found(*range(shown)), confidences=dict.fromkeys(range(shown + hidden), 0.9)).now.gain
+        compared(found(*range(shown)), confidences=dict.fromkeys(range(shown + hidden), 0.9)).now.sure_gain
         for shown, hidden in ((4, 1), (40, 10))
     )
     assert few == 0
@@ -112,8 +115,7 @@ def test_a_name_that_the_base_gets_wrong_counts():
     right = compared(found(0, 1, 2, 3), confidences=four).now
     wrong = compared(found(0, 1, 2, 3, class_id=1), confidences=four).now
     assert right.gain == pytest.approx(0)
-    sure = (4 - 2) * 0.9
-    assert (wrong.misnamed_share, wrong.gain) == (1.0, pytest.approx(2 * sure / 3 / (4 + 3.6), abs=1e-6))
+    assert (wrong.misnamed_share, wrong.gain) == (1.0, pytest.approx(2 * 3.6 / 3 / (4 + 3.6), abs=1e-6))
 
 
 def test_a_weak_detection_shows_what_a_strong_one_has_shown():

@@ -66,7 +66,7 @@ def test_auto_begins_with_what_the_base_hides(budget, hides):
     with open_source("demo", size=(640, 360), fps=15) as source:
         beginning = tried(config, source)
     assert 1.5 < beginning.shadow.comparisons < 3
-    assert (beginning.shadow.gain > 0.02) == hides
+    assert (beginning.shadow.sure_gain > 0.02) == hides
     assert (beginning.share < config.share) == hides
 
 
