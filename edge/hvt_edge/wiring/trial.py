@@ -56,10 +56,11 @@ def try_scene(
     feasible = config.base_bps >= least_base_bps(size, fps, edge_id=config.edge_id)
     if not (config.measures and feasible) or config.encoder != X265:
         return Beginning(decimation, config.share)
+    shadow = make_shadow(config, detector)
+    if shadow is None and not (config.auto_fps and decimation > 1):  # nothing would come of it
+        return Beginning(decimation, config.share)
     count = trial_frames(fps)
     analyzer = make_analyzer(config, detector=detector, view=source.view)
-    shadow = make_shadow(config, detector)
-
     until_ns = None if config.pace == "lockstep" else clock() + _MOST_NS
 
     def compare(frame: Frame, unit: AccessUnit) -> None:

@@ -70,6 +70,14 @@ def test_auto_begins_with_what_the_base_hides(budget, hides):
     assert (beginning.share < config.share) == hides
 
 
+def test_no_second_of_a_live_source_is_lost_for_nothing():
+    """With `motion` nothing is compared, and a fixed frame rate is not tried either."""
+    config = settings("demo", "100kbps", "--detector", "motion", "--fps", "15")
+    with open_source("demo", size=(640, 360), fps=15) as source:
+        source.steps = lambda **_kind: pytest.fail("a frame was taken")
+        assert tried(config, source).decimation == 1
+
+
 @pytest.mark.parametrize("flags", [("--profile", "thin"), ("--detector", "motion")])
 def test_nothing_is_measured_where_nothing_depends_on_it(flags):
     """Nor by a detector that remembers the pictures of one stream: there the settings decide alone."""
