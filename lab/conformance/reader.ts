@@ -290,6 +290,7 @@ const MESSAGES: Record<string, { most: number; payload?: number; fields: Fields 
       ["missing_stills", list(32, int(0, U32))], ["delay_p50_ms", int(-10, 36000000)],
       ["clock_offset_ns", int(-I63, I63)], ["clock_error_ns", int(-1, I63)],
       ["stills", list(32, nested(stillResult))], ["backlog", list(16, nested(acknowledged))],
+      ["objects_detected", int(-1, 65535), -1n],
     ],
   },
 };

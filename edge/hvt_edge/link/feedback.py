@@ -11,6 +11,7 @@ from hvt_edge.link.receivers import Report
 __all__ = ["FeedbackInbox"]
 
 _MAX_RESULTS = 1024
+_MAX_DETECTED = 64
 
 
 class FeedbackInbox:
@@ -28,6 +29,8 @@ class FeedbackInbox:
         self._answered: dict[int, None] = {}  # in the order in which they came
         self._known: dict[tuple[int, int, bool], None] = {}
         self._done_sequence = -1
+        self._detected: dict[int, int] = {}
+        """By frame, in the order in which they came."""
         self._base_messages = 0
         self._roi_messages = 0
         self.received_ns: int | None = None
@@ -43,6 +46,10 @@ class FeedbackInbox:
             self._roi_messages = max(self._roi_messages, feedback.roi_messages)
             for result in feedback.stills:
                 self._note(result)
+            if report.primary and feedback.objects_detected >= 0:
+                self._detected[feedback.last_frame_index] = feedback.objects_detected
+                if len(self._detected) > _MAX_DETECTED:
+                    del self._detected[next(iter(self._detected))]
             # A ground may answer what was never asked.
             while len(self._answered) > 2 * _MAX_RESULTS:
                 del self._answered[next(iter(self._answered))]
@@ -82,6 +89,18 @@ class FeedbackInbox:
                 (one for one in self._results if one.still_sequence > sequence), maxlen=_MAX_RESULTS
             )
             return ready
+
+    def take_detected(self, *, up_to: int | None = None) -> int | None:
+        """Return how many objects the ground's own detector shows, and forget it; None where there is no news.
+
+        ``up_to`` this frame: what was said of a later one is for another time.
+        """
+        with self._changed:
+            due = [one for one in self._detected if up_to is None or one <= up_to]
+            newest = self._detected[max(due)] if due else None
+            for one in due:
+                del self._detected[one]
+            return newest
 
     def wait_for(self, *, frame_index: int, stills: set[int], timeout_s: float) -> bool:
         """Wait until a ground is done with this frame and has answered these stills; False after the time-out."""

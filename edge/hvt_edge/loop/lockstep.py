@@ -66,7 +66,7 @@ class LockstepPace:
         self._in_flight: deque[tuple[int, int, set[int]]] = deque()
         """(frame index, newest coded index by then, stills sent with it): what the ground is to answer."""
         self._coded_index = -1
-        self._newest_answered = -1
+        self._newest_answered = self._newest_analyzed = -1
 
     def step(self, frame: Frame | None, *, missed: int = 0) -> None:
         """Encode this frame while the one before is analyzed; send that one's stills, then this one's unit.
@@ -123,7 +123,11 @@ class LockstepPace:
             if self._waits:
                 self._waits = self._answered(coded_index, sent)
             self._newest_answered = max([self._newest_answered, *sent])
-        self.stills.on_results(self.inbox.take_up_to(self._newest_answered))
+            self._newest_analyzed = coded_index
+        self.stills.on_results(
+            self.inbox.take_up_to(self._newest_answered),
+            detected=self.inbox.take_detected(up_to=self._newest_analyzed),
+        )
 
     def _answered(self, index: int, sent: set[int]) -> bool:
         """Wait for the ground's answer to a frame and its stills; False where it is gone or never answers."""

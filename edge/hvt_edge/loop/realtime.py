@@ -61,7 +61,11 @@ class RealtimePace:
         self._link_bound = False
         """Sending the last frame took longer than coding it."""
         self._worker = StillWorker(
-            self.stills, results=self.inbox.take, failures=self.failures, clock=self.clock
+            self.stills,
+            results=self.inbox.take,
+            detected=self.inbox.take_detected,
+            failures=self.failures,
+            clock=self.clock,
         )
 
     def step(self, frame: Frame | None, *, missed: int = 0) -> None:

@@ -17,13 +17,17 @@ confidences p):
 
 ``hidden`` are the source boxes that the base does not show and the ground would list: from `ALONE_CONFIDENCE` on.
 ``w`` is 1/3: of two names for one object that of the finer picture is right twice as often (our choice).
+
+The ground's detector may be another, or none. It reports how many objects it shows; where that differs from what was
+found on the base here, so many count as hidden, or as shown, instead (`Shadow.corrected`).
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -59,6 +63,10 @@ class ShadowSettings:
     """Time constant with which former comparisons fade."""
     scene_correlation: float = 0.3
     """Two pictures a third of a second apart that correlate less, as thumbnails, are of two scenes."""
+    reports: int = 24
+    """Of the ground, on how many objects it shows: so many of the newest count, …"""
+    report_rest_ns: int = SECOND_NS // 3
+    """… and of those that come sooner after each other, one."""
     match_iou: float = 0.3
     """As little as the ground takes for one object: boxes of 15 pixels from two pictures seldom reach more."""
 
@@ -101,6 +109,29 @@ class Shadow:
         Pictures of one second show the same objects, and of two or three the detector may just be wrong.
         """
         return self._gain(_sure(self.hidden), _sure(self.misnamed))
+
+    def corrected(self, detected: float, *, sure: bool) -> Shadow:
+        """The same for a ground whose detector shows so many objects, right and wrong ones, instead of shown + false.
+
+        With ``sure`` one standard error of that count counts for nothing (Poisson). Which objects they are nobody
+        says: each is taken to be as sure as the others of its kind here.
+        """
+        expected = self.shown + self.false
+        difference = detected - expected
+        error = math.sqrt(max(detected, expected)) if sure else 0.0
+        more = math.copysign(max(0.0, abs(difference) - error), difference)
+        more = min(self.hidden, max(-self.shown, more))
+        moved_p = more * (_per(self.hidden_p, self.hidden) if more > 0 else _per(self.shown_p, self.shown))
+        left = 1 + min(0.0, more) / self.shown if self.shown else 1.0
+        return replace(
+            self,
+            shown=self.shown + more,
+            shown_p=self.shown_p + moved_p,
+            hidden=self.hidden - more,
+            hidden_p=self.hidden_p - moved_p,
+            misnamed=self.misnamed * left,
+            misnamed_p=self.misnamed_p * left,
+        )
 
     @property
     def measured(self) -> Measured:
@@ -157,6 +188,29 @@ class ShadowGround:
         self.scene_changes = 0
         """How often another scene began."""
         self.now = before
+        """For a ground with the edge's detector."""
+        self._detected: deque[int] = deque(maxlen=settings.reports)
+        self._next_report_ns: int | None = None
+
+    @property
+    def measured(self) -> Measured:
+        """What decides on tracks, for the ground as it reports."""
+        if not self._detected:
+            return self.now.measured
+        detected = sum(self._detected) / len(self._detected)
+        plain, sure = (self.now.corrected(detected, sure=sure) for sure in (False, True))
+        return replace(sure.measured, gain=plain.gain)
+
+    def take_detected(self, count: int, *, now_ns: int) -> None:
+        """The ground's own detector shows so many objects; ``now_ns`` is any clock.
+
+        Of the first second nothing counts: the first picture is coarser than any other.
+        """
+        if self._next_report_ns is None:
+            self._next_report_ns = now_ns + self._settings.rest_ns
+        if now_ns >= self._next_report_ns:
+            self._next_report_ns = now_ns + self._settings.report_rest_ns
+            self._detected.append(count)
 
     def compare(self, seen: AnalyzedFrame) -> bool:
         """Compare, if this is a decision step on a coded frame and one is due; tell whether it was done."""
@@ -196,6 +250,7 @@ class ShadowGround:
         """Another scene: what was measured says nothing of it."""
         self.scene_changes += 1
         self.now, self._last_ns, self._next_ns = UNMEASURED, None, 0
+        self._detected.clear()
         self._shown_ids = np.empty(0, np.int64)
 
     def _compared(self, seen: AnalyzedFrame, found: Detections) -> Shadow:

@@ -47,6 +47,8 @@ class StillStage:
     def __post_init__(self) -> None:
         self._latest_tracks: Tracks | None = None
         self._scene_changes = 0
+        self._detected: int | None = None
+        """What the ground has reported since the decision before."""
 
     @property
     def latest_tracks(self) -> Tracks | None:
@@ -116,11 +118,14 @@ class StillStage:
                 sent.add(coded.still.sequence)
         return sent
 
-    def on_results(self, results: Sequence[StillResult]) -> None:
+    def on_results(self, results: Sequence[StillResult], *, detected: int | None = None) -> None:
         """What a ground made of stills counts for the next decision; one without a name is no opinion.
 
-        A still that it could not decode for want of the base frame is sent once more.
+        A still that it could not decode for want of the base frame is sent once more. ``detected`` objects its own
+        detector shows; None: it has not said anything new.
         """
+        if detected is not None:
+            self._detected = detected
         for result in results:
             if result.again:
                 self.outbox.on_undecodable(result.still_sequence)
@@ -146,7 +151,10 @@ class StillStage:
             if self.shadow.scene_changes != self._scene_changes:
                 self._scene_changes = self.shadow.scene_changes
                 self.levers.forget()
-            self.levers.take_shadow(self.shadow.now.measured)
+            if self._detected is not None:
+                self.shadow.take_detected(self._detected, now_ns=now_ns)
+                self._detected = None
+            self.levers.take_shadow(self.shadow.measured)
         return self.levers.decide(now_ns)
 
     def _note_change(self, result: StillResult) -> None:

@@ -35,14 +35,15 @@ _MOST_SKIPPED_BYTES = 2 * 2**20
 class StillWorker:
     """Runs a `StillStage` in a thread of its own.
 
-    The queue is bounded in frames and in bytes. Before each frame the thread takes ``results()``, what grounds have
-    reported of stills. An error in it stops stills and perception for a while, never the video: what is queued is
-    given up, and the stage goes on from a keyframe.
+    The queue is bounded in frames and in bytes. Before each frame the thread takes what grounds have reported:
+    ``results()`` of stills, and how many objects are ``detected()`` there. An error in it stops stills and perception
+    for a while, never the video: what is queued is given up, and the stage goes on from a keyframe.
     """
 
     stage: StillStage
     _: KW_ONLY
     results: Callable[[], Sequence[StillResult]]
+    detected: Callable[[], int | None] = lambda: None
     failures: Failures
     clock: Callable[[], int]
     length: int = 16
@@ -106,7 +107,7 @@ class StillWorker:
                 if (item := self._next()) is None:
                     return
                 behind = self._frames.qsize() >= _BEHIND_FRAMES
-                self.stage.on_results(self.results())
+                self.stage.on_results(self.results(), detected=self.detected())
                 analyzed = self.stage.analyze(*item, hurry=behind)
                 self.stage.send(analyzed, now_ns=self.clock())
                 self.failures.works(_PART)

@@ -130,6 +130,8 @@ class Pipeline:
         self._listed_frame = -1
         self._track_ids = DistinctIds()
         self.detections_run = 0
+        self.objects_detected = -1
+        """Objects that the detector showed when it last looked; -1 before the first time."""
         self.doubted = 0
         """Of the tracks that are shown, those that stills doubt."""
         self.steps_used = 0
@@ -251,6 +253,7 @@ class Pipeline:
                 if parts.turns is not None:
                     parts.turns.release()
             own = parts.tracker.update(found, frame_index=index, image_bgr=image)
+            self.objects_detected = int((own.seen_frames == index).sum())
         else:
             own = parts.tracker.predict(frame_index=index, image_bgr=image)
         before, affine = self._now.picture_index, parts.tracker.camera_step

@@ -14,6 +14,7 @@ from hvt_ground.link.statistics import LinkMeasurement
 __all__ = ["ReceiverReports"]
 
 _MOST_DELAY_MS = 3_600_000.0
+_MOST_OBJECTS = 65_535
 
 
 class ReceiverReports:
@@ -40,6 +41,7 @@ class ReceiverReports:
         *,
         session_id: int,
         last_frame_index: int,
+        objects_detected: int,
         base: tuple[int, int],
         roi: tuple[int, int],
         lost: int,
@@ -71,6 +73,7 @@ class ReceiverReports:
                 clock_error_ns=error_ns,
                 stills=stills,
                 backlog=self._backlog.take_acknowledged_ranges(MAX_ACKNOWLEDGED_RANGES),
+                objects_detected=min(objects_detected, _MOST_OBJECTS),
             )
             self._sequence += 1
             self._publish(feedback)

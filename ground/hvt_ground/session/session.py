@@ -92,8 +92,8 @@ class GroundSession:
         self.stills_received = 0
         self.steps_received = 0
         """Reports of the edge's tracks."""
-        self.last_frame_index = -1
-        """The last frame that was decoded, tracked and drawn."""
+        self._analyzed = (-1, -1)
+        """The last frame that was analyzed, and what was detected by then: reports want both of one moment."""
         self.failure = ""
         """What ended it, where that was no regular end."""
         self.counters = StreamCounters()
@@ -315,6 +315,16 @@ class GroundSession:
         return self._clock_offset.to_local_ns(edge_ns)
 
     @property
+    def last_frame_index(self) -> int:
+        """The last frame that was decoded, tracked and drawn; -1 before the first."""
+        return self._analyzed[0]
+
+    @property
+    def objects_detected(self) -> int:
+        """How many objects the detector showed when it last looked, by that frame; -1 before the first."""
+        return self._analyzed[1]
+
+    @property
     def not_sent(self) -> Mapping[str, int]:
         """Why candidates have no still: the edge's counts, by reason."""
         return {} if self.last_status is None else self.last_status.outcomes
@@ -378,9 +388,11 @@ class GroundSession:
         if self._reports is None:
             return
         with self._report_lock:
+            last_frame_index, objects_detected = self._analyzed
             self._reports.send(
                 session_id=self.info.session_id,
-                last_frame_index=self.last_frame_index,
+                last_frame_index=last_frame_index,
+                objects_detected=objects_detected,
                 base=(self.frames_received, self.ledger.base_bytes),
                 roi=(self.stills_received, self.ledger.roi_bytes),
                 lost=self.counters.lost,
@@ -412,7 +424,7 @@ class GroundSession:
 
     def _analyze(self, picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - called by the worker only
         self.pipeline.analyze(picture, hurry=hurry)
-        self.last_frame_index = picture.frame_index
+        self._analyzed = (picture.frame_index, self.pipeline.objects_detected)
         self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
         self._collect_results()
         if self.lockstep:

@@ -150,6 +150,7 @@ class _Inbox(FeedbackInbox):
         super().__init__()
         self.now_ns = _START_NS
         self.due: deque[tuple[int, StillResult]] = deque()
+        self.due_detected: deque[tuple[int, int]] = deque()
 
     def take(self) -> list[StillResult]:
         due = [one for at_ns, one in self.due if at_ns <= self.now_ns]
@@ -158,6 +159,12 @@ class _Inbox(FeedbackInbox):
 
     def take_up_to(self, sequence: int) -> list[StillResult]:  # noqa: ARG002 - time decides here
         return self.take()
+
+    def take_detected(self, *, up_to: int | None = None) -> int | None:  # noqa: ARG002 - time decides here
+        newest = None
+        while self.due_detected and self.due_detected[0][0] <= self.now_ns:
+            newest = self.due_detected.popleft()[1]
+        return newest
 
     def wait_for(self, **_: Any) -> bool:
         return True
@@ -351,7 +358,9 @@ class Flight:
         self._next_frame = frame.index + 1
         self.ground.advance(frame.capture_ns)
         self.inbox.due += self.ground.results
+        self.inbox.due_detected += self.ground.detected
         self.ground.results.clear()
+        self.ground.detected.clear()
 
     def _open_ground(self, answer: bytes) -> None:
         info = replace(Info.parse(answer), fps=NOMINAL_FPS, started_ns=_START_NS)
@@ -382,6 +391,7 @@ class _NoGround:
     def __init__(self, link: SerialLink[Received]) -> None:
         self._link = link
         self.results: deque[tuple[int, StillResult]] = deque()
+        self.detected: deque[tuple[int, int]] = deque()
 
     def pass_over(self, frame_index: int, *, capture_ns: int) -> None:
         """Nothing is listed."""

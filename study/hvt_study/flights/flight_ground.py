@@ -150,6 +150,8 @@ class GroundSide:
         """By frame."""
         self.results: deque[tuple[int, StillResult]] = deque()
         """What the edge is to hear, with the time at which it does."""
+        self.detected: deque[tuple[int, int]] = deque()
+        """The same of how many objects the detector shows."""
         self.back_bytes = 0
         """Line bytes of the reports that say something of stills; the way back is not the budget's."""
         self.arrivals: list[Arrival[Received]] = []
@@ -223,6 +225,8 @@ class GroundSide:
         for first in range(0, len(results), MAX_STILL_RESULTS):
             self.back_bytes += self._weight(results[first : first + MAX_STILL_RESULTS])
         self.results.extend((back_ns, one) for one in results)
+        if self._session.objects_detected >= 0:
+            self.detected.append((back_ns, self._session.objects_detected))
 
     def _weight(self, results: tuple[StillResult, ...]) -> int:
         """Line bytes of a report with these, as `hvt_ground.session.receiver_report` would send it."""
@@ -248,6 +252,7 @@ class GroundSide:
             clock_error_ns=0,
             stills=results,
             backlog=(),
+            objects_detected=self._session.objects_detected,
         ).pack()
         key, encoding = EdgeKeys(self._info.edge).key(Channel.FEEDBACK), DELIVERIES[Channel.FEEDBACK].encoding
         return len(payload) + overhead_bytes(len(payload), 0, key=key, encoding=encoding)

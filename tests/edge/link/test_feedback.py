@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 from hvt_common.protocol.messages import Feedback, StillResult
 from hvt_edge.link.feedback import FeedbackInbox
@@ -120,6 +121,27 @@ def test_the_goodbye_to_a_ground_that_joined_late_is_short():
     assert not inbox.wait_for_end(base=90, roi=8, frame_index=91, still_sequence=7, timeout_s=0.01)
 
 
+def detected(count: int, *, frame: int) -> Feedback:
+    """A report of how many objects the ground's own detector shows by that frame."""
+    return feedback(receiver_id=1, last_frame_index=frame, objects_detected=count)
+
+
+def test_what_the_ground_detects_is_taken_once_and_in_lockstep_by_its_frame():
+    """The levers would move at another frame in each run, or by what was said long ago."""
+    inbox = FeedbackInbox()
+    assert inbox.take_detected() is None
+    for frame, count in ((4, 7), (5, 8), (6, 9)):
+        inbox.on_report(counted(detected(count, frame=frame), now_ns=1))
+    assert inbox.take_detected(up_to=3) is None
+    assert inbox.take_detected(up_to=5) == 8
+    assert inbox.take_detected(up_to=5) is None
+    assert inbox.take_detected() == 9
+    inbox.on_report(counted(detected(-1, frame=7), now_ns=1))
+    assert inbox.take_detected() is None, "this ground has seen nothing yet"
+    inbox.on_report(replace(counted(detected(65_535, frame=8), now_ns=1), primary=False))
+    assert inbox.take_detected() is None, "another ground steers"
+
+
 def test_hostile_reports_take_no_memory_and_do_not_hide_true_ones():
     """Anybody on the link could fill a drone's memory, or make its methods deaf."""
     inbox = FeedbackInbox()
@@ -127,6 +149,7 @@ def test_hostile_reports_take_no_memory_and_do_not_hide_true_ones():
     for number in range(0, 100_000, 32):
         never_asked = tuple(result(U32 - number - one) for one in range(32))
         inbox.on_report(counted(report(*never_asked, frame=U32, base=2**53 - 1), now_ns=1))
+        inbox.on_report(counted(detected(number % 60_000, frame=number), now_ns=1))
         if number in (9_600, 96_000):
             sizes.append(footprint_bytes(inbox))
     assert sizes[1] < 1.1 * sizes[0]

@@ -65,7 +65,7 @@ class Stills:
         """Nothing."""
         return set()
 
-    def on_results(self, results):
+    def on_results(self, results, *, detected=None):
         """Nothing."""
 
 

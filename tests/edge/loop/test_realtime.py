@@ -63,7 +63,7 @@ class BlockedStills:
         """A ``put`` that blocks."""
         assert self.released.wait(60)
 
-    def on_results(self, results):
+    def on_results(self, results, *, detected=None):
         """Nothing."""
 
 

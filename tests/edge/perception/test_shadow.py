@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Detections, Frame, Tracks
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer, AnalyzerSettings
-from hvt_edge.perception.shadow import ShadowGround, ShadowSettings
+from hvt_edge.perception.shadow import Shadow, ShadowGround, ShadowSettings
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
@@ -97,6 +101,94 @@ def test_what_was_measured_before_the_flight_counts():
     assert shadow.compare(seen(6, {0: 0.9, 1: 0.9}))
     assert shadow.now.comparisons == pytest.approx(before.comparisons + 1, rel=0.05)
     assert shadow.now.hidden == pytest.approx(2 / 3, rel=0.1)
+
+
+TWENTY = dict.fromkeys(range(20), 0.9)
+
+
+def twenty(shown: int, detected: int) -> ShadowGround:
+    """Twenty objects: so many the base shows to the edge's detector, so many are detected at the ground."""
+    shadow = compared(found(*range(shown)), confidences=TWENTY)
+    for number in range(10):
+        shadow.take_detected(detected, now_ns=number * 1_000_000_000)
+    return shadow
+
+
+def test_a_ground_without_a_detector_is_told_what_any_base_would_show():
+    """It would show nothing at all on an easy scene: the edge's own detector sees everything on the base."""
+    easy = twenty(20, 0)
+    assert easy.now.gain == pytest.approx(0)
+    assert easy.measured.gain > easy.measured.sure_gain > 0.4
+    assert easy.measured.hidden == pytest.approx(20 - math.sqrt(20))
+
+
+def test_a_ground_that_sees_more_than_the_edge_needs_no_tracks():
+    """They would take bits to tell it what it knows."""
+    hidden = twenty(6, 20)
+    assert hidden.now.sure_gain > 0.3
+    assert hidden.measured.sure_gain < 0.5 * hidden.now.sure_gain
+    assert twenty(6, 200).measured.hidden == 0
+
+
+def test_a_count_that_differs_by_chance_changes_nothing():
+    """The lists of two detectors never have the same length."""
+    for detected in (17, 19, 23):
+        shadow = twenty(20, detected)
+        assert shadow.measured.sure_gain == shadow.now.sure_gain
+        assert shadow.measured.gain < 0.1
+    silent = compared(found(0), confidences=TWENTY)
+    assert silent.measured == silent.now.measured, "it has not reported"
+
+
+def test_the_only_object_there_is_counts():
+    """Of one object no count is sure; a ground that does not show it shows nothing."""
+    shadow = compared(found(0), confidences={0: 0.9})
+    for number in range(10):
+        shadow.take_detected(0, now_ns=number * 1_000_000_000)
+    assert shadow.measured.sure_gain == 0
+    assert shadow.measured.gain > 0.5
+
+
+def test_the_first_second_of_reports_does_not_count():
+    """The first picture is a coarse keyframe: each flight would begin with tracks, however easy its scene."""
+    shadow = compared(found(*range(20)), confidences=TWENTY)
+    for number in range(15):
+        shadow.take_detected(2, now_ns=number * PERIOD_NS)
+    assert shadow.measured == shadow.now.measured
+    for number in range(15, 60):
+        shadow.take_detected(20, now_ns=number * PERIOD_NS)
+    assert shadow.measured == shadow.now.measured
+
+
+@given(
+    st.floats(0, 300),
+    st.floats(0, 300),
+    st.floats(0, 300),
+    st.floats(0, 70_000),
+    st.floats(0.01, 1),
+    st.floats(0, 1),
+    st.booleans(),
+)
+def test_whatever_a_ground_reports_no_object_is_made_up(shown, hidden, false, detected, p, misnamed, sure):
+    """A ground that lies may have tracks sent or not; it can put nothing into the account that is not there."""
+    before = Shadow(
+        comparisons=3,
+        source_p=p * (shown + hidden),
+        shown=shown,
+        shown_p=p * shown,
+        hidden=hidden,
+        hidden_p=p * hidden,
+        misnamed=misnamed * shown,
+        misnamed_p=misnamed * p * shown,
+        false=false,
+        false_p=p * false,
+    )
+    after = before.corrected(detected, sure=sure)
+    assert after.shown + after.hidden == pytest.approx(shown + hidden)
+    assert after.shown_p + after.hidden_p == pytest.approx(before.source_p)
+    assert min(after.shown, after.hidden, after.shown_p, after.hidden_p, after.misnamed) >= -1e-9
+    assert after.misnamed <= after.shown + 1e-9
+    assert after.gain <= 1 + 1e-9
 
 
 def test_a_box_that_is_hardly_real_gains_nothing():

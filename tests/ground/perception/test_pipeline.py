@@ -68,6 +68,30 @@ def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures
         assert (one.classes, one.refined.tolist()) == (("car",), [False])
 
 
+def test_what_the_detector_shows_is_counted_without_what_the_edge_tells(pictures):
+    """The edge would take its own tracks for what the ground sees, and stop sending them."""
+
+    class BlindAtLast(RedSquares):
+        """Its model fails after a while."""
+
+        runs = 0
+
+        def detect(self, image_bgr):
+            self.runs += 1
+            return super().detect(image_bgr if self.runs <= 5 else np.zeros_like(image_bgr))
+
+    rig = Rig(detect_every=3, detector=BlindAtLast())
+    assert rig.pipeline.objects_detected == -1
+    counts = []
+    for picture in pictures:
+        rig.pipeline.analyze(picture, hurry=False)
+        far = {number: (40.0 * number, 100.0, 40.0 * number + 20, 120.0) for number in (2, 3)}
+        rig.pipeline.edge_step(tracks_at(picture.frame_index, far))
+        counts.append(rig.pipeline.objects_detected)
+    assert counts == [1] * 15 + [0] * 15
+    assert len(rig.of(Overlay)[-1].track_ids) > 1
+
+
 def test_in_a_hurry_detection_waits_but_the_track_goes_on(pictures):
     """Boxes would vanish whenever the machine is busy."""
     rig = Rig()

@@ -506,6 +506,9 @@ def test_lockstep_sees_every_frame_and_answers_every_still():
             frames = [report.last_frame_index for report in rig.port.reports]
             assert frames == sorted(frames)
             assert set(range(20)) <= set(frames)
+            assert {
+                report.objects_detected for report in rig.port.reports if report.last_frame_index >= 0
+            } == {1}
         content = summary(rig.ended[0])
         outcomes.append((content["tracks"], content["tracks_refined"], content["stills"]))
     assert outcomes[0] == outcomes[1]

@@ -31,14 +31,14 @@ def clip(tmp_path_factory):
     return Clip("drawn", SIZE, FRAMES, path)
 
 
-def flown(clip, *flags, link_bps=200_000, detector=None):
+def flown(clip, *flags, link_bps=200_000, detector=None, ground_detector=None):
     width, height = SIZE
     base = ["--source", "drawn", "--pace", "lockstep", "--size", f"{width}x{height}"]
     base += ["--budget", "200kbps", "--preset", "ultrafast"]
     edge, _ = load(EdgeConfig, [*base, *flags], program="hvt-edge", description="")
     ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
     plan = FlightPlan(clip, check_edge(edge), ground, link_bps)
-    return fly(plan, detector=detector or RedSquares(), models=SharedModels(RedSquares()))
+    return fly(plan, detector=detector or RedSquares(), models=SharedModels(ground_detector or RedSquares()))
 
 
 def f1_of(report, frames):
@@ -126,9 +126,26 @@ def test_tracks_are_sent_while_the_base_hides_what_they_tell(clip):
 
     shown = flown(clip, *AUTO)
     assert shown.messages.get("tracks", 0) <= 2
-    hidden = flown(clip, *AUTO, detector=Blind())
+    hidden = flown(clip, *AUTO, detector=Blind(), ground_detector=Blind())
     assert hidden.messages["tracks"] >= 5
     assert hidden.account.total_bps <= 200_000
+    # The ground's own detector sees it all the same, and says so: after a second no more are sent.
+    assert flown(clip, *AUTO, detector=Blind()).messages["tracks"] < hidden.messages["tracks"]
+
+
+def test_a_ground_that_sees_nothing_is_sent_tracks(clip):
+    """The edge's own detector finds all on its base: without the ground's word it would never send any."""
+
+    class Nothing(RedSquares):
+        """As where the model of the ground knows other objects."""
+
+        def detect(self, image_bgr):
+            return super().detect(np.zeros_like(image_bgr))
+
+    report = flown(clip, *AUTO, ground_detector=Nothing())
+    assert report.messages["tracks"] >= 5
+    assert f1_of(report, range(25, 40)) > 0.8
+    assert report.account.total_bps <= 200_000
 
 
 def test_coded_frames():

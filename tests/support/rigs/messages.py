@@ -179,6 +179,7 @@ FEEDBACK = replace(
         ),
     ),
     backlog=(AcknowledgedRange(session_id=U64, kind="base", number=450, acknowledged_bytes=12_000),),
+    objects_detected=214,
 )
 BACKLOG = BacklogHeader(session_id=7, kind="still", number=31, offset=1400, total_bytes=5_000, send_ns=I63)
 INFO_REQUEST = InfoRequest(requester_id=U64, still_codecs=("jpeg", "residual"))

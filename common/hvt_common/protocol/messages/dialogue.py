@@ -174,3 +174,6 @@ class Feedback(Message):
         ListOf(Nested(AcknowledgedRange), MAX_ACKNOWLEDGED_RANGES)
     )
     """Objects of which chunks were received since the last report."""
+    objects_detected: int = wire_field(Int(-1, 65535), default=-1)
+    """Objects that the ground's own detector showed when it last looked at a picture, up to ``last_frame_index``.
+    What only the edge's tracks or stills show does not count. -1 before it has looked."""
