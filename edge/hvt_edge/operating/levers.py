@@ -2,12 +2,13 @@
 
 Two levers cost bits that the video could have: the edge's own tracks, and stills. Each is pulled while it pays.
 
-**Tracks** pay where the base hides objects: their gain in F1 is what the shadow ground measured, less what the video
-would gain by the same bits. **Stills** pay where they change what the ground shows: it says of each what it made of
-it. Where hardly any changed anything they pause, and a few are sent now and then to find out whether that holds.
+**Tracks** pay where the ground does not see objects on the base: their gain in F1 is what the shadow ground measured,
+less what the video would gain by the same bits. **Stills** pay where they change what the ground shows: it says of each what it made of
+it. Where hardly any changed anything they pause, and a few are sent now and then to find out whether that holds. A
+source much finer than the base is reason enough: they go on, and show details.
 
-A ground that lies in its reports can stop stills or bring them back, within their share of the budget. It can change
-neither video nor budget.
+A ground that lies in its reports can stop stills and tracks or bring them back, within their shares of the budget. It
+can change neither the budget nor the frame rate.
 """
 
 from __future__ import annotations
@@ -61,6 +62,8 @@ class LeverSettings:
     """So many of the newest count."""
     least_changed: float = 0.1
     """The share of stills that must change something."""
+    finer: bool = False
+    """The source is so much finer than the base that stills show something in any case: they never pause."""
     pause_ns: int = 20 * SECOND_NS
     """How long stills pause before some are tried again; twice as long after each vain try, up to 8 times."""
     most_pauses: int = 8
@@ -138,7 +141,8 @@ class LeverControl:
         tracks = self._tracks(before.tracks) and not self._too_slow
         # Tracks tell classes too; without them a still is what corrects one.
         named = tracks or self._measured.misnamed_share < self._settings.least_changed
-        stills = (self._stills(now_ns) or not named) and not self._too_slow
+        wanted = self._settings.finer or self._stills(now_ns) or not named
+        stills = wanted and not self._too_slow
         levers = Levers(tracks, stills, self._says(tracks=tracks, stills=stills))
         if levers != before:
             self._operating.pull(levers)
@@ -175,4 +179,5 @@ class LeverControl:
             else "no tracks: not measured"
         )
         changed = f"changed {sum(self._changed)} of {len(self._changed)}"
-        return f"{of_tracks}; {f'stills {changed}' if stills else f'stills paused: {changed}'}"
+        of_stills = f"stills show details, {changed}" if self._settings.finer else f"stills {changed}"
+        return f"{of_tracks}; {of_stills if stills else f'stills paused: {changed}'}"

@@ -121,7 +121,7 @@ class EncoderReconfiguration:
         if self.split is None or not self._moving:
             return False
         with self._lock:
-            self.split.set_beside(metadata_bps=self._metadata_bps, stills=now.levers.stills)
+            self._tell_split(now.decimation)
             return self.split.wants_keyframe(now_ns)
 
     def open_again(self) -> Encoder:
@@ -134,7 +134,7 @@ class EncoderReconfiguration:
         if self.pacer is not None:
             return self._at_links_rate(self.pacer, decimation, now_ns, changed=changed)
         now = self.operating.now
-        base_bps, total_bps = self._proposed_bps(changed=changed), now.budget_bps
+        base_bps, total_bps = self._proposed_bps(decimation, changed=changed), now.budget_bps
         if not changed and (decimation, base_bps) == (now.decimation, now.base_bps):
             return None
         return self._open(total_bps, base_bps, decimation, now_ns=now_ns, encoder_total_bps=total_bps)
@@ -144,7 +144,7 @@ class EncoderReconfiguration:
         if changed:
             floor_bps = min(now.budget_bps, self.settings.min_budget_bps)
             pacer.set_ceiling(now.budget_bps, floor_bps=floor_bps)
-        self._proposed_bps(changed=changed)  # which moves the share
+        self._proposed_bps(decimation, changed=changed)  # which moves the share
         base_bps = self._base_of(pacer.steady_bps)
         near = abs(base_bps / now.base_bps - 1) <= _WORTH and not (pacer.at_ceiling or changed)
         if decimation == now.decimation and (near or base_bps == now.base_bps):
@@ -202,13 +202,18 @@ class EncoderReconfiguration:
         before, self._commanded = self._commanded, (now.budget_bps, now.video_share)
         return before != self._commanded
 
-    def _proposed_bps(self, *, changed: bool) -> int:
+    def _tell_split(self, decimation: int) -> None:
+        assert self.split is not None
+        stills = self.operating.now.levers.stills
+        self.split.set_beside(metadata_bps=self._metadata_bps, stills=stills, sparse=decimation > 1)
+
+    def _proposed_bps(self, decimation: int, *, changed: bool) -> int:
         now = self.operating.now
         if not self._moving or self.split is None:
             return self._base_of_budget() if changed else now.base_bps
         total_bps = now.budget_bps if self.pacer is None else self.pacer.steady_bps
         with self._lock:
-            self.split.set_beside(metadata_bps=self._metadata_bps, stills=now.levers.stills)
+            self._tell_split(decimation)
             if changed or self.pacer is not None:
                 self.split.set_total(total_bps)
             share = self.split.propose()

@@ -36,6 +36,8 @@ class SplitSettings:
     least_still_share: float = 0.05
     """For newcomers, and for stills that a ground asks for."""
     most_still_share: float = 0.35
+    most_sparse_share: float = 1.0
+    """For the base, while not all frames are coded: each takes the longer on the line the more bits it has."""
     horizon_s: float = 5.0
     """The need that waits is to be worked off in so long."""
     full_gain: float = 0.3
@@ -64,7 +66,7 @@ class Split:
         self._gain = gain or ExpectedGain()
         self.share = first_share
         """Of the budget, for the base: the first, then what was last proposed."""
-        self._stills = True
+        self._stills, self._sparse = True, False
         self._need_bytes = 0.0
         self._shown = 1.0
         self._observed_ns: int | None = None
@@ -90,10 +92,13 @@ class Split:
         self._settings = replace(self._settings, total_bps=total_bps)
         self.share = max(self.share, min(1.0, self._settings.least_base_bps / total_bps))
 
-    def set_beside(self, *, metadata_bps: int, stills: bool) -> None:
-        """What is sent beside the base from now on; without stills theirs is the base's."""
+    def set_beside(self, *, metadata_bps: int, stills: bool, sparse: bool) -> None:
+        """What is sent beside the base from now on; without stills theirs is the base's.
+
+        ``sparse``: not all source frames are coded.
+        """
         self._settings = replace(self._settings, metadata_bps=metadata_bps)
-        self._stills = stills
+        self._stills, self._sparse = stills, sparse
 
     def propose(self) -> float | None:
         """The base's share of the budget from the keyframe that is due now; None to leave it as it is."""
@@ -112,7 +117,8 @@ class Split:
         return abs(self._target() - self.share) >= self._settings.own_change - 1e-9
 
     def _target(self) -> float:
-        return round(1 - self._metadata_share() - self._still_share(), 2)
+        share = 1 - self._metadata_share() - self._still_share()
+        return round(min(share, self._settings.most_sparse_share) if self._sparse else share, 2)
 
     def _need(self, candidate: Candidate, step: Step) -> float:
         part = min(1.0, self._gain.gain(candidate, step) / self._settings.full_gain)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from hvt_common.protocol.channels import DELIVERIES, Channel, Direction
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
+from hvt_common.values import View
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
@@ -23,6 +24,11 @@ from hvt_edge.video.share import Split, SplitSettings
 
 _AUTO_STILL_SHARE = 0.15
 """Of the budget, at most, for stills that are not known to pay: what the base loses by it is .015 of F1."""
+SPARSE_SHARE = 0.9
+"""Of the budget, at most, for a base of which not all frames are coded. Each has more bits then; at 7.5 a second it
+still arrives within 1.5 times the delay of 15 a second with the whole budget."""
+_FINER = 0.5
+"""Of `hidden_pixels`: above it stills show what the base does not, whatever they are of."""
 _AUTO_REST_S = 8.0
 """Between two keyframes for the sake of another split."""
 
@@ -76,20 +82,30 @@ def make_split(config: EdgeConfig, size: tuple[int, int], *, first_share: float)
         metadata_bps=config.metadata_bps,
     )
     if config.measures:  # stills have to earn more
-        settings = replace(settings, most_still_share=_AUTO_STILL_SHARE, own_rest_s=_AUTO_REST_S)
+        settings = replace(
+            settings,
+            most_still_share=_AUTO_STILL_SHARE,
+            most_sparse_share=SPARSE_SHARE,
+            own_rest_s=_AUTO_REST_S,
+        )
     return Split(settings, first_share=first_share)
 
 
-def make_levers(config: EdgeConfig, operating: Operating) -> LeverControl | None:
+def make_levers(config: EdgeConfig, operating: Operating, view: View) -> LeverControl | None:
     """Who decides what is sent beside the video; None where the settings do."""
     if not config.measures:
         return None
-    return LeverControl(operating, lever_settings(config))
+    return LeverControl(operating, lever_settings(config, view))
 
 
-def lever_settings(config: EdgeConfig) -> LeverSettings:
+def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:
     """What tracks and stills must give."""
-    return LeverSettings(tracks_bps=config.metadata_bps)
+    return LeverSettings(tracks_bps=config.metadata_bps, finer=hidden_pixels(view) > _FINER)
+
+
+def hidden_pixels(view: View) -> float:
+    """0…1: the share of the source's pixels that the base has no pixel of its own for."""
+    return max(0.0, 1 - view.scale**2)
 
 
 def make_pacer(config: EdgeConfig, stream: CameraStream | None) -> Pacer | None:

@@ -256,7 +256,7 @@ def build_stages(
         keyframes=keyframes,
         reporter=TrackReporter(transmitter, session_id=session_id) if config.send_tracks else None,
         shadow=make_shadow(config, detector, before=beginning.shadow),
-        levers=make_levers(config, operating),
+        levers=make_levers(config, operating, view),
     )
     commands = Commands(
         config,

@@ -16,12 +16,15 @@ from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
-from hvt_edge.stills.policy.base import Step
-from hvt_edge.stills.policy.registry import method, tuning
+from hvt_edge.stills.policy.base import Method, Step
+from hvt_edge.stills.policy.registry import METHODS, method, tuning
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Gate, Suppression
+from hvt_edge.wiring.link import hidden_pixels
 
 _TRIAL_PX = 48
+_DETAIL_WEIGHT = 5.0
+"""Where the base has none of the source's pixels: then details count for more than a class (docs/legibility.md)."""
 
 
 def check_codecs(config: EdgeConfig) -> None:
@@ -40,6 +43,14 @@ def check_codecs(config: EdgeConfig) -> None:
             ) from error
         if not still_codec(config.still_codec).needs_base:
             return  # no fallback is used
+
+
+def make_method(config: EdgeConfig, view: View) -> Method:
+    """The method with its parameters; with auto details count, as far as the base has no pixels for them."""
+    parameters = tuning(config.tune)
+    if config.measures and "detail_weight" in METHODS[config.method].parameters:
+        parameters.setdefault("detail_weight", _DETAIL_WEIGHT * hidden_pixels(view))
+    return method(config.method, **parameters)
 
 
 def make_suppression(config: EdgeConfig) -> Suppression:
@@ -61,7 +72,7 @@ def make_chooser(
 ) -> Chooser:
     """Method, suppression, gate and maker; ``most_bytes`` is the largest payload the budget ever admits."""
     return Chooser(
-        method(config.method, **tuning(config.tune)),
+        make_method(config, view),
         suppression=make_suppression(config),
         outbox=outbox,
         maker=maker,

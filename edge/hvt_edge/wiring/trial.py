@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS
-from hvt_common.values import AccessUnit, Frame
+from hvt_common.values import AccessUnit, Frame, View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.perception.shadow import UNMEASURED, Shadow
@@ -17,7 +17,7 @@ from hvt_edge.video.encoder_settings import least_base_bps
 from hvt_edge.video.encoders.registry import X265
 from hvt_edge.video.share import FIRST_SHARE
 from hvt_edge.video.trial import trial_frames, trial_quantiser
-from hvt_edge.wiring.link import lever_settings
+from hvt_edge.wiring.link import SPARSE_SHARE, lever_settings
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.video import first_decimation, make_encoder, scene
 
@@ -55,10 +55,10 @@ def try_scene(
     fps = config.nominal_fps / decimation
     feasible = config.base_bps >= least_base_bps(size, fps, edge_id=config.edge_id)
     if not (config.measures and feasible) or config.encoder != X265:
-        return Beginning(decimation, config.share)
+        return Beginning(decimation, _share(config, source.view, decimation))
     shadow = make_shadow(config, detector)
     if shadow is None and not (config.auto_fps and decimation > 1):  # nothing would come of it
-        return Beginning(decimation, config.share)
+        return Beginning(decimation, _share(config, source.view, decimation))
     count = trial_frames(fps)
     analyzer = make_analyzer(config, detector=detector, view=source.view)
     until_ns = None if config.pace == "lockstep" else clock() + _MOST_NS
@@ -78,7 +78,7 @@ def try_scene(
     if config.auto_fps and quantiser < _FINE:
         decimation = _most_frames(config, size, decimation)
     seen = UNMEASURED if shadow is None else shadow.now
-    return Beginning(decimation, _share(config, seen), seen)
+    return Beginning(decimation, _share(config, source.view, decimation, seen), seen)
 
 
 def _most_frames(config: EdgeConfig, size: tuple[int, int], decimation: int) -> int:
@@ -89,8 +89,10 @@ def _most_frames(config: EdgeConfig, size: tuple[int, int], decimation: int) -> 
     return decimation
 
 
-def _share(config: EdgeConfig, seen: Shadow) -> float:
+def _share(config: EdgeConfig, view: View, decimation: int, seen: Shadow = UNMEASURED) -> float:
     """Where the base hides objects, stills find more of them than the video would by the same bits."""
-    pay = lever_settings(config).tracks_pay(seen.measured, total_bps=config.budget_bps)
-    moves = isinstance(config.video_share, str) and not method(config.method).video_only
-    return FIRST_SHARE if pay and moves else config.share
+    if not config.measures or config.fixed_share is not None:
+        return config.share
+    share = min(config.share, SPARSE_SHARE) if decimation > 1 else config.share
+    pay = lever_settings(config, view).tracks_pay(seen.measured, total_bps=config.budget_bps)
+    return FIRST_SHARE if pay and not method(config.method).video_only else share

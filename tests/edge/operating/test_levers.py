@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from hvt_edge.operating.levers import LeverControl, LeverSettings, Measured
@@ -14,11 +16,11 @@ SETTINGS = LeverSettings(tracks_bps=8_000)
 class Rig:
     """A control at a budget, fed by hand; time runs in seconds."""
 
-    def __init__(self, *, budget_bps: int = 800_000) -> None:
+    def __init__(self, *, budget_bps: int = 800_000, finer: bool = False) -> None:
         self.operating = Operating(
             budget_bps=budget_bps, video_share=None, base_bps=budget_bps, method="M6", decimation=1
         )
-        self.control = LeverControl(self.operating, SETTINGS)
+        self.control = LeverControl(self.operating, replace(SETTINGS, finer=finer))
         self.at_s = 0
 
     def tracks(
@@ -87,6 +89,17 @@ def test_stills_that_change_nothing_pause_and_are_tried_again():
     assert not rig.answers(SETTINGS.least_answers), "in vain"
     assert not rig.second(2 * pause_s - 1).stills, "the next try comes later"
     assert rig.second(1).stills
+
+
+def test_stills_of_a_source_much_finer_than_the_base_never_pause():
+    """Details are what they are for there: no class changes, and an operator could read nothing."""
+    rig = Rig(finer=True)
+    assert rig.answers(60)
+    assert rig.operating.now.levers.says.endswith("stills show details, changed 0 of 40")
+    rig.control.take_load(0, 0, now_ns=0)
+    for second in range(1, 10):
+        rig.control.take_load(15 * second, 15 * second, now_ns=second * SECOND_NS)
+    assert not rig.second().stills, "but on a machine that is too slow"
 
 
 def test_stills_that_change_something_go_on():

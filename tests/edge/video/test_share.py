@@ -175,6 +175,19 @@ def test_a_scene_that_has_changed_is_worth_a_keyframe_of_its_own_now_and_then():
     assert one.wants_keyframe(40 * SECOND), "the crowd has gone"
 
 
+def test_of_few_frames_the_base_takes_no_more_than_they_may_take_time():
+    """Each frame of half as many has twice the bits, and is on the line for twice as long."""
+    one = split(300_000, most_sparse_share=0.9)
+    for number in range(60):
+        one.observe([], moment(number / 3))
+    one.set_beside(metadata_bps=0, stills=False, sparse=True)
+    assert one.propose() == 0.9
+    one.set_beside(metadata_bps=60_000, stills=False, sparse=True)
+    assert one.propose() == 0.8
+    one.set_beside(metadata_bps=0, stills=False, sparse=False)
+    assert one.propose() == 1.0
+
+
 def test_what_stills_leave_while_they_pause_goes_back_to_the_base():
     """A tenth of a thin link would lie idle until the next scheduled keyframe, up to a minute later."""
     operating = Operating(budget_bps=300_000, video_share=None, base_bps=255_000, method="M6", decimation=2)

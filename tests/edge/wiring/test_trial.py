@@ -53,7 +53,9 @@ def test_auto_begins_with_the_frame_rate_that_the_scene_needs(tmp_path, coarse, 
     """An easy scene would be shown at half its rate, and a hard one in mud."""
     config = settings(str(moving(tmp_path, coarse=coarse, frames=frames)), "100kbps", *flags)
     with open_source(str(tmp_path), size=(640, 360), fps=15) as source:
-        assert tried(config, source).decimation == decimation
+        beginning = tried(config, source)
+        assert beginning.decimation == decimation
+        assert beginning.share == (0.9 if decimation > 1 else 0.95)
         first = next(iter(source.steps(start_ns=0)))
         assert first is not None
         assert first.index == 0, "the clip begins anew"

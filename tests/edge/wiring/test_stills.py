@@ -1,0 +1,52 @@
+"""What stills are worth, by how much finer the source is than the base."""
+
+from __future__ import annotations
+
+import pytest
+
+from hvt_common.config import load
+from hvt_common.values import View
+from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.stills.policy.m6 import ExpectedGain
+from hvt_edge.wiring.link import lever_settings
+from hvt_edge.wiring.stills import make_method
+
+
+def settings(*flags: str) -> EdgeConfig:
+    loaded, given = load(EdgeConfig, ["--source", "x.mp4", *flags], program="hvt-edge", description="")
+    return check(with_profile(loaded, given=given.values))
+
+
+@pytest.mark.parametrize(
+    ("source", "weight", "finer"),
+    [
+        ((3840, 2160), 5 * 8 / 9, True),
+        ((1920, 1080), 5 * 5 / 9, True),
+        ((1600, 900), 5 * (1 - 0.64), False),
+        ((1280, 720), 0, False),
+        ((640, 360), 0, False),
+    ],
+)
+def test_auto_values_pixels_that_the_base_does_not_have(source, weight, finer):
+    """Of a 4K camera the operator would get a 720p picture, and no still that shows more."""
+    view = View.fitted(source, (1280, 720), fit="letterbox")
+    config = settings()
+    made = make_method(config, view)
+    assert isinstance(made, ExpectedGain)
+    assert made.detail_weight == pytest.approx(weight)
+    assert lever_settings(config, view).finer == finer
+
+
+@pytest.mark.parametrize(
+    ("flags", "weight"),
+    [
+        (("--tune", "detail_weight=2"), 2),
+        (("--method", "M6"), 0),
+        (("--profile", "thin"), 0),
+        (("--profile", "auto", "--method", "M5"), None),
+    ],
+)
+def test_what_was_asked_for_holds(flags, weight):
+    """A study of M6 would fly another method, or a user's word count for nothing."""
+    made = make_method(settings(*flags), View.fitted((3840, 2160), (1280, 720), fit="letterbox"))
+    assert getattr(made, "detail_weight", None) == weight
