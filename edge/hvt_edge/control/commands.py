@@ -23,6 +23,7 @@ from hvt_edge.operating.point import Operating, base_rate_bps
 from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.on_demand_crop import OnDemandRequest, RefusedError
+from hvt_edge.stills.policy.base import Method
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser
 from hvt_edge.video.encoder_settings import least_base_bps
@@ -70,6 +71,8 @@ class Commands:
     keyframes: KeyframeRequests
     on_demand: OnDemand
     chooser: Chooser
+    make_method: Callable[[str], Method]
+    """By its name, with the edge's settings; `UserError` for an unknown one."""
     backlog: BacklogStage | None
     base_size: tuple[int, int]
     clock: Callable[[], int]
@@ -161,7 +164,7 @@ class Commands:
         name = reader.text("method")
         reader.end()
         now = self.operating.now
-        before, policy = method(now.method), method(name)
+        before, policy = method(now.method), self.make_method(name)
         if policy.name == before.name:
             return _Result()
         if "R0" in (policy.name, before.name):

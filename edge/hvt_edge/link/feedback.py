@@ -7,11 +7,11 @@ from collections import deque
 
 from hvt_common.protocol.messages import StillResult
 from hvt_edge.link.receivers import Report
+from hvt_edge.perception.detected import Detected
 
 __all__ = ["FeedbackInbox"]
 
 _MAX_RESULTS = 1024
-_MAX_DETECTED = 64
 
 
 class FeedbackInbox:
@@ -29,7 +29,7 @@ class FeedbackInbox:
         self._answered: dict[int, None] = {}  # in the order in which they came
         self._known: dict[tuple[int, int, bool], None] = {}
         self._done_sequence = -1
-        self._detected: dict[int, int] = {}
+        self._detected: dict[int, Detected] = {}
         """By frame, in the order in which they came."""
         self._base_messages = 0
         self._roi_messages = 0
@@ -47,8 +47,9 @@ class FeedbackInbox:
             for result in feedback.stills:
                 self._note(result)
             if report.primary and feedback.objects_detected >= 0:
-                self._detected[feedback.last_frame_index] = feedback.objects_detected
-                if len(self._detected) > _MAX_DETECTED:
+                index = feedback.last_frame_index
+                self._detected[index] = Detected(feedback.receiver_id, index, feedback.objects_detected)
+                if len(self._detected) > _MAX_RESULTS:
                     del self._detected[next(iter(self._detected))]
             # A ground may answer what was never asked.
             while len(self._answered) > 2 * _MAX_RESULTS:
@@ -90,8 +91,8 @@ class FeedbackInbox:
             )
             return ready
 
-    def take_detected(self, *, up_to: int | None = None) -> int | None:
-        """Return how many objects the ground's own detector shows, and forget it; None where there is no news.
+    def take_detected(self, *, up_to: int | None = None) -> Detected | None:
+        """Return what the ground's own detector shows, and forget it; None where there is no news.
 
         ``up_to`` this frame: what was said of a later one is for another time.
         """

@@ -3,12 +3,12 @@
 Two levers cost bits that the video could have: the edge's own tracks, and stills. Each is pulled while it pays.
 
 **Tracks** pay where the ground does not see objects on the base: their gain in F1 is what the shadow ground measured,
-less what the video would gain by the same bits. **Stills** pay where they change what the ground shows: it says of each what it made of
-it. Where hardly any changed anything they pause, and a few are sent now and then to find out whether that holds. A
-source much finer than the base is reason enough: they go on, and show details.
+less what the video would gain by the same bits. **Stills** pay where they change what the ground shows: it says of
+each what it made of it. Where hardly any changed anything they pause, and a few are sent now and then to find out
+whether that holds. A source much finer than the base is reason enough: they go on, and show details.
 
-A ground that lies in its reports can stop stills and tracks or bring them back, within their shares of the budget. It
-can change neither the budget nor the frame rate.
+A ground that lies in its reports can stop stills and tracks or bring them back, and with them move some of the bits
+of the video, within auto's bounds. It cannot change the budget.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ class Measured:
     """Objects a picture that the base does not show."""
     misnamed_share: float = 0.0
     """Of those that it shows, those that bear another class there."""
+    reported: bool = False
+    """The ground's own detector shows even fewer: ``hidden`` are those that it does not see."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +174,8 @@ class LeverControl:
         """One line for people."""
         if self._too_slow:
             return "video alone: this machine is too slow for the detector"
-        hidden = f"{self._measured.hidden:.0f} objects the base does not show"
+        who = "ground does not see" if self._measured.reported else "base does not show"
+        hidden = f"{self._measured.hidden:.0f} objects the {who}"
         of_tracks = (
             f"{'tracks' if tracks else 'no tracks'}: {hidden}"
             if self._measured.comparisons

@@ -25,7 +25,6 @@ found on the base here, so many count as hidden, or as shown, instead (`Shadow.c
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
@@ -38,10 +37,13 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
 from hvt_edge.operating.levers import Measured
 from hvt_edge.perception.analyzer import AnalyzedFrame
+from hvt_edge.perception.detected import Detected, GroundDifference
 
 __all__ = ["UNMEASURED", "Shadow", "ShadowGround", "ShadowSettings"]
 
 _THUMBNAIL = (32, 18)
+_LEAST_MORE = 0.5
+"""Of objects that the ground shows more or fewer than were found here."""
 _BASE_NAMES = 1 / 3
 """Where base and source name an object differently, how often the base's name is right."""
 
@@ -63,10 +65,6 @@ class ShadowSettings:
     """Time constant with which former comparisons fade."""
     scene_correlation: float = 0.3
     """Two pictures a third of a second apart that correlate less, as thumbnails, are of two scenes."""
-    reports: int = 24
-    """Of the ground, on how many objects it shows: so many of the newest count, …"""
-    report_rest_ns: int = SECOND_NS // 3
-    """… and of those that come sooner after each other, one."""
     match_iou: float = 0.3
     """As little as the ground takes for one object: boxes of 15 pixels from two pictures seldom reach more."""
 
@@ -110,24 +108,23 @@ class Shadow:
         """
         return self._gain(_sure(self.hidden), _sure(self.misnamed))
 
-    def corrected(self, detected: float, *, sure: bool) -> Shadow:
-        """The same for a ground whose detector shows so many objects, right and wrong ones, instead of shown + false.
+    def corrected(self, more: float, *, sure: bool) -> Shadow:
+        """The same for a ground whose own detector shows ``more`` objects than were found here; less than 0: fewer.
 
-        With ``sure`` one standard error of that count counts for nothing (Poisson). Which objects they are nobody
-        says: each is taken to be as sure as the others of its kind here.
+        With ``sure`` one standard error of the count counts for nothing (Poisson). Half an object is none. Which
+        objects they are nobody says: each is taken to be as sure as the others of its kind here.
         """
-        expected = self.shown + self.false
-        difference = detected - expected
-        error = math.sqrt(max(detected, expected)) if sure else 0.0
-        more = math.copysign(max(0.0, abs(difference) - error), difference)
-        more = min(self.hidden, max(-self.shown, more))
-        moved_p = more * (_per(self.hidden_p, self.hidden) if more > 0 else _per(self.shown_p, self.shown))
-        left = 1 + min(0.0, more) / self.shown if self.shown else 1.0
+        found = self.shown + self.false
+        error = math.sqrt(max(found, found + more)) if sure else 0.0
+        moved = math.copysign(max(0.0, abs(more) - error), more) if abs(more) >= _LEAST_MORE else 0.0
+        moved = min(self.hidden, max(-self.shown, moved))
+        moved_p = moved * (_per(self.hidden_p, self.hidden) if moved > 0 else _per(self.shown_p, self.shown))
+        left = 1 + min(0.0, moved) / self.shown if self.shown else 1.0
         return replace(
             self,
-            shown=self.shown + more,
+            shown=self.shown + moved,
             shown_p=self.shown_p + moved_p,
-            hidden=self.hidden - more,
+            hidden=self.hidden - moved,
             hidden_p=self.hidden_p - moved_p,
             misnamed=self.misnamed * left,
             misnamed_p=self.misnamed_p * left,
@@ -189,28 +186,21 @@ class ShadowGround:
         """How often another scene began."""
         self.now = before
         """For a ground with the edge's detector."""
-        self._detected: deque[int] = deque(maxlen=settings.reports)
-        self._next_report_ns: int | None = None
+        self._difference = GroundDifference(memory_s=settings.memory_s, grace_ns=settings.rest_ns)
 
     @property
     def measured(self) -> Measured:
         """What decides on tracks, for the ground as it reports."""
-        if not self._detected:
+        more = self._difference.mean
+        if more is None:
             return self.now.measured
-        detected = sum(self._detected) / len(self._detected)
-        plain, sure = (self.now.corrected(detected, sure=sure) for sure in (False, True))
-        return replace(sure.measured, gain=plain.gain)
+        plain, sure = (self.now.corrected(more, sure=sure) for sure in (False, True))
+        reported = plain.hidden > self.now.hidden
+        return replace(plain.measured, sure_gain=sure.sure_gain, reported=reported)
 
-    def take_detected(self, count: int, *, now_ns: int) -> None:
-        """The ground's own detector shows so many objects; ``now_ns`` is any clock.
-
-        Of the first second nothing counts: the first picture is coarser than any other.
-        """
-        if self._next_report_ns is None:
-            self._next_report_ns = now_ns + self._settings.rest_ns
-        if now_ns >= self._next_report_ns:
-            self._next_report_ns = now_ns + self._settings.report_rest_ns
-            self._detected.append(count)
+    def take_detected(self, report: Detected) -> None:
+        """What a ground says of its own detector."""
+        self._difference.take(report)
 
     def compare(self, seen: AnalyzedFrame) -> bool:
         """Compare, if this is a decision step on a coded frame and one is due; tell whether it was done."""
@@ -233,7 +223,9 @@ class ShadowGround:
         self._next_ns = capture_ns + max(rest_ns, round(took_ns / settings.most_share))
         if found is None:
             return False
-        self._take(self._compared(seen, found), capture_ns)
+        one = self._compared(seen, found)
+        self._take(one, capture_ns)
+        self._difference.expect(seen.frame.index, one.shown + one.false, capture_ns=capture_ns)
         return True
 
     def _is_another_scene(self, source_bgr: Image, capture_ns: int) -> bool:
@@ -250,7 +242,7 @@ class ShadowGround:
         """Another scene: what was measured says nothing of it."""
         self.scene_changes += 1
         self.now, self._last_ns, self._next_ns = UNMEASURED, None, 0
-        self._detected.clear()
+        self._difference.forget()
         self._shown_ids = np.empty(0, np.int64)
 
     def _compared(self, seen: AnalyzedFrame, found: Detections) -> Shadow:

@@ -14,6 +14,7 @@ from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.operating.levers import LeverControl
 from hvt_edge.operating.point import Levers
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
+from hvt_edge.perception.detected import Detected
 from hvt_edge.perception.shadow import ShadowGround
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser
@@ -47,8 +48,8 @@ class StillStage:
     def __post_init__(self) -> None:
         self._latest_tracks: Tracks | None = None
         self._scene_changes = 0
-        self._detected: int | None = None
-        """What the ground has reported since the decision before."""
+        self._detected: Detected | None = None
+        """Reported since the decision before; in lockstep a frame may be compared at this very moment."""
 
     @property
     def latest_tracks(self) -> Tracks | None:
@@ -118,11 +119,11 @@ class StillStage:
                 sent.add(coded.still.sequence)
         return sent
 
-    def on_results(self, results: Sequence[StillResult], *, detected: int | None = None) -> None:
+    def on_results(self, results: Sequence[StillResult], *, detected: Detected | None = None) -> None:
         """What a ground made of stills counts for the next decision; one without a name is no opinion.
 
-        A still that it could not decode for want of the base frame is sent once more. ``detected`` objects its own
-        detector shows; None: it has not said anything new.
+        A still that it could not decode for want of the base frame is sent once more. ``detected`` is what its own
+        detector shows; None: it has said nothing new.
         """
         if detected is not None:
             self._detected = detected
@@ -152,7 +153,7 @@ class StillStage:
                 self._scene_changes = self.shadow.scene_changes
                 self.levers.forget()
             if self._detected is not None:
-                self.shadow.take_detected(self._detected, now_ns=now_ns)
+                self.shadow.take_detected(self._detected)
                 self._detected = None
             self.levers.take_shadow(self.shadow.measured)
         return self.levers.decide(now_ns)

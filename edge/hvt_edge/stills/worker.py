@@ -15,6 +15,7 @@ from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.runtime.process import lower_priority
 from hvt_common.values import AccessUnit, Frame
+from hvt_edge.perception.detected import Detected
 from hvt_edge.stills.stage import StillStage
 
 __all__ = ["MAX_QUEUE_BYTES", "SkippedUnits", "StillWorker"]
@@ -36,14 +37,14 @@ class StillWorker:
     """Runs a `StillStage` in a thread of its own.
 
     The queue is bounded in frames and in bytes. Before each frame the thread takes what grounds have reported:
-    ``results()`` of stills, and how many objects are ``detected()`` there. An error in it stops stills and perception
+    ``results()`` of stills, and what is ``detected()`` there. An error in it stops stills and perception
     for a while, never the video: what is queued is given up, and the stage goes on from a keyframe.
     """
 
     stage: StillStage
     _: KW_ONLY
     results: Callable[[], Sequence[StillResult]]
-    detected: Callable[[], int | None] = lambda: None
+    detected: Callable[[], Detected | None] = lambda: None
     failures: Failures
     clock: Callable[[], int]
     length: int = 16

@@ -105,7 +105,8 @@ class Split:
         if self._observed_ns is None:
             return None
         share = self._target()
-        if abs(share - self.share) < self._settings.least_change - 1e-9:
+        over = self._sparse and self.share > self._most_sparse_share()
+        if abs(share - self.share) < self._settings.least_change - 1e-9 and not over:
             return None
         self.share, self._changed_ns = share, self._observed_ns
         return share
@@ -118,7 +119,11 @@ class Split:
 
     def _target(self) -> float:
         share = 1 - self._metadata_share() - self._still_share()
-        return round(min(share, self._settings.most_sparse_share) if self._sparse else share, 2)
+        return round(min(share, self._most_sparse_share()) if self._sparse else share, 2)
+
+    def _most_sparse_share(self) -> float:
+        settings = self._settings
+        return max(settings.most_sparse_share, min(1.0, settings.least_base_bps / settings.total_bps))
 
     def _need(self, candidate: Candidate, step: Step) -> float:
         part = min(1.0, self._gain.gain(candidate, step) / self._settings.full_gain)

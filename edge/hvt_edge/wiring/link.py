@@ -21,14 +21,13 @@ from hvt_edge.video.encoders.camera_rates import CameraRates, LeastLink, needed_
 from hvt_edge.video.encoders.passthrough import measure_camera
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.share import Split, SplitSettings
+from hvt_edge.wiring.stills import shows_details
 
 _AUTO_STILL_SHARE = 0.15
 """Of the budget, at most, for stills that are not known to pay: what the base loses by it is .015 of F1."""
 SPARSE_SHARE = 0.9
 """Of the budget, at most, for a base of which not all frames are coded. Each has more bits then; at 7.5 a second it
 still arrives within 1.5 times the delay of 15 a second with the whole budget."""
-_FINER = 0.5
-"""Of `hidden_pixels`: above it stills show what the base does not, whatever they are of."""
 _AUTO_REST_S = 8.0
 """Between two keyframes for the sake of another split."""
 
@@ -100,12 +99,7 @@ def make_levers(config: EdgeConfig, operating: Operating, view: View) -> LeverCo
 
 def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:
     """What tracks and stills must give."""
-    return LeverSettings(tracks_bps=config.metadata_bps, finer=hidden_pixels(view) > _FINER)
-
-
-def hidden_pixels(view: View) -> float:
-    """0…1: the share of the source's pixels that the base has no pixel of its own for."""
-    return max(0.0, 1 - view.scale**2)
+    return LeverSettings(tracks_bps=config.metadata_bps, finer=shows_details(config, view))
 
 
 def make_pacer(config: EdgeConfig, stream: CameraStream | None) -> Pacer | None:

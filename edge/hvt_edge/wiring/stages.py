@@ -47,7 +47,7 @@ from hvt_edge.wiring.link import (
     make_split,
 )
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
-from hvt_edge.wiring.stills import make_chooser, make_on_demand, make_still_maker
+from hvt_edge.wiring.stills import make_chooser, make_method, make_on_demand, make_still_maker
 from hvt_edge.wiring.storing import make_backlog
 from hvt_edge.wiring.trial import Beginning
 from hvt_edge.wiring.video import (
@@ -265,6 +265,7 @@ def build_stages(
         keyframes=keyframes,
         on_demand=on_demand,
         chooser=chooser,
+        make_method=lambda name: make_method(config, view, name=name),
         backlog=backlog,
         base_size=view.base_size,
         clock=clock,

@@ -20,9 +20,11 @@ from hvt_edge.stills.policy.base import Method, Step
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Gate, Suppression
-from hvt_edge.wiring.link import hidden_pixels
 
 _TRIAL_PX = 48
+_DETAIL = "detail_weight"
+_FINER = 0.5
+"""Of `_hidden_pixels`."""
 _DETAIL_WEIGHT = 5.0
 """Where the base has none of the source's pixels: then details count for more than a class (docs/legibility.md)."""
 
@@ -45,12 +47,27 @@ def check_codecs(config: EdgeConfig) -> None:
             return  # no fallback is used
 
 
-def make_method(config: EdgeConfig, view: View) -> Method:
-    """The method with its parameters; with auto details count, as far as the base has no pixels for them."""
-    parameters = tuning(config.tune)
-    if config.measures and "detail_weight" in METHODS[config.method].parameters:
-        parameters.setdefault("detail_weight", _DETAIL_WEIGHT * hidden_pixels(view))
-    return method(config.method, **parameters)
+def make_method(config: EdgeConfig, view: View, *, name: str | None = None) -> Method:
+    """The method of the settings, or another by its name.
+
+    With auto details count as far as the base has no pixels for them. Raises `UserError` for an unknown name.
+    """
+    own = method(config.method)
+    policy = own if name is None else method(name)
+    parameters = tuning(config.tune) if policy.name == own.name else {}
+    if config.measures and _DETAIL in METHODS[policy.name].parameters:
+        parameters.setdefault(_DETAIL, _DETAIL_WEIGHT * _hidden_pixels(view))
+    return method(policy.name, **parameters)
+
+
+def shows_details(config: EdgeConfig, view: View) -> bool:
+    """Whether stills are worth sending for what the base has no pixels for."""
+    return _hidden_pixels(view) > _FINER and getattr(make_method(config, view), _DETAIL, 0) > 0
+
+
+def _hidden_pixels(view: View) -> float:
+    """0…1: the share of the source's pixels that the base has no pixel of its own for."""
+    return max(0.0, 1 - view.scale**2)
 
 
 def make_suppression(config: EdgeConfig) -> Suppression:

@@ -36,6 +36,7 @@ from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
+from hvt_edge.perception.detected import Detected
 from hvt_edge.source.resample import Resizer
 from hvt_edge.wiring import base_size
 from hvt_edge.world import World
@@ -150,7 +151,7 @@ class _Inbox(FeedbackInbox):
         super().__init__()
         self.now_ns = _START_NS
         self.due: deque[tuple[int, StillResult]] = deque()
-        self.due_detected: deque[tuple[int, int]] = deque()
+        self.due_detected: deque[tuple[int, Detected]] = deque()
 
     def take(self) -> list[StillResult]:
         due = [one for at_ns, one in self.due if at_ns <= self.now_ns]
@@ -160,7 +161,7 @@ class _Inbox(FeedbackInbox):
     def take_up_to(self, sequence: int) -> list[StillResult]:  # noqa: ARG002 - time decides here
         return self.take()
 
-    def take_detected(self, *, up_to: int | None = None) -> int | None:  # noqa: ARG002 - time decides here
+    def take_detected(self, *, up_to: int | None = None) -> Detected | None:  # noqa: ARG002 - time decides here
         newest = None
         while self.due_detected and self.due_detected[0][0] <= self.now_ns:
             newest = self.due_detected.popleft()[1]
@@ -391,7 +392,7 @@ class _NoGround:
     def __init__(self, link: SerialLink[Received]) -> None:
         self._link = link
         self.results: deque[tuple[int, StillResult]] = deque()
-        self.detected: deque[tuple[int, int]] = deque()
+        self.detected: deque[tuple[int, Detected]] = deque()
 
     def pass_over(self, frame_index: int, *, capture_ns: int) -> None:
         """Nothing is listed."""

@@ -23,6 +23,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
+from hvt_edge.perception.detected import Detected
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.link.packets import BasePacket
@@ -150,8 +151,8 @@ class GroundSide:
         """By frame."""
         self.results: deque[tuple[int, StillResult]] = deque()
         """What the edge is to hear, with the time at which it does."""
-        self.detected: deque[tuple[int, int]] = deque()
-        """The same of how many objects the detector shows."""
+        self.detected: deque[tuple[int, Detected]] = deque()
+        """The same of what the detector shows."""
         self.back_bytes = 0
         """Line bytes of the reports that say something of stills; the way back is not the budget's."""
         self.arrivals: list[Arrival[Received]] = []
@@ -226,7 +227,8 @@ class GroundSide:
             self.back_bytes += self._weight(results[first : first + MAX_STILL_RESULTS])
         self.results.extend((back_ns, one) for one in results)
         if self._session.objects_detected >= 0:
-            self.detected.append((back_ns, self._session.objects_detected))
+            frame_index, objects = self._session.last_frame_index, self._session.objects_detected
+            self.detected.append((back_ns, Detected(_RECEIVER, frame_index, objects)))
 
     def _weight(self, results: tuple[StillResult, ...]) -> int:
         """Line bytes of a report with these, as `hvt_ground.session.receiver_report` would send it."""

@@ -45,6 +45,7 @@ class Ground:
             sequence=len(self.frames),
             last_frame_index=self.frames[-1],
             base_messages=len(self.frames),
+            objects_detected=self.frames[-1],
         )
         self.inbox.on_report(counted(report, now_ns=1))
 
@@ -55,6 +56,8 @@ class Stills:
     def __init__(self) -> None:
         self.seen: list[tuple[int, int | None]] = []
         self.latest_tracks = None
+        self.sends = 0
+        self.detected: list[tuple[int, int]] = []
 
     def analyze(self, frame, unit):
         """Keep it."""
@@ -63,10 +66,13 @@ class Stills:
 
     def send(self, seen, *, now_ns, held):
         """Nothing."""
+        self.sends += 1
         return set()
 
     def on_results(self, results, *, detected=None):
-        """Nothing."""
+        """Keep which frame the ground spoke of, and after how many frames."""
+        if detected is not None:
+            self.detected.append((self.sends, detected.frame_index))
 
 
 @pytest.mark.timeout(60)
@@ -107,3 +113,5 @@ def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
     assert ground.frames == list(range(0, 50, 3))
     assert stills.seen == [(index, None if index % 3 else index) for index in range(50)]
     assert counts.encoded == 17
+    # The ground is always done at once; what it says of a frame counts a second later, in every run the same.
+    assert stills.detected == [*((frame + 15, frame) for frame in range(0, 35, 3)), (50, 48)]

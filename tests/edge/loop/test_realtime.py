@@ -27,6 +27,7 @@ from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
+from rigs.messages import counted, feedback
 
 SIZE = (320, 192)
 
@@ -52,6 +53,7 @@ class BlockedStills:
         self.released, self.decoder = threading.Event(), BaseDecoder()
         self.frames: list[int] = []
         self.decoded = 0
+        self.detected: list[int] = []
 
     def analyze(self, frame, unit, skipped=(), *, hurry):
         """As `Analyzer.analyze` does: all units, in their order."""
@@ -64,7 +66,9 @@ class BlockedStills:
         assert self.released.wait(60)
 
     def on_results(self, results, *, detected=None):
-        """Nothing."""
+        """Keep what the ground detected."""
+        if detected is not None:
+            self.detected.append(detected.objects)
 
 
 def base_stage(out: Out) -> BaseStage:
@@ -89,11 +93,12 @@ def base_stage(out: Out) -> BaseStage:
 @pytest.mark.timeout(120)
 def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
     """The picture would freeze a second after a still met a full link, and thaw when the link does."""
-    out, stills, counts = Out(), BlockedStills(), FrameCounts()
+    out, stills, counts, inbox = Out(), BlockedStills(), FrameCounts(), FeedbackInbox()
+    inbox.on_report(counted(feedback(last_frame_index=0, objects_detected=7), now_ns=1))
     base = base_stage(out)
     frames = list(framed(smooth_pictures(60, size=SIZE)))
     with RealtimePace(
-        base, stills, inbox=FeedbackInbox(), clock=SteadyClock(), fps=15, live=True, counts=counts,
+        base, stills, inbox=inbox, clock=SteadyClock(), fps=15, live=True, counts=counts,
         stop=threading.Event(), failures=Failures(time.time_ns),
     ) as pace:  # fmt: skip
         for frame in frames[:50]:  # more than three seconds
@@ -104,6 +109,7 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
         for frame in frames[50:]:
             pace.step(frame)
     assert out.units == 60
+    assert stills.detected == [7]
     assert stills.decoded == max(stills.frames) + 1, "no unit is missing before any frame that was analyzed"
 
 

@@ -57,6 +57,14 @@ def test_tracks_follow_their_gain_and_do_not_flicker():
     assert [rig.tracks(gain) for gain in gains] == [False, False, True, True, False, False]
 
 
+def test_it_says_who_does_not_see_them():
+    """An operator would look for the fault in the video where the ground's model is the wrong one."""
+    rig = Rig()
+    for reported, who in ((True, "ground does not see"), (False, "base does not show")):
+        rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, reported=reported))
+        assert rig.second().says.startswith(f"tracks: 16 objects the {who}; ")
+
+
 def test_one_picture_is_no_measurement_unless_it_is_plain():
     """The first pictures of a stream hide everything: tracks would begin on every clip."""
     rig = Rig()

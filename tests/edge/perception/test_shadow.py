@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,6 +12,7 @@ from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Detections, Frame, Tracks
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer, AnalyzerSettings
+from hvt_edge.perception.detected import Detected
 from hvt_edge.perception.shadow import Shadow, ShadowGround, ShadowSettings
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.video.encoder_settings import encoder_settings
@@ -106,34 +105,39 @@ def test_what_was_measured_before_the_flight_counts():
 TWENTY = dict.fromkeys(range(20), 0.9)
 
 
-def twenty(shown: int, detected: int) -> ShadowGround:
-    """Twenty objects: so many the base shows to the edge's detector, so many are detected at the ground."""
-    shadow = compared(found(*range(shown)), confidences=TWENTY)
-    for number in range(10):
-        shadow.take_detected(detected, now_ns=number * 1_000_000_000)
+def reporting(
+    shown: int, detected: int, *, objects: dict[int, float] | None = None, seconds: int = 10
+) -> ShadowGround:
+    """So many of twenty objects are shown by the base to the edge's detector, and so many detected at the ground."""
+    objects = TWENTY if objects is None else objects
+    shadow = ShadowGround(lambda _image: found(*range(shown)), settings=SETTINGS)
+    for index in range(0, 15 * seconds, 5):
+        shadow.compare(seen(index, objects))
+        shadow.take_detected(Detected(receiver_id=1, frame_index=index, objects=detected))
     return shadow
 
 
 def test_a_ground_without_a_detector_is_told_what_any_base_would_show():
     """It would show nothing at all on an easy scene: the edge's own detector sees everything on the base."""
-    easy = twenty(20, 0)
+    easy = reporting(20, 0)
     assert easy.now.gain == pytest.approx(0)
     assert easy.measured.gain > easy.measured.sure_gain > 0.4
-    assert easy.measured.hidden == pytest.approx(20 - math.sqrt(20))
+    assert (easy.measured.hidden, easy.measured.reported) == (pytest.approx(20), True)
 
 
 def test_a_ground_that_sees_more_than_the_edge_needs_no_tracks():
     """They would take bits to tell it what it knows."""
-    hidden = twenty(6, 20)
+    hidden = reporting(6, 20)
     assert hidden.now.sure_gain > 0.3
     assert hidden.measured.sure_gain < 0.5 * hidden.now.sure_gain
-    assert twenty(6, 200).measured.hidden == 0
+    assert not hidden.measured.reported
+    assert reporting(6, 200).measured.hidden == 0
 
 
 def test_a_count_that_differs_by_chance_changes_nothing():
     """The lists of two detectors never have the same length."""
     for detected in (17, 19, 23):
-        shadow = twenty(20, detected)
+        shadow = reporting(20, detected)
         assert shadow.measured.sure_gain == shadow.now.sure_gain
         assert shadow.measured.gain < 0.1
     silent = compared(found(0), confidences=TWENTY)
@@ -142,34 +146,51 @@ def test_a_count_that_differs_by_chance_changes_nothing():
 
 def test_the_only_object_there_is_counts():
     """Of one object no count is sure; a ground that does not show it shows nothing."""
-    shadow = compared(found(0), confidences={0: 0.9})
-    for number in range(10):
-        shadow.take_detected(0, now_ns=number * 1_000_000_000)
+    shadow = reporting(1, 0, objects={0: 0.9})
     assert shadow.measured.sure_gain == 0
     assert shadow.measured.gain > 0.5
+    assert (shadow.measured.hidden, shadow.measured.reported) == (pytest.approx(1), True)
 
 
-def test_the_first_second_of_reports_does_not_count():
-    """The first picture is a coarse keyframe: each flight would begin with tracks, however easy its scene."""
-    shadow = compared(found(*range(20)), confidences=TWENTY)
-    for number in range(15):
-        shadow.take_detected(2, now_ns=number * PERIOD_NS)
-    assert shadow.measured == shadow.now.measured
-    for number in range(15, 60):
-        shadow.take_detected(20, now_ns=number * PERIOD_NS)
-    assert shadow.measured == shadow.now.measured
+def test_a_crowd_that_leaves_is_hidden_from_nobody():
+    """The mean of what was there falls slowly, and the ground's count at once: tracks would be sent of nothing."""
+    objects, shown = dict(TWENTY), list(range(20))
+    shadow = ShadowGround(lambda _image: found(*shown), settings=SETTINGS)
+    gains = []
+    for index in range(0, 15 * 40, 5):
+        if index == 150:
+            objects.clear()
+            shown.clear()
+        shadow.compare(seen(index, objects))
+        shadow.take_detected(
+            Detected(1, max(0, index - 10), len(shown) if index < 150 or index >= 160 else 20)
+        )
+        gains.append(shadow.measured.gain)
+    assert max(gains) < 0.02
+
+
+def test_reports_of_the_scene_before_say_nothing_of_this_one():
+    """Two seconds late they would tell of a ground that sees nothing of the new scene."""
+    shadow = ShadowGround(lambda _image: found(*range(20)), settings=SETTINGS)
+    other = np.random.default_rng(9).integers(0, 255, PICTURE.shape, np.uint8)
+    for index in range(0, 300, 5):
+        shadow.compare(seen(index, TWENTY, PICTURE if index < 150 else other))
+        shadow.take_detected(Detected(1, index - 30, 20 if index - 30 >= 150 else 2))
+        if index >= 150:
+            assert shadow.measured.gain < 0.02
+    assert shadow.scene_changes == 1
 
 
 @given(
     st.floats(0, 300),
     st.floats(0, 300),
     st.floats(0, 300),
-    st.floats(0, 70_000),
+    st.floats(-70_000, 70_000),
     st.floats(0.01, 1),
     st.floats(0, 1),
     st.booleans(),
 )
-def test_whatever_a_ground_reports_no_object_is_made_up(shown, hidden, false, detected, p, misnamed, sure):
+def test_whatever_a_ground_reports_no_object_is_made_up(shown, hidden, false, more, p, misnamed, sure):
     """A ground that lies may have tracks sent or not; it can put nothing into the account that is not there."""
     before = Shadow(
         comparisons=3,
@@ -183,7 +204,7 @@ def test_whatever_a_ground_reports_no_object_is_made_up(shown, hidden, false, de
         false=false,
         false_p=p * false,
     )
-    after = before.corrected(detected, sure=sure)
+    after = before.corrected(more, sure=sure)
     assert after.shown + after.hidden == pytest.approx(shown + hidden)
     assert after.shown_p + after.hidden_p == pytest.approx(before.source_p)
     assert min(after.shown, after.hidden, after.shown_p, after.hidden_p, after.misnamed) >= -1e-9

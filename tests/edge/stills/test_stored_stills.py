@@ -17,6 +17,7 @@ from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.commands import Commands
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.policy.registry import method
 from media.base_coded import StandIn
 from programs.processes import eventually
 from rigs.flight import CLASSES, RedSquares
@@ -125,6 +126,7 @@ def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
             keyframes=rig.keyframes,
             on_demand=None,
             chooser=None,
+            make_method=method,
             backlog=backlog,
             base_size=SIZE,
             clock=lambda: rig.now_ns,

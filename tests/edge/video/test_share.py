@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
@@ -186,6 +187,36 @@ def test_of_few_frames_the_base_takes_no_more_than_they_may_take_time():
     assert one.propose() == 0.8
     one.set_beside(metadata_bps=0, stills=False, sparse=False)
     assert one.propose() == 1.0
+    near = split(300_000, most_sparse_share=0.97)
+    near.share = 1.0
+    near.observe([], moment(0))
+    near.set_beside(metadata_bps=0, stills=False, sparse=True)
+    assert near.propose() == 0.97, "however small the change"
+    thin = split(95_000, most_sparse_share=0.9)
+    thin.observe([], moment(0))
+    thin.set_beside(metadata_bps=0, stills=False, sparse=True)
+    thin.share = 1.0
+    assert thin.propose() == 0.95, "x265 cannot follow less"
+
+
+def test_reconfiguration_tells_the_split_how_many_frames_are_coded():
+    """With half the frames the base would take all that stills leave, and each would arrive late."""
+    operating = Operating(budget_bps=300_000, video_share=None, base_bps=300_000, method="M6", decimation=1)
+    opened = []
+    reconfiguration = EncoderReconfiguration(
+        operating,
+        ReconfigurationSettings(
+            size=(1280, 720), nominal_fps=15, least_fps=2, edge_id="e", metadata_bps=0, min_budget_bps=50_000
+        ),
+        open_encoder=lambda **rates: opened.append(rates),
+        transmitter=SimpleNamespace(set_rates=lambda *_rates, **_when: None),
+        split=split(300_000, most_sparse_share=0.9),
+    )
+    operating.pull(Levers(stills=False))
+    reconfiguration.observe([], moment(0))
+    for decimation, share in ((2, 0.9), (1, 1.0)):
+        reconfiguration(decimation, SECOND)
+        assert opened[-1] == {"total_bps": 300_000, "base_bps": share * 300_000, "decimation": decimation}
 
 
 def test_what_stills_leave_while_they_pause_goes_back_to_the_base():

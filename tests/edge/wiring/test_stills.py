@@ -37,6 +37,21 @@ def test_auto_values_pixels_that_the_base_does_not_have(source, weight, finer):
     assert lever_settings(config, view).finer == finer
 
 
+def test_a_method_that_comes_back_has_the_parameters_it_began_with():
+    """`set-method M5` and back would fly another M6 than was asked for."""
+    view = View.fitted((1280, 720), (1280, 720), fit="letterbox")
+    config = settings("--tune", "min_gain=0.07")
+    assert make_method(config, view) == make_method(config, view, name="m6")
+    assert make_method(config, view, name="M5").name == "M5"
+
+
+@pytest.mark.parametrize("flags", [("--tune", "detail_weight=0"), ("--method", "M5", "--profile", "auto")])
+def test_stills_may_pause_where_nobody_wants_details(flags):
+    """They would be sent for ever, for what the method does not value."""
+    view = View.fitted((3840, 2160), (1280, 720), fit="letterbox")
+    assert not lever_settings(settings(*flags), view).finer
+
+
 @pytest.mark.parametrize(
     ("flags", "weight"),
     [

@@ -126,6 +126,7 @@ class Rig:
             keyframes=self.keyframes,
             on_demand=self.on_demand,
             chooser=self.chooser,
+            make_method=method,
             backlog=None,
             base_size=BASE,
             clock=lambda: self.request_ns,
