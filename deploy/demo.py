@@ -17,9 +17,9 @@ from pathlib import Path
 
 BIN = Path(sys.executable).parent
 FOLDER = Path("build/demo")
-_PROVIDER = "cpu"
-"""``auto`` takes what is quicker at the start, which need not be the same in the next run: neither would the figures."""
 EDGES = {"m0": ["--method", "M0"], "paper": ["--profile", "paper"], "auto": ["--profile", "auto"]}
+_PROVIDER = "cpu"
+"""``auto`` takes what is quicker at the start, which may be another in the next run: so would be the figures."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
