@@ -116,6 +116,7 @@ def served(link: GroundLink, folder: Path, ended: list[str]) -> Iterator[tuple[E
     assert thread.error is None
 
 
+@pytest.mark.realtime  # what a busy machine has in hand is given back later than is waited here
 def test_two_hundred_sessions_leave_nothing_behind(free_port: int, tmp_path: Path) -> None:
     """After a night with a drone that restarts every minute the ground would be killed for its memory."""
     limit_malloc_arenas()  # as hvt-ground does
