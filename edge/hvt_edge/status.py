@@ -96,8 +96,11 @@ class StatusReporter:
     def send(self, phase: Literal["running", "ended"]) -> None:
         """Send the report, made for the moment at which it may go."""
         state = self.heartbeat.beat(phase)
+        levers = self._levers_text(
+            state.levers
+        )  # once: the transmitter makes a report twice, first for its size
         self.transmitter.status(
-            lambda at_ns: self._status(state, at_ns), now_ns=self.loop_clock(), last=phase == "ended"
+            lambda at_ns: self._status(state, levers, at_ns), now_ns=self.loop_clock(), last=phase == "ended"
         )
         self._sequence += 1
 
@@ -105,12 +108,12 @@ class StatusReporter:
         """Where a lever was moved, and now and then: on a thin link a sentence a second is not free."""
         sent = self._reported
         moved = sent is None or (levers.tracks, levers.stills) != (sent.tracks, sent.stills)
-        if not moved and self._sequence - self._reported_sequence < _LEVERS_REST:
+        if not levers.says or (not moved and self._sequence - self._reported_sequence < _LEVERS_REST):
             return ""
         self._reported, self._reported_sequence = levers, self._sequence
         return fitted_text(levers.says, _LEVERS_BYTES)
 
-    def _status(self, state: EdgeState, at_ns: int) -> Status:
+    def _status(self, state: EdgeState, levers: str, at_ns: int) -> Status:
         """Totals, outcomes and health at ``at_ns``.
 
         In lockstep no field depends on this machine's speed: the same input gives the same bytes.
@@ -165,7 +168,7 @@ class StatusReporter:
                 )
                 for one in self.failures.parts[:MOST_FAILED_PARTS]
             ),
-            levers=self._levers_text(state.levers),
+            levers=levers,
         )
 
 

@@ -320,11 +320,6 @@ class GroundSession:
         return self._analyzed[0]
 
     @property
-    def objects_detected(self) -> int:
-        """How many objects the detector showed when it last looked, by that frame; -1 before the first."""
-        return self._analyzed[1]
-
-    @property
     def not_sent(self) -> Mapping[str, int]:
         """Why candidates have no still: the edge's counts, by reason."""
         return {} if self.last_status is None else self.last_status.outcomes

@@ -11,11 +11,10 @@ taken as late after its capture as the last picture was.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -25,16 +24,13 @@ import numpy as np
 
 from hvt_common.inference.detect import Detector
 from hvt_common.inference.tiles import tiled
-from hvt_common.protocol.channels import Channel, EdgeKeys
-from hvt_common.protocol.ledger import LedgerSummary, overhead_bytes
-from hvt_common.protocol.messages import BaseHeader, Info, RoiHeader, Status, StillResult, TrackStep
-from hvt_common.runtime.clock import SteadyClock
+from hvt_common.protocol.ledger import LedgerSummary
+from hvt_common.protocol.messages import Info, StillResult
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Fit, Frame
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig
-from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.perception.detected import Detected
 from hvt_edge.source.resample import Resizer
@@ -45,12 +41,12 @@ from hvt_ground.wiring import Models
 from hvt_study.cache.cached_detector import CachedDetector
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip, FrameSource
 from hvt_study.flights.flight_ground import GroundSide, InlineExecutor
+from hvt_study.flights.flight_link import START_NS, FlightInbox, FlightOutlet, MediaClock
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.serial_link import LinkReport, SerialLink
 
 __all__ = ["Flight", "FlightPlan", "FlightReport", "coded_frames", "dry_run", "fly"]
 
-_START_NS = 1_700_000_000_000_000_000
 _SESSION = 1 << 40  # as many bytes on the wire as a random one
 
 
@@ -139,112 +135,6 @@ def dry_run(plan: FlightPlan, *, detector: Detector) -> float:
     return flight.line_bytes * 8 / (plan.clip.frame_count / NOMINAL_FPS)
 
 
-class _MediaClock(SteadyClock):
-    def __call__(self) -> int:
-        return _START_NS
-
-
-class _Inbox(FeedbackInbox):
-    """What the ground said, when the link has brought it back; nobody ever waits for more."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.now_ns = _START_NS
-        self.due: deque[tuple[int, StillResult]] = deque()
-        self.due_detected: deque[tuple[int, Detected]] = deque()
-
-    def take(self) -> list[StillResult]:
-        due = [one for at_ns, one in self.due if at_ns <= self.now_ns]
-        self.due = deque((at_ns, one) for at_ns, one in self.due if at_ns > self.now_ns)
-        return due
-
-    def take_up_to(self, sequence: int) -> list[StillResult]:  # noqa: ARG002 - time decides here
-        return self.take()
-
-    def take_detected(self, *, up_to: int | None = None) -> Detected | None:  # noqa: ARG002 - time decides here
-        newest = None
-        while self.due_detected and self.due_detected[0][0] <= self.now_ns:
-            newest = self.due_detected.popleft()[1]
-        return newest
-
-    def wait_for(self, **_: Any) -> bool:
-        return True
-
-    def wait_for_end(self, **_: Any) -> bool:
-        return True
-
-
-class _Outlet:
-    """The edge's end of the link: `hvt_edge.link.publisher.EdgeLink` without Zenoh.
-
-    ``on_listen(info)`` is called with what the edge answers to ``info`` once it is ready.
-    """
-
-    unusable = 0
-    trouble = ""
-
-    def __init__(
-        self, link: SerialLink[Received], *, edge_id: str, on_listen: Callable[[bytes], None]
-    ) -> None:
-        self._link = link
-        self._keys = EdgeKeys(edge_id)
-        self._on_listen = on_listen
-        self._digest = hashlib.sha256()
-        self.line_bytes: Counter[str] = Counter()
-        self.messages: Counter[str] = Counter()
-        self.max_frame_bytes = 0
-        self.last_frame = -1
-        """Index of the newest frame sent."""
-
-    def has_ground(self) -> bool:
-        return True
-
-    def has_subscriber(self, channel: Channel) -> bool:  # noqa: ARG002
-        return True
-
-    def listen(self, *, info: Callable[[int], bytes], **_: Any) -> None:
-        self._on_listen(info(_START_NS))
-
-    def put(
-        self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
-    ) -> None:
-        """Hand over one message at the time that it says itself."""
-        attached = attachment or b""
-        key = self._keys.key(channel)
-        size_bytes = (
-            len(payload)
-            + len(attached)
-            + overhead_bytes(len(payload), len(attached), key=key, encoding=encoding)
-        )
-        self.line_bytes[channel] += size_bytes
-        self.messages[channel] += 1
-        if channel is not Channel.STATUS:  # it counts what the machine did
-            self._digest.update(payload)
-        self._link.put(
-            Received(key, payload, attached, encoding, 0),
-            size_bytes=size_bytes,
-            enter_ns=self._enter_ns(channel, payload, attached),
-            urgent=channel is Channel.BASE,
-        )
-
-    @property
-    def digest(self) -> str:
-        return self._digest.hexdigest()
-
-    def _enter_ns(self, channel: Channel, payload: bytes, attachment: bytes) -> int:
-        if channel is Channel.BASE:
-            header = BaseHeader.parse(attachment, payload)
-            self.last_frame = header.frame_index
-            self.max_frame_bytes = max(self.max_frame_bytes, len(payload))
-            return header.send_ns
-        if channel is Channel.ROI:
-            return RoiHeader.parse(attachment, payload).send_ns
-        if channel is Channel.TRACKS:
-            return TrackStep.parse(payload).send_ns
-        assert channel is Channel.STATUS, f"the edge sends no {channel}"
-        return Status.parse(payload).send_ns
-
-
 class _SteppedSource(FrameSource):
     """A clip with the ground in step: after each frame, what has arrived by then is taken in."""
 
@@ -270,7 +160,7 @@ class _FlightWorld(World):
         self._flight = flight
         self._detector = detector
         self.session_id = _SESSION
-        self.clock = _MediaClock()
+        self.clock = MediaClock()
         self.inbox = flight.inbox
         self.executor = InlineExecutor()
 
@@ -302,10 +192,10 @@ class Flight:
         make_ground: Callable[[Info, SerialLink[Received]], Any],
     ) -> None:
         self.plan = plan
-        self.inbox = _Inbox()
+        self.inbox = FlightInbox()
         self._link: SerialLink[Received] = SerialLink(rate_bps=plan.link_bps)
         self._make_ground = make_ground
-        self.outlet = _Outlet(self._link, edge_id=plan.edge.edge_id, on_listen=self._open_ground)
+        self.outlet = FlightOutlet(self._link, edge_id=plan.edge.edge_id, on_listen=self._open_ground)
         self._edge = Edge(
             replace(plan.edge, quiet=True), stop=threading.Event(), world=_FlightWorld(self, detector)
         )
@@ -364,21 +254,21 @@ class Flight:
         self.ground.detected.clear()
 
     def _open_ground(self, answer: bytes) -> None:
-        info = replace(Info.parse(answer), fps=NOMINAL_FPS, started_ns=_START_NS)
+        info = replace(Info.parse(answer), fps=NOMINAL_FPS, started_ns=START_NS)
         self.ground = self._make_ground(info, self._link)
 
     def _pass_over(self, until_frame: int) -> None:
         """The source did not give the frames before this one."""
         for frame_index in range(self._next_frame, until_frame):
             self.ground.pass_over(
-                frame_index, capture_ns=_START_NS + round(frame_index * SECOND_NS / NOMINAL_FPS)
+                frame_index, capture_ns=START_NS + round(frame_index * SECOND_NS / NOMINAL_FPS)
             )
         self._next_frame = max(self._next_frame, until_frame)
 
     def _picture_age_p95_ms(self) -> float:
         """Over the frames from the first picture on."""
         shown = np.array(self.ground.shown_ns, np.int64).reshape(-1, 2)
-        at_ns = _START_NS + np.round(np.arange(self.plan.clip.frame_count) * SECOND_NS / NOMINAL_FPS).astype(
+        at_ns = START_NS + np.round(np.arange(self.plan.clip.frame_count) * SECOND_NS / NOMINAL_FPS).astype(
             np.int64
         )
         at_ns = at_ns[at_ns >= shown[0, 0]]

@@ -226,9 +226,9 @@ class GroundSide:
         for first in range(0, len(results), MAX_STILL_RESULTS):
             self.back_bytes += self._weight(results[first : first + MAX_STILL_RESULTS])
         self.results.extend((back_ns, one) for one in results)
-        if self._session.objects_detected >= 0:
-            frame_index, objects = self._session.last_frame_index, self._session.objects_detected
-            self.detected.append((back_ns, Detected(_RECEIVER, frame_index, objects)))
+        objects = self._session.pipeline.objects_detected
+        if objects >= 0:
+            self.detected.append((back_ns, Detected(_RECEIVER, self._session.last_frame_index, objects)))
 
     def _weight(self, results: tuple[StillResult, ...]) -> int:
         """Line bytes of a report with these, as `hvt_ground.session.receiver_report` would send it."""
@@ -254,7 +254,7 @@ class GroundSide:
             clock_error_ns=0,
             stills=results,
             backlog=(),
-            objects_detected=self._session.objects_detected,
+            objects_detected=self._session.pipeline.objects_detected,
         ).pack()
         key, encoding = EdgeKeys(self._info.edge).key(Channel.FEEDBACK), DELIVERIES[Channel.FEEDBACK].encoding
         return len(payload) + overhead_bytes(len(payload), 0, key=key, encoding=encoding)
