@@ -23,15 +23,12 @@ from hvt_common.tracking.association import grown, overlaps, pair
 from hvt_common.tracking.track_table import LOST, TRACKED, UNCONFIRMED, TrackerInput, TrackTable
 from hvt_common.values import Detections, Image, Tracks
 
-__all__ = ["ALONE_CONFIDENCE", "ByteTracker", "TrackerSettings", "weak_confidence"]
+__all__ = ["ByteTracker", "TrackerSettings", "weak_confidence"]
 
 _Floats = npt.NDArray[np.float64]
 _Indices = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
-ALONE_CONFIDENCE: Final = 0.6
-"""What only the edge sees, in its source, is listed from this confidence on. Of what it reports at less, one in two
-was there on drawn scenes and hardly any on real labelled pictures."""
 _LOW_CONFIDENCE: Final = 0.1
 # Fixed in the authors' program, as costs 1 - IoU of at most 0.5, 0.7 and 0.15.
 _WEAK_COST_LIMIT: Final = 0.5

@@ -2,10 +2,11 @@
 
 Two levers cost bits that the video could have: the edge's own tracks, and stills. Each is pulled while it pays.
 
-**Tracks** pay where the ground does not see objects on the base: their gain in F1 is what the shadow ground measured,
-less what the video would gain by the same bits. **Stills** pay where they change what the ground shows: it says of
-each what it made of it. Where hardly any changed anything they pause, and a few are sent now and then to find out
-whether that holds. A source much finer than the base is reason enough: they go on, and show details.
+**Tracks** pay where the ground does not see objects on the base, or sees some that are not there: their gain in F1
+is what the shadow ground measured, less what the video would gain by the same bits. **Stills** pay where they change
+what the ground shows: it says of each what it made of it. Where hardly any changed anything they pause, and a few are
+sent now and then to find out whether that holds. A source much finer than the base is reason enough: they go on, and
+show details.
 
 A ground that lies in its reports can stop stills and tracks or bring them back, and with them move some of the bits
 of the video, within auto's bounds. It cannot change the budget.
@@ -36,6 +37,8 @@ class Measured:
     """The same where of few objects hardly any count."""
     hidden: float = 0.0
     """Objects a picture that the base does not show."""
+    denied: float = 0.0
+    """Objects a picture that the base shows, the source does not, and the ground lists unless it hears of it."""
     misnamed_share: float = 0.0
     """Of those that it shows, those that bear another class there."""
     reported: bool = False
@@ -48,10 +51,8 @@ class LeverSettings:
 
     tracks_bps: int
     """Line bits a second that tracks take of the budget."""
-    on_gain: float = 0.02
-    """From so much net gain on that is sure tracks are sent …"""
-    off_gain: float = 0.0
-    """… until it falls below this."""
+    least_gain: float = 0.005
+    """From so much net gain on that is sure tracks are sent, until the net gain, sure or not, falls below it."""
     gain_per_doubling: float = 0.07
     """What twice the bits give video: .05 to .11 between 100 and 400 kbps (docs/design-notes/compare.md)."""
     least_comparisons: float = 1.5
@@ -83,9 +84,9 @@ class LeverSettings:
         """Whether tracks are to be sent, by what was measured; ``sent``: they are being sent."""
         if measured.comparisons and self.net_gain(measured.gain, total_bps=total_bps) >= self.plain_gain:
             return True
-        least = self.off_gain if sent else self.on_gain
+        gain = measured.gain if sent else measured.sure_gain
         enough = measured.comparisons >= self.least_comparisons
-        return enough and self.net_gain(measured.sure_gain, total_bps=total_bps) >= least
+        return enough and self.net_gain(gain, total_bps=total_bps) >= self.least_gain
 
 
 class LeverControl:
@@ -176,6 +177,8 @@ class LeverControl:
             return "video alone: this machine is too slow for the detector"
         who = "ground does not see" if self._measured.reported else "base does not show"
         hidden = f"{self._measured.hidden:.0f} objects the {who}"
+        if round(self._measured.denied):
+            hidden += f", {self._measured.denied:.0f} it shows in error"
         of_tracks = (
             f"{'tracks' if tracks else 'no tracks'}: {hidden}"
             if self._measured.comparisons

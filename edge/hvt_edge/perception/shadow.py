@@ -7,15 +7,16 @@ confidence: with a calibrated detector a box of .6 is real three times in five. 
 show counts as much for being sent as against it.
 
 Expected named F1 of a list (F1 = 2 TP / (listed + true); a box counts only under its class; expectations by the
-confidences p):
+confidences p, those of base-only boxes by what the source's silence leaves of them, `Recall.real`):
 
-    true    = sum of p over source boxes + sum of p over base-only boxes
-    base    = 2 (sum of p over source boxes that the base shows, w of it where it bears another class there)
-                / (shown + base-only + true)
-    sent    = 2 (sum of p over shown and hidden boxes, 1 - w of it where the base bears another class)
-                / (shown + hidden + base-only + true)
+    true    = sum of p over source boxes and base-only boxes
+    base    = 2 (sum of p over source boxes that the base shows, w of it where it bears another class there,
+                and over base-only boxes) / (shown + base-only + true)
+    sent    = 2 (sum of p over shown and hidden boxes, 1 - w of it where the base bears another class,
+                and over base-only boxes but the denied) / (shown + hidden + base-only - denied + true)
 
 ``hidden`` are the source boxes that the base does not show and the ground would list: from `ALONE_CONFIDENCE` on.
+``denied`` are the base-only boxes that the ground no longer lists once it hears that the source does not show them.
 ``w`` is 1/3: of two names for one object that of the finer picture is right twice as often (our choice).
 
 The ground's detector may be another, or none. It reports how many objects it shows; where that differs from what was
@@ -32,7 +33,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.tracking.bytetrack import ALONE_CONFIDENCE
+from hvt_common.tracking.alone import ALONE_CONFIDENCE, Recall
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
 from hvt_edge.operating.levers import Measured
@@ -89,6 +90,9 @@ class Shadow:
     false: float = 0.0
     """Boxes of the base where the source has none."""
     false_p: float = 0.0
+    denied: float = 0.0
+    """Those of them that the ground would not list if it were sent tracks."""
+    denied_p: float = 0.0
 
     @property
     def misnamed_share(self) -> float:
@@ -98,15 +102,16 @@ class Shadow:
     @property
     def gain(self) -> float:
         """How much expected named F1 the ground's list gains by being sent the source's boxes; 0 at first."""
-        return self._gain(self.hidden, self.misnamed)
+        return self._gain(1.0)
 
     @property
     def sure_gain(self) -> float:
-        """The same where hidden and misnamed objects count less one standard error of such a count (Poisson).
+        """The same where of all that tracks change one standard error counts for nothing (Poisson).
 
         Pictures of one second show the same objects, and of two or three the detector may just be wrong.
         """
-        return self._gain(_sure(self.hidden), _sure(self.misnamed))
+        changed = self.hidden + self.misnamed + self.denied
+        return self._gain(1 - 1 / math.sqrt(changed)) if changed > 1 else 0.0
 
     def corrected(self, more: float, *, sure: bool) -> Shadow:
         """The same for a ground whose own detector shows ``more`` objects than were found here; less than 0: fewer.
@@ -128,27 +133,28 @@ class Shadow:
             hidden_p=self.hidden_p - moved_p,
             misnamed=self.misnamed * left,
             misnamed_p=self.misnamed_p * left,
+            denied=self.denied * left,
+            denied_p=self.denied_p * left,
         )
 
     @property
     def measured(self) -> Measured:
         """What decides on tracks."""
-        return Measured(self.comparisons, self.gain, self.sure_gain, self.hidden, self.misnamed_share)
+        return Measured(
+            self.comparisons, self.gain, self.sure_gain, self.hidden, self.denied, self.misnamed_share
+        )
 
-    def _gain(self, hidden: float, misnamed: float) -> float:
+    def _gain(self, share: float) -> float:
+        """Of F1, if only this share of what tracks change is true."""
         true = self.source_p + self.false_p
         if not true:
             return 0.0
-        hidden_p = hidden * _per(self.hidden_p, self.hidden)
-        misnamed_p = misnamed * _per(self.misnamed_p, self.misnamed)
-        named_p = self.shown_p - (1 - _BASE_NAMES) * misnamed_p
-        sent_p = self.shown_p + hidden_p - _BASE_NAMES * misnamed_p
+        hidden, denied = share * self.hidden, share * self.denied
+        hidden_p, misnamed_p, denied_p = (share * p for p in (self.hidden_p, self.misnamed_p, self.denied_p))
+        named_p = self.shown_p + self.false_p - (1 - _BASE_NAMES) * misnamed_p
+        sent_p = self.shown_p + self.false_p - denied_p + hidden_p - _BASE_NAMES * misnamed_p
         listed = self.shown + self.false
-        return 2 * sent_p / (listed + hidden + true) - 2 * named_p / (listed + true)
-
-
-def _sure(count: float) -> float:
-    return max(0.0, count - math.sqrt(count))
+        return 2 * sent_p / (listed + hidden - denied + true) - 2 * named_p / (listed + true)
 
 
 def _per(total: float, count: float) -> float:
@@ -184,6 +190,8 @@ class ShadowGround:
         self._thumbnail: tuple[int, npt.NDArray[np.float32]] | None = None
         self.scene_changes = 0
         """How often another scene began."""
+        self._recall = Recall()
+        """How much of what the base surely shows the source shows too."""
         self.now = before
         """For a ground with the edge's detector."""
         self._difference = GroundDifference(memory_s=settings.memory_s, grace_ns=settings.rest_ns)
@@ -243,6 +251,7 @@ class ShadowGround:
         self.scene_changes += 1
         self.now, self._last_ns, self._next_ns = UNMEASURED, None, 0
         self._difference.forget()
+        self._recall = Recall()
         self._shown_ids = np.empty(0, np.int64)
 
     def _compared(self, seen: AnalyzedFrame, found: Detections) -> Shadow:
@@ -257,7 +266,12 @@ class ShadowGround:
         shown = (same & (strong[:, None] | began)).any(axis=0)
         self._shown_ids = tracks.ids[rows][shown]
         hidden = ~shown & (p >= ALONE_CONFIDENCE)
-        alone = strong & ~same.any(axis=1)
+        in_source = same.any(axis=1)
+        sure = found.confidences >= ALONE_CONFIDENCE
+        self._recall.take(reported=int((in_source & sure).sum()), there=int(sure.sum()))
+        alone = strong & ~in_source
+        alone_p = self._recall.real(found.confidences)
+        denied = alone & (found.confidences < self._recall.least_confidence)
         misnamed = np.zeros(len(rows), bool)
         if shown.any():
             best = overlaps[:, shown].argmax(axis=0)
@@ -272,7 +286,9 @@ class ShadowGround:
             misnamed=int(misnamed.sum()),
             misnamed_p=float(p[misnamed].sum()),
             false=int(alone.sum()),
-            false_p=float(found.confidences[alone].sum()),
+            false_p=float(alone_p[alone].sum()),
+            denied=int(denied.sum()),
+            denied_p=float(alone_p[denied].sum()),
         )
 
     def _take(self, one: Shadow, capture_ns: int) -> None:

@@ -70,14 +70,37 @@ def compared(*answers: Detections, confidences: dict[int, float], every: int = 3
 def test_the_gain_is_that_of_the_formula():
     """Levers would be moved by a number that means something else than the docs say."""
     shadow = compared(found(0, 9), confidences={0: 0.9, 1: 0.5, **dict.fromkeys(range(2, 6), 0.7)})
+    # Of the two that the base surely shows the source shows one: its silence about the other says nothing yet.
     true = 0.9 + 0.5 + 4 * 0.7 + 0.8
-    base = 2 * 0.9 / (1 + 1 + true)
+    base = 2 * (0.9 + 0.8) / (1 + 1 + true)
     four, sure = (
-        2 * (0.9 + n * 0.7) / (1 + n + 1 + true) for n in (4, 4 - 2)
+        2 * (0.9 + n * 0.7 + 0.8) / (1 + n + 1 + true) for n in (4, 4 - 2)
     )  # at .5 it would not be listed
     assert shadow.now.gain == pytest.approx(four - base, abs=1e-6)
     assert shadow.now.sure_gain == pytest.approx(sure - base, abs=1e-6)
     assert (shadow.now.hidden, shadow.now.false) == (4, 1)
+
+
+def test_what_the_base_shows_in_error_counts():
+    """A ground that is sent tracks lists it no longer, and auto would send none for want of hidden objects."""
+    objects = dict.fromkeys(range(18), 0.9)
+    base = Detections(
+        np.array([box(place) for place in (*range(18), *range(30, 34), 40)], np.float32),
+        np.array([0.8] * 18 + [0.5] * 4 + [0.95], np.float32),
+        np.zeros(23, np.int32),
+    )
+    shadow = compared(base, confidences=objects).now
+    recall = 18 / (19 + 2)
+    weak, strong = (c * (1 - recall) / (c * (1 - recall) + 1 - c) for c in (0.5, 0.95))
+    assert (shadow.hidden, shadow.false, shadow.denied) == (0, 5, 4), "one is surer than the source is silent"
+    true = 18 * 0.9 + 4 * weak + strong
+    for share, gain in ((1, shadow.gain), (1 - 1 / 4**0.5, shadow.sure_gain)):
+        base_f1 = 2 * true / (23 + true)
+        sent_f1 = 2 * (true - share * 4 * weak) / (23 - share * 4 + true)
+        assert gain == pytest.approx(sent_f1 - base_f1, abs=1e-5)
+        assert gain > 0.02
+    fewer = compared(found(0, 1, *range(30, 34), confidence=0.7), confidences=objects).now
+    assert fewer.denied == 0, "of an edge that lists other things than the base shows nothing follows"
 
 
 def test_two_that_are_hidden_tell_less_than_twenty():
@@ -188,9 +211,12 @@ def test_reports_of_the_scene_before_say_nothing_of_this_one():
     st.floats(-70_000, 70_000),
     st.floats(0.01, 1),
     st.floats(0, 1),
+    st.floats(0, 1),
     st.booleans(),
 )
-def test_whatever_a_ground_reports_no_object_is_made_up(shown, hidden, false, more, p, misnamed, sure):
+def test_whatever_a_ground_reports_no_object_is_made_up(
+    shown, hidden, false, more, p, misnamed, denied, sure
+):
     """A ground that lies may have tracks sent or not; it can put nothing into the account that is not there."""
     before = Shadow(
         comparisons=3,
@@ -203,12 +229,15 @@ def test_whatever_a_ground_reports_no_object_is_made_up(shown, hidden, false, mo
         misnamed_p=misnamed * p * shown,
         false=false,
         false_p=p * false,
+        denied=denied * false,
+        denied_p=denied * p * false,
     )
     after = before.corrected(more, sure=sure)
     assert after.shown + after.hidden == pytest.approx(shown + hidden)
     assert after.shown_p + after.hidden_p == pytest.approx(before.source_p)
     assert min(after.shown, after.hidden, after.shown_p, after.hidden_p, after.misnamed) >= -1e-9
     assert after.misnamed <= after.shown + 1e-9
+    assert 0 <= after.denied <= after.false + 1e-9
     assert after.gain <= 1 + 1e-9
 
 

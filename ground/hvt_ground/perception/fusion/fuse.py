@@ -21,6 +21,10 @@ finer than the base. A still's opinion comes after, in `refine`, and stands abov
 **How long.** The edge's knowledge ends when two steps in a row do not list the track, or nothing has been reported of
 it for `PATIENCE_S`; what only a still has shown ends so long after the still.
 
+**Who is believed.** What only the edge sees is listed where it is sure. What only we see stands against its silence:
+as soon as one step has not listed it, it has to be the surer the more of what is there the edge was seen to list
+(`hvt_common.tracking.alone`). That ends when the edge is not heard for `PATIENCE_S`, and where a still has shown it.
+
 **Once each.** What only one side sees on top of what the other sees is listed once (`SAME_IOU`); so are two boxes of
 different class that are almost one (`TWIN_IOU`; less, and riders vanish on their motorcycles), which class-wise
 suppression lets pass. Where nothing comes from afar the list is the tracker's, box for box.
@@ -38,6 +42,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.tracking.alone import ALONE_CONFIDENCE, Recall
 from hvt_common.tracking.association import assign
 from hvt_common.values import Detections, Tracks, iou
 from hvt_ground.perception.fusion.camera_path import CameraPath
@@ -108,6 +113,7 @@ class Fusion:
         self._own: OrderedDict[int, Tracks] = OrderedDict()
         self._next_id = 1
         self._stepped = -1
+        self._edge_recall = Recall()
         self._merged: list[tuple[int, int]] = []
 
     def known_as(self, edge_track_id: int) -> int | None:
@@ -166,6 +172,7 @@ class Fusion:
         self._update(own, frame_index)
         if own is not None:
             self._note_own(own, frame_index)
+            self._note_unlisted(own)
         return True
 
     def take_found(self, found: Detections, *, known: Tracks) -> None:
@@ -206,7 +213,9 @@ class Fusion:
 
     def listed(self, own: Tracks) -> FusedTracks:
         """The list at the frame of ``own``: our tracker's list of a frame, or moved on from the newest."""
-        return list_entities(self._entities, own, path=self._path, rules=self._rules)
+        reporting = own.frame_index - self._stepped <= self._rules.patience
+        least_own = self._edge_recall.least_confidence if reporting else 0.0
+        return list_entities(self._entities, own, path=self._path, rules=self._rules, least_own=least_own)
 
     # Learning
 
@@ -279,6 +288,15 @@ class Fusion:
             entity = self._by_own.get(own_id)  # a step that comes late finds tracks merged away since
             if entity is not None:
                 entity.own_then = (centres[row], frame_index)
+
+    def _note_unlisted(self, own: Tracks) -> None:
+        """Note which of ours a step did not list, and how many of those that are surely there it did."""
+        ours = [entity for own_id in own.ids.tolist() if (entity := self._by_own.get(own_id)) is not None]
+        for entity in ours:
+            is_listed = entity.edge_id is not None and not entity.missed
+            entity.unlisted = 0 if is_listed else entity.unlisted + 1
+        sure = [entity for entity in ours if entity.own_vote.confidence >= ALONE_CONFIDENCE]
+        self._edge_recall.take(reported=sum(not entity.unlisted for entity in sure), there=len(sure))
 
     # After news
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.tracking.bytetrack import ALONE_CONFIDENCE
+from hvt_common.tracking.alone import ALONE_CONFIDENCE
 from hvt_common.values import Tracks, iou
 from hvt_ground.events import Origin
 from hvt_ground.perception.fusion.camera_path import CameraPath
@@ -65,10 +65,13 @@ class _Line:
 
 
 def list_entities(
-    entities: Sequence[Entity], own: Tracks, *, path: CameraPath, rules: FusionRules
+    entities: Sequence[Entity], own: Tracks, *, path: CameraPath, rules: FusionRules, least_own: float = 0.0
 ) -> FusedTracks:
-    """The list at the frame of ``own``, our tracker's list there; changes nothing."""
-    lines = _lines(entities, own, rules)
+    """The list at the frame of ``own``, our tracker's list there; changes nothing.
+
+    What we alone see, and the edge did not list when it looked, needs a confidence of ``least_own``.
+    """
+    lines = _lines(entities, own, rules, least_own)
     boxes = _boxes(lines, own, path, rules)
     classes, confidences = _classes(lines, own, rules)
     listed = _once_each(lines, boxes, classes, confidences)
@@ -102,12 +105,14 @@ def far_boxes(entities: Sequence[Entity], frame_index: int, *, path: CameraPath,
     return boxes
 
 
-def _lines(entities: Sequence[Entity], own: Tracks, rules: FusionRules) -> list[_Line]:
+def _lines(entities: Sequence[Entity], own: Tracks, rules: FusionRules, least_own: float) -> list[_Line]:
     rows: Mapping[int | None, int] = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
     lines = []
     for entity in entities:
         origin = entity.origin(rows, own.frame_index, patience=rules.patience)
-        unsure = origin == "edge" and entity.far_vote.confidence < ALONE_CONFIDENCE
+        unsure = (origin == "edge" and entity.far_vote.confidence < ALONE_CONFIDENCE) or (
+            origin == "base" and entity.is_doubted(least_own)
+        )
         if origin is not None and entity.id and not unsure:
             lines.append(_Line(entity, origin, rows.get(entity.own_id)))
     return sorted(lines, key=lambda line: line.entity.id)

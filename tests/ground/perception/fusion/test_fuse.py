@@ -179,6 +179,72 @@ def test_where_the_edge_lets_go_our_track_stays(ground):
     assert brief(ground.own(11, {1: A})) == {1: ("base", whole(A))}
 
 
+CROWD = {number: moved(A, 60 * number) for number in range(10)}
+CROWD_AT_EDGE = {number + 70: box for number, box in CROWD.items()}
+GHOST = (20, moved(A, 0, 200))
+"""The base shows it, and nothing is there."""
+
+
+def with_ghost(ground, index, confidence=0.5):
+    """A frame of ours in which it is seen; tell whether it is listed, and that everything else is."""
+    tracks = tracks_at(index, {**CROWD, GHOST[0]: GHOST[1]})
+    tracks.confidences[-1] = confidence
+    ground.fusion.take_own(tracks)
+    listed = brief(ground.fusion.listed(tracks))
+    assert {whole(box) for box in CROWD.values()} <= {box for _, box in listed.values()}
+    return ("base", whole(GHOST[1])) in listed.values()
+
+
+def test_what_the_edge_does_not_see_in_its_source_is_not_there(ground):
+    """At a thin link one in four that the base shows would be a shadow or a heap of stones."""
+    assert with_ghost(ground, 0), "the edge has not been heard"
+    ground.step(0, CROWD_AT_EDGE)
+    assert not with_ghost(ground, 1)
+    ground.step(3, {**CROWD_AT_EDGE, 99: GHOST[1]})
+    ground.own(4, {**CROWD, GHOST[0]: GHOST[1]})
+    assert ("edge+base", whole(GHOST[1])) in brief(ground.own(5, {**CROWD, GHOST[0]: GHOST[1]})).values()
+
+
+def test_an_edge_that_is_silent_no_longer_speaks_against_us(ground):
+    """What comes into view while its reports are lost would never be shown."""
+    with_ghost(ground, 0)
+    ground.step(0, CROWD_AT_EDGE)
+    assert not with_ghost(ground, 30)
+    assert with_ghost(ground, 31), "31 frames without a step"
+
+
+def test_what_we_are_surer_of_than_the_edge_is_thorough_stays(ground):
+    """The edge's detector makes errors too."""
+    assert with_ghost(ground, 0, confidence=0.95)
+    ground.step(0, CROWD_AT_EDGE)
+    assert with_ghost(ground, 1, confidence=0.95)
+
+
+def test_what_is_new_since_the_last_step_is_listed(ground):
+    """Who drives into the picture would be shown a third of a second late."""
+    ground.own(0, CROWD)
+    ground.step(0, CROWD_AT_EDGE)
+    assert with_ghost(ground, 2)
+    ground.step(2, CROWD_AT_EDGE)
+    assert not with_ghost(ground, 3)
+
+
+def test_what_a_still_has_shown_stays(ground):
+    """The picture at hand would show what the list denies."""
+    with_ghost(ground, 0)
+    ghost_id = max(ground.fusion.listed(ground.fusion.own_at(0)).tracks.ids.tolist())
+    ground.fusion.take_box(ghost_id, GHOST[1], frame_index=0)
+    ground.step(0, CROWD_AT_EDGE)
+    assert with_ghost(ground, 1)
+
+
+def test_an_edge_that_looks_for_other_things_says_nothing_of_ours(ground):
+    """An edge that reports what moves would take every parked car from the list."""
+    with_ghost(ground, 0)
+    ground.step(0, {70: CROWD[0], 71: CROWD[1]})
+    assert with_ghost(ground, 1)
+
+
 def test_witnesses_that_lie_apart_part(ground):
     """Two cars that once overlapped would share one box between them for ever."""
     ground.own(0, {1: A})
