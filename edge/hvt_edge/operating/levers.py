@@ -84,7 +84,8 @@ class LeverSettings:
         """Whether tracks are to be sent, by what was measured; ``sent``: they are being sent."""
         if measured.comparisons and self.net_gain(measured.gain, total_bps=total_bps) >= self.plain_gain:
             return True
-        gain = measured.gain if sent else measured.sure_gain
+        # Of a ground that sees more than the edge found, what is sure may be more: else they would come and go.
+        gain = max(measured.gain, measured.sure_gain) if sent else measured.sure_gain
         enough = measured.comparisons >= self.least_comparisons
         return enough and self.net_gain(gain, total_bps=total_bps) >= self.least_gain
 

@@ -122,9 +122,10 @@ class Shadow:
         found = self.shown + self.false
         error = math.sqrt(max(found, found + more)) if sure else 0.0
         moved = math.copysign(max(0.0, abs(more) - error), more) if abs(more) >= _LEAST_MORE else 0.0
-        moved = min(self.hidden, max(-self.shown, moved))
+        # Fewer: of each kind that is shown here the same share.
+        left = 1 + max(-1.0, min(0.0, moved) / found) if found else 1.0
+        moved = min(self.hidden, moved) if moved > 0 else (left - 1) * self.shown
         moved_p = moved * (_per(self.hidden_p, self.hidden) if moved > 0 else _per(self.shown_p, self.shown))
-        left = 1 + min(0.0, moved) / self.shown if self.shown else 1.0
         return replace(
             self,
             shown=self.shown + moved,
@@ -133,6 +134,8 @@ class Shadow:
             hidden_p=self.hidden_p - moved_p,
             misnamed=self.misnamed * left,
             misnamed_p=self.misnamed_p * left,
+            false=self.false * left,
+            false_p=self.false_p * left,
             denied=self.denied * left,
             denied_p=self.denied_p * left,
         )
@@ -268,7 +271,11 @@ class ShadowGround:
         hidden = ~shown & (p >= ALONE_CONFIDENCE)
         in_source = same.any(axis=1)
         sure = found.confidences >= ALONE_CONFIDENCE
-        self._recall.take(reported=int((in_source & sure).sum()), there=int(sure.sum()))
+        self._recall.take(
+            reported=int((in_source & sure).sum()),
+            there=int(sure.sum()),
+            at_s=seen.frame.capture_ns / SECOND_NS,
+        )
         alone = strong & ~in_source
         alone_p = self._recall.real(found.confidences)
         denied = alone & (found.confidences < self._recall.least_confidence)

@@ -13,10 +13,10 @@ CONFIDENCES = np.linspace(0, 1, 101)
 
 
 def heard(*pictures: tuple[int, int]) -> Recall:
-    """Of an observer who reported so many of so many that were surely there, picture by picture."""
+    """Of an observer who reported so many of so many that were surely there, three pictures a second."""
     recall = Recall()
-    for reported, there in pictures:
-        recall.take(reported=reported, there=there)
+    for number, (reported, there) in enumerate(pictures):
+        recall.take(reported=reported, there=there, at_s=number / 3)
     return recall
 
 
@@ -32,13 +32,17 @@ def test_who_reports_nearly_all_is_believed_against_the_weak():
     recall = heard(*[(9, 10)] * 60)
     assert recall.share == pytest.approx(0.9, abs=0.01)
     assert recall.least_confidence == pytest.approx(0.8, abs=0.02)
-    assert heard((60, 60)).least_confidence > 0.85, "a crowd tells at once"
+    assert heard((60, 60)).least_confidence > 0.8, "a crowd tells at once"
+    assert heard(*[(600, 600)] * 60).least_confidence < 0.82, "but nobody sees all of what is hard to see"
 
 
 def test_the_newest_seconds_count():
     """An edge whose detector was changed by command, or that has flown on, would be judged by what was."""
-    recall = heard(*[(10, 10)] * 100, *[(0, 10)] * 40)
+    recall = heard(*[(10, 10)] * 100, *[(0, 10)] * 30)
     assert recall.share == 0.0
+    recall = heard(*[(10, 10)] * 100)
+    recall.take(reported=0, there=1, at_s=200)
+    assert recall.share == 0.0, "minutes ago"
 
 
 @given(st.lists(st.tuples(st.integers(0, 80), st.integers(0, 80)), max_size=30))
@@ -52,3 +56,8 @@ def test_what_is_listed_is_as_likely_as_the_formula_says(counts):
     if recall.share:
         border = np.array([recall.least_confidence])
         assert recall.real(border)[0] == pytest.approx(0.3)
+
+
+def test_a_detector_that_is_surer_than_sure_is_sure():
+    """One of the user's own may count from 0 to 100."""
+    assert heard((9, 10)).real(np.array([100.0]))[0] == pytest.approx(1)

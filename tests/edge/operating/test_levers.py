@@ -60,6 +60,8 @@ def test_tracks_follow_their_gain_and_do_not_flicker():
     assert rig.tracks(0.05)
     assert rig.tracks(0.05, **unsure), "what they were sent for may still be there"
     assert not rig.tracks(0.0)
+    sees_more = [rig.tracks(0.0, sure_gain=0.05) for _ in range(4)]
+    assert sees_more == [True] * 4, "a ground may surely see less than it probably does"
 
 
 def test_it_says_who_does_not_see_them():

@@ -163,6 +163,10 @@ def test_a_count_that_differs_by_chance_changes_nothing():
         shadow = reporting(20, detected)
         assert shadow.measured.sure_gain == shadow.now.sure_gain
         assert shadow.measured.gain < 0.1
+    ghosts = reporting(4, 0, objects={})
+    assert (ghosts.now.false, ghosts.measured.gain) == (pytest.approx(4), 0), (
+        "who shows nothing shows no error"
+    )
     silent = compared(found(0), confidences=TWENTY)
     assert silent.measured == silent.now.measured, "it has not reported"
 

@@ -76,7 +76,9 @@ class Entity:
     missed: int = 0
     """Steps in a row that have not listed it."""
     unlisted: int = 0
-    """Steps in a row that have not listed it though we track it."""
+    """Steps in a row that have not shown it though we track it."""
+    is_doubted: bool = False
+    """Whether that speaks against it: only we see it, and are not sure enough."""
     still_frame: int = -1
     """Of the newest still that showed it."""
     apart: int = 0
@@ -102,10 +104,6 @@ class Entity:
         if not far:
             return None
         return "still" if self.edge_id is None else "edge"
-
-    def is_doubted(self, least_own: float) -> bool:
-        """Whether the edge's silence stands against us; no still has shown it, and we are less sure than this."""
-        return self.unlisted > 0 and self.still_frame < 0 and self.own_vote.confidence < least_own
 
     def part_from_own(self) -> None:
         """Forget our track, which is another object."""

@@ -21,13 +21,14 @@ finer than the base. A still's opinion comes after, in `refine`, and stands abov
 **How long.** The edge's knowledge ends when two steps in a row do not list the track, or nothing has been reported of
 it for `PATIENCE_S`; what only a still has shown ends so long after the still.
 
-**Who is believed.** What only the edge sees is listed where it is sure. What only we see stands against its silence:
-as soon as one step has not listed it, it has to be the surer the more of what is there the edge was seen to list
-(`hvt_common.tracking.alone`). That ends when the edge is not heard for `PATIENCE_S`, and where a still has shown it.
+**Who is believed.** What only the edge sees is listed where it is sure. What only we see has its silence against it:
+where a step shows nothing there, of a class that the edge can name, we have to be the surer the more of what is there
+the edge was seen to list (`hvt_common.tracking.alone`). That ends when nothing is reported for `PATIENCE_S`, and does
+not hold for `FORGET_S` after a still has shown it.
 
 **Once each.** What only one side sees on top of what the other sees is listed once (`SAME_IOU`); so are two boxes of
 different class that are almost one (`TWIN_IOU`; less, and riders vanish on their motorcycles), which class-wise
-suppression lets pass. Where nothing comes from afar the list is the tracker's, box for box.
+suppression lets pass. Without an edge's report the list is the tracker's, box for box.
 
 The constants were tried out on a 90-pixel and a 15-pixel scene at 200 and 800 kbit/s, steps three times a second and
 0.2 s late, against the list of one side alone. F1 does not depend on them much (0.01); the class agreement gains 0.01
@@ -63,6 +64,10 @@ HALF_LIFE_S = 0.3
 EDGE_CLASS_WEIGHT = 0.85
 """At equal size nearly as much as ours: the drone's network is often the smaller one. What is small in the base is
 called a car, and surely so: on drawn scenes at 640x360, a third of the source, 8 of 94 objects were."""
+LET_GO_STEPS = 6
+"""Of what the edge has listed once, so many steps in a row must be silent: a detection may fail now and then."""
+SURER = 0.1
+"""By so much surer than what was never doubted must be what was, or it would come and go."""
 FORGET_S = 10.0
 """How long an entity without any witness keeps its id for a track that is found again."""
 MAX_ENTITIES = 2048
@@ -99,6 +104,8 @@ class Fusion:
         base_per_source: float = 1.0,
     ) -> None:
         self._edge_classes = edge_classes
+        self._edge_names = frozenset(edge_classes.tolist())
+        self._fps = fps
         self._path = path
         self._rules = FusionRules(
             patience=max(1, round(PATIENCE_S * fps)),
@@ -172,7 +179,7 @@ class Fusion:
         self._update(own, frame_index)
         if own is not None:
             self._note_own(own, frame_index)
-            self._note_unlisted(own)
+            self._note_silence(step, own)
         return True
 
     def take_found(self, found: Detections, *, known: Tracks) -> None:
@@ -214,8 +221,7 @@ class Fusion:
     def listed(self, own: Tracks) -> FusedTracks:
         """The list at the frame of ``own``: our tracker's list of a frame, or moved on from the newest."""
         reporting = own.frame_index - self._stepped <= self._rules.patience
-        least_own = self._edge_recall.least_confidence if reporting else 0.0
-        return list_entities(self._entities, own, path=self._path, rules=self._rules, least_own=least_own)
+        return list_entities(self._entities, own, path=self._path, rules=self._rules, doubting=reporting)
 
     # Learning
 
@@ -289,14 +295,31 @@ class Fusion:
             if entity is not None:
                 entity.own_then = (centres[row], frame_index)
 
-    def _note_unlisted(self, own: Tracks) -> None:
-        """Note which of ours a step did not list, and how many of those that are surely there it did."""
-        ours = [entity for own_id in own.ids.tolist() if (entity := self._by_own.get(own_id)) is not None]
-        for entity in ours:
-            is_listed = entity.edge_id is not None and not entity.missed
+    def _note_silence(self, step: Tracks, own: Tracks) -> None:
+        """Find which of ours the step does not show, of classes that the edge can name, and doubt the unsure."""
+        frame_index = step.frame_index
+        touched = np.any(iou(own.boxes_xyxy_px, step.boxes_xyxy_px) >= APART_IOU, axis=1).tolist()
+        ours = []
+        for row, own_id in enumerate(own.ids.tolist()):
+            entity = self._by_own.get(own_id)
+            if entity is None or entity.own_vote.class_id not in self._edge_names:
+                continue
+            is_listed = touched[row] or (entity.edge_id is not None and not entity.missed)
             entity.unlisted = 0 if is_listed else entity.unlisted + 1
+            ours.append(entity)
         sure = [entity for entity in ours if entity.own_vote.confidence >= ALONE_CONFIDENCE]
-        self._edge_recall.take(reported=sum(not entity.unlisted for entity in sure), there=len(sure))
+        self._edge_recall.take(
+            reported=sum(not entity.unlisted for entity in sure),
+            there=len(sure),
+            at_s=frame_index / self._fps,
+        )
+        least = self._edge_recall.least_confidence
+        for entity in ours:
+            enough = least + (SURER if entity.is_doubted else 0.0)
+            shown = entity.still_frame >= 0 and frame_index - entity.still_frame <= self._forget
+            was_listed = entity.far_vote.class_id >= 0
+            silent = entity.unlisted >= (LET_GO_STEPS if was_listed else 1)
+            entity.is_doubted = silent and not shown and least > 0 and entity.own_vote.confidence < enough
 
     # After news
 

@@ -65,13 +65,13 @@ class _Line:
 
 
 def list_entities(
-    entities: Sequence[Entity], own: Tracks, *, path: CameraPath, rules: FusionRules, least_own: float = 0.0
+    entities: Sequence[Entity], own: Tracks, *, path: CameraPath, rules: FusionRules, doubting: bool = False
 ) -> FusedTracks:
     """The list at the frame of ``own``, our tracker's list there; changes nothing.
 
-    What we alone see, and the edge did not list when it looked, needs a confidence of ``least_own``.
+    ``doubting``: the edge reports at present, and what its silence speaks against is left out.
     """
-    lines = _lines(entities, own, rules, least_own)
+    lines = _lines(entities, own, rules, doubting=doubting)
     boxes = _boxes(lines, own, path, rules)
     classes, confidences = _classes(lines, own, rules)
     listed = _once_each(lines, boxes, classes, confidences)
@@ -105,13 +105,13 @@ def far_boxes(entities: Sequence[Entity], frame_index: int, *, path: CameraPath,
     return boxes
 
 
-def _lines(entities: Sequence[Entity], own: Tracks, rules: FusionRules, least_own: float) -> list[_Line]:
+def _lines(entities: Sequence[Entity], own: Tracks, rules: FusionRules, *, doubting: bool) -> list[_Line]:
     rows: Mapping[int | None, int] = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
     lines = []
     for entity in entities:
         origin = entity.origin(rows, own.frame_index, patience=rules.patience)
         unsure = (origin == "edge" and entity.far_vote.confidence < ALONE_CONFIDENCE) or (
-            origin == "base" and entity.is_doubted(least_own)
+            origin == "base" and doubting and entity.is_doubted
         )
         if origin is not None and entity.id and not unsure:
             lines.append(_Line(entity, origin, rows.get(entity.own_id)))

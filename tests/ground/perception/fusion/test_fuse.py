@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -236,6 +238,55 @@ def test_what_a_still_has_shown_stays(ground):
     ground.fusion.take_box(ghost_id, GHOST[1], frame_index=0)
     ground.step(0, CROWD_AT_EDGE)
     assert with_ghost(ground, 1)
+
+
+def test_a_class_that_the_edge_cannot_name_is_ours_to_say():
+    """Boats would vanish beside the cars that both know, and at an edge with `motion` whatever stands."""
+    ground = Ground(own=("car", "bus", "boat"), edge=("car", "bus"))
+    for index in range(0, 30, 5):
+        tracks = tracks_at(index, {**CROWD, GHOST[0]: GHOST[1]})
+        tracks.class_ids[-1] = 2
+        tracks.confidences[-1] = 0.5
+        ground.fusion.take_own(tracks)
+        ground.step(index, CROWD_AT_EDGE)
+        assert ("base", whole(GHOST[1])) in brief(ground.fusion.listed(tracks)).values()
+
+
+def test_what_the_edge_has_listed_may_be_missed_for_a_while(ground):
+    """Whatever its detector misses now and then would blink."""
+    with_ghost(ground, 0)
+    ground.step(0, {**CROWD_AT_EDGE, 99: GHOST[1]})
+    at_step = []
+    for step in range(1, 10):
+        ground.own(5 * step, {**CROWD, GHOST[0]: GHOST[1]})
+        tracks = tracks_at(5 * step, {**CROWD, GHOST[0]: GHOST[1]})
+        tracks.confidences[-1] = 0.3
+        for _ in range(4):
+            ground.fusion.take_own(tracks)
+        ground.step(5 * step, CROWD_AT_EDGE)
+        at_step.append(any(box == whole(GHOST[1]) for _, box in brief(ground.fusion.listed(tracks)).values()))
+    assert at_step == [True] * 5 + [False] * 4
+
+
+def test_what_wavers_at_the_border_does_not_blink(ground):
+    """The operator would take it for something that appears and disappears."""
+    seen = []
+    rng = np.random.default_rng(5)
+    for step in range(60):
+        seen.append(with_ghost(ground, 5 * step, confidence=float(rng.uniform(0.68, 0.92))))
+        ground.step(5 * step, CROWD_AT_EDGE)
+    assert sum(a != b for a, b in pairwise(seen)) <= 2
+
+
+def test_a_box_of_the_edge_nearby_is_no_silence(ground):
+    """Of a small object two boxes overlap little: ours would be denied, and the edge's is too unsure to be listed."""
+    tracks = tracks_at(0, {**CROWD, GHOST[0]: GHOST[1]})
+    tracks.confidences[-1] = 0.5
+    near = tracks_at(0, {**CROWD_AT_EDGE, 99: moved(GHOST[1], 25)})
+    near.confidences[near.ids.tolist().index(99)] = 0.5
+    ground.fusion.take_own(tracks)
+    ground.fusion.take_step(near, own=tracks)
+    assert ("base", whole(GHOST[1])) in brief(ground.fusion.listed(tracks)).values()
 
 
 def test_an_edge_that_looks_for_other_things_says_nothing_of_ours(ground):
