@@ -39,6 +39,8 @@ class Measured:
     """Objects a picture that the base does not show."""
     denied: float = 0.0
     """Objects a picture that the base shows, the source does not, and the ground lists unless it hears of it."""
+    misnamed: float = 0.0
+    """Objects a picture that it shows under another class."""
     misnamed_share: float = 0.0
     """Of those that it shows, those that bear another class there."""
     reported: bool = False
@@ -178,8 +180,9 @@ class LeverControl:
             return "video alone: this machine is too slow for the detector"
         who = "ground does not see" if self._measured.reported else "base does not show"
         hidden = f"{self._measured.hidden:.0f} objects the {who}"
-        if round(self._measured.denied):
-            hidden += f", {self._measured.denied:.0f} it shows in error"
+        for count, what in ((self._measured.denied, "shows in error"), (self._measured.misnamed, "misnames")):
+            if round(count):
+                hidden += f", {count:.0f} it {what}"
         of_tracks = (
             f"{'tracks' if tracks else 'no tracks'}: {hidden}"
             if self._measured.comparisons

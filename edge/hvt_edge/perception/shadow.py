@@ -144,7 +144,13 @@ class Shadow:
     def measured(self) -> Measured:
         """What decides on tracks."""
         return Measured(
-            self.comparisons, self.gain, self.sure_gain, self.hidden, self.denied, self.misnamed_share
+            comparisons=self.comparisons,
+            gain=self.gain,
+            sure_gain=self.sure_gain,
+            hidden=self.hidden,
+            denied=self.denied,
+            misnamed=self.misnamed,
+            misnamed_share=self.misnamed_share,
         )
 
     def _gain(self, share: float) -> float:

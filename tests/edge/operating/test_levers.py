@@ -70,8 +70,9 @@ def test_it_says_who_does_not_see_them():
     for reported, who in ((True, "ground does not see"), (False, "base does not show")):
         rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, reported=reported))
         assert rig.second().says.startswith(f"tracks: 16 objects the {who}; ")
-    rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, denied=4.2))
-    assert rig.second().says.startswith("tracks: 16 objects the base does not show, 4 it shows in error; ")
+    rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, denied=4.2, misnamed=2.6))
+    says = "tracks: 16 objects the base does not show, 4 it shows in error, 3 it misnames; "
+    assert rig.second().says.startswith(says)
 
 
 def test_one_picture_is_no_measurement_unless_it_is_plain():
