@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame, View
@@ -90,9 +90,13 @@ def _most_frames(config: EdgeConfig, size: tuple[int, int], decimation: int) -> 
 
 
 def _share(config: EdgeConfig, view: View, decimation: int, seen: Shadow = UNMEASURED) -> float:
-    """Where the base hides objects, stills find more of them than the video would by the same bits."""
+    """Where the base hides objects, stills find more of them than the video would by the same bits.
+
+    What it shows in error they do not change: their share would go unused.
+    """
     if not config.measures or config.fixed_share is not None:
         return config.share
     share = min(config.share, SPARSE_SHARE) if decimation > 1 else config.share
+    seen = replace(seen, denied=0.0, denied_p=0.0)
     pay = lever_settings(config, view).tracks_pay(seen.measured, total_bps=config.budget_bps)
     return FIRST_SHARE if pay and not method(config.method).video_only else share

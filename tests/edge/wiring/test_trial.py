@@ -71,7 +71,7 @@ def test_auto_begins_with_what_the_base_hides():
         seen[budget] = beginning.shadow
         assert 1.5 < beginning.shadow.comparisons < 3
         assert beginning.share < config.share, (
-            "a third of the source's size is in error whatever its bits are"
+            "at a third of the source's size some are hidden whatever its bits are"
         )
     assert seen["100kbps"].sure_gain > 2 * seen["8000kbps"].sure_gain
     assert seen["100kbps"].hidden > 2 * seen["8000kbps"].hidden
