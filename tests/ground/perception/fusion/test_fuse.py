@@ -198,7 +198,7 @@ def with_ghost(ground, index, confidence=0.5):
 
 
 def test_what_the_edge_does_not_see_in_its_source_is_not_there(ground):
-    """At a thin link one in four that the base shows would be a shadow or a heap of stones."""
+    """At a thin link one in five that the base shows would be nothing that is in the source."""
     assert with_ghost(ground, 0), "the edge has not been heard"
     ground.step(0, CROWD_AT_EDGE)
     assert not with_ghost(ground, 1)
@@ -238,6 +238,12 @@ def test_what_a_still_has_shown_stays(ground):
     ground.fusion.take_box(ghost_id, GHOST[1], frame_index=0)
     ground.step(0, CROWD_AT_EDGE)
     assert with_ghost(ground, 1)
+    for index in range(5, 155, 5):
+        with_ghost(ground, index)
+        ground.step(index, CROWD_AT_EDGE)
+    assert with_ghost(ground, 151), "ten seconds after it"
+    ground.step(155, CROWD_AT_EDGE)
+    assert not with_ghost(ground, 156)
 
 
 def test_a_class_that_the_edge_cannot_name_is_ours_to_say():
