@@ -40,7 +40,7 @@ class Measured:
     denied: float = 0.0
     """Objects a picture that the base shows, the source does not, and the ground lists unless it hears of it."""
     misnamed: float = 0.0
-    """Objects a picture that it shows under another class."""
+    """Objects a picture that the base shows under another class."""
     misnamed_share: float = 0.0
     """Of those that it shows, those that bear another class there."""
     reported: bool = False

@@ -23,8 +23,8 @@ it for `PATIENCE_S`; what only a still has shown ends so long after the still.
 
 **Who is believed.** What only the edge sees is listed where it is sure. What only we see has its silence against it:
 where a step shows nothing there, of a class that the edge can name, we have to be the surer the more of what is there
-the edge was seen to list (`hvt_common.tracking.alone`). That ends when nothing is reported for `PATIENCE_S`, and does
-not hold for `FORGET_S` after a still has shown it.
+the edge was seen to list (`silence`). That ends when nothing is reported for `PATIENCE_S`, and does not hold for
+`FORGET_S` after a still has shown it.
 
 **Once each.** What only one side sees on top of what the other sees is listed once (`SAME_IOU`); so are two boxes of
 different class that are almost one (`TWIN_IOU`; less, and riders vanish on their motorcycles), which class-wise
@@ -43,12 +43,12 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.tracking.alone import ALONE_CONFIDENCE, Recall
 from hvt_common.tracking.association import assign
 from hvt_common.values import Detections, Tracks, iou
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.entity import MISSED_STEPS, Entity, Witness
 from hvt_ground.perception.fusion.object_list import FusedTracks, FusionRules, far_boxes, list_entities
+from hvt_ground.perception.fusion.silence import EdgeSilence
 
 __all__ = ["FusedTracks", "Fusion", "unified_names"]
 
@@ -64,10 +64,6 @@ HALF_LIFE_S = 0.3
 EDGE_CLASS_WEIGHT = 0.85
 """At equal size nearly as much as ours: the drone's network is often the smaller one. What is small in the base is
 called a car, and surely so: on drawn scenes at 640x360, a third of the source, 8 of 94 objects were."""
-LET_GO_STEPS = 6
-"""Of what the edge has listed once, so many steps in a row must be silent: a detection may fail now and then."""
-SURER = 0.1
-"""By so much surer than what was never doubted must be what was, or it would come and go."""
 FORGET_S = 10.0
 """How long an entity without any witness keeps its id for a track that is found again."""
 MAX_ENTITIES = 2048
@@ -104,8 +100,6 @@ class Fusion:
         base_per_source: float = 1.0,
     ) -> None:
         self._edge_classes = edge_classes
-        self._edge_names = frozenset(edge_classes.tolist())
-        self._fps = fps
         self._path = path
         self._rules = FusionRules(
             patience=max(1, round(PATIENCE_S * fps)),
@@ -114,13 +108,13 @@ class Fusion:
             edge_class_weight=EDGE_CLASS_WEIGHT / base_per_source,
         )
         self._forget = max(1, round(FORGET_S * fps))
+        self._silence = EdgeSilence(edge_classes, fps=fps, still_frames=self._forget)
         self._entities: list[Entity] = []
         self._by_own: dict[int, Entity] = {}
         self._by_edge: dict[int, Entity] = {}
         self._own: OrderedDict[int, Tracks] = OrderedDict()
         self._next_id = 1
         self._stepped = -1
-        self._edge_recall = Recall()
         self._merged: list[tuple[int, int]] = []
 
     def known_as(self, edge_track_id: int) -> int | None:
@@ -179,7 +173,7 @@ class Fusion:
         self._update(own, frame_index)
         if own is not None:
             self._note_own(own, frame_index)
-            self._note_silence(step, own)
+            self._silence.take(step, own, by_own=self._by_own)
         return True
 
     def take_found(self, found: Detections, *, known: Tracks) -> None:
@@ -294,32 +288,6 @@ class Fusion:
             entity = self._by_own.get(own_id)  # a step that comes late finds tracks merged away since
             if entity is not None:
                 entity.own_then = (centres[row], frame_index)
-
-    def _note_silence(self, step: Tracks, own: Tracks) -> None:
-        """Find which of ours the step does not show, of classes that the edge can name, and doubt the unsure."""
-        frame_index = step.frame_index
-        touched = np.any(iou(own.boxes_xyxy_px, step.boxes_xyxy_px) >= APART_IOU, axis=1).tolist()
-        ours = []
-        for row, own_id in enumerate(own.ids.tolist()):
-            entity = self._by_own.get(own_id)
-            if entity is None or entity.own_vote.class_id not in self._edge_names:
-                continue
-            is_listed = touched[row] or (entity.edge_id is not None and not entity.missed)
-            entity.unlisted = 0 if is_listed else entity.unlisted + 1
-            ours.append(entity)
-        sure = [entity for entity in ours if entity.own_vote.confidence >= ALONE_CONFIDENCE]
-        self._edge_recall.take(
-            reported=sum(not entity.unlisted for entity in sure),
-            there=len(sure),
-            at_s=frame_index / self._fps,
-        )
-        least = self._edge_recall.least_confidence
-        for entity in ours:
-            enough = least + (SURER if entity.is_doubted else 0.0)
-            shown = entity.still_frame >= 0 and frame_index - entity.still_frame <= self._forget
-            was_listed = entity.far_vote.class_id >= 0
-            silent = entity.unlisted >= (LET_GO_STEPS if was_listed else 1)
-            entity.is_doubted = silent and not shown and least > 0 and entity.own_vote.confidence < enough
 
     # After news
 

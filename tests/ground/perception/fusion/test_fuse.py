@@ -258,6 +258,18 @@ def test_a_class_that_the_edge_cannot_name_is_ours_to_say():
         assert ("base", whole(GHOST[1])) in brief(ground.fusion.listed(tracks)).values()
 
 
+def test_what_turns_out_to_be_of_another_class_is_no_longer_doubted():
+    """A boat that was first taken for a car would be hidden to the end."""
+    ground = Ground(own=("car", "bus", "boat"), edge=("car", "bus"))
+    for index, class_id, is_listed in ((0, 0, False), (5, 2, True)):
+        tracks = tracks_at(index, {**CROWD, GHOST[0]: GHOST[1]})
+        tracks.class_ids[-1], tracks.confidences[-1] = class_id, 0.5
+        ground.fusion.take_own(tracks)
+        ground.step(index, CROWD_AT_EDGE)
+        listed = brief(ground.fusion.listed(tracks)).values()
+        assert (("base", whole(GHOST[1])) in listed) == is_listed
+
+
 def test_what_the_edge_has_listed_may_be_missed_for_a_while(ground):
     """Whatever its detector misses now and then would blink."""
     with_ghost(ground, 0)

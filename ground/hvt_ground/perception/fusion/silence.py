@@ -1,0 +1,65 @@
+"""Whether the edge's silence speaks against what only we see; see `fuse`, "Who is believed"."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.tracking.alone import ALONE_CONFIDENCE, Recall
+from hvt_common.values import Tracks, iou
+from hvt_ground.perception.fusion.entity import Entity
+
+__all__ = ["EdgeSilence"]
+
+NEAR_IOU = 0.1
+"""A box of the edge that overlaps ours by so much is no silence: of a small object two boxes overlap little."""
+LET_GO_STEPS = 6
+"""Of what the edge has listed once, so many steps in a row must be silent: a detection may fail now and then."""
+SURER = 0.1
+"""By so much surer than what was never doubted must be what was, or it would come and go."""
+
+
+class EdgeSilence:
+    """Sets `Entity.is_doubted` at each step of the edge.
+
+    ``edge_classes`` are the unified class ids that the edge can name; a still speaks for an object for
+    ``still_frames``.
+    """
+
+    def __init__(self, edge_classes: npt.NDArray[np.int32], *, fps: float, still_frames: int) -> None:
+        self._edge_classes = frozenset(edge_classes.tolist())
+        self._fps = fps
+        self._still_frames = still_frames
+        self._recall = Recall()
+
+    def take(self, step: Tracks, own: Tracks, *, by_own: Mapping[int, Entity]) -> None:
+        """Find which of our tracks at a step's frame it does not show, and doubt the unsure."""
+        near = np.any(iou(own.boxes_xyxy_px, step.boxes_xyxy_px) >= NEAR_IOU, axis=1).tolist()
+        ours = []
+        for own_id, is_near in zip(own.ids.tolist(), near, strict=True):
+            entity = by_own.get(own_id)
+            if entity is None:
+                continue
+            if entity.own_vote.class_id not in self._edge_classes:
+                entity.unlisted, entity.is_doubted = 0, False
+                continue
+            is_listed = is_near or (entity.edge_id is not None and not entity.missed)
+            entity.unlisted = 0 if is_listed else entity.unlisted + 1
+            ours.append(entity)
+        sure = [entity for entity in ours if entity.own_vote.confidence >= ALONE_CONFIDENCE]
+        reported = sum(not entity.unlisted for entity in sure)
+        self._recall.take(reported=reported, there=len(sure), at_s=step.frame_index / self._fps)
+        for entity in ours:
+            entity.is_doubted = self._is_doubted(entity, step.frame_index)
+
+    def _is_doubted(self, entity: Entity, frame_index: int) -> bool:
+        was_listed = entity.far_vote.class_id >= 0
+        if entity.unlisted < (LET_GO_STEPS if was_listed else 1):
+            return False
+        if entity.still_frame >= 0 and frame_index - entity.still_frame <= self._still_frames:
+            return False
+        least = self._recall.least_confidence
+        enough = least + (SURER if entity.is_doubted else 0.0)
+        return least > 0 and entity.own_vote.confidence < enough
