@@ -49,7 +49,8 @@ InfoAnswer = tuple[Info, int, int]
 class EdgePort:
     """One edge as the link knows it: its messages in order of arrival, its presence, and a way to talk to it.
 
-    ``put`` is for Zenoh's callbacks, all else for the edge's thread, which gets their errors by `raise_error`.
+    ``put`` is for Zenoh's callbacks, `close` for any thread, all else for the edge's thread, which gets the errors of
+    callbacks by `raise_error`.
     """
 
     def __init__(
@@ -77,6 +78,8 @@ class EdgePort:
         self._session = session
         self._keys = EdgeKeys(edge)
         self._feedback: zenoh.Publisher | None = None
+        self._sending = threading.Lock()
+        """Zenoh raises where a publisher is undeclared while another thread puts into it."""
         self._errors: deque[Exception] = deque(maxlen=_MOST_ERRORS)
         self._answers: deque[InfoAnswer] = deque(maxlen=_MOST_ANSWERS)
 
@@ -195,15 +198,19 @@ class EdgePort:
     def report(self, feedback: Feedback) -> None:
         """Publish a receiver report."""
         try:
-            if self._feedback is None:
-                self._feedback = declare_publisher(self._session, Channel.FEEDBACK, keys=self._keys)
-            self._feedback.put(feedback.pack())
+            with self._sending:
+                if self.inbox.closed:
+                    return
+                if self._feedback is None:
+                    self._feedback = declare_publisher(self._session, Channel.FEEDBACK, keys=self._keys)
+                self._feedback.put(feedback.pack())
         except zenoh.ZError as error:
             _log.debug("%s: feedback not sent: %s", self.edge, error)
 
     def close(self) -> None:
         """No more comes, and nothing goes out."""
         self.inbox.close()
-        if self._feedback is not None:
-            with suppress(zenoh.ZError):  # the session may be closed
+        with self._sending, suppress(zenoh.ZError):  # the session may be closed
+            if self._feedback is not None:
                 self._feedback.undeclare()  # type: ignore[no-untyped-call]
+                self._feedback = None

@@ -18,6 +18,7 @@ from hvt_common.protocol.messages import InfoRequest
 from hvt_common.transport.session import open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.video.still_codecs import still_codec_names
+from hvt_ground.session.edge_port import EdgePort
 from hvt_ground.session.subscribe import MAX_EDGES, GroundLink
 from programs.outsider import Tap, joined
 from programs.processes import eventually
@@ -226,6 +227,40 @@ def test_nothing_is_declared_in_a_callback(free_port: int) -> None:
 
             eventually(reported, within_s=20, what="the edge gets reports all the same")
             assert declarations.threads == [threading.current_thread().name]
+
+
+def test_an_edge_that_is_left_while_a_report_goes_out(free_port: int) -> None:
+    """Zenoh forbids what two threads do at once: a ground of a group ended when an edge moved to another."""
+    endpoint, reporting = f"tcp/127.0.0.1:{free_port}", threading.Event()
+
+    def report(port: EdgePort) -> None:
+        for _ in range(2000):
+            port.report(FEEDBACK)
+            reporting.set()
+
+    with open_session(LinkSettings("ground", listen=(endpoint,))) as session, joined(endpoint) as outsider:
+        tap = Tap(outsider, "hvt/uav-1/feedback")
+        for _ in range(20):
+            reporting.clear()
+            left = EdgePort(session, "uav-1", clock=time.time_ns)
+            worker = threading.Thread(target=report, args=(left,))
+            worker.start()
+            assert reporting.wait(10)
+            left.close()
+            worker.join()
+        next_port = EdgePort(session, "uav-2", clock=time.time_ns)
+        other = Tap(outsider, "hvt/uav-2/feedback")
+
+        def reported() -> bool:
+            next_port.report(FEEDBACK)
+            return bool(other.messages)
+
+        eventually(reported, within_s=20, what="another edge gets reports all the same")
+        count = len(tap.messages)
+        left.report(FEEDBACK)
+        next_port.report(FEEDBACK)
+        time.sleep(0.3)
+        assert 0 < len(tap.messages) == count, "after its end a port says nothing"
 
 
 def test_silent_edges_hold_up_nobody(free_port: int) -> None:

@@ -156,8 +156,9 @@ class LinkWatch:
                 return
         for host in hosts:
             _log.warning(
-                "somebody at %s connects again and again and is refused: it has no certificate of this CA, or speaks "
-                "no Zenoh; if it is one of yours, its own log says why (docs/security.md)",
+                "somebody at %s connects again and again and is refused: it has no certificate of this CA, speaks no "
+                "Zenoh, or its link keeps breaking; if it is one of yours, its own log says why "
+                "(docs/security.md)",
                 host,
             )
 

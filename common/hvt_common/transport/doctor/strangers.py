@@ -31,6 +31,7 @@ class Strangers:
         self._ports = frozenset(ports)
         self._tables = [one for one in tables if one.exists()] if self._ports else []
         self._linked: set[str] = set()
+        """Connections that are links, or were."""
         self._pending: set[str] = set()
         """Connections that are no links, or not yet."""
         self._refused: OrderedDict[str, list[float]] = OrderedDict()
@@ -45,7 +46,9 @@ class Strangers:
             return []
         linked = set(links())
         ended = self._pending - connected - linked
-        self._linked, self._pending = connected & linked, connected - linked
+        # The kernel goes on with the connection of a link that was lost: that was one all the same.
+        self._linked = connected & (linked | self._linked)
+        self._pending = connected - self._linked
         return [host for host in map(_host, sorted(ended)) if self._note(host, now_s)]
 
     def _note(self, host: str, now_s: float) -> bool:

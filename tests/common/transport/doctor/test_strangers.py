@@ -79,3 +79,9 @@ def test_each_stranger_once_a_minute(tmp_path: Path) -> None:
             "it takes its time, and is in"
         )
         assert shown(at_s + 1.5) == []
+    for number in range(6):
+        lost, found = (f"0900000A:A{number + more:03X}" for more in (0, 1))
+        links = (f"10.0.0.9:{0xA000 + number}", f"10.0.0.9:{0xA001 + number}")
+        assert shown(120 + number, lost, links=links[:1]) == []
+        both = shown(120.5 + number, lost, found, links=links[1:])
+        assert both == [], "the link is lost and made again; the kernel still has its old connection"
