@@ -25,43 +25,69 @@ was there on drawn scenes and hardly any on real labelled pictures. What is as s
 _LEAST_REAL: Final = 0.3
 _LEAST_SHARE: Final = 0.5
 """Who reports less than this looks for other things: its silence says nothing."""
+_STILL_SHARE: Final = 0.4
+"""Once it says something it does so down to here, or a list would come and go."""
 _MOST_SHARE: Final = 0.9
 """What is surely there is easy to see; of what is not, nobody reports more."""
 _CAUTION: Final = 2
 """So many objects not reported are added: after the first that both see nothing is known yet."""
+_OTHERS: Final = 20
+"""What is known of all classes counts as so many objects of each: few are enough to learn that an observer does not
+know one of them."""
 _MEMORY_S: Final = 10.0
 
 
 class Recall:
-    """Which share of what is surely there one observer reports; few objects count for little, and old ones fade."""
+    """Which share of what is surely there one observer reports; few objects count for little, and old ones fade.
+
+    By class: who reports each car may know no people. What is not known of a class is taken from all of them.
+    """
 
     def __init__(self) -> None:
-        self._there = 0.0
-        self._reported = 0.0
+        self._counts: dict[int, npt.NDArray[np.float64]] = {}
+        """By class, (2,) how many were there, and how many of them were reported."""
+        self._shares: dict[int, float] = {}
+        self._share_of_others = 0.0
+        """Of classes of which nothing is known."""
         self._at_s: float | None = None
 
-    def take(self, *, reported: int, there: int, at_s: float) -> None:
-        """Of one picture: how many objects were surely there, and how many of them were reported."""
+    def take(self, class_ids: npt.NDArray[Any], *, reported: npt.NDArray[np.bool_], at_s: float) -> None:
+        """Of one picture: the classes (N,) of what was surely there, and whether it was ``reported`` (N,)."""
         fade = 0.0 if self._at_s is None else math.exp(-max(0.0, at_s - self._at_s) / _MEMORY_S)
-        self._there = fade * self._there + there
-        self._reported = fade * self._reported + reported
         self._at_s = at_s
+        self._counts = {class_id: fade * counts for class_id, counts in self._counts.items()}
+        for class_id, is_reported in zip(class_ids.tolist(), reported.tolist(), strict=True):
+            self._counts.setdefault(class_id, np.zeros(2))[:] += (1.0, is_reported)
+        there, reports = sum(self._counts.values(), np.zeros(2)).tolist()
+        of_all = reports / (there + _CAUTION)
+        of_others = np.array([_OTHERS, _OTHERS * of_all])
+        self._shares = {
+            class_id: _believed(_share(counts + of_others), before=self.share(class_id))
+            for class_id, counts in self._counts.items()
+        }
+        self._share_of_others = _believed(of_all, before=self._share_of_others)
 
-    @property
-    def share(self) -> float:
-        """0.5…0.9, or 0 where silence says nothing."""
-        share = self._reported / (self._there + _CAUTION)
-        return min(share, _MOST_SHARE) if share >= _LEAST_SHARE else 0.0
+    def share(self, class_id: int) -> float:
+        """0.4…0.9, or 0 where silence says nothing."""
+        return self._shares.get(class_id, self._share_of_others)
 
-    @property
-    def least_confidence(self) -> float:
+    def least_confidence(self, class_id: int) -> float:
         """From where what is not reported is listed all the same; 0 where silence says nothing."""
-        if not self.share:
-            return 0.0
-        return _LEAST_REAL / (_LEAST_REAL + (1 - _LEAST_REAL) * (1 - self.share))
+        share = self.share(class_id)
+        return _LEAST_REAL / (_LEAST_REAL + (1 - _LEAST_REAL) * (1 - share)) if share else 0.0
 
-    def real(self, confidences: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-        """(N,) the probabilities that detections (N,) are real that are not reported; see the module."""
-        found = np.clip(np.asarray(confidences, np.float64), 0, 1)
-        there = found * (1 - self.share)
-        return np.asarray(there / np.maximum(there + 1 - found, 1e-9), np.float64)
+    def real(self, confidence: float, class_id: int) -> float:
+        """The probability that a detection is real that is not reported; see the module."""
+        found = min(max(confidence, 0.0), 1.0)
+        there = found * (1 - self.share(class_id))
+        return there / max(there + 1 - found, 1e-9)
+
+
+def _share(counts: npt.NDArray[np.float64]) -> float:
+    there, reports = counts.tolist()
+    return float(reports / there)
+
+
+def _believed(share: float, *, before: float) -> float:
+    """What the share counts as, when it counted as so much ``before``."""
+    return min(share, _MOST_SHARE) if share >= (_STILL_SHARE if before else _LEAST_SHARE) else 0.0

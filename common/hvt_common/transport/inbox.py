@@ -81,11 +81,6 @@ class Inbox:
             self._closed = True
             self._changed.notify_all()
 
-    @property
-    def closed(self) -> bool:
-        """Whether no more is waited for."""
-        return self._closed
-
     def __len__(self) -> int:
         return len(self._items)
 

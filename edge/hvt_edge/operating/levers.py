@@ -180,9 +180,9 @@ class LeverControl:
             return "video alone: this machine is too slow for the detector"
         who = "ground does not see" if self._measured.reported else "base does not show"
         hidden = f"{self._measured.hidden:.0f} objects the {who}"
-        for count, what in ((self._measured.denied, "shows in error"), (self._measured.misnamed, "misnames")):
+        for count, what in ((self._measured.denied, "false"), (self._measured.misnamed, "misnamed")):
             if round(count):
-                hidden += f", {count:.0f} it {what}"
+                hidden += f", {count:.0f} {what}"
         of_tracks = (
             f"{'tracks' if tracks else 'no tracks'}: {hidden}"
             if self._measured.comparisons

@@ -275,16 +275,13 @@ class ShadowGround:
         shown = (same & (strong[:, None] | began)).any(axis=0)
         self._shown_ids = tracks.ids[rows][shown]
         hidden = ~shown & (p >= ALONE_CONFIDENCE)
-        in_source = same.any(axis=1)
+        in_source = np.any(same, axis=1)
         sure = found.confidences >= ALONE_CONFIDENCE
         self._recall.take(
-            reported=int((in_source & sure).sum()),
-            there=int(sure.sum()),
-            at_s=seen.frame.capture_ns / SECOND_NS,
+            found.class_ids[sure], reported=in_source[sure], at_s=seen.frame.capture_ns / SECOND_NS
         )
         alone = strong & ~in_source
-        alone_p = self._recall.real(found.confidences)
-        denied = alone & (found.confidences < self._recall.least_confidence)
+        alone_p, denied_p = self._alone(found, np.flatnonzero(alone))
         misnamed = np.zeros(len(rows), bool)
         if shown.any():
             best = overlaps[:, shown].argmax(axis=0)
@@ -299,10 +296,21 @@ class ShadowGround:
             misnamed=int(misnamed.sum()),
             misnamed_p=float(p[misnamed].sum()),
             false=int(alone.sum()),
-            false_p=float(alone_p[alone].sum()),
-            denied=int(denied.sum()),
-            denied_p=float(alone_p[denied].sum()),
+            false_p=sum(alone_p),
+            denied=len(denied_p),
+            denied_p=sum(denied_p),
         )
+
+    def _alone(self, found: Detections, rows: npt.NDArray[np.int64]) -> tuple[list[float], list[float]]:
+        """How probably each of these is real that the source does not show, and those of them that are denied."""
+        alone_p, denied_p = [], []
+        for confidence, class_id in zip(
+            found.confidences[rows].tolist(), found.class_ids[rows].tolist(), strict=True
+        ):
+            alone_p.append(self._recall.real(confidence, class_id))
+            if confidence < self._recall.least_confidence(class_id):
+                denied_p.append(alone_p[-1])
+        return alone_p, denied_p
 
     def _take(self, one: Shadow, capture_ns: int) -> None:
         weight = 0.0

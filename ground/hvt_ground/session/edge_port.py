@@ -80,6 +80,7 @@ class EdgePort:
         self._feedback: zenoh.Publisher | None = None
         self._sending = threading.Lock()
         """Zenoh raises where a publisher is undeclared while another thread puts into it."""
+        self._closed = False
         self._errors: deque[Exception] = deque(maxlen=_MOST_ERRORS)
         self._answers: deque[InfoAnswer] = deque(maxlen=_MOST_ANSWERS)
 
@@ -199,7 +200,7 @@ class EdgePort:
         """Publish a receiver report."""
         try:
             with self._sending:
-                if self.inbox.closed:
+                if self._closed:
                     return
                 if self._feedback is None:
                     self._feedback = declare_publisher(self._session, Channel.FEEDBACK, keys=self._keys)
@@ -211,6 +212,7 @@ class EdgePort:
         """No more comes, and nothing goes out."""
         self.inbox.close()
         with self._sending, suppress(zenoh.ZError):  # the session may be closed
+            self._closed = True
             if self._feedback is not None:
                 self._feedback.undeclare()  # type: ignore[no-untyped-call]
                 self._feedback = None

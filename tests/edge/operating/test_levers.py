@@ -71,7 +71,7 @@ def test_it_says_who_does_not_see_them():
         rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, reported=reported))
         assert rig.second().says.startswith(f"tracks: 16 objects the {who}; ")
     rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, denied=4.2, misnamed=2.6))
-    says = "tracks: 16 objects the base does not show, 4 it shows in error, 3 it misnames; "
+    says = "tracks: 16 objects the base does not show, 4 false, 3 misnamed; "
     assert rig.second().says.startswith(says)
 
 

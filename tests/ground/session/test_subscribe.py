@@ -261,6 +261,10 @@ def test_an_edge_that_is_left_while_a_report_goes_out(free_port: int) -> None:
         next_port.report(FEEDBACK)
         time.sleep(0.3)
         assert 0 < len(tap.messages) == count, "after its end a port says nothing"
+        next_port.inbox.close()
+        count = len(other.messages)
+        next_port.report(FEEDBACK)
+        eventually(lambda: len(other.messages) > count, within_s=20, what="a ground that stops says its last")
 
 
 def test_silent_edges_hold_up_nobody(free_port: int) -> None:

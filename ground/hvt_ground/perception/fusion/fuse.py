@@ -203,7 +203,7 @@ class Fusion:
         if entity is None:
             return
         box = np.array(box_base_px, np.float64)
-        entity.still_frame = max(entity.still_frame, frame_index)
+        entity.still_frame, entity.is_doubted = max(entity.still_frame, frame_index), False
         far, own = entity.afar, self._own.get(frame_index)
         if entity.edge_id is None and far is not None and frame_index > far.frame_index:
             entity.afar = far.seen_again(box, frame_index, far.confidence, path=self._path)
@@ -335,6 +335,7 @@ class Fusion:
         survivor.own_then = ours.own_then
         survivor.edge_id, survivor.far_vote, survivor.afar = theirs.edge_id, theirs.far_vote, theirs.afar
         survivor.missed, survivor.apart = theirs.missed, 0
+        survivor.unlisted, survivor.is_doubted = 0, False
         if survivor.own_id is not None:
             self._by_own[survivor.own_id] = survivor
         if survivor.edge_id is not None:

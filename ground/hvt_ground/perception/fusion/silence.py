@@ -33,6 +33,7 @@ class EdgeSilence:
         self._fps = fps
         self._still_frames = still_frames
         self._recall = Recall()
+        self._stepped = -1
 
     def take(self, step: Tracks, own: Tracks, *, by_own: Mapping[int, Entity]) -> None:
         """Find which of our tracks at a step's frame it does not show, and doubt the unsure."""
@@ -46,13 +47,19 @@ class EdgeSilence:
                 entity.unlisted, entity.is_doubted = 0, False
                 continue
             is_listed = is_near or (entity.edge_id is not None and not entity.missed)
-            entity.unlisted = 0 if is_listed else entity.unlisted + 1
-            ours.append(entity)
-        sure = [entity for entity in ours if entity.own_vote.confidence >= ALONE_CONFIDENCE]
-        reported = sum(not entity.unlisted for entity in sure)
-        self._recall.take(reported=reported, there=len(sure), at_s=step.frame_index / self._fps)
-        for entity in ours:
+            # The edge's tracker may need two detections, and has had one at most of what is newer than its last step.
+            is_new = self._stepped < entity.born < step.frame_index
+            entity.unlisted = 0 if is_listed or is_new else entity.unlisted + 1
+            ours.append((entity, is_listed))
+        sure = [one for one in ours if one[0].own_vote.confidence >= ALONE_CONFIDENCE]
+        self._recall.take(
+            np.array([entity.own_vote.class_id for entity, _ in sure], np.int32),
+            reported=np.array([is_listed for _, is_listed in sure], bool),
+            at_s=step.frame_index / self._fps,
+        )
+        for entity, _ in ours:
             entity.is_doubted = self._is_doubted(entity, step.frame_index)
+        self._stepped = step.frame_index
 
     def _is_doubted(self, entity: Entity, frame_index: int) -> bool:
         was_listed = entity.far_vote.class_id >= 0
@@ -60,6 +67,6 @@ class EdgeSilence:
             return False
         if entity.still_frame >= 0 and frame_index - entity.still_frame <= self._still_frames:
             return False
-        least = self._recall.least_confidence
-        enough = least + (SURER if entity.is_doubted else 0.0)
-        return least > 0 and entity.own_vote.confidence < enough
+        vote = entity.own_vote
+        least = self._recall.least_confidence(vote.class_id)
+        return least > 0 and vote.confidence < least + (SURER if entity.is_doubted else 0.0)

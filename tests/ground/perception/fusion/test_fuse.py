@@ -246,6 +246,57 @@ def test_what_a_still_has_shown_stays(ground):
     assert not with_ghost(ground, 156)
 
 
+def test_a_still_brings_back_what_was_doubted(ground):
+    """The operator asks for a still of a place, sees a car in it, and the list has none until the next step."""
+    with_ghost(ground, 0)
+    ghost_id = max(ground.fusion.listed(ground.fusion.own_at(0)).tracks.ids.tolist())
+    ground.step(0, CROWD_AT_EDGE)
+    assert not with_ghost(ground, 5)
+    ground.fusion.take_box(ghost_id, GHOST[1], frame_index=5)
+    assert with_ghost(ground, 6)
+
+
+def test_what_only_a_still_has_found_is_not_doubted_for_ours(ground):
+    """A still shows a bus that the list does not have; our track of it, doubted until then, would hide it."""
+    with_ghost(ground, 0)
+    ground.step(0, CROWD_AT_EDGE)
+    assert not with_ghost(ground, 5)
+    ground.found(5, GHOST[1])
+    assert with_ghost(ground, 6)
+
+
+def test_an_edge_that_looks_less_often_is_given_two_looks(ground):
+    """Its tracker has seen it once at most: what drives into the picture would be shown, hidden and shown again."""
+    ground.own(10, CROWD)
+    ground.step(10, CROWD_AT_EDGE)
+    for index in range(12, 21):
+        boxes = {**CROWD, GHOST[0]: GHOST[1]}
+        tracks = tracks_at(index, boxes)
+        tracks.confidences[-1], tracks.born_frames[-1] = 0.5, 12
+        ground.fusion.take_own(tracks)
+        if index == 15:
+            ground.step(15, CROWD_AT_EDGE)
+        assert ("base", whole(GHOST[1])) in brief(ground.fusion.listed(tracks)).values()
+    ground.step(20, CROWD_AT_EDGE)
+    assert not with_ghost(ground, 21)
+
+
+def test_people_whom_the_edge_never_finds_are_listed():
+    """Beside many cars that both see, the ground's better network would be denied by the edge's small one."""
+    ground = Ground(own=("car", "person"), edge=("car", "person"))
+    cars = {number: moved(A, 60 * number) for number in range(40)}
+    people = {50 + number: moved(A, 60 * number, 200) for number in range(5)}
+    listed = []
+    for index in range(0, 60, 5):
+        tracks = tracks_at(index, {**cars, **people})
+        tracks.class_ids[-5:], tracks.confidences[-5:] = 1, 0.7
+        ground.fusion.take_own(tracks)
+        ground.step(index, {number + 100: box for number, box in cars.items()})
+        fused = brief(ground.fusion.listed(tracks)).values()
+        listed.append(sum(("base", whole(box)) in fused for box in people.values()))
+    assert listed[-8:] == [5] * 8
+
+
 def test_a_class_that_the_edge_cannot_name_is_ours_to_say():
     """Boats would vanish beside the cars that both know, and at an edge with `motion` whatever stands."""
     ground = Ground(own=("car", "bus", "boat"), edge=("car", "bus"))
