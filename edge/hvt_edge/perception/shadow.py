@@ -29,7 +29,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -39,10 +38,10 @@ from hvt_common.values import Detections, Image, iou
 from hvt_edge.operating.levers import Measured
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.detected import Detected, GroundDifference
+from hvt_edge.perception.scene_change import SceneChange
 
 __all__ = ["UNMEASURED", "Shadow", "ShadowGround", "ShadowSettings"]
 
-_THUMBNAIL = (32, 18)
 _LEAST_MORE = 0.5
 """Of objects that the ground shows more or fewer than were found here."""
 _BASE_NAMES = 1 / 3
@@ -64,8 +63,6 @@ class ShadowSettings:
     """Of a processor core, for comparisons; in lockstep, where no clock may decide, only ``rest_ns`` counts."""
     memory_s: float = 8.0
     """Time constant with which former comparisons fade."""
-    scene_correlation: float = 0.3
-    """Two pictures a third of a second apart that correlate less, as thumbnails, are of two scenes."""
     match_iou: float = 0.3
     """As little as the ground takes for one object: boxes of 15 pixels from two pictures seldom reach more."""
 
@@ -196,7 +193,7 @@ class ShadowGround:
         self._last_ns: int | None = None
         self._shown_ids = np.empty(0, np.int64)
         """Tracks that the base showed at the comparison before."""
-        self._thumbnail: tuple[int, npt.NDArray[np.float32]] | None = None
+        self._scene_change = SceneChange()
         self.scene_changes = 0
         """How often another scene began."""
         self._recall = Recall()
@@ -222,7 +219,7 @@ class ShadowGround:
     def compare(self, seen: AnalyzedFrame) -> bool:
         """Compare, if this is a decision step on a coded frame and one is due; tell whether it was done."""
         capture_ns = seen.frame.capture_ns
-        if seen.detected and self._is_another_scene(seen.frame.source_bgr, capture_ns):
+        if seen.detected and self._scene_change.take(seen.frame.source_bgr, capture_ns=capture_ns):
             self._forget()
         if not seen.detected or seen.base_bgr is None or capture_ns < self._next_ns:
             return False
@@ -244,16 +241,6 @@ class ShadowGround:
         self._take(one, capture_ns)
         self._difference.expect(seen.frame.index, one.shown + one.false, capture_ns=capture_ns)
         return True
-
-    def _is_another_scene(self, source_bgr: Image, capture_ns: int) -> bool:
-        """Whether this picture has nothing to do with that of the decision step just before."""
-        small = cv2.resize(source_bgr, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
-        small -= small.mean()
-        before, self._thumbnail = self._thumbnail, (capture_ns, small)
-        if before is None or capture_ns - before[0] > self._settings.rest_ns:
-            return False  # so much later a moving camera may show other ground
-        norm = float(np.linalg.norm(before[1]) * np.linalg.norm(small))
-        return norm > 0 and float(before[1] @ small) / norm < self._settings.scene_correlation
 
     def _forget(self) -> None:
         """Another scene: what was measured says nothing of it."""

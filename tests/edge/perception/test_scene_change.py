@@ -1,0 +1,99 @@
+"""Where another scene begins, and where there is only little to see."""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from hvt_common.units import SECOND_NS
+from hvt_common.values import Image
+from hvt_edge.perception.scene_change import SceneChange
+
+STEP_NS = SECOND_NS // 3
+SIZE = (640, 360)
+
+
+def plain(level: float, *, noise: float, boats: int = 0, waves: float = 0.0, seed: int = 1) -> list[Image]:
+    """A grey ground with small objects that move slowly, one picture a decision step."""
+    rng = np.random.default_rng(seed)
+    places, steps = rng.uniform(50, 300, (boats, 2)), rng.uniform(-4, 4, (boats, 2))
+    pictures = []
+    for k in range(12):
+        ground = np.full(SIZE[::-1], level, np.float32)
+        swell = rng.normal(0, waves, (22, 40)).astype(np.float32)
+        ground += cv2.resize(swell, SIZE, interpolation=cv2.INTER_CUBIC)
+        for place, step in zip(places, steps, strict=True):
+            x, y = (place + step * k).astype(int)
+            ground[y : y + 8, x : x + 8] += 60 if level < 200 else -60
+        pictures.append(filmed(ground, noise, rng))
+    return pictures
+
+
+def structured(contrast: float, level: float, *, noise: float, seed: int) -> list[Image]:
+    """Soft shapes that drift: hills in fog, or a landscape at night."""
+    rng = np.random.default_rng(seed)
+    shapes = cv2.resize(rng.normal(0, contrast, (8, 12)), (720, 360), interpolation=cv2.INTER_CUBIC)
+    return [filmed(level + shapes[:, 2 * k : 2 * k + SIZE[0]], noise, rng) for k in range(12)]
+
+
+def filmed(ground: np.ndarray, noise: float, rng: np.random.Generator) -> Image:
+    """With a sensor's noise, in 8 bits."""
+    return np.clip(np.rint(ground[..., None] + rng.normal(0, noise, (*ground.shape, 3))), 0, 255).astype(
+        np.uint8
+    )
+
+
+SCENES = {
+    "land": structured(30, 110, noise=2, seed=7),
+    "calm sea": plain(100.5, noise=3, boats=1),
+    "sea without noise": plain(60.5, noise=0, boats=1),
+    "waves": plain(140, noise=3, boats=3, waves=8),
+    "snow": plain(235.4, noise=2, boats=2),
+    "white": plain(254, noise=3),
+    "fog": structured(5, 170, noise=3, seed=5),
+    "night": structured(1, 4, noise=3, seed=6),
+    "dark": plain(2, noise=3),
+}
+
+# Of the two dark ones nobody sees which it is: they are a level apart.
+CUTS = [cut for cut in itertools.permutations(SCENES, 2) if set(cut) != {"dark", "night"}]
+
+
+def changes(pictures: list[Image], *, step_ns: int = STEP_NS) -> list[int]:
+    """The places at which another scene began."""
+    scene = SceneChange()
+    return [k for k, one in enumerate(pictures) if scene.take(one, capture_ns=(k + 1) * step_ns)]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_of_little_contrast_is_one_scene(name):
+    """Over water, snow and fog what was measured would be forgotten at each step: no tracks are ever sent."""
+    assert changes(SCENES[name]) == []
+
+
+@pytest.mark.parametrize(("before", "after"), CUTS)
+def test_a_cut_is_seen_in_each(before, after):
+    """What was measured of the scene before would hold levers for seconds."""
+    assert 6 in changes(SCENES[before][:6] + SCENES[after][:6])
+
+
+def test_a_fast_flight_is_one_scene():
+    """Half the picture is new at each step: nothing would ever be measured of such a flight."""
+    rng = np.random.default_rng(3)
+    land = cv2.resize(rng.normal(110, 40, (30, 400)), (12_000, 360), interpolation=cv2.INTER_CUBIC)
+    flight = [filmed(land[:, 640 * k : 640 * k + SIZE[0]], 2, rng) for k in range(12)]
+    assert changes(flight) == []
+
+
+def test_exposure_is_no_other_scene():
+    """A camera that adapts to a bright boat would make the edge forget."""
+    rng = np.random.default_rng(4)
+    assert changes([filmed(np.full(SIZE[::-1], 80.5 + 12 * (k % 2)), 3, rng) for k in range(12)]) == []
+
+
+def test_after_a_pause_nothing_is_compared():
+    """A moving camera shows other ground by then, of the same scene."""
+    assert changes(SCENES["land"][:6] + SCENES["snow"][:6], step_ns=2 * SECOND_NS) == []
