@@ -75,11 +75,16 @@ class LinkControl:
         if self.reconfiguration.track_link(now_ns) or back:
             self.keyframes.require(now_ns)
 
-    def admits(self, now_ns: int) -> bool:
-        """Whether a frame may be coded now; what is held back would only wait and grow old."""
+    def admits(self, now_ns: int, line_bytes: int | None = None) -> bool:
+        """Whether a message of so many line bytes may be coded now; held back it would only wait and grow old.
+
+        The size is of what would go: a keyframe, with which x265 is opened at the link's rate, has room where a
+        frame of the rate of before has none. None is an average frame.
+        """
         if self.pacer is None:
             return True
-        return self.pacer.admits_base(now_ns) and self.transmitter.base_wait_ns(now_ns) <= _MOST_WAIT_NS
+        wait_ns = self.transmitter.base_wait_ns(now_ns, line_bytes=line_bytes)
+        return self.pacer.admits_base(now_ns) and wait_ns <= _MOST_WAIT_NS
 
     def finish(
         self,

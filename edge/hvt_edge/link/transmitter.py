@@ -281,10 +281,15 @@ class Transmitter:
         with self._lock:
             self.budget.set_total(total_bps, base_bps, fps, now_ns=now_ns)
 
-    def base_wait_ns(self, now_ns: int) -> int:
-        """How long an average base frame would wait for the budget's window, were it sent now."""
+    @property
+    def frame_bytes(self) -> int:
+        """Line bytes of an average base frame at the rate that the encoder is open for."""
+        return round(self.budget.base_step_bytes)
+
+    def base_wait_ns(self, now_ns: int, *, line_bytes: int | None = None) -> int:
+        """How long a base message would wait for the budget's window, were it sent now; None: an average frame."""
         with self._lock:
-            line_bytes = round(self.budget.base_step_bytes)
+            line_bytes = self.frame_bytes if line_bytes is None else line_bytes
             return max(0, self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True) - now_ns)
 
     def base_unit_wait_ns(self, unit: AccessUnit, *, now_ns: int) -> int | None:

@@ -13,8 +13,10 @@ __all__ = [
     "EncoderSettings",
     "encoder_settings",
     "keyframe_floor_bytes",
+    "keyframe_total_bps",
     "least_base_bps",
     "minimum_bps",
+    "most_keyframe_bytes",
     "payload_bps",
 ]
 
@@ -60,6 +62,18 @@ def keyframe_floor_bytes(size: tuple[int, int]) -> int:
     return round(_KEYFRAME_FLOOR_BYTES + _KEYFRAME_FLOOR_BYTES_PER_SIDE_PX * math.sqrt(size[0] * size[1]))
 
 
+def most_keyframe_bytes(size: tuple[int, int], fps: float, base_bps: int) -> int:
+    """About the most that a keyframe takes: what the VBV holds at this B_v, or what x265 cannot go below."""
+    return max(keyframe_floor_bytes(size), round(_vbv_s(fps) * base_bps / 8))
+
+
+def keyframe_total_bps(size: tuple[int, int], *, window_s: float, metadata_bps: int, edge_id: str) -> int:
+    """The least total of which each window holds a keyframe, with ``status``, tracks and pose beside it."""
+    keyframe_bps = 8 * keyframe_floor_bytes(size) / window_s
+    beside_bps = base_overhead_bps(keyframe_bps, fps=1 / window_s, edge_id=edge_id)
+    return math.ceil(keyframe_bps + beside_bps + metadata_bps)
+
+
 def minimum_bps(size: tuple[int, int], fps: float) -> int:
     """The lowest payload rate that x265 can follow at this size and frame rate, keyframes apart."""
     return round(fps * (_FRAME_FLOOR_BITS + size[0] * size[1] * _FRAME_FLOOR_BITS_PER_PX))
@@ -91,7 +105,7 @@ def encoder_settings(
         fps=fps,
         bitrate_bps=max(1, round(payload_bps)),
         preset=preset,
-        vbv_s=max(_TIGHT_VBV_S if tight else VBV_S, 1 / fps),
+        vbv_s=_vbv_s(fps, tight=tight),
         side_data=side_data,
     )
 
@@ -105,6 +119,10 @@ def least_base_bps(size: tuple[int, int], fps: float, *, edge_id: str) -> int:
 def payload_bps(base_bps: int, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
     """About what x265 gets of B_v; never below 1."""
     return max(1.0, base_bps - _beside_bps(base_bps, size=size, fps=fps, edge_id=edge_id))
+
+
+def _vbv_s(fps: float, *, tight: bool = False) -> float:
+    return max(_TIGHT_VBV_S if tight else VBV_S, 1 / fps)
 
 
 def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:

@@ -13,7 +13,7 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.point import Operating, base_rate_bps
 from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import Step
-from hvt_edge.video.encoder_settings import least_base_bps
+from hvt_edge.video.encoder_settings import least_base_bps, most_keyframe_bytes
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.share import FIRST_SHARE, Split
 
@@ -106,6 +106,20 @@ class EncoderReconfiguration:
             if base_bps >= least_base_bps(settings.size, nominal_fps / decimation, edge_id=settings.edge_id):
                 return decimation
         return most
+
+    def keyframe_bytes(self, last_bytes: int) -> int:
+        """About the line bytes of the next keyframe, where the last one took so many.
+
+        At a lower rate, for which the encoder is opened with it, its VBV lets less through.
+        """
+        if self.pacer is None:
+            return last_bytes
+        now, settings = self.operating.now, self.settings
+        base_bps = self._base_of(min(now.budget_bps, self.pacer.steady_bps))
+        if base_bps >= now.base_bps:
+            return last_bytes
+        fps = settings.nominal_fps / max(now.decimation, self.least_decimation())
+        return min(last_bytes, most_keyframe_bytes(settings.size, fps, base_bps))
 
     def observe(self, candidates: Sequence[Candidate], step: Step) -> None:
         """Take in all tracks of a decision step."""

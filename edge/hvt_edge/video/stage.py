@@ -32,8 +32,9 @@ class BaseStage:
 
     ``first_keyframe_bytes`` is the guess until a keyframe has been coded. ``reconfigure(decimation, now_ns)`` runs
     before each keyframe for the link and returns a newly opened encoder, or None where nothing has changed: x265
-    takes neither another frame rate nor another bit rate once it is open. ``admits(now_ns)`` says whether pacer and
-    budget have room for a frame. ``open_again()`` gives another encoder for one that has failed; without it,
+    takes neither another frame rate nor another bit rate once it is open. ``keyframe_bytes(last_bytes)`` says about
+    how many line bytes that keyframe takes, ``admits(now_ns, line_bytes)`` whether pacer and budget have room for so
+    many. ``open_again()`` gives another encoder for one that has failed; without it,
     as in lockstep, the failure is raised.
     """
 
@@ -47,7 +48,8 @@ class BaseStage:
     regions: TrackRegions | None = None
     frame_skip: FrameSkip | None = None
     reconfigure: Callable[[int, int], Encoder | None] | None = None
-    admits: Callable[[int], bool] = lambda _now_ns: True
+    keyframe_bytes: Callable[[int], int] = lambda last_bytes: last_bytes
+    admits: Callable[[int, int], bool] = lambda _now_ns, _line_bytes: True
     backlog: BacklogStage | None = None
     open_again: Callable[[], Encoder] | None = None
     failures: Failures | None = None
@@ -62,13 +64,16 @@ class BaseStage:
 
     def decide(self, frame: Frame, *, now_ns: int) -> FrameDecision:
         """Decide on this source frame; once for each, in order."""
-        fits = self.transmitter.keyframe_fits(self._keyframe_bytes, now_ns=now_ns)
+        keyframe_bytes = self.keyframe_bytes(self._keyframe_bytes)
+        fits = self.transmitter.keyframe_fits(keyframe_bytes, now_ns=now_ns)
+        keyframe_due = self._plan.now(now_ns, fits=fits) or self._begins_anew
+        line_bytes = keyframe_bytes if keyframe_due else self.transmitter.frame_bytes
         backlog = self.backlog
         return decide(
             FrameInputs(
                 due=self._frame_skip.codes(frame.index),
-                keyframe_due=self._plan.now(now_ns, fits=fits) or self._begins_anew,
-                admitted=self.admits(now_ns),
+                keyframe_due=keyframe_due,
+                admitted=self.admits(now_ns, line_bytes),
                 link=State.LIVE if backlog is None else backlog.state,
                 segment_due=backlog is not None and backlog.segment_due(now_ns),
                 probe_due=backlog is not None and backlog.probe_due(now_ns),

@@ -22,6 +22,7 @@ from hvt_edge.video.encoders.passthrough import measure_camera
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.share import Split, SplitSettings
 from hvt_edge.wiring.stills import shows_details
+from hvt_edge.wiring.video import least_rate_bps
 
 _AUTO_STILL_SHARE = 0.15
 """Of the budget, at most, for stills that are not known to pay: what the base loses by it is .015 of F1."""
@@ -102,14 +103,14 @@ def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:
     return LeverSettings(tracks_bps=config.metadata_bps, finer=shows_details(config, view))
 
 
-def make_pacer(config: EdgeConfig, stream: CameraStream | None) -> Pacer | None:
+def make_pacer(config: EdgeConfig, stream: CameraStream | None, size: tuple[int, int]) -> Pacer | None:
     """What tracks the link's rate; None where the budget is to stay as it is.
 
     Of a camera that is passed through (``stream``) the rate is never below what it was seen to make.
     """
     if not config.adapts:
         return None
-    floor_bps = config.floor_bps
+    floor_bps = least_rate_bps(config, size)
     if stream is not None:
         floor_bps = max(floor_bps, _camera_needs_bps(config, _surveyed_bytes(config, stream), config.share))
     settings = RateSettings(ceiling_bps=config.budget_bps, floor_bps=min(config.budget_bps, floor_bps))

@@ -111,7 +111,8 @@ def build_stages(
         method=config.method,
         decimation=decimation,
     )
-    keyframes, pacer = make_keyframes(config, source), make_pacer(config, source.camera_stream)
+    keyframes = make_keyframes(config, source)
+    pacer = make_pacer(config, source.camera_stream, view.base_size)
     open_encoder = partial(make_encoder, config, size=view.base_size, headroom=headroom)
     encoder = open_encoder(total_bps=config.budget_bps, base_bps=base_bps, decimation=decimation)
     budget = make_budget(config, base_bps=base_bps, decimation=decimation)
@@ -223,6 +224,7 @@ def build_stages(
                 make_frame_skip(config, decimation, size=view.base_size), reconfiguration.least_decimation
             ),
             reconfigure=reconfiguration,
+            keyframe_bytes=reconfiguration.keyframe_bytes,
             admits=link_control.admits,
             backlog=backlog,
             open_again=None if lockstep else reconfiguration.open_again,

@@ -17,7 +17,12 @@ from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
 from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, without_password
-from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_bytes, payload_bps
+from hvt_edge.video.encoder_settings import (
+    encoder_settings,
+    keyframe_floor_bytes,
+    keyframe_total_bps,
+    payload_bps,
+)
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
 from hvt_edge.video.encoders.qualification import allowed, headroom_of, run_frames
@@ -242,8 +247,23 @@ def reconfiguration_settings(config: EdgeConfig, size: tuple[int, int]) -> Recon
         least_fps=LEAST_FPS,
         edge_id=config.edge_id,
         metadata_bps=config.metadata_bps,
-        min_budget_bps=config.min_budget_bps,
+        min_budget_bps=least_rate_bps(config, size),
     )
+
+
+def least_rate_bps(config: EdgeConfig, size: tuple[int, int]) -> int:
+    """What the link's rate is never taken below, where the budget is not lower itself.
+
+    Nobody can make a keyframe smaller than `keyframe_floor_bytes`. Were the rate taken below what one needs, none
+    would go; nothing arrives then, and a rate that grows with what arrives never grows again. What a camera's own
+    units need is measured (`hvt_edge.video.encoders.camera_rates`).
+    """
+    if config.passes_through:
+        return config.min_budget_bps
+    needed_bps = keyframe_total_bps(
+        size, window_s=config.window, metadata_bps=config.metadata_bps, edge_id=config.edge_id
+    )
+    return max(config.min_budget_bps, needed_bps)
 
 
 def make_regions(config: EdgeConfig, size: tuple[int, int]) -> TrackRegions | None:

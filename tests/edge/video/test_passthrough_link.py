@@ -68,7 +68,7 @@ class Flight:
             method=config.method,
             decimation=1,
         )
-        self.pacer = make_pacer(config, stream)
+        self.pacer = make_pacer(config, stream, SIZE)
         self.ledger, self.in_flight = Ledger(), BaseInFlight()
         self.transmitter = Transmitter(
             self,
