@@ -187,6 +187,8 @@ def status_text(state: EdgeState, *, paused_s: float = 0.0) -> str:
         parts.append(f"kept {backlog.stills} stills, {backlog.video_s:.0f} s")
     if state.levers.says:
         parts.append(state.levers.says)
+    if state.detection_slow:
+        parts.append(f"boxes {state.boxes_age_s:.1f} s old: detection is too slow")
     if state.frames.dropped_cpu:
         parts.append(f"{state.frames.dropped_cpu} frames dropped: slow machine")
     if paused_s:

@@ -5,12 +5,14 @@ are matched with predicted tracks first; tracks left over may take a weak detect
 still free starts a new track. The rules, constants and oddities are those of the authors' program, so that its
 results are reproduced. What is added: frames may pass without detection (`ByteTracker.predict`), and what finds no
 match after them is matched once more with a margin; the time of lost tracks is counted in frames whatever the
-rate of detection; a track has a class.
+rate of detection, and where a slow machine detects more seldom than that time lasts, in detections; a track has a
+class.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -35,6 +37,11 @@ _WEAK_COST_LIMIT: Final = 0.5
 _UNCONFIRMED_COST_LIMIT: Final = 0.7
 _DUPLICATE_COST_LIMIT: Final = 0.15
 
+_LONGEST_S: Final = 10.0
+"""What no detection was run for so long tells nothing of the picture now."""
+_LEAST_LOOKS: Final = 3
+"""Detections that a lost track is remembered for, where they are further apart than the buffer is long."""
+
 # Box lengths; wider, and neighbours in a queue of cars are taken for each other.
 _MOST_GROWTH: Final = 0.75
 
@@ -52,7 +59,8 @@ class TrackerSettings:
     match_iou: float = 0.2
     """Least IoU (times confidence, with ``fuse_scores``) of a first match; 1 - ``match_thresh``."""
     track_buffer: int = 30
-    """How long a lost track is remembered, in frames at 30 fps; scaled to the real rate."""
+    """How long a lost track is remembered, in frames at 30 fps; scaled to the real rate. Where detections are
+    further apart than that: for three of them."""
     fuse_scores: bool = True
     """Weigh overlaps by the detection's confidence, except for weak detections (off with ``mot20``)."""
     min_box_area_px2: float = 10.0
@@ -112,8 +120,8 @@ class ByteTracker:
     """Tracks objects through consecutive frames of one camera at ``fps`` frames a second.
 
     Call `update` for a frame that was searched for objects and `predict` for one that was not, with rising frame
-    indices. Frames left out altogether are stepped over; an interruption longer than the lost buffer ends
-    all tracks. Detections whose numbers are not finite, or whose box has no area, are left out.
+    indices. Frames left out altogether are stepped over; 10 s without an update end all tracks. Detections whose
+    numbers are not finite, or whose box has no area, are left out.
     Class ids must be small (an index into class names), not negative.
 
     A track is confirmed when the next update finds it again (with a detection every n-th frame: n frames after the
@@ -127,6 +135,7 @@ class ByteTracker:
         self._settings = settings or TrackerSettings()
         self._fps = fps
         self._buffer_frames = int(fps / 30.0 * self._settings.track_buffer)
+        self._longest_frames = max(self._buffer_frames, round(_LONGEST_S * fps))
         method = self._settings.camera_motion
         self._camera = None if method == "off" else CameraMotion(scale=None)
         self.camera_step: Affine | None = None
@@ -138,6 +147,8 @@ class ByteTracker:
         self._table = TrackTable.empty()
         self._frame_index: int | None = None
         self._updated_index: int | None = None
+        self._gaps: deque[int] = deque(maxlen=_LEAST_LOOKS)
+        """Frames from one update to the next, of the last ones."""
         self._next_id = 1
         if self._camera is not None:
             self._camera.reset()
@@ -150,11 +161,12 @@ class ByteTracker:
         """
         seen = TrackerInput.of(detections, low_confidence=self._settings.low_confidence)
         self._advance(frame_index, image_bgr, hold_unconfirmed=True)
+        first = self._updated_index is None
+        gap = 1 if self._updated_index is None else frame_index - self._updated_index
+        self._gaps.append(gap)
         self._forget_stale(frame_index)
         self._widen_for(seen)
-        first = self._updated_index is None
-        match, free = self._match(seen, growth=self._growth(frame_index))
-        gap = 1 if self._updated_index is None else frame_index - self._updated_index
+        match, free = self._match(seen, frame_index, growth=self._growth(frame_index))
         self._updated_index = frame_index
         self._correct(seen, match, frame_index, gap=gap)
         retained = self._retire(match, frame_index)
@@ -180,12 +192,10 @@ class ByteTracker:
         last = frame_index if self._frame_index is None else self._frame_index
         if frame_index < last:
             raise ValueError(f"frame_index is {frame_index}, must not be below the last one, {last}")
-        table = self._table
-        elapsed = frame_index - last
-        states = table.states.copy()
-        for _ in range(min(elapsed, self._buffer_frames + 2)):
+        states = self._table.states.copy()
+        ended = self._outdated(frame_index)
+        for _ in range(0 if ended else frame_index - last):
             kalman.predict(states)
-        ended = elapsed > self._buffer_frames + 1
         listed = self._listed(frame_index, states=states[:0] if ended else states)
         return replace(listed, started=np.zeros(len(listed), bool))
 
@@ -198,7 +208,7 @@ class ByteTracker:
         affine = None if self._camera is None or image_bgr is None else self._camera.step(image_bgr)
         self.camera_step = affine
         table = self._table
-        if elapsed > self._buffer_frames + 1:
+        if self._outdated(frame_index):
             table.retain(np.zeros(len(table), bool))
         if not len(table):
             return
@@ -216,6 +226,20 @@ class ByteTracker:
         if affine is not None:
             kalman.warp(table.states, affine)
 
+    def _outdated(self, frame_index: int) -> bool:
+        """Whether the last update lies so far back that no track of it can be believed."""
+        last = self._updated_index
+        return last is not None and frame_index - last > self._longest_frames + 1
+
+    @property
+    def _lost_frames(self) -> int:
+        """How long a lost track is remembered now.
+
+        Where each look comes later than the buffer is long, nothing would be remembered from one to the next.
+        """
+        gap = max(self._gaps, default=1)
+        return self._buffer_frames if gap <= self._buffer_frames + 1 else _LEAST_LOOKS * gap
+
     def _forget_stale(self, frame_index: int) -> None:
         """Drop lost tracks whose time ran out between two updates; each has had one chance to be found, though.
 
@@ -223,7 +247,7 @@ class ByteTracker:
         it sweeps out what it removes one update late. Counted in frames, the same holds at any rate of detection.
         """
         table = self._table
-        stale = (table.phase == LOST) & (frame_index - table.seen > self._buffer_frames + 2)
+        stale = (table.phase == LOST) & (frame_index - table.seen > self._lost_frames + 2)
         if stale.any():
             table.retain(~(stale & (table.lost_at != self._updated_index)))
 
@@ -245,7 +269,7 @@ class ByteTracker:
         unsearched = frame_index - self._updated_index - 1
         return min(_MOST_GROWTH, self._settings.search_growth_per_s * unsearched / self._fps)
 
-    def _match(self, seen: TrackerInput, *, growth: float) -> tuple[_Indices, _Indices]:
+    def _match(self, seen: TrackerInput, frame_index: int, *, growth: float) -> tuple[_Indices, _Indices]:
         """The detection of each track (-1: none), and the confident detections left that may start tracks."""
         settings, table = self._settings, self._table
         # A detection at exactly the threshold is neither confident nor weak in the authors' program.
@@ -263,10 +287,20 @@ class ByteTracker:
             pair(iou, (table.phase == TRACKED) & (match < 0), weak, match, limit=_WEAK_COST_LIMIT)
             pair(fused, unconfirmed, free, match, limit=_UNCONFIRMED_COST_LIMIT)
             if growth > 0:
-                wide = self._fused(overlaps(grown(boxes, growth), grown(seen.boxes, growth)), seen)
-                pair(wide, match < 0, free, match, limit=limit)
+                wide = overlaps(grown(boxes, growth), grown(seen.boxes, growth))
+                if max(self._gaps) > self._buffer_frames + 1:
+                    held = grown(self._held(frame_index), growth)
+                    wide = np.maximum(wide, overlaps(held, grown(seen.boxes, growth)))
+                pair(self._fused(wide, seen), match < 0, free, match, limit=limit)
         free &= seen.confidences >= settings.birth_confidence
         return match, free.nonzero()[0]
+
+    def _held(self, frame_index: int) -> _Floats:
+        """The boxes as they were last seen, moved with the camera alone: meanwhile what drove may have stopped."""
+        states = self._table.states.copy()
+        elapsed = (frame_index - self._table.seen)[:, None]
+        states[:, kalman.POSITION] -= elapsed * states[:, kalman.VELOCITY]
+        return kalman.boxes_of(states)
 
     def _fused(self, iou: _Floats, seen: TrackerInput) -> _Floats:
         return iou * seen.confidences if self._settings.fuse_scores else iou
@@ -280,7 +314,7 @@ class ByteTracker:
         kalman.correct(states, seen.measured[columns], gap=gap)
         table.states[rows] = states
         phase = table.phase[rows]
-        table.overdue[rows] |= (phase == LOST) & (frame_index - table.seen[rows] > self._buffer_frames + 1)
+        table.overdue[rows] |= (phase == LOST) & (frame_index - table.seen[rows] > self._lost_frames + 1)
         table.started[:] = False
         table.started[rows] = phase != TRACKED
         table.phase[rows] = TRACKED
@@ -294,7 +328,7 @@ class ByteTracker:
         """Mark as lost what was not found; the answer says which tracks live on."""
         table = self._table
         missed = match < 0
-        over = (table.phase == LOST) & (frame_index - table.seen > self._buffer_frames + 1)
+        over = (table.phase == LOST) & (frame_index - table.seen > self._lost_frames + 1)
         newly_lost = missed & (table.phase == TRACKED)
         ended = (missed & (table.phase == UNCONFIRMED)) | over | (newly_lost & table.overdue)
         table.phase[newly_lost] = LOST

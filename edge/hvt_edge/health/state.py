@@ -43,6 +43,9 @@ __all__ = [
     "lacks",
 ]
 
+_LEAST_OLD_S = 1.0
+"""Boxes that are younger are not called old."""
+
 Phase = Literal["waiting", "running", "ended"]
 """``waiting``: a clip waits for its first ground."""
 
@@ -173,6 +176,10 @@ class EdgeState:
     encode_ms: float | None
     """Mean of one frame, since the start; like the next."""
     perception_ms: float | None
+    boxes_age_s: float | None
+    """From the picture in which objects were last searched for to the newest one; None before the first search."""
+    detection_slow: bool
+    """Boxes are older than they would be if detection had its time."""
     cores_needed: float | None
     """Processor cores for every frame, had none been left out."""
     cores_free: float | None
@@ -231,6 +238,7 @@ class StateMaker:
         total_bps = self._bps(None)
         outcomes = Counter(ledger.outcomes("deferred")) + Counter(ledger.outcomes("dropped"))
         came_ns = counts.newest_came_ns
+        boxes_age_s = self._boxes_age_s()
         return EdgeState(
             at_ns=now_ns,
             version=__version__,
@@ -276,6 +284,8 @@ class StateMaker:
             tracks=analyzer.tracks,
             encode_ms=counts.encode_ms if counts.encoded else None,
             perception_ms=analyzer.mean_ms if analyzer.frames else None,
+            boxes_age_s=boxes_age_s,
+            detection_slow=boxes_age_s is not None and boxes_age_s > self._usual_age_s(),
             cores_needed=None if cores == Cores() else cores.needed,
             cores_free=None if cores == Cores() else cores.free,
             system=read_system(),
@@ -283,6 +293,19 @@ class StateMaker:
             backlog=None if self.backlog is None else _backlog(self.backlog),
             failed=self.failures.now,
         )
+
+    def _boxes_age_s(self) -> float | None:
+        """A source that gives no pictures makes no box older than its picture."""
+        newest_ns = self.loop_clock() if self.config.pace == "lockstep" else self.counts.newest_came_ns
+        detected_ns = self.stills.analyzer.detected_ns
+        if newest_ns is None or detected_ns is None:
+            return None
+        return max(0.0, (newest_ns - detected_ns) / SECOND_NS)
+
+    def _usual_age_s(self) -> float:
+        """Twice the time between two detections, which wait for frames that are coded."""
+        frames = max(self.stills.analyzer.detect_every, self.operating.now.decimation)
+        return max(_LEAST_OLD_S, 2 * frames / self.config.nominal_fps)
 
     def _bps(self, account: Account | None) -> float | None:
         if not self.counts.encoded:

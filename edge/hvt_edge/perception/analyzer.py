@@ -80,6 +80,8 @@ class Analyzer:
         self._settings = settings
         self._decoder = decoder or BaseDecoder()
         self._detected_index: int | None = None
+        self.detected_ns: int | None = None
+        """Capture time of the newest picture that was searched for objects; None before the first."""
         self._coded_index: int | None = None
         self._coded_gap = 1
         self._track_ids = DistinctIds()
@@ -87,6 +89,11 @@ class Analyzer:
         """Time to decode, detect and track so far."""
         self.frames = 0
         """How many were analyzed."""
+
+    @property
+    def detect_every(self) -> int:
+        """Source frames from one detection to the next, where there is time for it and each of them is coded."""
+        return self._settings.detect_every
 
     @property
     def tracks(self) -> int:
@@ -133,7 +140,7 @@ class Analyzer:
         if detections is None:
             tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
             return AnalyzedFrame(frame, base_bgr, tracks, detected=False, picture=picture)
-        self._detected_index = frame.index
+        self._detected_index, self.detected_ns = frame.index, frame.capture_ns
         tracks = self._tracker.update(detections, frame_index=frame.index, image_bgr=pixels)
         return AnalyzedFrame(frame, base_bgr, tracks, detected=True, picture=picture)
 

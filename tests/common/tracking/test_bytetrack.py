@@ -333,6 +333,58 @@ def test_lost_tracks_are_remembered_in_frames_not_in_updates(
     assert tracks.ids.tolist() == ([1] if same else [2])
 
 
+@pytest.mark.parametrize("every_s", [1.0, 1.1, 1.5, 2.0, 3.0, 5.0])
+@pytest.mark.parametrize("predicted", [0, 2, None], ids=["none", "some", "all"])
+@pytest.mark.parametrize("lengths_per_s", [0.0, 0.1, 0.3])
+def test_a_slow_machine_lists_what_stands_or_moves_slowly(
+    every_s: float, predicted: int | None, lengths_per_s: float
+) -> None:
+    """With a detection in some seconds, a board would burn a core for nothing, and show nothing."""
+    tracker, fps = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15), 15
+    every = round(every_s * fps)
+    for k in range(12 * every):
+        moved = k / fps * lengths_per_s * 60
+        boxes = [(100 + moved, 100, 160 + moved, 140), (900 - moved, 300, 960 - moved, 340)]
+        if k % every == 0:
+            tracks = tracker.update(seen(*boxes, confidence=0.8), frame_index=k)
+        elif predicted is None or k % every <= predicted:
+            tracks = tracker.predict(frame_index=k)
+        assert tracks.ids.tolist() == [1, 2] or k < 2 * every
+    np.testing.assert_allclose(tracker.extrapolated(frame_index=12 * every).ids, [1, 2])
+
+
+@pytest.mark.parametrize("every", [17, 30, 60])
+def test_what_a_slow_machine_misses_once_keeps_its_id(every: int) -> None:
+    """A detector that misses an object now and then would give it a new id each time, listed a look too late."""
+    tracker, box = ByteTracker(fps=15), (100, 100, 140, 160)
+    found = [True, True, False, True, False, True, True, False, False, True]
+    listed = [
+        tracker.update(seen(box) if one else Detections.none(), frame_index=k * every).ids.tolist()
+        for k, one in enumerate(found)
+    ]
+    assert listed == [[1] if one else [] for one in found]
+
+
+def test_what_drove_and_has_stopped_is_found_again_by_a_slow_machine() -> None:
+    """Between two looks a car at a light would be carried across the crossing, and be another one afterwards."""
+    tracker = ByteTracker(fps=15)
+    ids = [
+        tracker.update(seen((x, 100, x + 100, 150)), frame_index=30 * look).ids.tolist()
+        for look, x in enumerate([0, 150, 300, 450, 600, 600, 600])
+    ]
+    assert ids == [[1]] * 7
+
+
+def test_nothing_is_listed_of_a_picture_that_is_long_past() -> None:
+    """With a detector that fails, boxes of a minute ago would be shown as if of now."""
+    tracker, box = ByteTracker(fps=15), (100, 100, 140, 160)
+    for k in range(0, 30, 5):
+        tracker.update(seen(box), frame_index=k)
+    listed = [len(tracker.predict(frame_index=k)) for k in range(30, 300)]
+    assert listed[:100] == [1] * 100
+    assert listed[-60:] == [0] * 60
+
+
 def test_a_long_interruption_ends_all_tracks() -> None:
     """After an outage, objects would get the ids of others that stood there a minute ago."""
     tracker, box = ByteTracker(fps=15), (100, 100, 140, 160)

@@ -8,14 +8,17 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from hvt_common.values import Frame
+from hvt_common.inference.detect import Detector
+from hvt_common.values import Detections, Frame, Image
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.source.contract import Source
@@ -75,7 +78,14 @@ def test_an_edge_says_how_it_is_from_its_start_to_its_flight(tmp_path, address):
         eventually(lambda: state(address), within_s=60, what="it answers")
         waits = state(address)
         assert (waits["state"], waits["frames"]["captured"]) == ("waiting", 0)
-        unknown = ("total_bps", "budget_share", "encode_ms", "perception_ms", "source_silent_s")
+        unknown = (
+            "total_bps",
+            "budget_share",
+            "encode_ms",
+            "perception_ms",
+            "boxes_age_s",
+            "source_silent_s",
+        )
         assert {waits[name] for name in unknown} == {None}, "what is unknown is not 0"
         assert waits["link"]["round_trip_ms"] is waits["link"]["reported_s"] is None
         assert asked(address, "/healthz") == (200, "ok; it waits for a ground\n")
@@ -201,3 +211,52 @@ def test_a_loop_that_hangs_tells_nobody_that_it_lives(tmp_path, address, free_po
         end.set()
         thread.join(60)
     assert not thread.is_alive()
+
+
+class SlowDetector(Detector):
+    """Sees one object, and takes its time."""
+
+    class_names = ("car",)
+
+    def detect(self, image_bgr: Image) -> Detections:
+        """See there."""
+        time.sleep(1.5)
+        return Detections(
+            np.array([[50, 50, 90, 80]], np.float32), np.array([0.9], np.float32), np.zeros(1, np.int32)
+        )
+
+
+class SlowWorld(World):
+    """With such a detector."""
+
+    def open_detector(self, config: EdgeConfig) -> Detector:
+        """See there."""
+        return SlowDetector()
+
+
+def test_a_machine_too_slow_to_detect_says_how_old_its_boxes_are(address, free_port, capsys):
+    """Boxes of seconds ago would be taken for those of now, or none for a scene without objects."""
+    config = check(
+        EdgeConfig(
+            source="demo",
+            fps=5.0,
+            size=(320, 192),
+            method="M2",
+            listen=(f"tcp/127.0.0.1:{free_port}",),
+            wait=0.0,
+            metrics=address,
+        )
+    )
+    stop = threading.Event()
+    thread = threading.Thread(target=Edge(config, stop=stop, world=SlowWorld()).run, daemon=True)
+    thread.start()
+    try:
+        eventually(lambda: state(address).get("detection_slow"), within_s=60, what="it is said")
+        assert state(address)["boxes_age_s"] > 1
+        assert state(address)["tracks"] >= 1
+        assert series(address)["hvt_edge_boxes_age_seconds"] > 1
+        assert "s old" in status("--at", address).stdout
+    finally:
+        stop.set()
+        thread.join(60)
+    assert " s old: detection is too slow" in capsys.readouterr().err

@@ -19,7 +19,8 @@ over some detections, is its weight; the edge's counts `EDGE_CLASS_WEIGHT` times
 finer than the base. A still's opinion comes after, in `refine`, and stands above both.
 
 **How long.** The edge's knowledge ends when two steps in a row do not list the track, or nothing has been reported of
-it for `PATIENCE_S`; what only a still has shown ends so long after the still.
+it for `PATIENCE_S` or, where an edge is so slow that half of that passes from one step to the next, for twice the
+time between them; what only a still has shown ends so long after the still.
 
 **Who is believed.** What only the edge sees is listed where it is sure. What only we see has its silence against it:
 where a step shows nothing there, of a class that the edge can name, we have to be the surer the more of what is there
@@ -39,6 +40,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -107,6 +109,7 @@ class Fusion:
             half_life=HALF_LIFE_S * fps,
             edge_class_weight=EDGE_CLASS_WEIGHT / base_per_source,
         )
+        self._usual_patience = self._rules.patience
         self._forget = max(1, round(FORGET_S * fps))
         self._silence = EdgeSilence(edge_classes, fps=fps, still_frames=self._forget)
         self._entities: list[Entity] = []
@@ -159,6 +162,8 @@ class Fusion:
         frame_index = step.frame_index
         if frame_index <= self._stepped:
             return False
+        if self._stepped >= 0:
+            self._rules = replace(self._rules, patience=self._patience(frame_index - self._stepped))
         self._stepped = frame_index
         listed = {int(step.ids[row]): row for row in _usable(step, classes=len(self._edge_classes))}
         fresh = [row for edge_id, row in listed.items() if edge_id not in self._by_edge]
@@ -218,6 +223,11 @@ class Fusion:
         return list_entities(self._entities, own, path=self._path, rules=self._rules, doubting=reporting)
 
     # Learning
+
+    def _patience(self, gap: int) -> int:
+        """For how long a step is believed, in frames, where the one before it came so many frames earlier."""
+        usual = self._usual_patience
+        return usual if 2 * gap <= usual else min(2 * gap, max(usual, self._forget))
 
     def _add(self, entity: Entity) -> Entity:
         self._entities.append(entity)

@@ -543,3 +543,16 @@ def test_random_scenes_never_list_an_object_twice_or_an_id_twice():
                 }
                 ground.step(index, step)
                 assert isinstance(ground.fusion.own_at(index), Tracks)
+
+
+@pytest.mark.parametrize("every_s", [0.3, 1.5, 3, 4.5])
+def test_what_a_slow_edge_reports_stays_listed_from_one_report_to_the_next(ground, every_s):
+    """An object that only the edge sees would vanish two seconds after each report, and come back with the next."""
+    every = round(15 * every_s)
+    for index in range(6 * every):
+        if index % every == 0:
+            ground.step(index, {7: A})
+        fused = ground.own(index, {})
+        assert fused.origins == ("edge",) or index < 2 * every
+    gone = [len(ground.own(index, {}).origins) for index in range(6 * every, 6 * every + 300)]
+    assert gone[-100:] == [0] * 100
