@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -14,7 +13,6 @@ __all__ = [
     "SECOND_NS",
     "Limit",
     "bitrate_text",
-    "counts_text",
     "exact_rate",
     "parse_bitrate",
     "parse_bytes",
@@ -130,12 +128,6 @@ def parse_share(text: str, *, name: str) -> float:
 def bitrate_text(bps: float) -> str:
     """800000 → ``800 kbps``."""
     return f"{bps / 1e6:.2f} Mbps" if bps >= 1e6 else f"{bps / 1e3:.0f} kbps"
-
-
-def counts_text(counts: Mapping[str, int], *, most: int | None = None) -> str:
-    """``49 base_good, 3 border``: the most frequent first, ``most`` of them."""
-    ordered = sorted(counts.items(), key=lambda one: (-one[1], one[0]))
-    return ", ".join(f"{count} {name}" for name, count in ordered[:most])
 
 
 def exact_rate(fps: float) -> Fraction:

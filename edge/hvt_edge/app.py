@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 from hvt_common.errors import FlightError, UserError, needs_extra
@@ -180,6 +181,7 @@ class Edge:
     ) -> None:
         """Take one frame after the other; once a second report."""
         next_status_ns = restarts = 0
+        self._counts.begin(source)
         with ExitStack() as stack:
             if source.live:
                 stack.enter_context(closing_on(self._stop, source))
@@ -194,6 +196,7 @@ class Edge:
                 if frame is not None:
                     self._counts.newest_came_ns = self._world.clock()
                 pace.step(frame, missed=source.missed)
+                self._counts.note_source(source)
                 self._step_pose(stages, frame)
                 del frame  # 9 MB at 1080p, while the next is read
                 now_ns = self._loop_clock()
@@ -236,6 +239,7 @@ class Edge:
                 has_ground=link.has_ground,
                 stop=self._stop,
                 executor=self._world.executor,
+                has_viewer=partial(link.has_subscriber, Channel.BASE),
             )
         return RealtimePace(
             stages.base,
@@ -248,6 +252,7 @@ class Edge:
             stop=self._stop,
             failures=self._failures,
             before_frame=stages.link_control.before_frame,
+            has_viewer=partial(link.has_subscriber, Channel.BASE),
         )
 
     def _wait_until(self, at_ns: int) -> None:
@@ -321,19 +326,14 @@ class Edge:
 
     def _summary(self, stages: Stages, link: EdgeLink) -> dict[str, Any]:
         counts, config, backlog, now = self._counts, self._config, stages.backlog, stages.operating.now
-        stored = 0 if backlog is None else backlog.frames
         return summary(
             self.ledger,
             edge=config.edge_id,
             session=f"{self._world.session_id:016x}",
             method=now.method,
             levers=now.levers.says,
-            frames=counts.encoded - stored,
-            frames_stored=stored,
-            frames_captured=counts.captured,
-            frames_dropped=counts.dropped,
-            frames_dropped_cpu=counts.dropped_cpu,
-            frames_unanalyzed=counts.unanalyzed,
+            frames=counts.account(coded_fps=config.nominal_fps / now.decimation, auto_fps=config.auto_fps),
+            unanalyzed=counts.unanalyzed,
             clip_paused_s=counts.paused_ns / SECOND_NS,
             cores=counts.cpu.short,
             duration_s=counts.duration_s(config.nominal_fps),

@@ -15,7 +15,7 @@ from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.doctor import command as doctor
 from hvt_edge.health import watch
-from hvt_edge.summary import table, title
+from hvt_edge.summary import in_vain, table, title
 from hvt_edge.world import World
 
 __all__ = ["main", "program"]
@@ -28,7 +28,7 @@ _DESCRIPTION = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the edge; return 0, or 2 after a sentence on what is wrong."""
+    """Run the edge; return 0, 1 where nobody received a picture of it, or 2 after a sentence on what is wrong."""
     return exit_with_sentence(_run, program="hvt-edge", argv=argv)
 
 
@@ -68,7 +68,7 @@ def _run(argv: Sequence[str] | None) -> int:
             print_table(title(content), table(content))
         if config.summary is not None:
             write_json(config.summary, content)
-    return 0
+    return 1 if in_vain(content) else 0
 
 
 if __name__ == "__main__":

@@ -143,9 +143,9 @@ class StatusReporter:
             deferred=account.outcomes["deferred"],
             dropped=account.outcomes["dropped"],
             health=Health(
-                frames_captured=frames.captured,
+                frames_captured=frames.account.came,
                 frames_encoded=frames.encoded,
-                frames_dropped=frames.dropped,
+                frames_dropped=frames.account.dropped,
                 keyframes=state.keyframes,
                 tracks=state.tracks,
                 base_queue=0,  # the base stream has no queue: frames are dropped before they are encoded
@@ -153,7 +153,7 @@ class StatusReporter:
                 encode_ms=(state.encode_ms or 0.0) if measured else 0.0,
                 detect_ms=(state.perception_ms or 0.0) if measured else 0.0,
                 feedback_age_ms=round(1000 * reported_s) if measured and reported_s is not None else -1,
-                frames_dropped_cpu=frames.dropped_cpu,
+                frames_dropped_cpu=frames.account.groups.get("processor", 0),
                 frames_unanalyzed=frames.unanalyzed,
                 cores_needed=(state.cores_needed or 0.0) if measured else 0.0,
                 cores_free=(state.cores_free or 0.0) if measured else 0.0,
@@ -169,6 +169,9 @@ class StatusReporter:
                 for one in self.failures.parts[:MOST_FAILED_PARTS]
             ),
             levers=levers,
+            frames=frames.account.as_counts(),
+            coded_fps=frames.account.coded_fps,
+            auto_fps=frames.account.auto_fps,
         )
 
 
@@ -179,6 +182,7 @@ def status_text(state: EdgeState, *, paused_s: float = 0.0) -> str:
         f"{state.edge} {state.duration_s:6.1f} s",
         f"{bitrate_text(state.total_bps or 0)} of {bitrate_text(operating.allowed_bps)}",
         f"auto, {state.method}" if operating.profile == "auto" else state.method,
+        str(state.frames.account),
         f"stills {state.stills_sent}, {state.stills_pending} pending",
         f"tracks {state.tracks}",
         _link_text(link),
@@ -189,8 +193,6 @@ def status_text(state: EdgeState, *, paused_s: float = 0.0) -> str:
         parts.append(state.levers.says)
     if state.detection_slow:
         parts.append(f"boxes {state.boxes_age_s:.1f} s old: detection is too slow")
-    if state.frames.dropped_cpu:
-        parts.append(f"{state.frames.dropped_cpu} frames dropped: slow machine")
     if paused_s:
         parts.append(f"clip {paused_s:.0f} s longer: slow machine")
     parts += [f"{one.part.upper()} FAILED" for one in state.failed]

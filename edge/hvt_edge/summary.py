@@ -6,13 +6,15 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
+from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.still_words import counts_text
 from hvt_common.runtime.failures import Failure
 from hvt_common.units import bitrate_text
 from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.loop.cpu import Cores
 
-__all__ = ["summary", "table", "title"]
+__all__ = ["in_vain", "summary", "table", "title"]
 
 
 _RATES = (
@@ -25,6 +27,8 @@ def summary(
     ledger: Ledger,
     *,
     duration_s: float,
+    frames: FrameAccount,
+    unanalyzed: int,
     cores: Cores,
     store: StoreNumbers | None,
     failed: tuple[Failure, ...],
@@ -32,8 +36,9 @@ def summary(
 ) -> dict[str, Any]:
     """The JSON summary; rates count every byte on the line: payload, attachments, transport overhead.
 
-    ``duration_s`` is from the first frame sent to the last, by their capture; ``cores`` of the times in which frames
-    were left out for want of time. ``facts`` are numbers that the ledger does not hold, as they are.
+    ``duration_s`` is from the first frame sent to the last, by their capture; ``frames`` says what became of each;
+    perception skipped ``unanalyzed`` of those that came to it; ``cores`` are of the times in which frames were left
+    out for want of time. ``facts`` are numbers that the ledger does not hold, as they are.
     """
     account = ledger.summary(duration_s)
     reasons = {outcome: account.outcomes[outcome] for outcome in ("sent", "deferred", "dropped")}
@@ -45,6 +50,13 @@ def summary(
     return {
         **{name: round(fact, 2) if isinstance(fact, float) else fact for name, fact in facts.items()},
         "duration_s": round(duration_s, 3),
+        "frames": frames.groups.get("sent", 0) + frames.groups.get("nobody_listened", 0),
+        "frames_stored": frames.groups.get("stored", 0),
+        "frames_captured": frames.came,
+        "frames_dropped": frames.dropped,
+        "frames_dropped_cpu": frames.groups.get("processor", 0),
+        "frames_unanalyzed": unanalyzed,
+        "frame_account": frames.as_dict(),
         **{name: getattr(account, name) for name in _RATES},
         "replies": ledger.replies,
         "reply_bytes": ledger.reply_bytes,
@@ -57,14 +69,23 @@ def summary(
     }
 
 
+def in_vain(content: dict[str, Any]) -> bool:
+    """Whether pictures were made of which nobody received one, and none is stored for later."""
+    return bool(content["unreached"] and content["frames"] and not content["frames_stored"])
+
+
 def title(content: dict[str, Any]) -> str:
-    """Of the table: it counts what would have been sent where nobody took it."""
-    sent = f"NOT SENT ({content['unreached']})" if content["unreached"] else "sent"
-    return f"{content['edge']}: {sent}"
+    """Of the table."""
+    edge, why = content["edge"], content["unreached"]
+    if in_vain(content):
+        return f"{edge}: NOT SENT ({why}): 0 bytes received"
+    if why and not content["frames_stored"]:
+        return f"{edge}: ended before its first picture ({why})"
+    return f"{edge}: stored for later ({why})" if why else f"{edge}: sent"
 
 
 def table(content: dict[str, Any]) -> list[tuple[str, str]]:
-    """The same as rows of name and value."""
+    """The same as rows of name and value; of what nobody received only what it would have been."""
     stills, worst = content["stills"], content["worst_window_bps"]
     total = content["total_bps"]
     share = f"{total / content['budget_bps']:.0%} of {bitrate_text(content['budget_bps'])}"
@@ -74,18 +95,27 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
             "method",
             f"auto, {content['method']}: {content['levers']}" if content["levers"] else content["method"],
         ),
-        ("frames", f"{content['frames']} in {content['duration_s']:.1f} s"),
-        *_left_out(content),
+        ("frames", f"{content['frame_account']['text']}; {content['duration_s']:.1f} s"),
+        *_too_slow(content),
+    ]
+    failed = [("failed", _failure(one)) for one in content["failed"]]
+    if in_vain(content):
+        return [
+            *rows,
+            ("total", f"0 bytes received; {bitrate_text(total)} would have been, {share}"),
+            *failed,
+        ]
+    rows += [
         ("total", f"{bitrate_text(total)}, {share}; fullest window {bitrate_text(worst['total'])}"),
         ("base", f"{bitrate_text(content['base_bps'])}; fullest window {bitrate_text(worst['base'])}"),
         ("stills", f"{bitrate_text(content['roi_bps'])}; fullest window {bitrate_text(worst['roi'])}"),
         ("stills sent", f"{sent}{_reasons(stills['reasons']['sent'])}"),
-        ("deferred", f"{stills['deferred']}{_reasons(stills['reasons']['deferred'])}"),
-        ("dropped", f"{stills['dropped']}{_reasons(stills['reasons']['dropped'])}"),
+        ("not sent yet", f"{stills['deferred']}{_reasons(stills['reasons']['deferred'])}"),
+        ("not sent", f"{stills['dropped']}{_reasons(stills['reasons']['dropped'])}"),
         ("tracks", str(content["tracks"])),
         ("keyframes", f"{content['keyframes']}, {content['keyframe_requests']} asked for by a ground"),
     ]
-    return rows + _store_rows(content["store"]) + [("failed", _failure(one)) for one in content["failed"]]
+    return rows + _store_rows(content["store"]) + failed
 
 
 def _clock_time(at_ns: int) -> str:
@@ -98,20 +128,16 @@ def _failure(one: dict[str, Any]) -> str:
     return f"{one['part']} at {one['failed_at']}{times}: {one['reason']}{again}"
 
 
-def _left_out(content: dict[str, Any]) -> list[tuple[str, str]]:
-    """Why frames were not coded or not analyzed."""
-    captured, cpu, skipped = (content[f"frames_{name}"] for name in ("captured", "dropped_cpu", "unanalyzed"))
-    needed, free = content["cores_needed"], content["cores_free"]
-    cores = f": encoder and detector need {needed:.1f} cores, {free:.1f} were free" if needed else ""
+def _too_slow(content: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the machine had no time for, and what it would have needed."""
     rows = []
-    if link := content["frames_dropped"] - cpu:
-        rows.append(("", f"{link} of {captured} frames dropped: the link had no room"))
-    if cpu:
-        rows.append(("", f"{cpu} of {captured} frames dropped{cores}"))
+    if skipped := content["frames_unanalyzed"]:
+        rows.append(("", f"{skipped} of {content['frames_captured']} frames not analyzed"))
     if longer := content["clip_paused_s"]:
         rows.append(("", f"the clip took {longer:.0f} s longer than it is: this machine is too slow for it"))
-    if skipped:
-        rows.append(("", f"{skipped} of {captured} frames not analyzed{'' if cpu else cores}"))
+    needed, free = content["cores_needed"], content["cores_free"]
+    if needed and (skipped or content["frames_dropped_cpu"]):
+        rows.append(("", f"encoder and detector need {needed:.1f} cores, {free:.1f} were free"))
     return rows
 
 
@@ -127,7 +153,4 @@ def _store_rows(store: dict[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def _reasons(counts: dict[str, int]) -> str:
-    if not counts:
-        return ""
-    ordered = sorted(counts.items(), key=lambda item: -item[1])
-    return " (" + ", ".join(f"{reason} {count}" for reason, count in ordered) + ")"
+    return f" ({counts_text(counts)})" if counts else ""

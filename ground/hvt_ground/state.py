@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from hvt_common import __version__
+from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.messages import WIRE_VERSION, Status
 from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.units import SECOND_NS
@@ -22,13 +23,13 @@ from hvt_ground.session.session import GroundSession
 __all__ = ["EdgeState", "GroundState", "LinkState", "StateMaker"]
 
 LinkState = Literal["waiting", "up", "thin", "lost", "ended"]
-"""``waiting`` for a keyframe to begin with; ``up``; ``thin``: the edge leaves frames out for want of link; ``lost``:
-nothing has come for `LOST_S`; ``ended``: the edge said so, or stayed away."""
+"""``waiting`` for a keyframe to begin with; ``up``; ``thin``: the edge leaves frames out that the link does not
+carry; ``lost``: nothing has come for `LOST_S`; ``ended``: the edge said so, or stayed away."""
 
 LOST_S = 3.0
 """A report comes once a second: nothing for so long is no accident."""
 _THIN_S = 5.0
-"""So long after the last frame that was left out for want of link it counts as thin."""
+"""So long after the last frame that the link did not carry it counts as thin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +104,8 @@ class SessionState:
     backlog_video_s: float
     backlog_working: int
     """Objects of the backlog that have come and are not where they belong yet."""
+    edge_frames: FrameAccount | None
+    """What became of each of the edge's source frames; None also where an earlier edge does not say."""
     edge_frames_dropped: int | None
     """At the edge before encoding, all; None before its first report, as all below."""
     edge_frames_dropped_cpu: int | None
@@ -153,7 +156,11 @@ class GroundState:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return asdict(self)
+        found = asdict(self)
+        for one, made in zip(self.edges, found["edges"], strict=True):
+            if one.session is not None and one.session.edge_frames is not None:
+                made["session"]["edge_frames"] = one.session.edge_frames.as_dict()
+        return found
 
 
 class StateMaker:
@@ -175,7 +182,7 @@ class StateMaker:
         self._failures = failures
         self._links: dict[str, tuple[LinkState, int]] = {}
         self._left_out: dict[str, tuple[str, int, int]] = {}
-        """By edge: session, frames that it left out for want of link, and when that last rose."""
+        """By edge: session, frames that the link did not carry, and when that last rose."""
 
     def make(self, edges: Iterable[tuple[str, EdgeSessions]]) -> GroundState:
         """The state now."""
@@ -235,8 +242,8 @@ class StateMaker:
 
 
 def _left_out(status: Status | None) -> int:
-    """Frames that the edge dropped because the link had no room."""
-    return 0 if status is None else status.health.frames_dropped - status.health.frames_dropped_cpu
+    """Frames that the link did not carry; of an earlier edge, which does not tell, none."""
+    return 0 if status is None else status.frame_account.groups.get("link", 0)
 
 
 def _pose(session: GroundSession) -> PoseState | None:
@@ -292,6 +299,7 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
         backlog_stills=totals.stills,
         backlog_video_s=totals.video_s,
         backlog_working=sessions.backlog.working,
+        edge_frames=None if status is None or not status.frames else status.frame_account,
         edge_frames_dropped=None if health is None else health.frames_dropped,
         edge_frames_dropped_cpu=None if health is None else health.frames_dropped_cpu,
         edge_encode_ms=None if health is None else health.encode_ms,

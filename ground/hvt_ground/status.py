@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from hvt_common.protocol.still_words import counts_text
 from hvt_common.runtime.failures import FailedPart, Failures
-from hvt_common.units import bitrate_text, counts_text
+from hvt_common.units import bitrate_text
 from hvt_ground.events import Event
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
@@ -46,6 +47,7 @@ def summary(session: GroundSession) -> dict[str, Any]:
     """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do."""
     info, pipeline, counters = session.info, session.pipeline, session.counters
     account = session.ledger.summary(session.duration_s)
+    status = session.last_status
     worst = account.worst_window_bps
     unread = pipeline.outcomes.get("unread", 0)
     backlog = session.backlog.totals
@@ -57,6 +59,7 @@ def summary(session: GroundSession) -> dict[str, Any]:
         "frames": session.frames_received,
         "frames_decoded": session.frames_decoded,
         "frames_untracked": session.frames_untracked,
+        "edge_frames": None if status is None or not status.frames else status.frame_account.as_dict(),
         "duration_s": round(session.duration_s, 3),
         "base_bytes": account.base_bytes,
         "roi_bytes": account.roi_bytes,
@@ -161,6 +164,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("session", f"{content['session']}, {content['method']}"),
         ("frames", f"{content['frames_decoded']} decoded in {content['duration_s']:.1f} s, {lossless}"),
+        *([("", f"at the edge {content['edge_frames']['text']}")] if content["edge_frames"] else []),
         (
             "total",
             f"{bitrate_text(content['total_bps'])}, {share}; fullest window {bitrate_text(worst['total'])}",

@@ -2,10 +2,38 @@
 
 from __future__ import annotations
 
+from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failure
 from hvt_edge.loop.cpu import Cores
-from hvt_edge.summary import summary, table
+from hvt_edge.summary import in_vain, summary, table, title
+
+
+def summary_of(**changed):
+    """Of a short flight."""
+    facts = {
+        "edge": "uav-1",
+        "session": "0",
+        "method": "M6",
+        "levers": "no tracks: 0 objects the base does not show; stills changed 2 of 3",
+        "frames": FrameAccount({"sent": 9}),
+        "unanalyzed": 0,
+        "clip_paused_s": 0.0,
+        "cores": Cores(needed=1.63, free=1.1),
+        "duration_s": 5.3,
+        "budget_bps": 800_000,
+        "budget_base_bps": 650_000,
+        "keyframes": 1,
+        "keyframe_requests": 0,
+        "tracks": 0,
+        "encode_ms": 20.0,
+        "perception_ms": 50.0,
+        "unusable_messages": 0,
+        "unreached": "",
+        "store": None,
+        "failed": (),
+    }
+    return summary(Ledger(), **{**facts, **changed})
 
 
 def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
@@ -13,35 +41,42 @@ def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
     failure = Failure(
         "local copy", "card.mkv is full", 3, 1_790_000_000 * 10**9, 1_790_000_000 * 10**9, working=True
     )
-    content = summary(
-        Ledger(),
-        edge="uav-1",
-        session="0",
-        method="M6",
-        levers="no tracks: 0 objects the base does not show; stills changed 2 of 3",
-        frames=9,
-        frames_captured=80,
-        frames_dropped=70,
-        frames_dropped_cpu=66,
-        frames_unanalyzed=8,
+    content = summary_of(
+        frames=FrameAccount({"sent": 9, "frame_rate": 1, "link": 1, "budget": 3, "processor": 66}, 7.5, True),
+        unanalyzed=8,
         clip_paused_s=14.2,
-        cores=Cores(needed=1.63, free=1.1),
-        duration_s=5.3,
-        budget_bps=800_000,
-        budget_base_bps=650_000,
-        keyframes=1,
-        keyframe_requests=0,
-        tracks=0,
-        encode_ms=20.0,
-        perception_ms=50.0,
-        unusable_messages=0,
-        store=None,
         failed=(failure,),
     )
     said = [text for _, text in table(content)]
     assert said[0] == "auto, M6: no tracks: 0 objects the base does not show; stills changed 2 of 3"
-    assert "66 of 80 frames dropped: encoder and detector need 1.6 cores, 1.1 were free" in said
-    assert "4 of 80 frames dropped: the link had no room" in said
+    assert said[1] == (
+        "80 frames came: 9 sent, 1 left out by auto's 7.5 a second, 3 had no room in the budget, "
+        "1 the link did not carry, 66 the processor had no time for; 5.3 s"
+    )
+    assert "encoder and detector need 1.6 cores, 1.1 were free" in said
     assert "the clip took 14 s longer than it is: this machine is too slow for it" in said
     assert "8 of 80 frames not analyzed" in said
     assert said[-1] == "local copy at 2026-09-21T14:13:20+00:00, 3 times: card.mkv is full; works again"
+
+
+def test_a_flight_that_nobody_received_claims_no_bytes():
+    """Who flies would read 800 kbps under NOT SENT and look for the fault at the ground."""
+    content = summary_of(
+        frames=FrameAccount({"nobody_listened": 150}), unreached="nobody subscribed to its video"
+    )
+    assert in_vain(content)
+    assert title(content) == "uav-1: NOT SENT (nobody subscribed to its video): 0 bytes received"
+    rows = dict(table(content))
+    assert rows["frames"] == "150 frames came: 150 coded while nobody listened; 5.3 s"
+    assert rows["total"].startswith("0 bytes received")
+    assert not {"base", "stills", "stills sent"} & rows.keys()
+
+
+def test_what_is_stored_for_later_is_no_flight_in_vain():
+    """A recorder that works as meant would be called failed by systemd."""
+    stored = summary_of(frames=FrameAccount({"stored": 150}), unreached="nobody subscribed to its video")
+    assert not in_vain(stored)
+    assert title(stored) == "uav-1: stored for later (nobody subscribed to its video)"
+    unborn = summary_of(frames=FrameAccount(), unreached="nobody subscribed to its video")
+    assert not in_vain(unborn)
+    assert title(unborn) == "uav-1: ended before its first picture (nobody subscribed to its video)"

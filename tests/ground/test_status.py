@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.messages import Info, Status
 from hvt_common.runtime.failures import Failures
 from hvt_ground.session.edge_sessions import EdgeSessions
@@ -68,12 +69,12 @@ def ground(tmp_path: Path) -> Ground:
 
 def test_who_gets_no_stills_reads_why(ground):
     """49 stills that the base made needless looked like a fault of the link."""
-    assert "stills 0 (not sent: 49 base_good, 3 cooldown)" in ground.line()
+    assert "stills 0 (not sent: 49 the video already shows well, 3 sent a moment ago)" in ground.line()
     ground.sessions.close()
     ground.outputs.close()
     content = summary(ground.ended[0])
     assert content["stills"]["reasons"]["not_sent"] == {"base_good": 49, "cooldown": 3, "too_large": 1}
-    said = "49 base_good, 3 cooldown, 1 too_large"
+    said = "49 the video already shows well, 3 sent a moment ago, 1 too large for the budget"
     assert said in dict(table(content))["stills"]
     assert f"stills that the edge did not send: {said}" in [
         text for _, _, text in Recording(ground.path).events()
@@ -137,25 +138,22 @@ def test_the_state_says_what_is_known_and_nothing_else(ground):
 
 
 def test_an_edge_that_leaves_frames_out_is_on_a_thin_link(ground):
-    """Frames lost to the link and frames lost to a slow machine want different remedies."""
+    """Frames that the link did not carry, the budget left out, or a slow machine missed want different remedies."""
     flight, now_ns = ground.port.flight, [time.time_ns()]
     maker = StateMaker(lambda: now_ns[0])
 
-    def link_after(sequence: int, *, dropped: int, dropped_cpu: int) -> str:
+    def link_after(sequence: int, **groups: int) -> str:
         item = flight.status(base=5)
         report = Status.parse(item.payload)
-        health = replace(report.health, frames_dropped=dropped, frames_dropped_cpu=dropped_cpu)
-        report = replace(report, sequence=sequence, health=health)
+        report = replace(report, sequence=sequence, frames=FrameAccount(groups).as_counts())
         ground.sessions.handle(replace(item, payload=report.pack()))
         now_ns[0] += 10**9
         return maker.make([("uav-1", ground.sessions)]).edges[0].link
 
-    assert link_after(100, dropped=0, dropped_cpu=0) == "up"
-    assert link_after(101, dropped=4, dropped_cpu=4) == "up"
-    assert link_after(102, dropped=7, dropped_cpu=4) == "thin"
-    assert [link_after(number, dropped=7, dropped_cpu=4) for number in range(103, 108)] == ["thin"] * 4 + [
-        "up"
-    ]
+    assert link_after(100, sent=10) == "up"
+    assert link_after(101, sent=11, processor=4, budget=7) == "up"
+    assert link_after(102, sent=12, link=3) == "thin"
+    assert [link_after(number, sent=13, link=3) for number in range(103, 108)] == ["thin"] * 4 + ["up"]
 
 
 def test_a_state_can_be_written_as_json(ground):

@@ -25,12 +25,12 @@ def full_disk() -> int:
     return os.open("/dev/full", os.O_WRONLY)
 
 
-def play(module: str, *words: str, folder: Path, output: int) -> object:
-    """Run a program with both outputs going there; return the summary of a good end."""
+def play(module: str, *words: str, folder: Path, output: int, code: int = 0) -> object:
+    """Run a program with both outputs going there, to its end with ``code``; return the summary."""
     command = [sys.executable, "-m", module, *words, "--summary", "s.json"]
     with os.fdopen(output, "wb") as file:
         done = subprocess.run(command, cwd=folder, stdout=file, stderr=file, timeout=60, check=False)
-    assert done.returncode == 0
+    assert done.returncode == code
     return json.loads((folder / "s.json").read_text())
 
 
@@ -39,8 +39,8 @@ def test_an_edge_flies_on_when_nobody_reads_its_status(scene, tmp_path, free_por
     """The video would end with the terminal, or the log's disk, from which the drone was started."""
     edge = ("--source", str(scene), "--size", "320x180", "--preset", "ultrafast", "--max-frames", "40")
     link = ("--connect", f"tcp/127.0.0.1:{free_port}", "--wait", "0s", "--pace", "lockstep")
-    summary = play("hvt_edge.cli", *edge, *link, folder=tmp_path, output=output())
-    assert summary["frames"] == 40
+    summary = play("hvt_edge.cli", *edge, *link, folder=tmp_path, output=output(), code=1)
+    assert summary["frame_account"]["nobody_listened"] == summary["frames"] == 40
 
 
 def test_a_ground_serves_on_when_nobody_reads_its_status(tmp_path, free_port):

@@ -100,7 +100,7 @@ class BacklogStage:
         self._segment_ns: int | None = None
         self._probed_ns = 0
         self.frames = 0
-        """Stored and not sent."""
+        """Stored, to be sent later; those included that went out too, to find out whether the link is back."""
         self.folder, self.max_bytes = store.path, store.max_bytes
         self.breaks = 0
         """How often what was in flight has been taken for lost."""
@@ -150,16 +150,17 @@ class BacklogStage:
         """Whether what is stored goes on from a keyframe without a hole."""
         return self._segment_ns is not None
 
-    def base(self, unit: AccessUnit, *, now_ns: int, sent: bool = False) -> None:
-        """Store a frame; ``sent``: it goes out too."""
+    def base(self, unit: AccessUnit, *, now_ns: int, sent: bool = False) -> bool:
+        """Store a frame; ``sent``: it goes out too. False where the store does not take it."""
         if sent:
             self._probed_ns = now_ns
-        else:
-            self.frames += 1
         if unit.keyframe:
             self._segment_ns = now_ns
-        if not self._worker.offer(unit):
+        taken = self._worker.offer(unit)
+        self.frames += taken
+        if not taken:
             self._segment_ns = None  # what follows can be shown from a keyframe on only
+        return taken
 
     def probe_due(self, now_ns: int) -> bool:
         """Whether the next frame should be sent too: without any, no ground can show that the link is back."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 
+from hvt_common.protocol.frame_account import FrameGroup
 from hvt_common.protocol.messages import Feedback
 from hvt_common.runtime.failures import Failures
 from hvt_edge.backlog.outage import BaseInFlight
@@ -85,6 +86,10 @@ class LinkControl:
             return True
         wait_ns = self.transmitter.base_wait_ns(now_ns, line_bytes=line_bytes)
         return self.pacer.admits_base(now_ns) and wait_ns <= _MOST_WAIT_NS
+
+    def holder(self, now_ns: int) -> FrameGroup:
+        """What has no room for a frame that `admits` has just held back."""
+        return "link" if self.pacer is not None and self.pacer.holds(now_ns) else "budget"
 
     def finish(
         self,

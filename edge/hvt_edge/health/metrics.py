@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from prometheus_client.core import Metric
 
+from hvt_common.protocol.frame_account import FRAME_GROUPS
 from hvt_common.runtime.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
 from hvt_common.units import SECOND_NS
 from hvt_edge.health.state import BacklogState, EdgeState
@@ -33,10 +34,13 @@ _GAUGES: Table[EdgeState] = {
     "hvt_edge_wireless_dbm": ("Level of the signal.", lambda one: one.system.wireless_dbm),
 }
 _COUNTERS: Table[EdgeState] = {
-    "hvt_edge_frames_captured": ("Of the source.", lambda one: one.frames.captured),
+    "hvt_edge_frames_captured": ("Of the source.", lambda one: one.frames.account.came),
     "hvt_edge_frames_encoded": ("Pictures.", lambda one: one.frames.encoded),
-    "hvt_edge_frames_dropped": ("Before encoding.", lambda one: one.frames.dropped),
-    "hvt_edge_frames_dropped_cpu": ("Of these, for want of CPU.", lambda one: one.frames.dropped_cpu),
+    "hvt_edge_frames_dropped": ("Before encoding.", lambda one: one.frames.account.dropped),
+    "hvt_edge_frames_dropped_cpu": (
+        "Of these, for want of CPU.",
+        lambda one: one.frames.account.groups.get("processor", 0),
+    ),
     "hvt_edge_frames_unanalyzed": ("Skipped by perception.", lambda one: one.frames.unanalyzed),
     "hvt_edge_keyframes": ("Keyframes.", lambda one: one.keyframes),
     "hvt_edge_keyframe_requests": ("Of grounds, served.", lambda one: one.keyframe_requests),
@@ -81,7 +85,10 @@ def _metrics(state: EdgeState) -> Iterator[Metric]:
     not_sent = Counter("hvt_stills_not_sent", "Candidates without a still.", labels=("edge", "reason"))
     for reason, count in state.stills_not_sent.items():
         not_sent.add_metric((edge, reason), count)
-    yield from (sent, failed, not_sent)
+    groups = Counter("hvt_edge_frames", "Source frames: what became of them.", labels=("edge", "group"))
+    for group in FRAME_GROUPS:
+        groups.add_metric((edge, group), state.frames.account.groups.get(group, 0))
+    yield from (sent, failed, not_sent, groups)
     yield from of_table(_GAUGES, Gauge, [(edge, state)])
     yield from of_table(_COUNTERS, Counter, [(edge, state)])
     stores = [] if state.backlog is None else [(edge, state.backlog)]

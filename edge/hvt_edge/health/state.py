@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 from hvt_common import __version__
 from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.protocol.messages import WIRE_VERSION
 from hvt_common.runtime.failures import FailedPart, Failures
@@ -74,19 +75,11 @@ class OperatingState:
 class Frames:
     """Since the start."""
 
-    captured: int
+    account: FrameAccount
+    """What became of each."""
     encoded: int
-    dropped_link: int
-    """Before encoding: the link had no room."""
-    dropped_cpu: int
-    """Before encoding: the machine was behind."""
     unanalyzed: int
     """Skipped by perception for want of time."""
-
-    @property
-    def dropped(self) -> int:
-        """Before encoding, all."""
-        return self.dropped_link + self.dropped_cpu
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +185,9 @@ class EdgeState:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return asdict(self)
+        found = asdict(self)
+        found["frames"] |= {"account": self.frames.account.as_dict()}
+        return found
 
 
 def lacks(state: EdgeState, *, patience_s: float) -> str:
@@ -268,10 +263,10 @@ class StateMaker:
             meta_bps=self._bps(Account.META),
             budget_share=None if total_bps is None else total_bps / now.total_bps,
             frames=Frames(
-                captured=counts.captured,
+                account=counts.account(
+                    coded_fps=config.nominal_fps / now.decimation, auto_fps=config.auto_fps
+                ),
                 encoded=counts.encoded,
-                dropped_link=counts.dropped_link,
-                dropped_cpu=counts.dropped_cpu,
                 unanalyzed=counts.unanalyzed,
             ),
             source_silent_s=None if came_ns is None else max(0.0, (now_ns - came_ns) / SECOND_NS),

@@ -7,8 +7,9 @@ from typing import Any
 
 from rich.table import Table
 
+from hvt_common.protocol.still_words import counts_text
 from hvt_common.runtime.status_command import StatusCommand
-from hvt_common.units import SECOND_NS, bitrate_text, counts_text
+from hvt_common.units import SECOND_NS, bitrate_text
 
 __all__ = ["run"]
 
@@ -66,8 +67,7 @@ def _stills(state: dict[str, Any]) -> str:
 def _frames(state: dict[str, Any]) -> str:
     frames = state["frames"]
     return _listed(
-        f"{frames['captured']} captured, {frames['encoded']} coded",
-        f"dropped {frames['dropped_link']} for the link and {frames['dropped_cpu']} for want of CPU",
+        frames["account"]["text"],
         _known(state["source_silent_s"], "newest {:.1f} s ago"),
     )
 

@@ -139,10 +139,12 @@ class _PushGrabber:
     def __init__(self) -> None:
         self._news = threading.Condition()
         self._newest: tuple[Image, int] | None = None
+        self._replaced = 0
         self._opened = self._ended = False
 
     def put(self, frame_bgr: Image, capture_ns: int) -> None:
         with self._news:
+            self._replaced += self._newest is not None
             self._newest = frame_bgr, capture_ns
             self._news.notify_all()
 
@@ -175,7 +177,8 @@ class _PushGrabber:
             if self._newest is None:
                 raise SignalLost(f"no frame was pushed for {_PATIENCE_S:g} s")
             (frame_bgr, capture_ns), self._newest = self._newest, None
-        return Shot(lambda: frame_bgr, camera_ns=capture_ns)
+            replaced, self._replaced = self._replaced, 0
+        return Shot(lambda: frame_bgr, camera_ns=capture_ns, missed=replaced)
 
     def close(self) -> None:
         """There is no device."""

@@ -290,6 +290,14 @@ class Pacer:
                 self._flight.clear()
             return self._is_open(now_ns, _MOST_BACKLOG_NS)
 
+    def holds(self, now_ns: int) -> bool:
+        """Whether it is the link that leaves no room for a frame now, and not the budget's own rate."""
+        with self._lock:
+            if self._reported_ns is None:
+                return not self._may_start(now_ns)
+            silent = now_ns - self._reported_ns > _SILENCE_NS
+            return silent or not self.at_ceiling or self._overdue_ns(now_ns) > self._slack_ns
+
     def admits_still(self, now_ns: int) -> bool:
         """Whether a still may go now."""
         with self._lock:
@@ -303,9 +311,12 @@ class Pacer:
         return not _START_NS <= now_ns - self._started_ns < _START_NS + _START_HOLD_NS
 
     def _is_open(self, now_ns: int, most_backlog_ns: int) -> bool:
-        slack_ns = _SLACK_NS + 5 * self._held_ns // 4
         backlog_ns = self._flight.backlog_ns(now_ns=now_ns, rate_bps=self.rate_bps)
-        return backlog_ns <= most_backlog_ns and self._overdue_ns(now_ns) <= slack_ns
+        return backlog_ns <= most_backlog_ns and self._overdue_ns(now_ns) <= self._slack_ns
+
+    @property
+    def _slack_ns(self) -> int:
+        return _SLACK_NS + 5 * self._held_ns // 4
 
     def _overdue_ns(self, now_ns: int) -> int:
         oldest = self._flight.oldest

@@ -84,6 +84,8 @@ class Transmitter:
         self.base_sequence = -1
         """Of the last access unit sent; -1 before the first."""
         self.still_sequence = -1
+        self.base_waited_ns = 0
+        """How long base messages have waited for the budget's window, all together."""
         self._newest: StillEnvelope | None = None
         self._ended = False
 
@@ -113,6 +115,7 @@ class Transmitter:
                 self.pacer.sent_base(self.base_sequence, line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
             if self.in_flight is not None:
                 self.in_flight.sent(self.base_sequence, unit, now_ns=at_ns)
+        self.base_waited_ns += max(0, at_ns - now_ns)
         self.wait_until(at_ns)
         self.outlet.put(
             Channel.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Channel.BASE].encoding

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
+from hvt_common.protocol.frame_account import FrameAccount, FrameGroup
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame
 from hvt_edge.loop.cpu import CpuMeter
+from hvt_edge.source.contract import Source
+from hvt_edge.video.frame_decision import Action, FrameDecision
 
 __all__ = ["FrameCounts"]
 
@@ -15,12 +19,11 @@ __all__ = ["FrameCounts"]
 class FrameCounts:
     """Frames of one run."""
 
-    captured: int = 0
+    groups: Counter[FrameGroup] = field(default_factory=Counter)
+    """What became of the frames that came to the loop, each in one."""
+    source_groups: Counter[FrameGroup] = field(default_factory=Counter)
+    """Frames that did not come to it: damaged, or more than the base rate takes."""
     encoded: int = 0
-    dropped_link: int = 0
-    """Before encoding: the link had no room."""
-    dropped_cpu: int = 0
-    """Before encoding: the machine was behind."""
     unanalyzed: int = 0
     """Coded, or left out by frame decimation, and skipped by perception, because stills or detection were behind."""
     encode_ns: int = 0
@@ -32,13 +35,48 @@ class FrameCounts:
     first_capture_ns: int | None = None
     last_capture_ns: int = 0
     cpu: CpuMeter = field(default_factory=CpuMeter)
+    _source_before: tuple[int, int] = (0, 0)
     _measured: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
     """Captured, dropped for want of time, not analyzed, time of encoding and of perception when it was measured."""
 
     @property
-    def dropped(self) -> int:
-        """Before encoding."""
-        return self.dropped_link + self.dropped_cpu
+    def captured(self) -> int:
+        """Frames that came to the loop, those included that it was too slow for."""
+        return self.groups.total()
+
+    @property
+    def dropped_cpu(self) -> int:
+        """Before encoding: the machine was behind."""
+        return self.groups["processor"]
+
+    def account(self, *, coded_fps: float, auto_fps: bool) -> FrameAccount:
+        """What became of each source frame so far."""
+        return FrameAccount(dict(self.groups + self.source_groups), coded_fps, auto_fps)
+
+    def drop(self, group: FrameGroup, count: int = 1) -> None:
+        """So many frames were given up before anything was decided on them."""
+        if count:
+            self.groups[group] += count
+
+    def settle(
+        self, decision: FrameDecision, *, coded: bool, taken: bool = True, has_viewer: bool = True
+    ) -> None:
+        """A frame on which ``decision`` was taken is done with; once for each.
+
+        ``coded``: there is a unit; ``taken``: it was sent or stored; ``has_viewer``: somebody
+        subscribes to the video.
+        """
+        self.groups[_group(decision, coded=coded, taken=taken, has_viewer=has_viewer)] += 1
+
+    def begin(self, source: Source) -> None:
+        """The flight begins: what the source left out before is none of it."""
+        self._source_before = (source.unreadable, source.passed_over)
+
+    def note_source(self, source: Source) -> None:
+        """Take over what the source left out by itself."""
+        unreadable, passed_over = self._source_before
+        self.source_groups["unreadable"] = source.unreadable - unreadable
+        self.source_groups["frame_rate"] = source.passed_over - passed_over
 
     @property
     def encode_ms(self) -> float:
@@ -70,3 +108,29 @@ class FrameCounts:
         if self.first_capture_ns is None:
             return 0.0
         return (self.last_capture_ns - self.first_capture_ns) / SECOND_NS + 1 / fps
+
+
+def _group(decision: FrameDecision, *, coded: bool, taken: bool, has_viewer: bool) -> FrameGroup:
+    """The one group of a frame.
+
+    | decision | coded | taken | has_viewer | group |
+    |---|---|---|---|---|
+    | skip | | | | frame_rate |
+    | hold | | | | who held it: budget, link, closer_look … |
+    | code | no | | | encoder |
+    | code | yes | no | | link |
+    | code, to the store | yes | yes | | stored |
+    | code, to the link | yes | yes | yes | sent |
+    | code, to the link | yes | yes | no | nobody_listened |
+    """
+    if decision.action is Action.SKIP:
+        return "frame_rate"
+    if decision.action is Action.HOLD:
+        return decision.held_by
+    if not coded:
+        return "encoder"
+    if not taken:
+        return "link"
+    if decision.to_store:
+        return "stored"
+    return "sent" if has_viewer else "nobody_listened"

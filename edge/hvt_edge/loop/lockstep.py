@@ -57,6 +57,7 @@ class LockstepPace:
     has_ground: Callable[[], bool]
     stop: threading.Event
     executor: Executor | None = None
+    has_viewer: Callable[[], bool] = lambda: True
 
     def __post_init__(self) -> None:
         self._ahead_frames = max(1, round(_AHEAD_S * self.fps))
@@ -76,7 +77,6 @@ class LockstepPace:
         del missed  # of a camera, whose frames wait for nobody
         if frame is None:
             return
-        self.counts.captured += 1
         now_ns = frame.capture_ns
         began_ns = time.perf_counter_ns()
         decision = self.base.decide(frame, now_ns=now_ns)
@@ -85,9 +85,11 @@ class LockstepPace:
             self.counts.note(frame, encode_ns=time.perf_counter_ns() - began_ns)
         self._finish_analysis()
         self.clock.advance(now_ns)
+        taken = False
         if unit is not None:
             self._coded_index = frame.index
-            self.base.send(unit, decision, now_ns=now_ns)
+            taken = self.base.send(unit, decision, now_ns=now_ns)
+        self.counts.settle(decision, coded=unit is not None, taken=taken, has_viewer=self.has_viewer())
         held = self.keyframes.due(now_ns)
         analysis = self._executor.submit(self.stills.analyze, frame, unit)
         self._analysis = (frame, self._coded_index, held, analysis)

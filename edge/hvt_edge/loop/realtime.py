@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Self
 
+from hvt_common.protocol.frame_account import FrameGroup
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame
@@ -14,7 +15,6 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.stills.worker import StillWorker
-from hvt_edge.video.frame_decision import Action
 from hvt_edge.video.passthrough import VideoStage
 
 __all__ = ["RealtimePace"]
@@ -39,6 +39,7 @@ class RealtimePace:
 
     Video waits for nothing behind it: frames for which the stills' thread has no place are coded and sent all the
     same, and only their analysis is skipped. ``before_frame(now_ns)`` runs first, so that rates can track the link.
+    ``has_viewer()`` tells whether anybody subscribes to the video.
     """
 
     base: VideoStage
@@ -52,14 +53,15 @@ class RealtimePace:
     stop: threading.Event
     failures: Failures
     before_frame: Callable[[int], None] = lambda _now_ns: None
+    has_viewer: Callable[[], bool] = lambda: True
 
     def __post_init__(self) -> None:
         self._missed: int | None = None
         self._must_code_ns = 0
         self._sent_ns = self._link_late_ns = 0
         """When the last frame was sent; how late a clip is because the link took its time, not yet made up."""
-        self._link_bound = False
-        """Sending the last frame took longer than coding it."""
+        self._bound: FrameGroup = "processor"
+        """What took longest with the last frame: coding it, the budget's window, or the link."""
         self._worker = StillWorker(
             self.stills,
             results=self.inbox.take,
@@ -79,8 +81,7 @@ class RealtimePace:
         if self._missed is None:  # before the first frame there was no loop
             self._missed = missed
         newly_missed, self._missed = missed - self._missed, missed
-        self.counts.captured += 1 + newly_missed
-        self._drop(newly_missed)
+        self.counts.drop(self._bound, newly_missed)
         behind = newly_missed > 0
         if not self.live:
             frame = self._by_clip_clock(frame)
@@ -88,26 +89,28 @@ class RealtimePace:
             in_time = self._in_time(frame) or frame.camera_unit is not None
             shown_lately = self.clock() - self._sent_ns < _MOST_GAP_NS
             if not in_time and frame.capture_ns < self._must_code_ns and shown_lately:
-                self._drop(1)
+                self.counts.drop(self._bound)
                 return
             self._must_code_ns = frame.capture_ns + _MOST_GAP_NS
             behind = self.clock() - frame.capture_ns > _BEHIND_SHARE * SECOND_NS / self.fps
         now_ns = self.clock()
         self.before_frame(now_ns)
-        began_ns = self.clock()
+        began_ns, budget_ns = self.clock(), self.base.budget_waited_ns
         decision = self.base.decide(frame, now_ns=now_ns)
         decided_ns = self.clock()  # later, where a camera's own unit waited for its room
         unit = self.base.encode(frame, decision, now_ns=decided_ns, tracks=self.stills.latest_tracks)
-        encoded_ns = self.clock()
+        encoded_ns, taken = self.clock(), False
         if unit is not None:
             self.counts.note(frame, encode_ns=encoded_ns - decided_ns)
-            self.base.send(unit, decision, now_ns=encoded_ns)
-        elif decision.action is Action.HOLD:
-            self.counts.dropped_link += 1
+            taken = self.base.send(unit, decision, now_ns=encoded_ns)
+        self.counts.settle(decision, coded=unit is not None, taken=taken, has_viewer=self.has_viewer())
         self._sent_ns = self.clock()
         sending_ns = decided_ns - began_ns + self._sent_ns - encoded_ns
         self._link_late_ns = min(_MOST_LINK_LATE_NS, self._link_late_ns + sending_ns)
-        self._link_bound = sending_ns > max(encoded_ns - decided_ns, _LINK_BOUND_NS)
+        self._bound = "processor"
+        if sending_ns > max(encoded_ns - decided_ns, _LINK_BOUND_NS):
+            for_budget = 2 * (self.base.budget_waited_ns - budget_ns) > sending_ns
+            self._bound = self.base.holder(self._sent_ns) if for_budget else "link"
         # Video goes first: perception gets no frame while the loop is late.
         self.counts.unanalyzed += not self._worker.take(frame, unit, late=behind)
 
@@ -116,13 +119,6 @@ class RealtimePace:
 
     def __exit__(self, *_error: object) -> None:
         self._worker.close()
-
-    def _drop(self, count: int) -> None:
-        """So many frames came while the one before was coded or sent, whichever took longer."""
-        if self._link_bound:
-            self.counts.dropped_link += count
-        else:
-            self.counts.dropped_cpu += count
 
     def _by_clip_clock(self, frame: Frame) -> Frame:
         """The frame of a clip with the time at which it is due, which is later where the machine is too slow.

@@ -93,6 +93,8 @@ class CodedLiveSource(LiveSource):
         self.warning = ""
         self._queue: deque[_Queued] = deque()
         self._queued_bytes = self._number = 0
+        self._skips = False
+        """Units are left out up to the next keyframe because the reader was too slow for some."""
         super().__init__(
             grabber, size=size, fps=1.0, fit=fit, max_frames=max_frames, clock=clock, failures=failures
         )
@@ -115,11 +117,14 @@ class CodedLiveSource(LiveSource):
                 yield None
                 continue
             if item.packet.decoder is not decoder or newest is None or item.number != newest + 1:
+                self._skips = item.packet.decoder is decoder  # a camera that begins anew has lost them itself
                 decoder = item.packet.decoder
                 decoder.skip()
             newest = item.number
             frame = self._frame(item, index=0 if first is None else item.number - first)
             if frame is None:
+                if first is not None:  # before its first keyframe there is no flight
+                    self._note_left_out()
                 yield None
                 continue
             first = item.number if first is None else first
@@ -127,20 +132,24 @@ class CodedLiveSource(LiveSource):
             count += 1
 
     def _frame(self, item: _Queued, *, index: int) -> Frame | None:
-        """None where the unit cannot be sent, which counts as missed."""
+        """None where the unit cannot be sent: damaged, or of a picture of which units were missed."""
         decoder = item.packet.decoder
         decoded = decoder.decode(item.packet.data)
         if decoded is None:
-            with self._news:
-                self.missed += 1
             if decoder.trouble:
                 self._failures.failed(
                     SOURCE_PART, f"{self._grabber.name} sends what cannot be passed on ({decoder.trouble})"
                 )
             return None
         self._failures.works(SOURCE_PART)
+        self._skips = False
         unit, picture = decoded
         return self._resizer.coded_frame(picture.bgr(), unit, index=index, capture_ns=item.capture_ns)
+
+    def _note_left_out(self) -> None:
+        with self._news:
+            self.missed += self._skips
+            self.unreadable += not self._skips
 
     def _take(self, shot: Shot, capture_ns: int) -> None:
         packet = shot.packet

@@ -99,6 +99,7 @@ class CodedVideoSource(Source):
                 decoded = decoder.decode(packet)
                 if decoded is None:
                     left_out += 1
+                    self.unreadable = left_out - before if begun else 0
                     continue
                 if not begun:
                     begun, zero_s, before = True, at_s, left_out

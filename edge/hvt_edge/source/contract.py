@@ -64,6 +64,10 @@ class Source(ABC):
     """Names of the classes in the ground truth; only the demo has any."""
     missed: int = 0
     """Frames of a live source for which the reader was too slow."""
+    unreadable: int = 0
+    """Frames that were damaged, and took no place among the others."""
+    passed_over: int = 0
+    """Frames of a live source beyond the base rate."""
     restarts: int = 0
     """How often a live source was opened again."""
     camera_stream: CameraStream | None = None

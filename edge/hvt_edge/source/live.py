@@ -49,6 +49,8 @@ class Shot:
     """When it was taken by the camera's own clock, Unix nanoseconds; None where it does not say."""
     packet: CameraPacket | None = None
     """For ``--encoder passthrough``; ``image`` then decodes it, and is not called beside."""
+    missed: int = 0
+    """Frames that came between the one before and this one, and were not taken in time."""
 
 
 class SignalLost(Exception):  # noqa: N818 - an event, not a fault of the program
@@ -179,10 +181,12 @@ class LiveSource(Source):
     def _take(self, shot: Shot, capture_ns: int) -> None:
         """A frame has come (the reader's thread)."""
         if not self._gate.accept(capture_ns):
+            self.missed += shot.missed
+            self.passed_over += 1
             return
         image = shot.image()
         with self._news:
-            self.missed += self._latest is not None
+            self.missed += (self._latest is not None) + shot.missed
             self._latest = (capture_ns, image)
             self._news.notify_all()
         self._failures.works(SOURCE_PART)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from hvt_common.protocol.frame_account import FrameGroup
 from hvt_edge.backlog.stage import State
 
 __all__ = ["Action", "FrameDecision", "FrameInputs", "decide"]
@@ -14,7 +15,7 @@ class Action(Enum):
     """What happens to a source frame."""
 
     SKIP = "not coded: frame decimation leaves it out"
-    HOLD = "due, and not coded: the link is busy"
+    HOLD = "due, and not coded: there is no room for it"
     CODE = "coded"
 
 
@@ -48,6 +49,8 @@ class FrameDecision:
     """This keyframe is the one that the plan waits for."""
     resumes: bool = False
     """With it the link has the stream again."""
+    held_by: FrameGroup = "budget"
+    """Of HOLD: what had no room for it."""
 
     @property
     def codes(self) -> bool:

@@ -7,8 +7,9 @@ all that follow are left out up to the camera's next keyframe: nobody could show
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 
+from hvt_common.protocol.frame_account import FrameGroup
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame, Tracks
@@ -82,10 +83,10 @@ class PassthroughStage:
     """Runs in the frame loop, in place of `BaseStage`: `decide` for each frame, `encode` and `send` what goes out.
 
     ``pause(ns)`` sleeps and returns the time; None in lockstep, where nothing is waited for. ``admits(now_ns)`` says
-    whether the link has room. ``observe(unit)`` sees each unit. ``reconfigure(decimation, now_ns)`` runs before it is
-    asked whether a keyframe may go to the link, so that another budget holds from there on: one that was lowered too
-    far could never be raised again. ``least_link`` holds a keyframe that follows a break. ``local_copy`` has all that
-    the camera gave, sent or not.
+    whether there is room, ``holder(now_ns)`` whether the link or the budget has none. ``observe(unit)`` sees each
+    unit. ``reconfigure(decimation, now_ns)`` runs before it is asked whether a keyframe may go to the link,
+    so that another budget holds from there on: one that was lowered too far could never be raised again.
+    ``least_link`` holds a keyframe that follows a break. ``local_copy`` has all that the camera gave, sent or not.
     """
 
     keyframes: KeyframeRequests
@@ -97,6 +98,7 @@ class PassthroughStage:
     observe: Callable[[AccessUnit], None] = lambda _unit: None
     least_link: LeastLink | None = None
     admits: Callable[[int], bool] = lambda _now_ns: True
+    holder: Callable[[int], FrameGroup] = lambda _now_ns: "budget"
     pause: Callable[[int], int] | None = None
     backlog: BacklogStage | None = None
 
@@ -104,6 +106,9 @@ class PassthroughStage:
         self._sent_index = self._stored_index = self._copied_index = -2
         """Of the frame that was sent last, stored last, copied last."""
         self._keyframes = 0
+        self._paused_ns = 0
+        self._held_by: FrameGroup = "unreadable"
+        """Why the chain of units is broken: up to the next keyframe that is sent, for that none can be shown."""
         self.left_out = 0
         """Units that were neither sent nor stored."""
 
@@ -121,6 +126,8 @@ class PassthroughStage:
         if unit.keyframe and link is not State.OFFLINE:
             self.reconfigure(1, now_ns)
         wanted = unit.keyframe or (after_sent if link is State.LIVE else link is State.OFFLINE)
+        if link is not State.LIVE:
+            self._held_by = "link"
         decision = decide_unit(
             UnitInputs(
                 keyframe=unit.keyframe,
@@ -134,7 +141,7 @@ class PassthroughStage:
         self.left_out += not decision.codes
         if decision.codes and decision.keyframe:
             self.failures.works(_PART)
-        return decision
+        return decision if decision.codes else replace(decision, held_by=self._held_by)
 
     def encode(
         self, frame: Frame, decision: FrameDecision, *, now_ns: int, tracks: Tracks | None = None
@@ -149,6 +156,7 @@ class PassthroughStage:
             self._stored_index = unit.frame_index
         else:
             self._sent_index = unit.frame_index
+        self._held_by = "unreadable"  # what does not come next was lost before
         if unit.keyframe:
             self._keyframes += 1
             self.keyframes.publish(KeyframeState(0, now_ns, sent=self._keyframes))
@@ -156,18 +164,24 @@ class PassthroughStage:
             self.backlog.resume()
         return unit
 
-    def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> None:
+    @property
+    def budget_waited_ns(self) -> int:
+        """As of `BaseStage`."""
+        return self._paused_ns + self.transmitter.base_waited_ns
+
+    def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> bool:
         """Store the unit, or send it, or both; as of `BaseStage`."""
         if self.backlog is None or not decision.to_store:
             line_bytes = self.transmitter.base(unit, now_ns=now_ns, announced=False)
             if self.least_link is not None:
                 self.least_link.sent(line_bytes, now_ns=now_ns)
-            return
-        self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
+            return True
+        taken = self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
         if decision.to_link:
             self.transmitter.base(unit, now_ns=now_ns, after_hole=not unit.keyframe, announced=False)
         elif self.backlog.offline:
             self.transmitter.store_base(unit, now_ns=now_ns)
+        return taken or decision.to_link
 
     def _admitted(self, unit: AccessUnit, now_ns: int, *, live: bool) -> bool:
         """Whether it may go now; where the link is ``live``, or a moment later."""
@@ -182,13 +196,16 @@ class PassthroughStage:
                 return True
             if wait_ns is None or self.pause is None or now_ns + _POLL_NS > until_ns:
                 if live:
-                    self._note_left_out(unit, in_time=in_time)
+                    self._held_by = self.holder(now_ns) if free else "link"
+                    self._note_left_out(unit)
                 return False
+            before_ns = now_ns
             now_ns = self.pause(_POLL_NS)
+            self._paused_ns += 0 if in_time and not wait_ns else now_ns - before_ns
 
-    def _note_left_out(self, unit: AccessUnit, *, in_time: bool) -> None:
+    def _note_left_out(self, unit: AccessUnit) -> None:
         what = f"{'a keyframe' if unit.keyframe else 'a frame'} of {len(unit.data) / 1000:.1f} kB"
-        full = "the link has no room" if in_time else "the budget's window has no room"
+        full = "the link has no room" if self._held_by == "link" else "the budget's window has no room"
         self.failures.failed(_PART, f"{full} for {what}: nothing is sent up to the camera's next keyframe")
 
     def _copy(self, unit: AccessUnit) -> None:

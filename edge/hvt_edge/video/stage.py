@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 
 from hvt_common.errors import FlightError
+from hvt_common.protocol.frame_account import FrameGroup
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame, Tracks
@@ -14,7 +15,7 @@ from hvt_edge.backlog.stage import BacklogStage, State
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.video.encoders.contract import Encoder
-from hvt_edge.video.frame_decision import FrameDecision, FrameInputs, decide
+from hvt_edge.video.frame_decision import Action, FrameDecision, FrameInputs, decide
 from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.local_copy import LocalCopy
@@ -34,8 +35,8 @@ class BaseStage:
     before each keyframe for the link and returns a newly opened encoder, or None where nothing has changed: x265
     takes neither another frame rate nor another bit rate once it is open. ``keyframe_bytes(last_bytes)`` says about
     how many line bytes that keyframe takes, ``admits(now_ns, line_bytes)`` whether pacer and budget have room for so
-    many. ``open_again()`` gives another encoder for one that has failed; without it,
-    as in lockstep, the failure is raised.
+    many, ``holder(now_ns)`` which of them has none. ``open_again()`` gives another encoder for one that has failed;
+    without it, as in lockstep, the failure is raised.
     """
 
     encoder: Encoder
@@ -50,6 +51,7 @@ class BaseStage:
     reconfigure: Callable[[int, int], Encoder | None] | None = None
     keyframe_bytes: Callable[[int], int] = lambda last_bytes: last_bytes
     admits: Callable[[int, int], bool] = lambda _now_ns, _line_bytes: True
+    holder: Callable[[int], FrameGroup] = lambda _now_ns: "budget"
     backlog: BacklogStage | None = None
     open_again: Callable[[], Encoder] | None = None
     failures: Failures | None = None
@@ -69,7 +71,7 @@ class BaseStage:
         keyframe_due = self._plan.now(now_ns, fits=fits) or self._begins_anew
         line_bytes = keyframe_bytes if keyframe_due else self.transmitter.frame_bytes
         backlog = self.backlog
-        return decide(
+        decision = decide(
             FrameInputs(
                 due=self._frame_skip.codes(frame.index),
                 keyframe_due=keyframe_due,
@@ -79,6 +81,7 @@ class BaseStage:
                 probe_due=backlog is not None and backlog.probe_due(now_ns),
             )
         )
+        return replace(decision, held_by=self.holder(now_ns)) if decision.action is Action.HOLD else decision
 
     def encode(
         self, frame: Frame, decision: FrameDecision, *, now_ns: int, tracks: Tracks | None = None
@@ -112,20 +115,29 @@ class BaseStage:
             self.local_copy.write(unit)
         return unit
 
-    def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> None:
-        """Store the unit, or send it, or both; blocks while the link is full: frames are dropped before encoding."""
+    @property
+    def budget_waited_ns(self) -> int:
+        """How long frames have waited for the budget's window, all together."""
+        return self.transmitter.base_waited_ns
+
+    def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> bool:
+        """Store the unit, or send it, or both; blocks while the link is full: frames are dropped before encoding.
+
+        False where it was for the store, and the store did not take it.
+        """
         if self.backlog is not None and decision.to_store:
-            self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
+            taken = self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
             if decision.to_link:  # a probe; what it builds on was not sent
                 self.transmitter.base(unit, now_ns=now_ns, after_hole=not unit.keyframe)
             elif self.backlog.offline:
                 self.transmitter.store_base(unit, now_ns=now_ns)
             # On the way back none of it is on the line: the budget has to get room for the keyframe to go on with.
-            return
+            return taken or decision.to_link
         line_bytes = self.transmitter.base(unit, now_ns=now_ns)
         if unit.keyframe:
             self._keyframe_bytes = line_bytes
             self.keyframes.note_cost(self.transmitter.takes_ns(line_bytes))
+        return True
 
     def wants_keyframe(self, index: int) -> bool:
         """Whether more frames are worth a keyframe of their own after this one; about once a second."""

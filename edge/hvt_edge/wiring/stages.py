@@ -208,6 +208,7 @@ def build_stages(
             observe=rates.observe,
             least_link=make_least_link(config, pacer=pacer, in_flight=in_flight),
             admits=link_control.admits,
+            holder=link_control.holder,
             pause=None if lockstep else partial(_paused, clock, wait_until),
             backlog=backlog,
         )
@@ -226,6 +227,7 @@ def build_stages(
             reconfigure=reconfiguration,
             keyframe_bytes=reconfiguration.keyframe_bytes,
             admits=link_control.admits,
+            holder=link_control.holder,
             backlog=backlog,
             open_again=None if lockstep else reconfiguration.open_again,
             failures=failures,

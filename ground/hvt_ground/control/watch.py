@@ -7,8 +7,9 @@ from typing import Any
 
 from rich.table import Table
 
+from hvt_common.protocol.still_words import counts_text
 from hvt_common.runtime.status_command import StatusCommand
-from hvt_common.units import SECOND_NS, bitrate_text, counts_text
+from hvt_common.units import SECOND_NS, bitrate_text
 
 __all__ = ["run"]
 
@@ -40,6 +41,11 @@ def _table(state: dict[str, Any]) -> Table:
         f"{one['edge']} is at {_place(one['session']['pose'])}"
         for one in state["edges"]
         if one["session"] and one["session"]["pose"]
+    ]
+    said += [
+        f"{one['edge']}: {one['session']['edge_frames']['text']}"
+        for one in state["edges"]
+        if one["session"] and one["session"].get("edge_frames")
     ]
     said += [f"{one['part']}: {one['reason']}" for one in state["failed"]]
     table.caption = "; ".join(said) or None

@@ -25,8 +25,9 @@ from hvt_common.protocol.messages import (
     TrackStep,
     TrackStepDecoder,
 )
+from hvt_common.protocol.still_words import counts_text
 from hvt_common.transport.inbox import Received
-from hvt_common.units import SECOND_NS, bitrate_text, counts_text
+from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception

@@ -10,9 +10,10 @@ from typing import Any
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Info
+from hvt_common.protocol.still_words import counts_text
 from hvt_common.runtime.failures import FailedPart
 from hvt_common.runtime.process import lower_priority
-from hvt_common.units import bitrate_text, counts_text
+from hvt_common.units import bitrate_text
 from hvt_ground.events import Event, MessageTiming, Notice, Overlay, Refinement, VideoSample
 from hvt_ground.state import EdgeState, GroundState, SessionState
 from hvt_ground.web.pictures import Pictures, jpeg

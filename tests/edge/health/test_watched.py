@@ -77,7 +77,7 @@ def test_an_edge_says_how_it_is_from_its_start_to_its_flight(tmp_path, address):
         edge = link.edge("--source", "demo", "--wait", "60", "--metrics", address, *SMALL, *store)
         eventually(lambda: state(address), within_s=60, what="it answers")
         waits = state(address)
-        assert (waits["state"], waits["frames"]["captured"]) == ("waiting", 0)
+        assert (waits["state"], waits["frames"]["account"]["came"]) == ("waiting", 0)
         unknown = (
             "total_bps",
             "budget_share",

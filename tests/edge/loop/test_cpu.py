@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
+from collections import Counter
 
 import pytest
 
@@ -53,8 +54,9 @@ def test_a_core_that_another_process_takes_is_not_free():
 
 def test_video_and_perception_count_by_what_each_took():
     """A detector that skipped half of its frames would count as if it had seen all."""
-    skipping = FrameCounts(captured=100, unanalyzed=50, encode_ns=1_000)
-    whole = FrameCounts(captured=100, encode_ns=1_000)
+    came = Counter({"sent": 100})
+    skipping = FrameCounts(groups=came, unanalyzed=50, encode_ns=1_000)
+    whole = FrameCounts(groups=came, encode_ns=1_000)
     burn(0.3)
     skipping.measure_cpu(perception_ns=3_000)
     whole.measure_cpu(perception_ns=3_000)

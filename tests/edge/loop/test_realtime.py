@@ -103,7 +103,7 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
     ) as pace:  # fmt: skip
         for frame in frames[:50]:  # more than three seconds
             pace.step(frame)
-        assert (out.units, counts.dropped) == (50, 0)
+        assert (out.units, counts.groups) == (50, {"sent": 50})
         assert counts.unanalyzed > 20
         stills.released.set()
         for frame in frames[50:]:
@@ -124,14 +124,14 @@ def test_frames_missed_count_for_the_link_or_for_the_machine():
         stop=threading.Event(), failures=Failures(time.time_ns),
     ) as pace:  # fmt: skip
         pace.step(frames[0], missed=4)
-        assert (counts.captured, counts.dropped) == (1, 0), "what came before the first is nobody's fault"
+        assert counts.groups == {"sent": 1}, "what came before the first is nobody's fault"
         out.takes_s = 0.5
         pace.step(frames[1], missed=4)
         out.takes_s = 0.0
         pace.step(frames[2], missed=9)
-        assert (counts.dropped_link, counts.dropped_cpu) == (5, 0)
+        assert (counts.groups["link"], counts.dropped_cpu) == (5, 0)
         pace.step(frames[3], missed=12)
-        assert (counts.dropped_link, counts.dropped_cpu) == (5, 3)
+        assert (counts.groups["link"], counts.dropped_cpu) == (5, 3)
         assert counts.captured == 4 + 8
         assert counts.unanalyzed == 2, "perception gave way where video was late"
 

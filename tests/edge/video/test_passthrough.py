@@ -87,7 +87,13 @@ class Rig:
     """A stage with all that it needs, without a store; ``paused_ns`` counts what it has waited."""
 
     def __init__(
-        self, *, budget_bps: int = 800_000, admits=lambda _now_ns: True, copy=None, waits=True
+        self,
+        *,
+        budget_bps: int = 800_000,
+        admits=lambda _now_ns: True,
+        holder=lambda _now_ns: "budget",
+        copy=None,
+        waits=True,
     ) -> None:
         self.kept, self.failures, self.ledger = Kept(), Failures(time.time_ns), Ledger()
         self.now_ns = START_NS
@@ -105,6 +111,7 @@ class Rig:
             ),
             failures=self.failures,
             admits=admits,
+            holder=holder,
             local_copy=copy,
             pause=self.wait if waits else None,
         )
@@ -182,7 +189,10 @@ def test_a_link_that_is_busy_for_a_moment_costs_nothing(burst):
     rig = Rig(admits=lambda now_ns: now_ns >= busy_until)
     assert rig.play(burst[:30]) == list(range(30))
     assert rig.now_ns >= busy_until
-    busy = Rig(admits=lambda now_ns: not 0 < now_ns - START_NS - SECOND_NS // 2 < 2 * SECOND_NS)
+    busy = Rig(
+        admits=lambda now_ns: not 0 < now_ns - START_NS - SECOND_NS // 2 < 2 * SECOND_NS,
+        holder=lambda _now_ns: "link",
+    )
     sent = busy.play(burst)
     assert sent[:5] == list(range(5))
     assert 45 in sent

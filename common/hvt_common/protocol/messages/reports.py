@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.messages.envelope import Message, Nested
 from hvt_common.protocol.messages.fields import (
     I63,
@@ -116,7 +117,7 @@ class Health:
     feedback_age_ms: int = wire_field(Int(-1, U32))
     """Since the last feedback from any ground; -1 for none yet."""
     frames_dropped_cpu: int = wire_field(_COUNT)
-    """Of `frames_dropped` those for which the machine was too slow; for the others the link had no room."""
+    """Of `frames_dropped` those for which the machine was too slow; `Status.frames` has the others."""
     frames_unanalyzed: int = wire_field(_COUNT)
     """Skipped by perception for want of time."""
     cores_needed: float = wire_field(_CORES)
@@ -174,6 +175,17 @@ class Status(Message):
     failed: tuple[FailedPart, ...] = wire_field(ListOf(Nested(FailedPart), MOST_FAILED_PARTS))
     levers: str = wire_field(Text(120))
     """What is sent beside the video and why, one line for people; empty where settings alone decide."""
+    frames: tuple[int, ...] = wire_field(ListOf(_COUNT, 32), default=())
+    """How many source frames are in each group of `FRAME_GROUPS`, in its order, zeros at the end left out."""
+    coded_fps: float = wire_field(Scaled(0, 1000, 100), default=0.0)
+    """Frames a second that the frame rate leaves now; 0 where an earlier edge does not say."""
+    auto_fps: bool = wire_field(Flag(), default=False)
+    """``--fps auto`` chose it."""
+
+    @property
+    def frame_account(self) -> FrameAccount:
+        """What became of each source frame."""
+        return FrameAccount.of_counts(self.frames, coded_fps=self.coded_fps, auto_fps=self.auto_fps)
 
     @property
     def outcomes(self) -> Mapping[str, int]:

@@ -34,6 +34,7 @@ PATIENCE_S = 4.0
 _FIRST_PAUSE_S, _LAST_PAUSE_S = 10.0, 120.0
 """From one visit to the next: doubled each time, for a visit costs some kilobytes of a link that may be thin."""
 _SAY_AGAIN_S = 300.0
+_MOST_EVENTS = 1024
 _MAX_NAMES = 256
 """Names that are remembered. Each takes a certificate of the CA, so a fleet of that size comes first."""
 
@@ -72,6 +73,10 @@ class LinkWatch:
         self._examine = examine or visit
         self._config, listen = configure(settings)
         self._strangers = Strangers(listening_ports(listen))
+        # A link that stood for less than a look was one all the same.
+        self._link_events = session.info.declare_link_events_listener(
+            zenoh.handlers.RingChannel(_MOST_EVENTS), history=True
+        )
         self._file = settings.zenoh_config
         self._edge = settings.name
         self._served = served
@@ -151,6 +156,8 @@ class LinkWatch:
             if self._stop.is_set():
                 return
             try:
+                while (event := self._link_events.try_recv()) is not None:
+                    self._strangers.note_links(_ends(event.link))
                 hosts = self._strangers.check(self._far_ends, now_s)
             except (OSError, zenoh.ZError):  # the session is closed elsewhere
                 return
@@ -163,8 +170,7 @@ class LinkWatch:
             )
 
     def _far_ends(self) -> list[str]:
-        ends = (str(end) for link in self._session.info.links() for end in (link.src, link.dst))
-        return [_bare(end).partition("/")[2] for end in ends]
+        return [end for link in self._session.info.links() for end in _ends(link)]
 
     def _names(self, links: list[zenoh.Link]) -> dict[str, bool]:
         """Who is at the other end of the links, each with whether it is a router."""
@@ -273,6 +279,10 @@ def visit(config: zenoh.Config) -> list[str]:
 def _connected_twice(config: zenoh.Config) -> set[str]:
     places = Counter(map(_bare, connect_endpoints(config)))
     return {place for place, count in places.items() if count > 1}
+
+
+def _ends(link: zenoh.Link) -> list[str]:
+    return [_bare(str(end)).partition("/")[2] for end in (link.src, link.dst)]
 
 
 def _bare(endpoint: str) -> str:

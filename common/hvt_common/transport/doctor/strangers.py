@@ -1,7 +1,8 @@
 """Who connects to our listening ports and is refused: Zenoh closes such a connection and says nothing of it.
 
 The kernel's table of TCP connections (/proc/net/tcp, Linux only) has who connects now. A connection that ends and
-never was one of the session's links was refused: no certificate, one of another CA, or no Zenoh at all.
+never was one of the session's links was refused: no certificate, one of another CA, or no Zenoh at all. From a host
+that has had a link it is taken for one of its own that broke off, as in an outage: who is known there is no stranger.
 """
 
 from __future__ import annotations
@@ -18,8 +19,7 @@ __all__ = ["Strangers", "listening_ports"]
 _TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
 _LISTEN = "0A"
 _TIMES, _WITHIN_S = 3, 600.0
-"""Who is refused tries again each second, and on a quick link is seen now and then only; an own client that comes and
-goes between two looks is not so frequent."""
+"""Who is refused tries again each second, and on a quick link is seen now and then only."""
 _AGAIN_S = 60.0
 _MOST_HOSTS = 256
 
@@ -34,9 +34,22 @@ class Strangers:
         """Connections that are links, or were."""
         self._pending: set[str] = set()
         """Connections that are no links, or not yet."""
+        self._known: OrderedDict[str, None] = OrderedDict()
+        """Hosts that have had a link, the last ones."""
         self._refused: OrderedDict[str, list[float]] = OrderedDict()
         """Host → when its connections ended, the last ones."""
         self._said_s: dict[str, float] = {}
+
+    def note_links(self, far_ends: Iterable[str]) -> None:
+        """These have a link, or had one a moment ago, however short: `check` may see neither."""
+        for end in far_ends:
+            host, _, port = end.rpartition(":")
+            if port.isdigit() and int(port) in self._ports:
+                continue  # our own end
+            self._known[host] = None
+            self._known.move_to_end(host)
+            if len(self._known) > _MOST_HOSTS:
+                self._known.popitem(last=False)
 
     def check(self, links: Callable[[], Iterable[str]], now_s: float) -> list[str]:
         """Return the hosts to be named now; ``links`` gives the far ends of the links that stand."""
@@ -45,11 +58,13 @@ class Strangers:
             self._linked = connected
             return []
         linked = set(links())
+        self.note_links(linked & connected)
         ended = self._pending - connected - linked
         # The kernel goes on with the connection of a link that was lost: that was one all the same.
         self._linked = connected & (linked | self._linked)
         self._pending = connected - self._linked
-        return [host for host in map(_host, sorted(ended)) if self._note(host, now_s)]
+        hosts = [host for host in map(_host, sorted(ended)) if host not in self._known]
+        return [host for host in hosts if self._note(host, now_s)]
 
     def _note(self, host: str, now_s: float) -> bool:
         times = self._refused.setdefault(host, [])

@@ -18,9 +18,9 @@ from programs.processes import eventually
 pytestmark = pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="needs the kernel's table")
 
 
-def knock(port: int) -> None:
-    """A program that speaks neither TLS nor Zenoh, such as a scanner of ports."""
-    with socket.create_connection(("127.0.0.1", port)):
+def knock(port: int, *, host: str = "127.0.0.2") -> None:
+    """A program that speaks neither TLS nor Zenoh, such as a scanner of ports, on another host than the edges."""
+    with socket.create_connection(("127.0.0.1", port), source_address=(host, 0)):
         time.sleep(0.3)
 
 
@@ -45,13 +45,17 @@ def test_a_stranger_is_named_and_an_edge_is_not(tmp_path: Path, free_port: int, 
             with open_session(edge) as own:
                 eventually(lambda own=own: own.info.links(), within_s=20, what="the edge has a link")
                 time.sleep(0.3)
+        for _ in range(13):  # the ground's own command line: less than a look of the watch each
+            with open_session(edge) as own:
+                eventually(lambda own=own: own.info.links(), within_s=20, what="the client has a link")
+        for _ in range(4):  # an edge whose link breaks off before there is one
+            knock(free_port, host="127.0.0.1")
         assert said() == []
         for _ in range(6):
             knock(free_port)
         eventually(said, within_s=20, what="the stranger is named")
-        time.sleep(0.5)
     assert len(said()) == 1
-    assert said()[0].startswith("somebody at 127.0.0.1 connects again and again and is refused")
+    assert said()[0].startswith("somebody at 127.0.0.2 connects again and again and is refused")
 
 
 def test_each_stranger_once_a_minute(tmp_path: Path) -> None:
@@ -85,3 +89,11 @@ def test_each_stranger_once_a_minute(tmp_path: Path) -> None:
         assert shown(120 + number, lost, links=links[:1]) == []
         both = shown(120.5 + number, lost, found, links=links[1:])
         assert both == [], "the link is lost and made again; the kernel still has its old connection"
+    strangers.note_links(["10.0.0.10:41000", "10.0.0.1:7447"])
+    for number in range(6):
+        assert shown(200 + number, f"0A00000A:A{number:03X}") == [], "its link was there between two looks"
+        assert shown(200.5 + number) == []
+    for number in range(6):
+        told += [(0, host) for host in shown(300 + number, f"0100000A:A{number:03X}")]
+        told += [(0, host) for host in shown(300.5 + number)]
+    assert told[2:] == [(0, "10.0.0.1")], "our own end of a link is nobody's"

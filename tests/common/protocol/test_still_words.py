@@ -1,0 +1,59 @@
+"""Every word of the code has one for people."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import get_args
+
+from hvt_common.protocol.frame_account import FRAME_GROUPS, FrameGroup
+from hvt_common.protocol.still_words import STILL_WORDS, counts_text
+from hvt_ground.perception.stills.resolved import Outcome
+
+ROOT = Path(__file__).parents[3]
+EMITTED = (
+    ("edge/hvt_edge/stills", r'NoStill\(\s*"(\w+)"'),
+    ("edge/hvt_edge/stills", r'_refuse\([^)]*?"(\w+)"'),
+    ("edge/hvt_edge", r'(?:on_outcome|record_outcome)\(\s*"\w+",\s*"(\w+)"'),
+    ("edge/hvt_edge", r'on_outcome\([^)]*?else "\w+", "(\w+)"'),
+    ("edge/hvt_edge/stills/policy", r'reason="(\w+)"'),
+    ("edge/hvt_edge/stills/suppression.py", r'return "(\w+)"'),
+    ("edge/hvt_edge/stills/outbox.py", r'_expire\([^"]*?"(\w+)"'),
+    ("edge/hvt_edge/stills/outbox.py", r'^AGAIN = "(\w+)"'),
+    ("edge/hvt_edge/stills/on_demand_crop.py", r'^ON_DEMAND = "(\w+)"'),
+    ("edge/hvt_edge/stills/maker.py", r"reason: Literal\[(.*)\]"),
+    ("ground/hvt_ground/perception", r'(?:dropped|outcomes)\["([\w ]+)"\]'),
+)
+
+
+def words(place: str, pattern: str) -> set[str]:
+    """All that this place of the tree can say."""
+    path = ROOT / place
+    files = [path] if path.is_file() else sorted(path.rglob("*.py"))
+    found = {one for file in files for one in re.findall(pattern, file.read_text(), re.MULTILINE)}
+    return {word for one in found for word in re.findall(r"[\w ]+", one) if word.strip()}
+
+
+def test_each_reason_that_the_code_can_give_is_said_in_plain_words():
+    """The end would say ``49 base_good``, and who flies look it up in the source."""
+    for place, pattern in EMITTED:
+        if "else" not in pattern:
+            assert words(place, pattern), f"nothing of {place} says {pattern}"
+        missing = words(place, pattern) - STILL_WORDS.keys()
+        assert not missing, f"{place} says {missing}"
+    assert set(get_args(Outcome)) <= STILL_WORDS.keys()
+    assert not any("_" in said for said in STILL_WORDS.values())
+    assert (
+        counts_text({"base_good": 2, "border": 1})
+        == "2 the video already shows well, 1 cut by the picture's edge"
+    )
+
+
+def test_the_page_has_all_words_of_a_summary():
+    """Who reads the JSON would find keys that nothing explains."""
+    page = (ROOT / "docs" / "summary.md").read_text()
+    rows = dict(re.findall(r"^\| `([^`]+)` \| (.+?) \|$", page, re.MULTILINE))
+    groups = {name: said.format(frame_rate="the frame rate") for name, said in FRAME_GROUPS.items()}
+    assert set(get_args(FrameGroup)) == groups.keys()
+    assert groups.items() <= rows.items()
+    assert STILL_WORDS.items() <= rows.items()
