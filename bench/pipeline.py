@@ -94,7 +94,9 @@ def _edge() -> float:
         ]
         command += ["--pace", "lockstep", "--wait", "0s", "--max-frames", str(count)]
         began = time.perf_counter()
-        done = subprocess.run([*command, "--connect", "tcp/127.0.0.1:9"], check=False, stdout=subprocess.DEVNULL)
+        done = subprocess.run(
+            [*command, "--connect", "tcp/127.0.0.1:9"], check=False, stdout=subprocess.DEVNULL
+        )
         assert done.returncode == 1, "nobody listens"
         took[count] = time.perf_counter() - began
     return (took[20 + _FRAMES] - took[20]) / _FRAMES

@@ -60,11 +60,11 @@ class FailingEncoder(BaseEncoder):
 
     fails = False
 
-    def encode(self, frame, **wishes):
+    def encode(self, frame, **how):
         """One frame."""
         if self.fails:
             raise RuntimeError("out of memory")
-        return super().encode(frame, **wishes)
+        return super().encode(frame, **how)
 
 
 def encoder() -> FailingEncoder:
