@@ -1,2 +1,4 @@
-"""HVT as bytes, without Zenoh: `channels` (the key table), `messages`, `ledger`, `clock_offset`; what becomes of frames
-and stills, and its words: `frame_account`, `still_words`."""
+"""HVT as bytes, without Zenoh: `channels` (the key table), `messages`, `ledger`, `clock_offset`.
+
+What becomes of frames and stills has its words in `frame_account` and `still_words`.
+"""
