@@ -49,7 +49,7 @@ class Sent:
     up_to_bytes: int
     """Line bytes of everything sent so far, this message included."""
     messages: int
-    """Base messages sent so far."""
+    """Messages of base and stills sent so far: reports count the lost of both."""
 
 
 class Flight:
@@ -88,6 +88,7 @@ class Flight:
     def sent_still(self, sequence: int, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
         """A still goes out."""
         self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
+        self._messages += 1
         self._last = (self._last[0], sequence)
         self._stills.append((sequence, now_ns, line_bytes))
 

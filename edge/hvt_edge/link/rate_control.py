@@ -15,6 +15,7 @@ back is found again in some seconds.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, replace
 
@@ -22,6 +23,7 @@ from hvt_common.units import SECOND_NS
 
 __all__ = [
     "LeastDelay",
+    "LossCount",
     "Progress",
     "RateController",
     "RateSettings",
@@ -35,7 +37,10 @@ _MTU_BITS = 12_000
 _SOME_LOSS = 0.02
 _GRAVE, _GRAVE_SPAN_NS = 2.5, 150 * _MS
 _LOSS_EVERY_NS = 3 * SECOND_NS
-"""Loss is counted over some seconds: a lower rate shows as late."""
+"""Between two falls for the same loss: a lower rate shows as late."""
+_FEW_MESSAGES, _LOSS_MESSAGES = 20, 100
+"""Loss among fewer messages says nothing; that of so many is taken as it is."""
+_LOSS_DEVIATIONS = 2.0
 _MUCH_LESS, _MUCH_MORE = 0.8, 1.25
 """By so much the base's rate may be off before x265 is opened anew at once."""
 _SOME_OFF, _SOME_NS = 0.08, 3 * SECOND_NS
@@ -86,7 +91,7 @@ class Progress:
     arrived_bytes: int
     """Line bytes sent up to and with it: they have all arrived, or are lost."""
     messages: int = 0
-    """So many base messages were sent up to and with it."""
+    """So many messages of base and stills were sent up to and with it."""
     lost: int = 0
     """So many of them never came, as the ground counts."""
 
@@ -113,6 +118,75 @@ class LeastDelay:
         return self._since_ns is None
 
 
+class LossCount:
+    """Whether more than ``most_share`` of the newest messages are lost, at any frame rate.
+
+    It counts messages, not seconds: the newest 100, however long these took. Of so many the share is taken as it is.
+    Of 20 to 99, two standard deviations of the binomial distribution more must be lost than a link of just
+    ``most_share`` would lose; of 12 % that are 6 of 20, or 11 of 50. Fewer than 20 say nothing.
+    """
+
+    def __init__(self, most_share: float) -> None:
+        self._most_share = most_share
+        self._counts: deque[tuple[int, int]] = deque()
+        """(messages, lost of them) by report."""
+        self._marked: tuple[int, int] | None = None
+        """When the rate last fell for it."""
+
+    def add(self, messages: int, lost: int) -> None:
+        """Take in the counts of one report, both since the beginning."""
+        self._counts.append((messages, lost))
+        while len(self._counts) > 1 and messages - self._counts[1][0] >= _LOSS_MESSAGES:
+            self._counts.popleft()
+        marked = self._marked
+        if marked is not None and self._beyond(marked) < 0:  # the lower rate has helped, or the loss is over
+            self._marked = None
+            while self._counts[0][0] < marked[0]:
+                self._counts.popleft()
+
+    def exceeds(self) -> bool:
+        """Whether too many are lost."""
+        return bool(self._counts) and self._beyond(self._counts[0]) > 0
+
+    def lasts(self) -> bool:
+        """Whether too many were lost, as counted, since `mark`."""
+        return self._marked is None or self._share_since(self._marked) > self._most_share
+
+    def mark(self) -> None:
+        """The rate falls for it."""
+        self._marked = self._counts[-1]
+
+    def clear(self) -> None:
+        """What was lost before is no property of the link from now on."""
+        self._counts.clear()
+        self._marked = None
+
+    @property
+    def share(self) -> float:
+        """Of the newest messages, 0…1; 0 where there are too few."""
+        few = not self._counts or self._since(self._counts[0])[0] < _FEW_MESSAGES
+        return 0.0 if few else self._share_since(self._counts[0])
+
+    def _since(self, first: tuple[int, int]) -> tuple[int, int]:
+        messages, lost = self._counts[-1]
+        return messages - first[0], min(messages - first[0], max(0, lost - first[1]))
+
+    def _share_since(self, first: tuple[int, int]) -> float:
+        messages, lost = self._since(first)
+        return lost / messages if messages else 0.0
+
+    def _beyond(self, first: tuple[int, int]) -> int:
+        """1 where surely more than the share was lost since then, -1 where surely less, 0 where nobody can tell."""
+        messages, lost = self._since(first)
+        if messages < _FEW_MESSAGES:
+            return 0
+        share, doubt = self._most_share, 0.0
+        if messages < _LOSS_MESSAGES:
+            doubt = _LOSS_DEVIATIONS * math.sqrt(share * (1 - share) * messages)
+        more = lost - share * messages
+        return (more > doubt) - (more < -doubt)
+
+
 @dataclass(frozen=True, slots=True)
 class _Judged:
     progress: Progress
@@ -137,7 +211,7 @@ class RateController:
         """How far along the curve of growth: only time in which nothing speaks against it counts."""
         self._last_ns: int | None = None
         self._silent = False
-        self._losses: deque[tuple[int, int]] = deque(maxlen=64)
+        self._losses = LossCount(settings.most_loss)
         self._next_loss_ns = 0
         self.backoffs = 0
         """How often the rate was lowered."""
@@ -182,16 +256,17 @@ class RateController:
             return self.rate_bps
         self._silent = False
         self._recent.append(_Judged(progress, excess_ns))
-        self._losses.append((progress.messages, progress.lost))
+        self._losses.add(progress.messages, progress.lost)
         limit_ns = self._limit_ns()
         if self._overused(limit_ns):
             self._back_off(progress, self._settings.backoff * min(self._rate, self._arriving_bps()))
-        elif (loss := self._loss()) > self._settings.most_loss:
-            if progress.now_ns >= self._next_loss_ns:
+        elif self._losses.exceeds():
+            if progress.now_ns >= self._next_loss_ns and self._losses.lasts():
                 self._next_loss_ns = progress.now_ns + _LOSS_EVERY_NS
-                self._back_off(progress, self._rate * (1 - loss / 2))
+                self._losses.mark()
+                self._back_off(progress, self._rate * (1 - self._losses.share / 2))
         elif excess_ns < limit_ns // 2:
-            self._grow(step_ns // 2 if loss > _SOME_LOSS else step_ns)
+            self._grow(step_ns // 2 if self._losses.share > _SOME_LOSS else step_ns)
         return self.rate_bps
 
     def on_silence(self, now_ns: int) -> int:
@@ -203,6 +278,7 @@ class RateController:
             self._rate = self._low = float(self._settings.floor_bps)
             self._curve_ns, self._plateau_ns = 0, self._settings.resume_ns
             self.backoffs += 1
+            self._losses.clear()  # what a link loses while it is away is no property of it
             self._start_over(now_ns)
         self._last_ns = now_ns
         return self.rate_bps
@@ -258,14 +334,6 @@ class RateController:
         """What arrived while the queue stood: what the link carries."""
         chosen = self._verdict() or list(self._recent)
         return _arrival_bps(chosen[0].progress, chosen[-1].progress) or self._rate
-
-    def _loss(self) -> float:
-        """The share of the last 100 messages or more that never came; 0 where there were fewer."""
-        last = self._losses[-1]
-        for messages, lost in reversed(self._losses):
-            if (sent := last[0] - messages) >= 100:
-                return min(1.0, max(0, last[1] - lost) / sent)
-        return 0.0
 
     def _back_off(self, progress: Progress, rate: float) -> None:
         broke_bps = min(self._rate, self._arriving_bps())

@@ -269,6 +269,84 @@ def test_heavy_loss_lowers_the_rate():
     assert world.pacer.backoffs >= 2
 
 
+ANY_FPS = pytest.mark.parametrize("fps", [1, 2, 3, 5, 7.5, 10, 15, 30])
+
+
+def rates_under_loss(fps: float, lost: list[bool], *, report_s: float = 0.1) -> list[int]:
+    """The rate after each report of a link without a queue that loses these messages, and reports the rest."""
+    controller = RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))
+    rates, count, reported_s = [], 0, -1.0
+    for number, gone in enumerate(lost):
+        count += gone
+        if gone or number / fps - reported_s < report_s:
+            continue
+        reported_s, sent_ns = number / fps, round(number * S / fps)
+        controller.on_progress(
+            Progress(
+                now_ns=sent_ns + 40 * MS, sent_ns=sent_ns, arrived_ns=sent_ns + 20 * MS, serialization_ns=0,
+                arrived_bytes=round((number + 1) * 100_000 / fps), messages=number + 1, lost=count,
+            )
+        )  # fmt: skip
+        rates.append(controller.rate_bps)
+    return rates
+
+
+def losses(share: float, count: int, *, seed: int) -> list[bool]:
+    """Which of so many messages are lost."""
+    chance = random.Random(f"{share} {seed}")
+    return [chance.random() < share for _ in range(count)]
+
+
+@ANY_FPS
+@pytest.mark.parametrize(("share", "messages"), [(0.15, 400), (0.2, 250), (0.3, 120), (0.4, 80)])
+def test_heavy_loss_lowers_the_rate_at_any_frame_rate(fps, share, messages):
+    """At ten frames a second and below a policer would be flooded for ever: too few messages came together."""
+    for seed in range(3):
+        rates = rates_under_loss(fps, losses(share, messages, seed=seed))
+        assert rates[-1] < 700_000, f"{share:.0%} lost of {messages} messages, seed {seed}"
+
+
+@ANY_FPS
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.05])
+def test_a_little_loss_leaves_the_rate_at_any_frame_rate(fps, share):
+    """A radio that loses one packet in twenty would be taken for a full one, or two lost of three for all."""
+    for seed in range(3):
+        assert min(rates_under_loss(fps, losses(share, 600, seed=seed))) > 600_000
+    assert min(rates_under_loss(fps, [False, True, True, *[False] * 17])) == 800_000
+
+
+@ANY_FPS
+def test_a_loss_that_is_over_lowers_the_rate_no_more(fps):
+    """Behind a hill a few seconds were lost: at two frames a second the rate would go on falling for a minute."""
+    rates = rates_under_loss(fps, [*losses(0.4, 60, seed=1), *[False] * 200])
+    lowest = rates.index(min(rates))
+    assert min(rates) < 700_000
+    assert lowest < 60, "of the reports: some 36 come while messages are lost"
+    assert rates[-1] == 800_000
+
+
+def test_what_an_outage_lost_is_no_property_of_the_link():
+    """After each tunnel the rate would stay down for the messages that were lost in it."""
+    controller = RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))
+    number = lost = 0
+    for second in range(60):
+        if 20 <= second < 24:
+            number, lost = number + 15, lost + 15
+            controller.on_silence(second * S)
+            continue
+        for frame in range(15):
+            number += 1
+            sent_ns = second * S + frame * S // 15
+            controller.on_progress(
+                Progress(
+                    now_ns=sent_ns + 40 * MS, sent_ns=sent_ns, arrived_ns=sent_ns + 20 * MS, serialization_ns=0,
+                    arrived_bytes=number * 7_000, messages=number, lost=lost,
+                )
+            )  # fmt: skip
+    assert controller.backoffs == 1, "the silence itself"
+    assert controller.rate_bps == 800_000
+
+
 @pytest.mark.parametrize("stills", [True, False])
 def test_a_link_below_the_budget_is_filled_without_oscillation(stills):
     """The picture would pump between coarse and frozen."""
