@@ -1,12 +1,16 @@
-"""The clock of a process: Unix time that never steps."""
+"""The clock of a process, Unix time that never steps; how much time has passed, whatever the wall clock says."""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from uuid import uuid4
 
-__all__ = ["SteadyClock"]
+__all__ = ["Moment", "SteadyClock", "boot_id", "since_boot_ns", "unwitnessed_ns"]
 
 _log = logging.getLogger(__name__)
 
@@ -51,3 +55,39 @@ class SteadyClock:
                 "until the next start",
                 off_ns / 1e9,
             )
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One moment by two clocks: by the one that may be set, and by the one of this boot, which nobody sets."""
+
+    unix_ns: int
+    boot: str
+    """Which boot ``steady_ns`` counts from."""
+    steady_ns: int
+
+
+@cache
+def boot_id() -> str:
+    """Of this boot of the machine; where the system has none, of this process."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return uuid4().hex
+
+
+def since_boot_ns() -> int:
+    """Nanoseconds since this boot, those included in which the machine slept."""
+    return time.clock_gettime_ns(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
+def unwitnessed_ns(before: Moment, now: Moment, *, most_ns: int) -> int:
+    """By how much Unix time has moved from ``before`` to ``now`` beyond the time that is known to have passed.
+
+    Within a boot that time is known. Over a boot nobody knows it: the clock of a machine without a battery stood
+    still, and a clock that was set says nothing of how it was before. Then what it says counts up to ``most_ns``.
+    """
+    moved_ns = now.unix_ns - before.unix_ns
+    if now.boot == before.boot:
+        return moved_ns - (now.steady_ns - before.steady_ns)
+    return moved_ns - min(max(moved_ns, 0), most_ns)

@@ -9,6 +9,9 @@ What has to go where the store is full, least useful first:
   short while ago than from an hour ago.
 * **Stills by their worth**: the utility that their method gave, halved with each ten minutes. They are a hundredth
   of the video's bytes and most of what it shows of an object, so the best outlive the video around them.
+
+What earlier runs have stored is moved to the clock of this run when it is taken over, because that of an earlier one
+may have been years off: so ages and order are those of the time that has passed (`unwitnessed_ns`).
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import contextlib
 import errno
 import logging
 import sqlite3
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,8 +34,10 @@ from hvt_common.protocol.messages import (
     ObjectKey,
     pack_backlog_units,
 )
+from hvt_common.runtime.clock import Moment, boot_id, since_boot_ns, unwitnessed_ns
+from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.entry import Entry, OpenSegment, worth
+from hvt_edge.backlog.entry import Entry, OpenSegment, moved_rank, worth
 
 __all__ = ["FILE_NAME", "Store"]
 
@@ -44,6 +50,10 @@ _LOG_BYTES = 2 * 64 * _PAGE_BYTES
 """Of the write-ahead log: 64 pages are moved into the file, and the last write before that may be a large one."""
 _REMOVED = "removed, with all that was stored"
 _TRIAL_BYTES = 64 * 1024
+_SET_NS = 60 * SECOND_NS
+"""From capture to store may pass some seconds, and no clock has been set for that."""
+_TRUSTED_SHARE = 1 / 4
+"""Of ``--store-age``: so much the clock's word counts at most for the time between two boots."""
 # One process at a time: exclusive locking also keeps the log's index in memory, so no disk needs shared mappings.
 _NEW = """
 PRAGMA page_size = 4096;
@@ -65,10 +75,12 @@ CREATE TABLE IF NOT EXISTS part (
     object INTEGER REFERENCES object ON DELETE CASCADE, frame_index INTEGER, capture_ns INTEGER, keyframe INTEGER,
     crc INTEGER, data BLOB);
 CREATE INDEX IF NOT EXISTS part_object ON part (object);
+CREATE TABLE IF NOT EXISTS stored (capture_ns INTEGER, boot TEXT, steady_ns INTEGER);
 CREATE TEMP TABLE gone (id INTEGER PRIMARY KEY);
 CREATE TEMP VIEW here AS SELECT * FROM object WHERE id NOT IN (SELECT id FROM gone);
 COMMIT;
 """
+# `stored` is when the newest object was, by both clocks; `object.capture_ns` is by the clock of the run that has it.
 # `gone` is what has arrived and cannot be deleted yet, because a full disk has no space for the log either.
 # After a kill the segment that was open has no size yet.
 _ADOPT = """
@@ -90,12 +102,21 @@ class Store:
     """The objects of this session and of those before it, in bounded space. For one thread; any may read the counts.
 
     The folder is made when something is stored for the first time; ``max_bytes`` counts the file and its log.
-    ``info()`` is this session's `Info`, packed. What was captured before ``oldest_ns`` is dropped by `enter`.
+    ``info()`` is this session's `Info`, packed. What was captured before ``oldest_ns`` is dropped by `enter`; that is
+    of ``clock``, as capture times are, Unix nanoseconds. ``since_boot()`` is the boot and its nanoseconds.
     Every method raises `OSError` where the disk refuses, and can be called again.
     """
 
     def __init__(
-        self, path: Path, *, max_bytes: int, session_id: int, info: Callable[[], bytes], oldest_ns: int = 0
+        self,
+        path: Path,
+        *,
+        max_bytes: int,
+        session_id: int,
+        info: Callable[[], bytes],
+        oldest_ns: int = 0,
+        clock: Callable[[], int] = time.time_ns,
+        since_boot: Callable[[], tuple[str, int]] = lambda: (boot_id(), since_boot_ns()),
     ) -> None:
         self.path = path
         self._file = path / FILE_NAME
@@ -105,6 +126,8 @@ class Store:
         self._session_id = session_id
         self._info = info
         self._oldest_ns = oldest_ns
+        self._clock = clock
+        self._since_boot = since_boot
         self._db: sqlite3.Connection | None = None
         self._open: OpenSegment | None = None
         self._still_bytes = self._span_ns = 0
@@ -189,6 +212,9 @@ class Store:
             values = (self._session, kind, number, capture_ns, rank, len(data), 0)
             insert = "INSERT INTO object VALUES (NULL, ?, ?, ?, ?, ?, ?, ?)"
             row = self._db.execute(insert, values).lastrowid
+            if kind is not BacklogKind.INFO:
+                self._db.execute("DELETE FROM stored")
+                self._db.execute("INSERT INTO stored VALUES (?, ?, ?)", (capture_ns, *self._since_boot()))
             if data:
                 crc = zlib.crc32(data)
                 self._db.execute("INSERT INTO part (object, crc, data) VALUES (?, ?, ?)", (row, crc, data))
@@ -348,17 +374,43 @@ class Store:
         """What earlier runs have stored, but for what is too old. A full disk refuses that, and can still be read."""
         with contextlib.suppress(sqlite3.OperationalError):
             db.executescript(_ADOPT)
-            too_old = "DELETE FROM object WHERE kind <> 'info' AND capture_ns < ?"
-            dropped = db.execute(too_old, (self._oldest_ns,)).rowcount
+            self._move_times(db)
+            too_old = "FROM object WHERE kind <> 'info' AND capture_ns < ?"
+            dropped = db.execute(f"SELECT session, kind, number {too_old}", (self._oldest_ns,)).fetchall()
+            db.execute(f"DELETE {too_old}", (self._oldest_ns,))
             if dropped:
+                named = ", ".join(
+                    f"{kind} {number} of session {session}" for session, kind, number in dropped[:5]
+                )
+                more = ", …" if len(dropped) > 5 else ""
                 _log.warning(
                     "%d stills and stretches of video of an earlier run were never sent and are older than "
-                    "--store-age: they are dropped",
-                    dropped,
+                    "--store-age: they are dropped (%s)",
+                    len(dropped),
+                    named + more,
                 )
             db.execute(_TIDY, (self._session,))
         self._count()
         self._evict_for(0, db)
+
+    def _move_times(self, db: sqlite3.Connection) -> None:
+        """Of what earlier runs have stored: to the present clock."""
+        found = db.execute("SELECT capture_ns, boot, steady_ns FROM stored").fetchone()
+        if found is None:  # a version that did not note it, if any
+            (newest_ns,) = db.execute("SELECT max(capture_ns) FROM object WHERE kind <> 'info'").fetchone()
+            if newest_ns is None:
+                return
+            found = newest_ns, "", 0
+        now_ns = self._clock()
+        most_ns = round(max(0, now_ns - self._oldest_ns) * _TRUSTED_SHARE)
+        moved_ns = unwitnessed_ns(Moment(*found), Moment(now_ns, *self._since_boot()), most_ns=most_ns)
+        if abs(moved_ns) > _SET_NS:
+            with db:
+                db.execute("BEGIN")
+                for kind in (BacklogKind.BASE, BacklogKind.STILL):
+                    move = "UPDATE object SET capture_ns = capture_ns + ?, rank = rank + ? WHERE kind = ?"
+                    db.execute(move, (moved_ns, moved_rank(kind, moved_ns), kind))
+                db.execute("UPDATE stored SET capture_ns = capture_ns + ?", (moved_ns,))
 
     def _disconnect(self) -> None:
         db, self._db, self._open = self._db, None, None

@@ -9,7 +9,7 @@ from hvt_common.protocol.messages import MAX_BACKLOG_BYTES, BacklogKind, ObjectK
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 
-__all__ = ["FIRST_STORED", "SEGMENT_NS", "Entry", "OpenSegment", "worth"]
+__all__ = ["FIRST_STORED", "SEGMENT_NS", "Entry", "OpenSegment", "moved_rank", "worth"]
 
 FIRST_STORED = 2**31
 """Stills that are stored for later have numbers of their own: those that are sent have no holes then."""
@@ -82,3 +82,8 @@ def worth(utility: float, capture_ns: int) -> float:
     else:
         strength = _LEAST_STRENGTH - math.log2(1 + min(-utility, 1e12))
     return strength + capture_ns / _HALF_LIFE_NS
+
+
+def moved_rank(kind: BacklogKind, moved_ns: int) -> float:
+    """What is added to the rank of an object whose time moves by so much."""
+    return moved_ns / _HALF_LIFE_NS if kind is BacklogKind.STILL else float(moved_ns)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import atexit
 import operator
 import threading
-import time
 from typing import Any, Self, cast
 
 import numpy as np
@@ -61,7 +60,9 @@ class PushedEdge:
         self._grabber = _PushGrabber()
         self._stop = threading.Event()
         self._error: BaseException | None = None
-        self._edge = Edge(config, stop=self._stop, world=_PushedWorld(self._grabber))
+        world = _PushedWorld(self._grabber)
+        self._clock = world.clock
+        self._edge = Edge(config, stop=self._stop, world=world)
         self._thread = threading.Thread(target=self._run, name="hvt-edge", daemon=True)
         self._thread.start()
         atexit.register(self._stop_and_join)
@@ -72,7 +73,7 @@ class PushedEdge:
         ``capture_ns`` is when it was taken, Unix nanoseconds, a whole number; None is now. Raises `ValueError` for
         another array or time, and `UserError` or `FlightError` once the edge has ended for that.
         """
-        taken_ns = time.time_ns() if capture_ns is None else _nanoseconds(capture_ns)
+        taken_ns = self._clock() if capture_ns is None else _nanoseconds(capture_ns)
         if (
             frame_bgr.dtype != np.uint8
             or frame_bgr.ndim != 3

@@ -86,7 +86,7 @@ def make_backlog(
     path = store_folder(config)
     oldest_ns = max(0, clock() - round(config.store_age * SECOND_NS))
     return BacklogStage(
-        Store(path, max_bytes=max_bytes, session_id=session_id, info=info, oldest_ns=oldest_ns),
+        Store(path, max_bytes=max_bytes, session_id=session_id, info=info, oldest_ns=oldest_ns, clock=clock),
         session_id=session_id,
         live=live,
         link=BacklogLink(

@@ -87,7 +87,10 @@ def _cells(row: RecordingRow) -> tuple[str, ...]:
         " ".join([classes, *notes]).strip(),
     )
     # Names come from the wire: none may move the cursor.
-    return tuple("".join(one if one.isprintable() else "?" for one in cell) for cell in cells)
+    return tuple(
+        cell if cell.isprintable() else "".join(one if one.isprintable() else "?" for one in cell)
+        for cell in cells
+    )
 
 
 def _as_json(row: RecordingRow, folder: Path) -> dict[str, object]:

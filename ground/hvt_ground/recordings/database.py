@@ -13,6 +13,8 @@ from contextlib import closing
 from pathlib import Path
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.clock import Moment, unwitnessed_ns
+from hvt_common.units import SECOND_NS
 from hvt_ground.recordings.row import RecordingRow
 
 __all__ = ["INDEX", "Index", "read_index"]
@@ -34,6 +36,8 @@ CREATE TABLE classes (
 ) WITHOUT ROWID;
 CREATE INDEX by_class ON classes (class);
 """
+_LOOKED = "CREATE TABLE IF NOT EXISTS looked (unix_ns INTEGER, boot TEXT, steady_ns INTEGER)"
+"""When a ground looked last; grounds of before it was kept are not troubled by it."""
 _COLUMNS = (
     *("file", "edge", "session", "begin_ns", "end_ns", "written_ns", "size_bytes", "frames", "stills"),
     *("backlog", "video", "whole"),
@@ -76,14 +80,37 @@ class Index:
                 "INSERT INTO classes VALUES (?, ?, ?)", [(row.file, *one) for one in row.classes.items()]
             )
 
+    def stripped(self, file: str, *, size_bytes: int) -> None:
+        """The file has lost its video."""
+        with self._database as transaction:
+            transaction.execute(
+                "UPDATE recordings SET video = 0, size_bytes = ? WHERE file = ?", [size_bytes, file]
+            )
+
     def forget(self, files: Iterable[str]) -> None:
         """The files are there no more."""
         with self._database as transaction:
             transaction.executemany("DELETE FROM recordings WHERE file = ?", [(one,) for one in files])
 
-    def rows(self) -> list[RecordingRow]:
-        """All files, in the order of their times."""
-        return _rows(self._database)
+    def pass_time(self, now: Moment, *, most_ns: int) -> int:
+        """Note that time has passed; the nanoseconds by which the clock moved otherwise, and all times with it.
+
+        So the files keep their ages and their order, whoever sets the clock. The first to look with another clock
+        moves them, of all grounds that have the folder.
+        """
+        with self._database as transaction:
+            transaction.execute("BEGIN IMMEDIATE")
+            before = transaction.execute("SELECT unix_ns, boot, steady_ns FROM looked").fetchone()
+            moved_ns = 0 if before is None else unwitnessed_ns(Moment(*before), now, most_ns=most_ns)
+            if abs(moved_ns) > SECOND_NS:
+                transaction.execute("UPDATE recordings SET written_ns = written_ns + ?", [moved_ns])
+            transaction.execute("DELETE FROM looked")
+            transaction.execute("INSERT INTO looked VALUES (?, ?, ?)", [now.unix_ns, now.boot, now.steady_ns])
+        return moved_ns
+
+    def rows(self, *, classes: bool = True) -> list[RecordingRow]:
+        """All files, in the order of their times; without ``classes`` it is quicker where there are many."""
+        return _rows(self._database, classes=classes)
 
 
 def read_index(folder: Path) -> list[RecordingRow]:
@@ -118,6 +145,7 @@ def _opened(path: Path) -> sqlite3.Connection:
         database.execute("PRAGMA foreign_keys = ON")
         if not version:
             database.executescript(f"BEGIN IMMEDIATE; {_TABLES} PRAGMA user_version = {_VERSION}; COMMIT;")
+        database.execute(_LOOKED)
         _check(database)
     except BaseException:
         database.close()
@@ -148,18 +176,16 @@ def _set_aside(path: Path, error: Exception) -> None:
     path.replace(aside)
 
 
-def _rows(database: sqlite3.Connection) -> list[RecordingRow]:
-    classes: dict[str, dict[str, int]] = {}
-    for file, name, tracks in database.execute(
-        "SELECT file, class, tracks FROM classes ORDER BY tracks DESC"
-    ):
-        classes.setdefault(file, {})[name] = tracks
+def _rows(database: sqlite3.Connection, *, classes: bool = True) -> list[RecordingRow]:
+    by_file: dict[str, dict[str, int]] = {}
+    if classes:
+        for file, name, tracks in database.execute(
+            "SELECT file, class, tracks FROM classes ORDER BY tracks DESC"
+        ):
+            by_file.setdefault(file, {})[name] = tracks
     order = "coalesce(begin_ns, written_ns), file"
     found = database.execute(f"SELECT {', '.join(_COLUMNS)} FROM recordings ORDER BY {order}")  # noqa: S608
     return [
-        RecordingRow(
-            **dict(zip(_COLUMNS, (*values[:-3], *map(bool, values[-3:])), strict=True)),
-            classes=classes.get(values[0], {}),
-        )
-        for values in found
+        RecordingRow(*(*facts, by_file.get(facts[0], {}), bool(backlog), bool(video), bool(whole)))
+        for *facts, backlog, video, whole in found
     ]

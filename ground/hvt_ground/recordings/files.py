@@ -18,7 +18,7 @@ from rerun.chunk import Chunk, RrdReader
 from hvt_ground.recordings.row import FileAccount, RecordingRow
 from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 
-__all__ = ["SCRATCH", "claimed", "described", "is_claimed", "is_own_name", "remove_video"]
+__all__ = ["SCRATCH", "claimed", "described", "is_claimed", "remove_video"]
 
 SCRATCH = ".part"
 """Ends the name of a copy that is being made of a recording."""
@@ -26,13 +26,7 @@ _SPARE_BYTES = 2 * 2**20
 _PATIENCE_S = 600.0
 _VIDEO = "/base/video"
 _LAYERS = ("/base/tracks", "/base/reported", "/base/refined")
-_OWN = re.compile(r"hvt-.+-\d{8}-\d{6}(-\d+|-backlog)*\.rrd")
 _STILL = re.compile(r"(late )?still #(\d+) ")
-
-
-def is_own_name(name: str) -> bool:
-    """Whether a ground gives such names of its own accord: a copy that somebody named is his."""
-    return _OWN.fullmatch(name) is not None
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import subprocess
 import threading
 import time
@@ -13,11 +14,13 @@ from pathlib import Path
 from typing import Self
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.clock import Moment, boot_id, since_boot_ns
 from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
 from hvt_ground.recordings.database import Index
-from hvt_ground.recordings.files import SCRATCH, claimed, described, is_claimed, is_own_name, remove_video
+from hvt_ground.recordings.files import SCRATCH, claimed, described, is_claimed, remove_video
 from hvt_ground.recordings.retention import Retention, due
-from hvt_ground.recordings.row import RecordingRow
+from hvt_ground.recordings.row import RecordingRow, is_own_name
 from hvt_ground.sinks import QueuedSink
 
 __all__ = ["IndexWriter", "RecordingsFolder"]
@@ -26,6 +29,9 @@ _log = logging.getLogger(__name__)
 
 _POLL_S = 60.0
 _END_S = 3.0
+_SET_NS = 10 * SECOND_NS
+_DOUBT_NS = 3600 * SECOND_NS
+"""For so long after the clock was set nothing goes for its age: who set it may set it again."""
 
 
 class IndexWriter:
@@ -33,33 +39,46 @@ class IndexWriter:
 
     At the beginning it is brought to what is in the folder: files that are gone are forgotten, those that a killed
     program left are read, and so are those that it does not know, as far as they have a name of ours.
+
+    A wall clock may be years off, and be set at any time: ages count the time since the index learned of a file,
+    which is that of the boot's own clock (`Index.pass_time`). For its age one file goes at a time.
     """
 
     path: Path | None = None
     """It is no recording."""
 
     def __init__(
-        self, folder: Path, retention: Retention, *, now_ns: Callable[[], int] = time.time_ns
+        self,
+        folder: Path,
+        retention: Retention,
+        *,
+        now_ns: Callable[[], int] = time.time_ns,
+        since_boot: Callable[[], tuple[str, int]] = lambda: (boot_id(), since_boot_ns()),
     ) -> None:
         self._folder = folder
         self._retention = retention
         self._now_ns = now_ns
+        self._since_boot = since_boot
+        self._doubted_ns: int | None = None
+        """When the clock was found to have been set, by ``since_boot``."""
         self._refused: set[str] = set()
         """Files that could not be removed or stripped: said once."""
         self._index = Index(folder)
         try:
-            self._compare()
-            self._remove_due()
+            now = self._pass_time()
+            self._compare(now.unix_ns)
+            self._remove_due(now)
         except BaseException:
             self._index.close()
             raise
 
     def log(self, item: RecordingRow | None) -> None:
         """Note what is known of a file; None looks for what is due."""
+        now = self._pass_time()
         if item is not None:
-            self._index.put(item)
+            self._index.put(replace(item, written_ns=now.unix_ns))
         if item is None or item.whole:
-            self._remove_due()
+            self._remove_due(now)
 
     def skipped(self, count: int) -> None:
         """The next row of a file says it all; one that was closed is read at the next start."""
@@ -68,7 +87,15 @@ class IndexWriter:
         """Close the index; a second call does nothing."""
         self._index.close()
 
-    def _compare(self) -> None:
+    def _pass_time(self) -> Moment:
+        """Before anything is noted or judged: with what the clock says now, all files have the age they have."""
+        now = Moment(self._now_ns(), *self._since_boot())
+        moved_ns = self._index.pass_time(now, most_ns=self._retention.trusted_ns)
+        if abs(moved_ns) > _SET_NS:
+            self._doubted_ns = now.steady_ns
+        return now
+
+    def _compare(self, now_ns: int) -> None:
         known = {row.file: row for row in self._index.rows()}
         there = {one.name for one in self._folder.glob("*.rrd") if one.is_file() and not one.is_symlink()}
         self._index.forget(known.keys() - there)
@@ -87,27 +114,45 @@ class IndexWriter:
                     continue
                 found = described(path)
             if found is not None and (row is not None or name.startswith(f"hvt-{found.edge}-")):
-                self._index.put(found)
+                # Nobody saw how old one is that is met for the first time.
+                self._index.put(replace(found, written_ns=now_ns if row is None else row.written_ns))
             elif row is not None:
                 self._index.put(replace(row, size_bytes=path.stat().st_size, whole=True))
 
-    def _remove_due(self) -> None:
-        if not (self._retention.limits or self._retention.video_age):
+    def _remove_due(self, now: Moment) -> None:
+        retention = self._retention
+        if not (retention.limits or retention.video_age):
             return
-        rows = {row.file: row for row in self._index.rows() if _is_plain(row.file)}
-        gone = [name for name in rows if not (self._folder / name).exists()]
-        self._index.forget(gone)
-        for name in gone:
-            del rows[name]
-        in_use = {name for name in rows if is_claimed(self._folder / name)}
-        found = due(list(rows.values()), self._retention, in_use=in_use, now_ns=self._now_ns())
+        rows = {row.file: row for row in self._index.rows(classes=False) if _is_plain(row.file)}
+        there = {one.name for one in os.scandir(self._folder)}
+        self._index.forget(rows.keys() - there)
+        found = due(
+            [row for name, row in rows.items() if name in there],
+            retention,
+            in_use=_InUse(self._folder),
+            now_ns=now.unix_ns,
+        )
         for name in found.remove:
-            if self._done(name, "removed", (self._folder / name).unlink):
-                self._index.forget([name])
-        for name in found.strip:
-            path = self._folder / name
-            if self._done(name, "stripped of its video", partial(remove_video, path)):
-                self._index.put(replace(rows[name], video=False, size_bytes=path.stat().st_size))
+            self._remove(name, "all are larger than --keep allows, and it is the oldest")
+        if self._doubted_ns is not None and now.steady_ns - self._doubted_ns < _DOUBT_NS:
+            return
+        any(self._remove(name, "it is older than --keep allows") for name in found.outdated)
+        any(self._strip(rows[name]) for name in found.strip)
+
+    def _remove(self, name: str, why: str) -> bool:
+        if not self._done(name, "removed", (self._folder / name).unlink):
+            return False
+        self._index.forget([name])
+        _log.warning("recording %s is removed: %s", name, why)
+        return True
+
+    def _strip(self, row: RecordingRow) -> bool:
+        path = self._folder / row.file
+        if not self._done(row.file, "stripped of its video", partial(remove_video, path)):
+            return False
+        self._index.stripped(row.file, size_bytes=path.stat().st_size)
+        _log.warning("the video of recording %s is removed: it is older than --keep-video", row.file)
+        return True
 
     def _done(self, name: str, what: str, do: Callable[[], None]) -> bool:
         try:
@@ -168,6 +213,16 @@ class RecordingsFolder:
         """Files grow old while nobody flies, too."""
         while self._sink is not None and not self._stop.wait(_POLL_S):
             self._sink.log(None)
+
+
+class _InUse:
+    """Which files of a folder are written to: looked up for those in question alone."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __contains__(self, name: object) -> bool:
+        return is_claimed(self._folder / str(name))
 
 
 def _is_plain(name: str) -> bool:

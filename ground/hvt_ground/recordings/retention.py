@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS, Limit
-from hvt_ground.recordings.row import RecordingRow
+from hvt_ground.recordings.row import RecordingRow, begun_ns
 
 __all__ = ["Due", "Retention", "due"]
 
 _CLOCK_SET_NS = 1_577_836_800 * SECOND_NS
-"""2020: a file that is older was written before the machine knew the time, and nobody knows how old it is."""
+"""2020: a name of before was given before the machine knew the time, and nobody knows how old the file is."""
+_TRUSTED_SHARE = 1 / 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,48 +22,77 @@ class Retention:
     limits: tuple[Limit, ...] = ()
     video_age: Limit | None = None
 
+    @property
+    def ages(self) -> tuple[Limit, ...]:
+        """Those of the limits that are times."""
+        return tuple(one for one in self.limits if one.seconds is not None)
+
+    @property
+    def trusted_ns(self) -> int:
+        """What the clock's word for the time between two boots counts at most.
+
+        A clock that is wrong once, by however much, makes no file of today too old.
+        """
+        ages = [one.seconds or 0.0 for one in (*self.ages, self.video_age) if one is not None]
+        return round(min(ages, default=0.0) * _TRUSTED_SHARE * SECOND_NS)
+
 
 @dataclass(frozen=True, slots=True)
 class Due:
     """Names of files."""
 
     remove: tuple[str, ...] = ()
+    outdated: tuple[str, ...] = ()
+    """Too old: these go one by one."""
     strip: tuple[str, ...] = ()
-    """These lose their video."""
+    """These lose their video, one by one."""
 
 
-def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Collection[str], now_ns: int) -> Due:
+def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Container[str], now_ns: int) -> Due:
     """What is to be done, the oldest first.
 
     | a file | is |
     |---|---|
     | that is written to (``in_use``) | left alone, but counts among the bytes |
-    | whose last byte is older than a time of ``limits`` | removed |
+    | whose last byte is older than a time of ``limits``, and its name too | removed |
     | that is the oldest left while all have more bytes than ``limits`` allow | removed |
-    | with video, older than ``video_age`` | stripped of it |
+    | with video, older than ``video_age`` as above | stripped of it |
     """
     ordered = sorted(rows, key=lambda row: (row.written_ns, row.file))
-    free = [row for row in ordered if row.file not in in_use]
-    removed: list[str] = []
-    for limit in retention.limits:
-        if limit.seconds is not None:
-            removed += [row.file for row in free if _older(row, limit, now_ns)]
+    outdated = dict.fromkeys(
+        row.file
+        for limit in retention.ages
+        for row in ordered
+        if _older(row, limit, now_ns) and row.file not in in_use
+    )
+    removed: dict[str, None] = {}
     for limit in retention.limits:
         if limit.size_bytes is not None:
-            excess = sum(row.size_bytes for row in rows if row.file not in removed) - limit.size_bytes
-            for row in free:
-                if excess > 0 and row.file not in removed:
-                    removed.append(row.file)
+            excess = sum(row.size_bytes for row in ordered) - limit.size_bytes
+            for row in ordered:
+                if excess <= 0:
+                    break
+                if row.file not in in_use:
+                    removed[row.file] = None
                     excess -= row.size_bytes
     video = retention.video_age
-    stripped = [
+    stripped = tuple(
         row.file
-        for row in free
-        if video is not None and row.video and row.file not in removed and _older(row, video, now_ns)
-    ]
-    return Due(tuple(removed), tuple(stripped))
+        for row in ordered
+        if video is not None
+        and row.video
+        and row.file not in outdated
+        and row.file not in removed
+        and _older(row, video, now_ns)
+        and row.file not in in_use
+    )
+    return Due(tuple(removed), tuple(outdated), stripped)
 
 
 def _older(row: RecordingRow, limit: Limit, now_ns: int) -> bool:
-    age_ns = now_ns - row.written_ns
-    return row.written_ns >= _CLOCK_SET_NS and age_ns > (limit.seconds or 0.0) * SECOND_NS
+    """Whether it is, by what the index has seen of it and by its own name."""
+    limit_ns = (limit.seconds or 0.0) * SECOND_NS
+    if now_ns - row.written_ns <= limit_ns:
+        return False
+    began_ns = begun_ns(row.file)
+    return began_ns is not None and began_ns >= _CLOCK_SET_NS and now_ns - began_ns > limit_ns

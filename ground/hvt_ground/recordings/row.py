@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
+import time
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 
-__all__ = ["FileAccount", "RecordingRow"]
+__all__ = ["FileAccount", "RecordingRow", "begun_ns", "is_own_name"]
 
+_OWN = re.compile(r"hvt-.+-(\d{8}-\d{6})(-\d+|-backlog)*\.rrd")
 _MOST_REMEMBERED = 4096
 """Tracks and stills that are known again; one that comes back after so many others counts twice."""
 _LATEST_NS = 2**63 - 1
@@ -30,7 +34,7 @@ class RecordingRow:
     end_ns: int | None
     """Of the last."""
     written_ns: int
-    """When it was written to last, by the ground's clock: its age counts from there."""
+    """When it was written to last: its age counts from there. `IndexWriter` says it, and moves it with the clock."""
     size_bytes: int
     frames: int
     """Access units."""
@@ -43,6 +47,22 @@ class RecordingRow:
     """False once the video was removed."""
     whole: bool = False
     """It was closed; otherwise it is written to, or its program was killed."""
+
+
+def is_own_name(name: str) -> bool:
+    """Whether a ground gives such names of its own accord: a copy that somebody named is his."""
+    return _OWN.fullmatch(name) is not None
+
+
+def begun_ns(name: str) -> int | None:
+    """When the session of a file began by its name, Unix time; None where that says nothing."""
+    found = _OWN.fullmatch(name)
+    try:
+        return (
+            None if found is None else int(time.mktime(time.strptime(found[1], "%Y%m%d-%H%M%S"))) * SECOND_NS
+        )
+    except (ValueError, OverflowError):
+        return None
 
 
 class FileAccount:

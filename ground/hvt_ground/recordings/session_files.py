@@ -202,7 +202,7 @@ class SessionFiles:
                 session=self._settings.session,
                 begin_ns=account.begin_ns,
                 end_ns=account.end_ns,
-                written_ns=time.time_ns(),
+                written_ns=0,
                 size_bytes=file.size_bytes,
                 frames=file.frames,
                 stills=account.stills,

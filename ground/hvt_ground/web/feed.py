@@ -13,7 +13,7 @@ from hvt_common.protocol.messages import Info
 from hvt_common.protocol.still_words import counts_text
 from hvt_common.runtime.failures import FailedPart
 from hvt_common.runtime.process import lower_priority
-from hvt_common.units import bitrate_text
+from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_ground.events import Event, MessageTiming, Notice, Overlay, Refinement, VideoSample
 from hvt_ground.state import EdgeState, GroundState, SessionState
 from hvt_ground.web.pictures import Pictures, jpeg
@@ -71,7 +71,9 @@ class SessionFeed:
             case Refinement():
                 self._still(item)
             case Notice():
-                message = self._text("notice", item, level=item.level, text=item.text, at=time.time())
+                message = self._text(
+                    "notice", item, level=item.level, text=item.text, at=self._clock() / SECOND_NS
+                )
                 self._hub.post(partial(self._hub.notice, self._page, message))
 
     def skipped(self, count: int) -> None:  # noqa: ARG002 - one is as bad as many

@@ -71,7 +71,7 @@ class WebPage:
         self._loop = asyncio.new_event_loop()
         self._hub = Hub(self._loop)
         config = uvicorn.Config(
-            make_site(Access(tokens, proxy), self._hub, EdgeRequests(self._control)),
+            make_site(Access(tokens, proxy), self._hub, EdgeRequests(self._control), clock=clock),
             ssl_certfile=None if keys is None else keys[0],
             ssl_keyfile=None if keys is None else keys[1],
             http=_BoundedProtocol,

@@ -43,8 +43,11 @@ _FILES = {
 class Site:
     """What the addresses do."""
 
-    def __init__(self, access: Access, hub: Hub, edge_requests: EdgeRequests) -> None:
+    def __init__(
+        self, access: Access, hub: Hub, edge_requests: EdgeRequests, clock: Callable[[], int]
+    ) -> None:
         self._access = access
+        self._clock = clock
         self._hub = hub
         self._requests = edge_requests
 
@@ -114,7 +117,7 @@ class Site:
         await socket.accept()
         viewer = Viewer()
         role: Role = socket.scope["role"]
-        viewer.put(text("hello", role=role, rungs=RUNGS, now=_now_ms()))
+        viewer.put(text("hello", role=role, rungs=RUNGS, now=self._now_ms()))
         self._hub.join(viewer)
         tasks = [asyncio.ensure_future(one) for one in (self._receive(socket, viewer), _send(socket, viewer))]
         try:
@@ -133,7 +136,7 @@ class Site:
         while True:
             try:
                 message = json.loads(await socket.receive_text())
-                _obey(self._hub, viewer, message)
+                self._obey(viewer, message)
             except (WebSocketDisconnect, RuntimeError, KeyError, TypeError, ValueError, RecursionError):
                 return
             now_s = time.monotonic()
@@ -141,24 +144,27 @@ class Site:
                 return
             times.append(now_s)
 
+    def _obey(self, viewer: Viewer, message: dict[str, Any]) -> None:
+        """Raises `ValueError` and the like for what is no message."""
+        match message["type"]:
+            case "watch":
+                edge = message["edge"]
+                if edge is None:
+                    self._hub.leave_edge(viewer)
+                    return
+                if message["rung"] not in RUNGS or not isinstance(edge, str):
+                    raise ValueError("no rung")
+                self._hub.watch(viewer, edge, message["rung"])
+            case "wall":
+                self._hub.show_wall(viewer, shown=message["shown"] is True)
+            case "time":
+                viewer.put(text("time", sent=float(message["sent"]), now=self._now_ms()))
+            case _:
+                raise ValueError("no message")
 
-def _obey(hub: Hub, viewer: Viewer, message: dict[str, Any]) -> None:
-    """Raises `ValueError` and the like for what is no message."""
-    match message["type"]:
-        case "watch":
-            edge = message["edge"]
-            if edge is None:
-                hub.leave_edge(viewer)
-                return
-            if message["rung"] not in RUNGS or not isinstance(edge, str):
-                raise ValueError("no rung")
-            hub.watch(viewer, edge, message["rung"])
-        case "wall":
-            hub.show_wall(viewer, shown=message["shown"] is True)
-        case "time":
-            viewer.put(text("time", sent=float(message["sent"]), now=_now_ms()))
-        case _:
-            raise ValueError("no message")
+    def _now_ms(self) -> float:
+        """By the clock of all other times on the page."""
+        return round(self._clock() / 1e6, 1)
 
 
 async def _send(socket: WebSocket, viewer: Viewer) -> None:
@@ -197,10 +203,6 @@ def _file(name: str) -> Response:
         return PlainTextResponse("there is nothing here", 404)
     data, media_type = _FILES[name]
     return Response(data, media_type=media_type)
-
-
-def _now_ms() -> float:
-    return round(time.time_ns() / 1e6, 1)
 
 
 class _Guard:
@@ -247,9 +249,11 @@ class _Guard:
         return None
 
 
-def make_site(access: Access, hub: Hub, edge_requests: EdgeRequests) -> Callable[..., Any]:
-    """The ASGI application."""
-    site = Site(access, hub, edge_requests)
+def make_site(
+    access: Access, hub: Hub, edge_requests: EdgeRequests, *, clock: Callable[[], int]
+) -> Callable[..., Any]:
+    """The ASGI application; ``clock`` is the ground's, Unix nanoseconds."""
+    site = Site(access, hub, edge_requests, clock)
     routes = [
         Route("/", site.index),
         Route("/static/{name}", site.file),

@@ -166,17 +166,57 @@ def test_what_is_too_old_is_dropped_at_the_start(tmp_path, caplog):
     """Last week's flight would fill the link of today's."""
     with opened(tmp_path) as folder:
         add_stills(folder, {1: 1.0}, capture_ns=START_NS)
-        add_stills(folder, {2: 1.0}, capture_ns=START_NS + 100 * S)
         add_units(folder, UNITS[:5])
+    with opened(tmp_path, at_s=(100, 100)) as folder:
+        add_stills(folder, {2: 1.0}, capture_ns=START_NS + 100 * S)
     with (
         caplog.at_level(logging.WARNING),
-        opened(tmp_path, session_id=8, oldest_ns=START_NS + 50 * S) as folder,
+        opened(tmp_path, session_id=8, oldest_ns=START_NS + 50 * S, at_s=(110, 110)) as folder,
     ):
         assert numbers(folder.best_stills()) == [2]
         assert folder.segments == 0
     (said,) = caplog.messages
     assert said.startswith("2 stills and stretches of video")
     assert "--store-age" in said
+    assert "still 1 of session 0000000000000007" in said
+
+
+HOUR_S = 3600
+YEAR_S = 365 * 86_400
+
+
+@pytest.mark.parametrize("boot", ["a boot", "the next"])
+@pytest.mark.parametrize("set_by_s", [2 * HOUR_S, 56 * YEAR_S, -2 * YEAR_S])
+def test_a_clock_that_is_set_drops_nothing(tmp_path, caplog, set_by_s, boot):
+    """NTP comes between two flights, or the drone has no clock: what was not sent would be gone without a look."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0})
+        add_units(folder, UNITS)
+    for session_id in (8, 9):
+        now_s = set_by_s + 60
+        with opened(
+            tmp_path,
+            session_id=session_id,
+            oldest_ns=max(0, START_NS + (now_s - HOUR_S) * S),
+            at_s=(now_s, 60),
+            boot=boot,
+        ) as folder:
+            assert (folder.stills, folder.segments) == (1, 1)
+    assert caplog.messages == []
+
+
+@pytest.mark.parametrize("ahead_s", [-YEAR_S, YEAR_S])
+def test_the_oldest_goes_first_whatever_the_clocks_said(tmp_path, ahead_s):
+    """A flight with a clock that was behind has the oldest dates: it would make room, and be sent last."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0})
+        add_units(folder, UNITS)
+    with opened(tmp_path, session_id=8, at_s=(ahead_s + 60, 60)) as folder:
+        add_stills(folder, {2: 1.0}, capture_ns=START_NS + (ahead_s + 60) * S)
+        add_units(folder, [shifted(one, ahead_s + 60) for one in UNITS])
+    with opened(tmp_path, session_id=9, at_s=(300, 300)) as folder:
+        assert [one.session_id for one in folder.newest_segments()] == [8, 7]
+        assert numbers(folder.best_stills()) == [2, 1]
 
 
 def test_corrupt_entries_are_skipped_with_few_warnings(tmp_path, caplog):
@@ -353,7 +393,7 @@ def test_a_full_disk_evicts_nothing_in_vain(small_disk):
     with contextlib.suppress(OSError), (small_disk / "junk").open("wb", buffering=0) as junk:
         while junk.write(bytes(4096)):
             pass
-    folder = Store(small_disk, max_bytes=700_000, session_id=8, info=INFO.pack)
+    folder = Store(small_disk, max_bytes=720_000, session_id=8, info=INFO.pack)
     with pytest.raises(OSError, match="no space is left"):
         folder.enter()
     assert numbers(folder.newest_segments()) == stored

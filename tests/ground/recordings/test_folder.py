@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.clock import boot_id, since_boot_ns
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import Limit
 from hvt_ground.events import Event, Refinement, VideoSample
@@ -36,7 +37,8 @@ from programs.rrd import Recording
 
 FRAMES = 60
 SPLIT = Limit(seconds=2.0)
-NAMES = [f"hvt-uav-1-20261122-130000-000{number}.rrd" for number in (1, 2)]
+STEM = time.strftime("hvt-uav-1-%Y%m%d-%H%M%S")
+NAMES = [f"{STEM}-000{number}.rrd" for number in (1, 2)]
 ALL = Retention()
 
 
@@ -49,7 +51,7 @@ def events() -> list[Event]:
 
 def settings(folder: Path) -> RecorderSettings:
     """Of a session whose files have names of ours."""
-    path = folder / "hvt-uav-1-20261122-130000.rrd"
+    path = folder / f"{STEM}.rrd"
     return RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 400_000.0)
 
 
@@ -65,9 +67,24 @@ def fly(folder: Path, events: list[Event], retention: Retention = ALL) -> Failur
     return failures
 
 
-def look(folder: Path, retention: Retention = ALL, *, later_s: float = 0.0) -> list[RecordingRow]:
-    """Start a ground there, so much later; what the index says then."""
-    IndexWriter(folder, retention, now_ns=lambda: time.time_ns() + round(later_s * 1e9)).close()
+def look(
+    folder: Path, retention: Retention = ALL, *, later_s: float = 0.0, set_by_s: float = 0.0, times: int = 1
+) -> list[RecordingRow]:
+    """Start a ground there, so much later, which looks so often; what the index says then.
+
+    In between somebody set the clock by ``set_by_s``.
+    """
+    later_ns = round(later_s * 1e9)
+    with closing(
+        IndexWriter(
+            folder,
+            retention,
+            now_ns=lambda: time.time_ns() + later_ns + round(set_by_s * 1e9),
+            since_boot=lambda: (boot_id(), since_boot_ns() + later_ns),
+        )
+    ) as writer:
+        for _ in range(times - 1):
+            writer.log(None)
     return read_index(folder)
 
 
@@ -185,7 +202,7 @@ def test_an_index_that_is_removed_in_flight_is_made_anew(tmp_path, events):
     assert [one.file for one in look(tmp_path)] == NAMES
 
 
-def test_by_age_and_by_bytes(tmp_path, events):
+def test_by_age_and_by_bytes(tmp_path, events, caplog):
     """The disk is full after a month."""
     fly(tmp_path, events)
     day = Retention((Limit(seconds=86_400),))
@@ -194,8 +211,77 @@ def test_by_age_and_by_bytes(tmp_path, events):
     least = Retention((Limit(size_bytes=second.size_bytes),))
     assert [one.file for one in look(tmp_path, least)] == [second.file]
     assert not (tmp_path / first.file).exists()
-    assert look(tmp_path, day, later_s=90_000) == []
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        assert look(tmp_path, day, later_s=90_000) == []
+    assert caplog.messages == [f"recording {second.file} is removed: it is older than --keep allows"]
     assert list(tmp_path.glob("*.rrd")) == []
+
+
+def test_by_age_one_goes_at_a_time(tmp_path, events):
+    """Whatever went wrong with a clock, there would be nothing left to look at when it is noticed."""
+    fly(tmp_path, events)
+    day = Retention((Limit(seconds=86_400),))
+    assert [one.file for one in look(tmp_path, day, later_s=90_000)] == NAMES[1:]
+
+
+CLOCKS = Retention((Limit(seconds=90 * 86_400.0),), Limit(seconds=14 * 86_400.0))
+YEAR_S = 365 * 86_400.0
+
+
+@pytest.mark.parametrize("set_by_s", [100 * 86_400.0, 2 * YEAR_S, 56 * YEAR_S, -2 * YEAR_S])
+def test_a_clock_that_is_set_removes_nothing(tmp_path, events, set_by_s):
+    """NTP comes after the flight, or the clock is years ahead: the flight of a minute ago would be gone."""
+    fly(tmp_path, events)
+    for step_s in (set_by_s, 0.0, set_by_s):  # in flight, and at the next starts
+        rows = look(tmp_path, CLOCKS, set_by_s=step_s, later_s=60, times=3)
+        assert [(one.file, one.video) for one in rows] == [(name, True) for name in NAMES]
+        rows = look(tmp_path, CLOCKS, set_by_s=step_s, later_s=7200, times=3)
+        assert [(one.file, one.video) for one in rows] == [(name, True) for name in NAMES]
+
+
+@pytest.mark.parametrize("ahead_s", [2 * YEAR_S, -56 * YEAR_S])
+def test_a_clock_that_is_wrong_after_a_boot_removes_nothing(tmp_path, events, ahead_s):
+    """The clock of a machine without a battery says anything: nobody knows how long it was off."""
+    fly(tmp_path, events)
+    clock = {
+        "now_ns": lambda: time.time_ns() + round(ahead_s * 1e9),
+        "since_boot": lambda: ("the next", since_boot_ns()),
+    }
+    with closing(IndexWriter(tmp_path, CLOCKS, **clock)) as writer:
+        for _ in range(3):
+            writer.log(None)
+    assert [(one.file, one.video) for one in read_index(tmp_path)] == [(name, True) for name in NAMES]
+
+
+def test_files_that_no_look_has_seen_before_are_not_old(tmp_path, events):
+    """A copied folder, or a lost index: their times are those of the copy, or of a clock that nobody knows."""
+    fly(tmp_path, events)
+    (tmp_path / INDEX).unlink()
+    for one in NAMES:
+        os.utime(tmp_path / one, (0, 0))
+        (tmp_path / one).rename(tmp_path / one.replace(STEM, "hvt-uav-1-20200202-020202"))
+    week = Retention((Limit(seconds=7 * 86_400.0),))
+    assert len(look(tmp_path, week, times=3)) == 2
+    assert len(look(tmp_path, week, later_s=8 * 86_400)) == 1
+
+
+def test_by_bytes_the_newest_stays_whatever_the_clock_says(tmp_path, events):
+    """The flight in the air has the oldest date where the clock was set back: it would make room for the others."""
+    row = RecordingRow("", "uav-1", "00ff", None, None, 0, 100, 1, 0, whole=True)
+    limit = Retention((Limit(size_bytes=200),))
+    clock_ns = [time.time_ns()]
+    since_boot = [("first", 0)]
+    files = [f"hvt-uav-1-20261122-13000{number}.rrd" for number in range(3)]
+    with closing(
+        IndexWriter(tmp_path, limit, now_ns=lambda: clock_ns[0], since_boot=lambda: since_boot[0])
+    ) as writer:
+        for file, days, boot in zip(files, (0, -1000, 500), ("first", "first", "second"), strict=True):
+            clock_ns[0] = time.time_ns() + round(days * 86_400e9)
+            since_boot[0] = (boot, since_boot_ns())
+            (tmp_path / file).touch()
+            writer.log(replace(row, file=file))
+    assert [one.file for one in read_index(tmp_path)] == files[1:]
 
 
 def test_what_somebody_removed_does_not_count(tmp_path, events):
@@ -203,7 +289,7 @@ def test_what_somebody_removed_does_not_count(tmp_path, events):
     fly(tmp_path, events)
     rows = read_index(tmp_path)
     both = Retention((Limit(size_bytes=sum(one.size_bytes for one in rows)),))
-    third = "hvt-uav-1-20261122-130000-0003.rrd"
+    third = f"{STEM}-0003.rrd"
     with closing(IndexWriter(tmp_path, both)) as writer:
         (tmp_path / NAMES[1]).rename(tmp_path / third)
         writer.log(replace(rows[1], file=third))
@@ -227,7 +313,7 @@ def test_only_files_of_ours_in_the_folder_are_removed(tmp_path, events):
             "FROM recordings LIMIT 1"
         )
         forged.execute("UPDATE recordings SET written_ns = 1600000000000000000")
-    look(folder, Retention((Limit(seconds=1.0),)))
+    look(folder, Retention((Limit(seconds=1.0),)), later_s=100, times=3)
     assert [one.name for one in kept if not one.exists()] == []
     assert link.is_symlink()
     assert sorted(one.name for one in folder.glob("*-0*.rrd")) == [link.name]
@@ -253,7 +339,7 @@ def test_video_is_removed_and_the_rest_stays(tmp_path, events):
     """Who wants to know in a year what flew there would have to keep all pictures for it."""
     fly(tmp_path, events)
     before = Recording(tmp_path / NAMES[0])
-    rows = look(tmp_path, Retention(video_age=Limit(seconds=86_400)), later_s=90_000)
+    rows = look(tmp_path, Retention(video_age=Limit(seconds=86_400)), later_s=90_000, times=2)
     assert [one.video for one in rows] == [False, False]
     after = Recording(tmp_path / NAMES[0])
     assert after.video() == []
@@ -272,7 +358,7 @@ def test_a_file_that_cannot_be_stripped_holds_up_no_other(tmp_path, events, capl
     """One bad file, and nothing is removed any more."""
     fly(tmp_path, events)
     (tmp_path / NAMES[0]).write_bytes(b"RRF2 no more")
-    rows = look(tmp_path, Retention(video_age=Limit(seconds=60.0)), later_s=1000)
+    rows = look(tmp_path, Retention(video_age=Limit(seconds=60.0)), later_s=1000, times=2)
     assert [one.video for one in rows] == [True, False]
     assert len([one for one in caplog.messages if "cannot be stripped" in one]) == 1
     assert (tmp_path / NAMES[0]).read_bytes() == b"RRF2 no more"
@@ -342,7 +428,7 @@ def test_a_ground_killed_while_it_removes_video_leaves_no_half_file(tmp_path, ev
     fly(folder, events)
     half = folder / f"{NAMES[0]}.part"
     half.write_bytes((folder / NAMES[0]).read_bytes()[:5000])  # as a kill in the middle leaves it
-    empty = folder / "hvt-uav-1-20261122-130000-0003.rrd"
+    empty = folder / f"{STEM}-0003.rrd"
     empty.touch()
     other = folder / "mine.rrd.part"
     other.write_text("mine")

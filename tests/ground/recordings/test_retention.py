@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from hvt_common.units import SECOND_NS, Limit
@@ -12,55 +14,79 @@ DAY_NS = 86_400 * SECOND_NS
 NOW_NS = 1_790_000_000 * SECOND_NS
 
 
-def row(days: float, *, video: bool = True, written_ns: int | None = None) -> RecordingRow:
-    """A file of 100 MB that was written to last so many days ago."""
-    written_ns = NOW_NS - round(days * DAY_NS) if written_ns is None else written_ns
-    return RecordingRow(
-        f"{days:g}.rrd", "uav-1", "00ff", None, None, written_ns, 100_000_000, 1, 0, video=video
-    )
+def name(days: float) -> str:
+    """Of a file whose session began so many days ago."""
+    begun = time.localtime((NOW_NS - round(days * DAY_NS)) // SECOND_NS)
+    return f"hvt-uav-1-{time.strftime('%Y%m%d-%H%M%S', begun)}.rrd"
+
+
+def row(days: float, *, video: bool = True, file: str | None = None) -> RecordingRow:
+    """A file of 100 MB that was written to last so many days ago, and named then."""
+    written_ns = NOW_NS - round(days * DAY_NS)
+    file = file or name(days)
+    return RecordingRow(file, "uav-1", "00ff", None, None, written_ns, 100_000_000, 1, 0, video=video)
+
+
+def names(*days: float) -> tuple[str, ...]:
+    """Of those files."""
+    return tuple(map(name, days))
 
 
 ROWS = [row(days) for days in (0, 1, 5, 20)]
 
 
 @pytest.mark.parametrize(
-    ("keep", "remove"),
+    ("keep", "remove", "outdated"),
     [
-        ((), ()),
-        ((Limit(seconds=14 * 86_400),), ("20.rrd",)),
-        ((Limit(size_bytes=400_000_000),), ()),
-        ((Limit(size_bytes=399_999_999),), ("20.rrd",)),
-        ((Limit(size_bytes=150_000_000),), ("20.rrd", "5.rrd", "1.rrd")),
-        ((Limit(seconds=3 * 86_400), Limit(size_bytes=200_000_000)), ("20.rrd", "5.rrd")),
-        ((Limit(size_bytes=100_000_000), Limit(seconds=14 * 86_400)), ("20.rrd", "5.rrd", "1.rrd")),
-        ((Limit(size_bytes=1),), ("20.rrd", "5.rrd", "1.rrd", "0.rrd")),
+        ((), (), ()),
+        ((Limit(seconds=14 * 86_400),), (), (20,)),
+        ((Limit(size_bytes=400_000_000),), (), ()),
+        ((Limit(size_bytes=399_999_999),), (20,), ()),
+        ((Limit(size_bytes=150_000_000),), (20, 5, 1), ()),
+        ((Limit(seconds=3 * 86_400), Limit(size_bytes=300_000_000)), (20,), (20, 5)),
+        ((Limit(size_bytes=100_000_000), Limit(seconds=14 * 86_400)), (20, 5, 1), (20,)),
+        ((Limit(size_bytes=1),), (20, 5, 1, 0), ()),
     ],
 )
-def test_the_oldest_go_first(keep, remove):
+def test_the_oldest_go_first(keep, remove, outdated):
     """The disk would fill, or the flight of today be gone."""
-    assert due(ROWS, Retention(keep), in_use=(), now_ns=NOW_NS) == Due(remove)
+    found = due(ROWS, Retention(keep), in_use=(), now_ns=NOW_NS)
+    assert found == Due(names(*remove), names(*outdated))
 
 
 def test_what_is_written_stays_and_counts():
     """The flight in the air would be lost, or the disk hold more than was allowed."""
     limits = (Limit(size_bytes=150_000_000), Limit(seconds=1.0))
-    assert due(ROWS, Retention(limits), in_use={"20.rrd", "0.rrd"}, now_ns=NOW_NS).remove == (
-        "5.rrd",
-        "1.rrd",
-    )
+    found = due(ROWS, Retention(limits), in_use=names(20, 0), now_ns=NOW_NS)
+    assert (found.remove, found.outdated) == (names(5, 1), names(5, 1))
 
 
 def test_video_goes_before_the_rest():
     """Who wants to know in a year what flew there would have to keep all pictures for it."""
     rows = [*ROWS, row(7, video=False)]
     wanted = Retention((Limit(seconds=14 * 86_400),), Limit(seconds=3 * 86_400))
-    assert due(rows, wanted, in_use=(), now_ns=NOW_NS) == Due(("20.rrd",), ("5.rrd",))
+    assert due(rows, wanted, in_use=(), now_ns=NOW_NS) == Due((), names(20), names(5))
 
 
-def test_a_file_of_unknown_age_is_not_old():
+@pytest.mark.parametrize(
+    "file",
+    [
+        pytest.param(name(0), id="a name of today: the index was with another clock"),
+        pytest.param("hvt-uav-1-19700101-000100.rrd", id="named before the machine knew the time"),
+        pytest.param("hvt-uav-1-20269999-000100.rrd", id="named by no calendar"),
+        pytest.param("flight-0001.rrd", id="named by somebody"),
+    ],
+)
+def test_an_age_that_the_name_does_not_confirm_is_none(file):
     """A ground without a battery clock begins in 1970: its flights would be gone once it knows the time."""
-    first = row(0, written_ns=60 * SECOND_NS)
-    assert (
-        due([first], Retention((Limit(seconds=1.0),), Limit(seconds=1.0)), in_use=(), now_ns=NOW_NS) == Due()
-    )
-    assert due([first], Retention((Limit(size_bytes=1),)), in_use=(), now_ns=NOW_NS).remove == ("0.rrd",)
+    first = row(100, file=file)
+    ages = Retention((Limit(seconds=86_400.0),), Limit(seconds=3600.0))
+    assert due([first], ages, in_use=(), now_ns=NOW_NS) == Due()
+    assert due([first], Retention((Limit(size_bytes=1),)), in_use=(), now_ns=NOW_NS).remove == (file,)
+
+
+def test_an_age_that_the_index_does_not_confirm_is_none():
+    """The flight of five minutes ago has a name of a hundred days ago: its ground was that long on the shelf."""
+    fresh = row(0, file=name(100))
+    ages = Retention((Limit(seconds=86_400.0),), Limit(seconds=3600.0))
+    assert due([fresh], ages, in_use=(), now_ns=NOW_NS) == Due()

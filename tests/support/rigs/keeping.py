@@ -191,7 +191,14 @@ class Rig:
         self.outcomes: list[tuple[str, str]] = []
         self.failures = Failures(lambda: self.now_ns)
         self.backlog = BacklogStage(
-            Store(folder, max_bytes=50_000_000, session_id=session_id, info=info),
+            Store(
+                folder,
+                max_bytes=50_000_000,
+                session_id=session_id,
+                info=info,
+                clock=lambda: self.now_ns,
+                since_boot=lambda: ("a boot", self.now_ns - START_NS),
+            ),
             session_id=session_id,
             live=live,
             link=link_of(self.sender, self.outbox),
@@ -322,7 +329,8 @@ class Rig:
     def kept(self) -> list:
         """What another start of the edge finds."""
         self.close()
-        with opened(self.path, session_id=8) as folder:
+        now_s = (self.now_ns - START_NS) / S
+        with opened(self.path, session_id=8, at_s=(now_s, now_s)) as folder:
             return [
                 unit
                 for entry in reversed(list(folder.newest_segments()))
@@ -332,7 +340,8 @@ class Rig:
     def stored_stills(self) -> dict[int, float]:
         """Numbers and worth of the stills that another start of the edge finds."""
         self.close()
-        with opened(self.path, session_id=8) as folder:
+        now_s = (self.now_ns - START_NS) / S
+        with opened(self.path, session_id=8, at_s=(now_s, now_s)) as folder:
             return {entry.number: entry.rank for entry in folder.best_stills()}
 
 

@@ -29,9 +29,25 @@ def coded(count: int, *, keyframe_each: int = 15) -> list[AccessUnit]:
 UNITS = coded(60)
 
 
-def opened(path: Path, *, max_bytes: int = 50_000_000, session_id: int = 7, oldest_ns: int = 0) -> Store:
-    """The store, as a run of an edge opens it."""
-    store = Store(path, max_bytes=max_bytes, session_id=session_id, info=INFO.pack, oldest_ns=oldest_ns)
+def opened(
+    path: Path,
+    *,
+    max_bytes: int = 50_000_000,
+    session_id: int = 7,
+    oldest_ns: int = 0,
+    at_s: tuple[float, float] = (0.0, 0.0),
+    boot: str = "a boot",
+) -> Store:
+    """The store, as a run of an edge opens it ``at_s``: by its clock after `START_NS`, and after its boot."""
+    store = Store(
+        path,
+        max_bytes=max_bytes,
+        session_id=session_id,
+        info=INFO.pack,
+        oldest_ns=oldest_ns,
+        clock=lambda: START_NS + round(at_s[0] * S),
+        since_boot=lambda: (boot, round(at_s[1] * S)),
+    )
     store.enter()
     return store
 
