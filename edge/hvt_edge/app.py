@@ -190,6 +190,7 @@ class Edge:
             for frame in source.steps(start_ns=stages.operating.now.started_ns):
                 if self._stop.is_set():
                     break
+                status.send_pending()
                 if source.restarts != restarts:  # another picture than the last
                     restarts = source.restarts
                     stages.keyframes.require(self._loop_clock())

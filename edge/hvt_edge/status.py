@@ -18,7 +18,7 @@ from hvt_common.protocol.messages import (
     fitted_text,
 )
 from hvt_common.runtime.failures import Failures
-from hvt_common.units import bitrate_text
+from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.health.heartbeat import Heartbeat
@@ -30,6 +30,8 @@ __all__ = ["InfoReporter", "StatusReporter", "status_text"]
 
 _PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
 _LEVERS_REST = 10
+_LATE_NS = 2 * SECOND_NS
+"""A report that has waited so long for what video leaves goes before the next frame: grounds live by it too."""
 
 
 @dataclass(eq=False)
@@ -90,19 +92,32 @@ class StatusReporter:
 
     def __post_init__(self) -> None:
         self._sequence = 0
+        self._pending: tuple[EdgeState, str] | None = None
+        """What was not sent yet: the newest second's."""
+        self._due_ns: int | None = None
+        """Since when a report waits."""
         self._reported: Levers | None = None
         self._reported_sequence = 0
 
     def send(self, phase: Literal["running", "ended"]) -> None:
-        """Send the report, made for the moment at which it may go."""
+        """Make the report of this second, and send it as soon as it leaves video its room; the last one waits."""
         state = self.heartbeat.beat(phase)
-        levers = self._levers_text(
-            state.levers
-        )  # once: the transmitter makes a report twice, first for its size
-        self.transmitter.status(
-            lambda at_ns: self._status(state, levers, at_ns), now_ns=self.loop_clock(), last=phase == "ended"
-        )
-        self._sequence += 1
+        # Once: the transmitter makes a report twice, first for its size.
+        self._pending = (state, self._levers_text(state.levers))
+        self._due_ns = self.loop_clock() if self._due_ns is None else self._due_ns
+        self.send_pending(last=phase == "ended")
+
+    def send_pending(self, *, last: bool = False) -> None:
+        """Before each frame: a report that found no room is tried again."""
+        if self._pending is None:
+            return
+        (state, levers), now_ns = self._pending, self.loop_clock()
+        late = self._due_ns is not None and now_ns - self._due_ns >= _LATE_NS
+        if self.transmitter.status(
+            lambda at_ns: self._status(state, levers, at_ns), now_ns=now_ns, before_frames=late, last=last
+        ):
+            self._pending = self._due_ns = None
+            self._sequence += 1
 
     def _levers_text(self, levers: Levers) -> str:
         """Where a lever was moved, and now and then: on a thin link a sentence a second is not free."""

@@ -18,6 +18,10 @@ Two limits hold for stills at once, both in line bytes (payload, attachment and 
 So stills yield where the base overshoots. What no forecast sees, a base frame that is suddenly large after stills
 have taken their share, waits the few milliseconds until the window has room (`earliest_ns`): nothing is dropped, and
 the total holds all the same.
+
+Whatever is no frame goes only where the frames to come keep their room: pieces of the backlog by the same forecast
+as stills, also while the camera gives no frame, since the next may come at any moment (`backlog_allowance`); tracks,
+pose and status by one of their own (`metadata_fits`).
 """
 
 from __future__ import annotations
@@ -85,6 +89,7 @@ class RollingBudget:
         self._query_ns: int | None = None
         self._last_ns = 0
         self._last_base_ns: int | None = None
+        self._base_ended = False
         self._old_peak = (0, 0.0)
         """(until when, bytes in a window): after a change, frames of the former rate are still in the window."""
         self._adopt(settings)
@@ -160,8 +165,12 @@ class RollingBudget:
         self._base_steps.append(round(self.base_step_bytes) if keyframe else line_bytes)
         self._burst = self._recent_bursts()
 
+    def end_base(self) -> None:
+        """The source has given its last frame: from now on no room is kept for any."""
+        self._base_ended = True
+
     def record_metadata(self, line_bytes: int, *, now_ns: int) -> None:
-        """Count a message that belongs to neither stream, such as ``status``; it waits as the base does."""
+        """Count a message that belongs to neither stream, such as ``status``."""
         self._record(line_bytes, now_ns)
         self._last_ns = max(self._last_ns, now_ns)
 
@@ -186,6 +195,21 @@ class RollingBudget:
         """
         after_ns = now_ns - self._settings.window_ns
         return line_bytes + sum(size for at_ns, size in self._events if at_ns > after_ns) <= self._total
+
+    def metadata_fits(self, line_bytes: int, *, now_ns: int, before_frames: bool = False) -> bool:
+        """Tell whether a message of neither stream, sent now, leaves the base frames to come their room.
+
+        The next may be as large as any lately, those after it are taken as they are on average: with the fullest
+        window of the base nothing would ever go beside it. ``before_frames``: the message has waited long enough, and
+        only has to fit itself.
+        """
+        unspent, _ = self._unspent(now_ns)
+        if before_frames:
+            return bool(line_bytes <= unspent[0])
+        steps = self._base_steps
+        mean_bytes = sum(steps) / len(steps) if steps else self.base_step_bytes
+        left = unspent - self._forecasts * mean_bytes
+        return bool(line_bytes <= min(left.min(), (unspent - self._burst)[1]))
 
     def earliest_ns(self, line_bytes: int, *, now_ns: int, base: bool = False) -> int:
         """Return when a message of so many line bytes may go: now, or as soon as its window has room.
@@ -224,24 +248,22 @@ class RollingBudget:
         """Return how many line bytes of what was kept may go now: what neither base nor stills will want.
 
         It takes no share of anybody's. ``reserve`` is left free of a window, as a share of what stills have of one.
+        A camera that is silent may give its next frame at any moment: its room stays free until `end_base`.
         """
         settings = self._settings
+        free = self._unspent(now_ns)[0][0] if self._base_ended else self._window_allowance(now_ns)
         reserved = reserve * settings.still_bps * settings.window_ns / 8 / SECOND_NS
-        return max(0, int(self._free(now_ns) - reserved))
+        return max(0, int(free - reserved))
 
     def keyframe_fits(self, keyframe_bytes: int, *, now_ns: int) -> bool:
-        """Tell whether a keyframe of this many line bytes, sent now, leaves every window within the total."""
-        return self._free(now_ns) + self.base_step_bytes >= keyframe_bytes
+        """Tell whether a keyframe of this many line bytes, sent now, leaves every window within the total.
 
-    def _free(self, now_ns: int) -> float:
-        """What the window has room for, in line bytes, beside the base frames that are expected.
-
-        Where no base frame has gone out for a window, none is expected.
+        Where no base frame has gone out for a window, none but the keyframe is expected.
         """
-        window_ns = self._settings.window_ns
-        if self._last_base_ns is not None and now_ns - self._last_base_ns <= window_ns:
-            return self._window_allowance(now_ns)
-        return self._total - sum(size for at_ns, size in self._events if at_ns > now_ns - window_ns)
+        last_ns = self._last_base_ns
+        silent = last_ns is None or now_ns - last_ns > self._settings.window_ns
+        free = self._unspent(now_ns)[0][0] if silent else self._window_allowance(now_ns)
+        return bool(free + self.base_step_bytes >= keyframe_bytes)
 
     def _record(self, line_bytes: int, now_ns: int) -> None:
         insort(self._events, (now_ns, line_bytes))
@@ -282,12 +304,18 @@ class RollingBudget:
         return max(0.0, settings.base_bps * settings.window_ns / 8 / SECOND_NS - taken - borrowed)
 
     def _window_allowance(self, now_ns: int) -> float:
-        """The least room over every window that would contain a message sent now.
+        """The least room over every window that would contain a message sent now, beside base and metadata."""
+        unspent, ahead_ns = self._unspent(now_ns)
+        beside = self._settings.metadata_bps / 8 / SECOND_NS * ahead_ns
+        return float((unspent - self._burst - beside).min())
+
+    def _unspent(self, now_ns: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+        """What the past leaves of each window that would contain a message sent now, and when that window ends.
 
         The fullest windows end with a base frame. The one that ends with the ``k``-th from now holds the past bytes
-        younger than the window less the time until then, and ``k`` frames of the base to come. The first, of ``k`` =
-        0, ends now and also holds what was recorded for later: with it the room is never more than any window
-        has, whatever the base does.
+        younger than the window less the time until then, and ``k`` frames of the base to come, for each ``k`` of the
+        forecast. The first, of ``k`` = 0, ends now and also holds what was recorded for later: with it the room is
+        never more than any window has, whatever the base does.
         """
         self._note_query(now_ns)
         due_ns = max(now_ns, (self._last_base_ns or now_ns - self._step_ns) + self._step_ns)
@@ -298,8 +326,7 @@ class RollingBudget:
         times_ns = np.array([at_ns for at_ns, _ in self._events], np.int64)
         upto = np.cumsum([0, *(size for _, size in self._events)])
         spent = upto[-1] - upto[np.searchsorted(times_ns, now_ns - spans_ns, side="right")]
-        beside = self._settings.metadata_bps / 8 / SECOND_NS * ahead_ns
-        return float((self._total - spent - self._burst - beside).min())
+        return self._total - spent, ahead_ns
 
     def _recent_bursts(self) -> npt.NDArray[np.float64]:
         """Bytes that ``k`` base frames in a row may take, for each ``k`` of the forecast."""

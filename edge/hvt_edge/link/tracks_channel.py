@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
@@ -36,8 +37,8 @@ class TrackReportSettings:
 class TrackSender(Protocol):
     """Where steps go: `hvt_edge.link.transmitter.Transmitter`."""
 
-    def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
-        """Send ``make(at_ns)``, made for the moment at which the budget has room; by that a few bytes may differ."""
+    def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> bool:
+        """Send ``make(now_ns)``; False where the budget has no room for it beside the next frame."""
         ...
 
 
@@ -64,13 +65,14 @@ class TrackReporter:
         capture_ns = seen.frame.capture_ns
         if not seen.detected or not self._due(capture_ns):
             return False
-        self._last_ns = capture_ns
         tracks = _fresh(seen.tracks, most_frames=self._settings.fresh_frames)
-        step = self._encoder.encode(tracks, capture_ns=capture_ns)
-        self._last_bytes = len(step.pack())
-        self._sender.tracks(
+        encoder = copy(self._encoder)  # the next step builds on the last one that was sent
+        step = encoder.encode(tracks, capture_ns=capture_ns)
+        if not self._sender.tracks(
             lambda at_ns: replace(step, send_delay_ns=at_ns - capture_ns).pack(), now_ns=now_ns
-        )
+        ):
+            return False
+        self._encoder, self._last_ns, self._last_bytes = encoder, capture_ns, len(step.pack())
         self.steps += 1
         self.boxes += len(tracks)
         return True

@@ -2,7 +2,7 @@
 
 Base first, then metadata, stills by utility, the backlog. Four threads send:
 
-* the frame loop: `base`, `status`, `pose`, and what it stores in place of sending;
+* the frame loop: `base`, `status`, `pose`, and what it stores in place of sending; it waits for video alone;
 * the stills' thread: `tracks` and `still`;
 * the store's thread: `backlog`;
 * the link's callbacks: `reply`, what grounds asked of ``info`` and ``control``.
@@ -45,7 +45,7 @@ _LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
 _CHUNK_S = 0.05
 """So long the link is busy with a chunk at most, so that a frame or a live still need not wait for it."""
 _GROWTH_BYTES = 16
-"""By how much metadata may grow when it is made for a later moment: its two times."""
+"""By how much a message may grow when it is made for a later moment: its two times."""
 
 
 class Outlet(Protocol):
@@ -247,22 +247,32 @@ class Transmitter:
         )
         return line_bytes
 
-    def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
-        """Send the edge's own tracks of one decision step, made for the moment at which they may go."""
-        self._metadata(Channel.TRACKS, make, now_ns=now_ns)
+    def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> bool:
+        """Send the edge's own tracks of one decision step, where the next frame keeps its room; else False."""
+        return self._metadata(Channel.TRACKS, make, now_ns=now_ns)
 
-    def pose(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
-        """Send where the camera is, made for the moment at which it may go."""
-        self._metadata(Channel.POSE, make, now_ns=now_ns)
+    def pose(self, make: Callable[[int], bytes], *, now_ns: int) -> bool:
+        """Send where the camera is, where the next frame keeps its room; else False."""
+        return self._metadata(Channel.POSE, make, now_ns=now_ns)
 
-    def status(self, make: Callable[[int], Status], *, now_ns: int, last: bool = False) -> None:
-        """Send the once-a-second report, made for the moment at which it may go.
+    def status(
+        self, make: Callable[[int], Status], *, now_ns: int, before_frames: bool = False, last: bool = False
+    ) -> bool:
+        """Send the once-a-second report, where the next frame keeps its room; else False, and it may be tried again.
+
+        ``before_frames``: one that has waited long goes as soon as it fits. The ``last`` one waits until it does.
 
         ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment. Behind the
         ``last`` one go no stills and no tracks, whichever thread still has some: a ground that has all that it names
         closes the session.
         """
-        self._metadata(Channel.STATUS, lambda at_ns: make(at_ns).pack(), now_ns=now_ns, last=last)
+        return self._metadata(
+            Channel.STATUS,
+            lambda at_ns: make(at_ns).pack(),
+            now_ns=now_ns,
+            before_frames=before_frames,
+            last=last,
+        )
 
     def reply(self, channel: Channel, payload: bytes) -> bytes:
         """Count an answer to a query, and let it go at once: the link puts it on the line as this returns.
@@ -302,6 +312,11 @@ class Transmitter:
             at_ns = self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
             return at_ns - now_ns if self.budget.fits(line_bytes, now_ns=at_ns) else None
 
+    def end_base(self) -> None:
+        """The source has given its last frame; see `RollingBudget.end_base`."""
+        with self._lock:
+            self.budget.end_base()
+
     def takes_ns(self, line_bytes: int) -> int:
         """How long so many line bytes take the whole budget."""
         with self._lock:
@@ -319,15 +334,25 @@ class Transmitter:
             self.ledger.record_outcome(outcome, reason)  # type: ignore[arg-type]
 
     def _metadata(
-        self, channel: Channel, make: Callable[[int], bytes], *, now_ns: int, last: bool = False
-    ) -> None:
-        """Send what belongs to neither stream as soon as the budget's window has room for it."""
+        self,
+        channel: Channel,
+        make: Callable[[int], bytes],
+        *,
+        now_ns: int,
+        before_frames: bool = False,
+        last: bool = False,
+    ) -> bool:
+        """Send what belongs to neither stream, if there is room; only the ``last`` message waits for it."""
+        at_ns = now_ns
         with self._lock:
             if self._ended:
-                return
+                return False
             self._ended = last
             size_bytes = _GROWTH_BYTES + self._line_bytes(channel, make(now_ns), 0)
-            at_ns = self.budget.earliest_ns(size_bytes, now_ns=now_ns)
+            if last:
+                at_ns = self.budget.earliest_ns(size_bytes, now_ns=now_ns)
+            elif not self.budget.metadata_fits(size_bytes, now_ns=now_ns, before_frames=before_frames):
+                return False
             payload = make(at_ns)
             line_bytes = self._count(channel, Account.META, payload, b"", at_ns=at_ns)
             self.budget.record_metadata(line_bytes, now_ns=at_ns)
@@ -335,6 +360,7 @@ class Transmitter:
                 self.pacer.sent_other(line_bytes, now_ns=at_ns)
         self.wait_until(at_ns)
         self.outlet.put(channel, payload, encoding=DELIVERIES[channel].encoding)
+        return True
 
     def _still_at_ns(self, envelope: StillEnvelope, now_ns: int) -> int:
         """When it may go: now, unless its allowance is gone."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import KW_ONLY, dataclass
 from typing import Final, Protocol
 
@@ -23,8 +24,8 @@ _PART: Final = "pose"
 class PoseSender(Protocol):
     """Where reports go: `hvt_edge.link.transmitter.Transmitter`."""
 
-    def pose(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
-        """Send ``make(at_ns)``, made for the moment at which the budget has room."""
+    def pose(self, make: Callable[[int], bytes], *, now_ns: int) -> bool:
+        """Send ``make(now_ns)``; False where the budget has no room for it beside the next frame."""
         ...
 
 
@@ -48,8 +49,9 @@ class PoseStage:
             return
         self._due_ns = capture_ns + round(_EARLY * SECOND_NS)
         pose = self.source.at(media_ns, capture_ns=capture_ns)
+        encoder = copy(self._encoder)  # the next report builds on the last one that was sent
         try:
-            make = None if pose is None else self._encoder.encode(pose)
+            make = None if pose is None else encoder.encode(pose)
         except ValueError as error:  # a number from outside that no place on earth has
             self.failures.failed(_PART, str(error))
             return
@@ -57,6 +59,9 @@ class PoseStage:
             self.failures.failed(_PART, self.source.trouble)
             return
         self.failures.works(_PART)
+        if not self.sender.pose(lambda at_ns: make(at_ns).pack(), now_ns=now_ns):
+            self._due_ns = None  # the next frame tries again
+            return
+        self._encoder = encoder
         pause_s = max(1.0, 8 * len(make(now_ns).pack()) / _MOST_BPS)
         self._due_ns = capture_ns + round(_EARLY * pause_s * SECOND_NS)
-        self.sender.pose(lambda at_ns: make(at_ns).pack(), now_ns=now_ns)

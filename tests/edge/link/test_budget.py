@@ -145,6 +145,39 @@ def test_a_base_message_waits_no_longer_than_a_window_and_keeps_its_order(one, s
         last_ns = at_ns
 
 
+@settings(max_examples=80, deadline=None)
+@given(
+    total=st.sampled_from([60_000, 300_000, 800_000]),
+    share=st.floats(0.5, 0.97),
+    fps=st.sampled_from([2.0, 3.0, 4.0, 5.0, 15.0]),
+    silence_s=st.floats(0, 4),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_nothing_of_lower_priority_delays_a_frame(total, share, fps, silence_s, seed):
+    """After a short silence of the camera the backlog would fill each window, and no frame would ever go again."""
+    rng = np.random.default_rng(seed)
+    one = BudgetSettings(total, round(total * share), fps=fps)
+    budget, mean = RollingBudget(one), int(one.base_bps / 8 / fps - 400 / fps)  # the rest is for status
+    silent = range(round(5 * fps), round((5 + silence_s) * fps))
+    backlog_bytes = 0
+    for number in range(round((9 + silence_s) * fps)):
+        due_ns = START_NS + round(number * SECOND_NS / fps)
+        if number not in silent:
+            at_ns = budget.earliest_ns(mean, now_ns=due_ns, base=True)
+            assert at_ns == due_ns, f"frame {number} waits {(at_ns - due_ns) / 1e6:.0f} ms"
+            budget.record_base(mean, now_ns=at_ns)
+        for now_ns in range(due_ns, due_ns + round(SECOND_NS / fps), SECOND_NS // 50):
+            kind, size = rng.integers(5), int(rng.integers(100, 300))
+            if kind == 0 and budget.metadata_fits(size, now_ns=now_ns):
+                budget.record_metadata(size, now_ns=now_ns)
+            elif kind == 1 and (room := budget.still_allowance(now_ns)) >= 600:
+                budget.record_still(room, now_ns=now_ns)
+            elif kind > 1 and (room := min(2_000, budget.backlog_allowance(now_ns, reserve=0.0))) >= 600:
+                budget.record_backlog(room, now_ns=now_ns)
+                backlog_bytes += room
+    assert backlog_bytes or share * total > total - 5_000 or total < 100_000, "what is over is used"
+
+
 def test_messages_of_one_moment_leave_the_window_together():
     """In lockstep a frame and its stills have one time: frames a second later would wait longer than they must."""
     run = Run(

@@ -38,11 +38,16 @@ class Line:
 
     def __init__(self) -> None:
         self.steps: list[TrackStep] = []
+        self.full_ns: set[int] = set()
+        """Times at which the budget has no room."""
 
     def tracks(self, make, *, now_ns):
         """Keeps what goes out."""
+        if now_ns in self.full_ns:
+            return False
         make(now_ns)
         self.steps.append(TrackStep.parse(make(now_ns + 40_000_000)))
+        return True
 
 
 def told(shown: list[AnalyzedFrame], **settings) -> list[TrackStep]:
@@ -98,3 +103,19 @@ def test_an_empty_scene_is_told():
     steps = told([seen(0), seen(5, ages=())])
     decoder = TrackStepDecoder()
     assert [len(decoder.decode(step)) for step in steps] == [2, 0]
+
+
+def test_a_step_without_room_is_left_out_and_the_next_is_understood():
+    """The ground would read changes of a step that it never got, and show no track until the next whole one."""
+    line, reader = Line(), TrackStepDecoder()
+    reporter = TrackReporter(line, session_id=77, settings=TrackReportSettings(refresh_ns=10**12))
+    shown = [seen(index) for index in range(0, 60, 5)]
+    line.full_ns = {one.frame.capture_ns for one in shown[2:9:3]}
+    sent = [reporter.report(one, now_ns=one.frame.capture_ns) for one in shown]
+    assert sent == [number not in (2, 5, 8) for number in range(12)]
+    for one, step in zip(
+        (one for one, went in zip(shown, sent, strict=True) if went), line.steps, strict=True
+    ):
+        tracks = reader.decode(step)
+        assert tracks is not None
+        np.testing.assert_allclose(tracks.boxes_xyxy_px, one.tracks.boxes_xyxy_px, atol=1)

@@ -242,7 +242,7 @@ def test_what_finds_no_room_is_sent_when_there_is_and_says_so():
     rig = Rig(total_bps=80_000)  # 10 000 bytes a second
     rig.sender.base(unit(0, 6_000, keyframe=True), now_ns=NOW_NS)
     rig.sender.base(unit(1, 6_000), now_ns=NOW_NS + 100)
-    rig.sender.status(status, now_ns=NOW_NS + 200)
+    rig.sender.status(status, now_ns=NOW_NS + 200, last=True)
     assert rig.waits == [NOW_NS, NOW_NS + SECOND_NS, NOW_NS + SECOND_NS]
     (_, _, _, _), (_, payload, attachment, _), (_, report, _, _) = rig.out.puts
     assert BaseHeader.parse(attachment, payload).send_ns == NOW_NS + SECOND_NS
@@ -319,23 +319,40 @@ def test_before_there_is_a_still_the_room_is_that_of_a_usual_one():
     assert abs(rig.sender.most_still_bytes() - exact) < 32
 
 
-def test_tracks_wait_for_the_window_and_are_counted_as_metadata():
-    """The third channel would break the budget, or come out of thin air in the account."""
-    rig = Rig(total_bps=80_000)  # 10 000 bytes a second
-    rig.sender.base(unit(0, 9_400, keyframe=True), now_ns=NOW_NS)
-    rig.sender.tracks(lambda at_ns: bytes([at_ns == NOW_NS + SECOND_NS] * 200), now_ns=NOW_NS + 100)
-    (_, (row, payload, attachment, encoding)) = rig.out.puts
-    assert (row, payload, attachment, encoding) == (
-        Channel.TRACKS,
-        bytes([True] * 200),
-        b"",
-        DELIVERIES[Channel.TRACKS].encoding,
+@pytest.mark.parametrize("channel", [Channel.TRACKS, Channel.POSE, Channel.STATUS])
+def test_what_is_no_frame_waits_for_nothing_and_leaves_the_next_frame_its_room(channel):
+    """The frame loop would sleep a second over a status, or the next frame over tracks."""
+    rig = Rig(total_bps=80_000)  # 10 000 bytes a second, of which a frame takes 333 on average
+
+    def send(now_ns: int, **late: bool) -> bool:
+        if channel is Channel.STATUS:
+            return rig.sender.status(status, now_ns=now_ns, **late)
+        send_it = rig.sender.tracks if channel is Channel.TRACKS else rig.sender.pose
+        return send_it(lambda _at_ns: bytes(200), now_ns=now_ns)
+
+    rig.sender.base(unit(0, 9_000, keyframe=True), now_ns=NOW_NS)
+    assert not send(NOW_NS + 100)
+    assert not send(NOW_NS + SECOND_NS // 2)
+    assert rig.waits == [NOW_NS]
+    assert rig.budget.earliest_ns(500, now_ns=NOW_NS + 100) == NOW_NS + 100, (
+        "a frame that fits goes before it"
     )
-    assert rig.waits == [NOW_NS, NOW_NS + SECOND_NS]
+    assert send(NOW_NS + SECOND_NS + 1)
+    assert rig.waits == [NOW_NS, NOW_NS + SECOND_NS + 1]
+    row, _, attachment, encoding = rig.out.puts[-1]
+    assert (row, attachment, encoding) == (channel, b"", DELIVERIES[channel].encoding)
     assert rig.ledger.messages(Account.META) == 1
     assert rig.ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
-    assert rig.ledger.worst_window_bps.total <= 80_000
     assert rig.ledger.line_bytes == sum(rig.budget.sizes)
+
+
+def test_a_status_that_has_waited_long_goes_before_the_next_frame():
+    """Where video takes all that there is, a ground would take the edge for gone."""
+    rig = Rig(total_bps=80_000)
+    rig.sender.base(unit(0, 9_150, keyframe=True), now_ns=NOW_NS)
+    assert not rig.sender.status(status, now_ns=NOW_NS + 100)
+    assert rig.sender.status(status, now_ns=NOW_NS + 100, before_frames=True)
+    assert rig.ledger.worst_window_bps.total <= 80_000
 
 
 def test_a_reply_goes_at_once_is_counted_and_takes_no_room():

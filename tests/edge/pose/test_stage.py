@@ -15,17 +15,21 @@ START_NS = 1_790_000_000_000_000_000
 class Sent:
     """What would have left, with its time."""
 
-    def __init__(self) -> None:
+    def __init__(self, full_ns: range = range(0)) -> None:
         self.messages: list[tuple[int, bytes]] = []
+        self.full_ns = full_ns
 
     def pose(self, make, *, now_ns):
-        """Take it at once."""
+        """Take it at once, if there is room."""
+        if now_ns in self.full_ns:
+            return False
         self.messages.append((now_ns, make(now_ns)))
+        return True
 
 
-def fly(table: PoseTable, *, seconds: int, fps: int = 15) -> tuple[Sent, Failures]:
-    """Every frame of a flight."""
-    sent, failures = Sent(), Failures(lambda: START_NS)
+def fly(table: PoseTable, *, seconds: int, fps: int = 15, full_ns: range = range(0)) -> tuple[Sent, Failures]:
+    """Every frame of a flight; at times of ``full_ns`` the budget has no room."""
+    sent, failures = Sent(full_ns), Failures(lambda: START_NS)
     stage = PoseStage(table, session_id=5, sender=sent, failures=failures)
     for index in range(seconds * fps):
         media_ns = index * SECOND_NS // fps
@@ -46,6 +50,17 @@ def test_it_is_told_once_a_second_and_within_300_bits():
     assert all(pose is not None for pose in poses)
     assert [pose.capture_ns for pose in poses if pose] == [at for at, _ in sent.messages]
     assert failures.parts == ()
+
+
+def test_without_room_it_is_told_at_the_next_frame_and_understood():
+    """A ground would read changes of a report that never came, and show no place for ten seconds."""
+    ends = [Pose(0, 52.0, 13.0, height_m=80.0), Pose(60 * SECOND_NS, 52.01, 13.01, height_m=90.0)]
+    full_ns = range(START_NS + 5 * SECOND_NS // 2, START_NS + 9 * SECOND_NS // 2)
+    sent, _ = fly(PoseTable(ends, most_gap_s=99), seconds=8, full_ns=full_ns)
+    decoder = PoseDecoder()
+    assert all(decoder.decode(PoseReport.parse(data)) is not None for _, data in sent.messages)
+    after = [at for at, _ in sent.messages if at >= full_ns.stop]
+    assert after[0] - full_ns.stop <= SECOND_NS // 15
 
 
 def test_where_there_is_none_it_says_so_and_goes_on():
