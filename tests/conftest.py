@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,12 @@ ROOT = Path(__file__).resolve().parent.parent
 # break a property that holds. Here and not in a fixture: `@settings` takes what is loaded when its module is read.
 settings.register_profile("hvt", deadline=None)
 settings.load_profile("hvt")
+
+# A signal that is ignored (`nohup`, a job of a script in the background) stays ignored in every process that a test
+# starts, and a test of how a program ends on it would wait for ever. What is handled here begins there as usual.
+for ending in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+    if signal.getsignal(ending) is signal.SIG_IGN:
+        signal.signal(ending, lambda *_: None)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
