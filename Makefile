@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.hvt-setup
 UV     := $(shell command -v uv 2>/dev/null)
 
-.PHONY: setup demo test check arm lint type format docs bench bench-fleet bench-stills bench-compare bench-peers link soak kills failures fuzz clean help
+.PHONY: setup demo test check arm lint type format docs bench bench-fleet bench-stills bench-compare bench-peers link soak kills failures fuzz training clean help
 
 .PHONY: nightly nightly-tests
 
@@ -35,14 +35,20 @@ test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX mo
 	@$(BIN)/python -m pytest -m 'not realtime' --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder; \
 		together=$$?; $(BIN)/python -m pytest -m realtime && exit $$together
 
-nightly: setup   ## hours: the nightly tests, every scenario at full length, kills, fuzzers, parts taken away, soak; fails where a bar is missed; COUNT= RUNS= LASTS=
-	@failed=; for part in nightly-tests link 'kills COUNT=$(or $(COUNT),50)' 'fuzz RUNS=$(or $(RUNS),15000)' \
-		failures 'soak LASTS=$(or $(LASTS),20min)'; do \
+nightly: setup   ## an hour: the nightly tests, training, every scenario at full length, kills, fuzzers, parts taken away, soak; fails where a bar is missed; COUNT= RUNS= LASTS=
+	@failed=; for part in nightly-tests training link 'kills COUNT=$(or $(COUNT),50)' 'fuzz RUNS=$(or $(RUNS),15000)' \
+		failures 'soak LASTS=$(or $(LASTS),10min)'; do \
 		$(MAKE) --no-print-directory COUNT= RUNS= LASTS= STRICT=1 $$part || failed="$$failed, $${part%% *}"; done; \
 		test -z "$$failed" || { echo "failed$$failed"; exit 1; }
 
 nightly-tests: setup ## the tests that `make test` leaves out, and nothing else
 	@$(BIN)/python -m pytest --nightly -m nightly
+
+training: setup  ## the tests of training, in an environment of their own, for PyTorch is large; TORCH=
+	@test -x build/training/bin/python || $(PYTHON) -m venv build/training
+	@build/training/bin/python -m pip install --quiet --upgrade 'pip>=25.1'
+	@build/training/bin/python -m pip install --quiet $(or $(TORCH),torch==2.13.0) --editable '.[study]' --group test
+	@build/training/bin/python -m pytest tests/study/train
 
 lint: setup
 	@$(BIN)/ruff check
