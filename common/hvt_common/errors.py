@@ -6,9 +6,13 @@ import argparse
 import os
 import select
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from types import TracebackType
 from typing import NoReturn
+
+from hvt_common.redaction import Redaction
 
 __all__ = ["FlightError", "Parser", "UserError", "exit_with_sentence", "needs_extra"]
 
@@ -48,20 +52,35 @@ def exit_with_sentence(
 ) -> int:
     """Return the exit code of ``run(argv)``: 2 after a `UserError`, 1 after a `FlightError`, said on stderr.
 
+    Neither that nor a traceback has the secrets of an address in ``argv``.
+
     Standard output that nobody reads any more, as after ``| head``, ends the program with 1 and no word.
     """
+    redaction = Redaction(sys.argv[1:] if argv is None else argv)
+    sys.excepthook = _traceback_without(redaction)
     try:
         code = run(argv)
         print(end="", flush=True)  # no error where there is no standard output at all
     except (UserError, FlightError) as error:
         if not error.said:
-            print(f"{program}: {error}", file=sys.stderr)
+            print(f"{program}: {redaction.text(str(error))}", file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1
     except BrokenPipeError:
         if sys.stdout is None or not _reader_left():
             raise
         return 1
     return code
+
+
+def _traceback_without(
+    redaction: Redaction,
+) -> Callable[[type[BaseException], BaseException, TracebackType | None], None]:
+    """For ``sys.excepthook``: a bug before there is a log."""
+
+    def show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        print(redaction.text("".join(traceback.format_exception(kind, error, trace))), file=sys.stderr)
+
+    return show
 
 
 def _reader_left() -> bool:

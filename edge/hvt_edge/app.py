@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -13,6 +14,7 @@ from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.health_server import HealthServer, state_answers
+from hvt_common.runtime.log import START_LOGGER
 from hvt_common.runtime.process import notify_systemd, with_lower_priority
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
@@ -97,6 +99,8 @@ class Edge:
             if config.metrics is not None:
                 stack.enter_context(self._health_server(config.metrics))
             source = stack.enter_context(world.open_source(config))
+            for note in source.notes:
+                logging.getLogger(START_LOGGER).info("source: %s", note)
             config = self._config = as_the_camera_is(config, source)
             pose_source = world.open_pose(config, source)
             if pose_source is not None:

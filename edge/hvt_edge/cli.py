@@ -8,6 +8,7 @@ from typing import NoReturn
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
+from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
 from hvt_common.runtime.process import leave, limit_malloc_arenas, stop_on_signals
 from hvt_common.runtime.reporting import print_table, write_json
@@ -46,8 +47,9 @@ def _run(argv: Sequence[str] | None) -> int:
         return doctor.run(words[1:])
     config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
     config = with_profile(config, given=given.values)
+    redaction = Redaction([*words, *(str(one) for one in given.values.values())])
     if given.print_config:
-        print(to_toml(config), end="")
+        print(redaction.text(to_toml(config)), end="")
         return 0
     config = check(config)
     limit_malloc_arenas()
@@ -56,12 +58,13 @@ def _run(argv: Sequence[str] | None) -> int:
         "hvt-edge",
         quiet=config.quiet,
         form=config.log_format,
+        redaction=redaction,
         edge=config.edge_id,
         session=f"{world.session_id:016x}",
     )
     stop = stop_on_signals()
     with log.ending():
-        content = Edge(config, stop=stop, on_started=log.release, world=world).run()
+        content = redaction.value(Edge(config, stop=stop, on_started=log.release, world=world).run())
         if log.as_json:
             log.result(content)
         else:

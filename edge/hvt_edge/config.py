@@ -110,6 +110,9 @@ class EdgeConfig:
     source_fps: float | None = _SOURCE_RARE.option(
         number(0.1, 1000), None, "frame rate of an image folder, or instead of what a file says"
     )
+    follow: bool = _SOURCE_RARE.switch(
+        "wait for a video file that still grows; it ends when it has not for 10 s"
+    )
     pose: str | None = _SOURCE.option(
         TEXT,
         None,

@@ -19,7 +19,7 @@ from hvt_edge.link.publisher import EdgeLink, ZenohLink
 from hvt_edge.pose.opening import PoseSource, open_pose
 from hvt_edge.pose.table import PoseTable
 from hvt_edge.source.demo import DemoSource
-from hvt_edge.source.opening import Source, open_source
+from hvt_edge.source.opening import Source, open_source, shown
 from hvt_edge.wiring import base_size, make_detector, make_link_settings, warm_up_for
 
 __all__ = ["World"]
@@ -58,6 +58,7 @@ class World:
             max_frames=config.max_frames,
             source_fps=config.source_fps,
             coded=config.passes_through,
+            growing=config.follow,
             clock=self.clock,
             failures=self.failures,
         )
@@ -68,7 +69,9 @@ class World:
             return None
         if config.pose == "demo":
             if not isinstance(source, DemoSource):
-                raise UserError(f"--pose demo is of the drawn scene, and --source is {config.source}")
+                raise UserError(
+                    f"--pose demo is of the drawn scene, and --source is {shown(str(config.source))}"
+                )
             return PoseTable(source.poses())
         return open_pose(config.pose, hfov_deg=config.fov, clock=self.clock)
 

@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence, needs_extra
+from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
 from hvt_common.runtime.process import leave, limit_malloc_arenas, stop_on_signals
 from hvt_common.runtime.reporting import print_table, say, write_json
@@ -66,16 +67,17 @@ def _run(argv: Sequence[str] | None) -> int:
         from hvt_ground.app import Ground  # noqa: PLC0415
         from hvt_ground.sinks.rerun.sdk import leave_out_pandas  # noqa: PLC0415
     config, requested = load(GroundConfig, argv, program="hvt-ground", description=_DESCRIPTION)
+    redaction = Redaction([*words, *(str(one) for one in requested.values.values())])
     if requested.print_config:
-        print(to_toml(config), end="")
+        print(redaction.text(to_toml(config)), end="")
         return 0
     config = check(config)
     limit_malloc_arenas()
     leave_out_pandas()
-    log = start_log("hvt-ground", quiet=config.quiet, form=config.log_format)
+    log = start_log("hvt-ground", quiet=config.quiet, form=config.log_format, redaction=redaction)
     stop = stop_on_signals()
     with log.ending():
-        sessions = Ground(config, stop=stop, on_started=log.release).run()
+        sessions = redaction.value(Ground(config, stop=stop, on_started=log.release).run())
         if log.as_json:
             log.result(sessions)
         else:

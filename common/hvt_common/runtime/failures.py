@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 from hvt_common.errors import UserError
+from hvt_common.redaction import Redaction
 from hvt_common.units import SECOND_NS
 
 __all__ = ["FailedPart", "Failure", "Failures", "Retried", "RetryPause", "reason_of"]
@@ -18,6 +19,7 @@ _log = logging.getLogger(__name__)
 
 _Part = TypeVar("_Part")
 _Answer = TypeVar("_Answer")
+_REDACTION = Redaction()
 _STEADY_NS = 60 * SECOND_NS
 """What fails again after it worked for so long is news, and begins with a short pause."""
 
@@ -75,7 +77,11 @@ class Failures:
         return tuple(FailedPart(one.part, one.reason, one.since_ns) for one in self.parts if not one.working)
 
     def failed(self, part: str, reason: str) -> None:
-        """It has stopped. The log says so once, however often it is tried in vain."""
+        """It has stopped. The log says so once, however often it is tried in vain.
+
+        The ground, who watches the process and the summary are told the reason, without secrets of an address.
+        """
+        reason = _REDACTION.text(reason)
         now_ns = self._clock()
         with self._lock:
             before = self._parts.get(part)

@@ -15,6 +15,7 @@ from types import MappingProxyType, TracebackType
 from typing import Any
 
 from hvt_common.errors import FlightError, UserError
+from hvt_common.redaction import Redaction
 
 __all__ = ["LOG_FORMATS", "START_LOGGER", "STATUS_LOGGER", "Log", "log_fields", "start_log"]
 
@@ -33,17 +34,20 @@ def log_fields(**fields: str) -> None:
     _fields.set({name: value for name, value in {**_fields.get(), **fields}.items() if value})
 
 
-def start_log(program: str, *, quiet: bool, form: str = "text", **fields: str) -> Log:
+def start_log(
+    program: str, *, quiet: bool, form: str = "text", redaction: Redaction | None = None, **fields: str
+) -> Log:
     """Buffer the log until `Log.release`, then write it to stderr. So a start that fails says one sentence.
 
     Unless ``quiet``, the provider of each network and what else was found at the start is logged, and with
     ``form="json"`` a line of status now and then.
-    ``fields`` are of every JSON line.
+    ``fields`` are of every JSON line. No line has what ``redaction`` hides, nor has a traceback.
     """
     stream = logging.StreamHandler()
     as_json = form == "json"
+    redaction = redaction or Redaction()
     stream.setFormatter(
-        _JsonFormatter(program, fields) if as_json else logging.Formatter(f"{program}: %(message)s")
+        _JsonFormatter(program, fields, redaction) if as_json else _TextFormatter(program, redaction)
     )
     held = _HeldLog(stream)
     held.addFilter(_with_fields)
@@ -53,10 +57,10 @@ def start_log(program: str, *, quiet: bool, form: str = "text", **fields: str) -
     log = Log(program, held, as_json=as_json)
     if as_json:
         logging.captureWarnings(capture=True)
-        sys.excepthook = log.crashed
-        threading.excepthook = lambda args: log.crashed(
-            args.exc_type, args.exc_value or args.exc_type(), args.exc_traceback
-        )
+    sys.excepthook = log.crashed
+    threading.excepthook = lambda args: log.crashed(
+        args.exc_type, args.exc_value or args.exc_type(), args.exc_traceback
+    )
     return log
 
 
@@ -89,7 +93,7 @@ class Log:
             raise
 
     def crashed(self, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        """A bug: its traceback, as one JSON line."""
+        """A bug: its traceback, with JSON as one line."""
         self.release()
         self._logger.critical("%s: %s", kind.__name__, error, exc_info=(kind, error, trace))
 
@@ -131,11 +135,21 @@ def _with_fields(record: logging.LogRecord) -> bool:
     return True
 
 
+class _TextFormatter(logging.Formatter):
+    def __init__(self, program: str, redaction: Redaction) -> None:
+        super().__init__(f"{program}: %(message)s")
+        self._redaction = redaction
+
+    def format(self, record: logging.LogRecord) -> str:
+        return self._redaction.text(super().format(record))
+
+
 class _JsonFormatter(logging.Formatter):
     """``time`` (ISO 8601, UTC), ``level``, ``program``, ``logger``, ``message``, what it is about, ``traceback``."""
 
-    def __init__(self, program: str, fields: Mapping[str, str]) -> None:
+    def __init__(self, program: str, fields: Mapping[str, str], redaction: Redaction) -> None:
         super().__init__()
+        self._redaction = redaction
         self._program = program
         self._fields = dict(fields)
 
@@ -153,4 +167,4 @@ class _JsonFormatter(logging.Formatter):
         }
         if record.exc_info and record.exc_info[0] is not None:
             line["traceback"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False, default=str)
+        return json.dumps(self._redaction.value(line), ensure_ascii=False, default=str)

@@ -30,7 +30,7 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.loop.cpu import Cores, CpuMeter
 from hvt_edge.source.contract import Source
-from hvt_edge.source.opening import without_password
+from hvt_edge.source.opening import shown
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.wiring import (
     as_the_camera_is,
@@ -102,7 +102,7 @@ class _Checks:
     def source(self) -> Finding:
         """Opens it, and looks for two seconds how many pictures it gives."""
         config = self._config
-        name = without_password(str(config.source))
+        name = shown(str(config.source))
         source = self._world.open_source(config)
         try:
             self._config = as_the_camera_is(config, source)
@@ -126,6 +126,7 @@ class _Checks:
         self._source = source
         size, base = source.view.source_size, source.view.base_size
         found = f"{name}: {size[0]}x{size[1]}, sent as {base[0]}x{base[1]} at {source.fps:g} fps"
+        found = "; ".join((found, *source.notes))
         rate = count / (time.monotonic() - began_s)
         if source.live and rate < _SLOW * source.fps:
             return Finding(

@@ -136,6 +136,7 @@ class _PushGrabber:
     """The newest frame that was pushed and not yet taken."""
 
     name = _NAME
+    notes = None
 
     def __init__(self) -> None:
         self._news = threading.Condition()

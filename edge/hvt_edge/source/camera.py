@@ -24,6 +24,8 @@ _READ_MS = 2000
 class CameraGrabber:
     """One V4L2 device: ``path`` is /dev/videoN, ``fps`` is requested of the camera."""
 
+    notes = None
+
     def __init__(self, path: str, *, fps: float) -> None:
         self.name = path
         self._fps = fps

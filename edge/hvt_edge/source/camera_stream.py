@@ -16,6 +16,7 @@ from hvt_common.values import CameraUnit
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_edge.source.camera_units import CameraUnits
 from hvt_edge.source.contract import BaseSize, SeenUnit, check_shape
+from hvt_edge.source.decoding.pictures import matrix_of, turn_of
 
 __all__ = [
     "LONG_STEP_S",
@@ -34,7 +35,7 @@ _FORMATS = frozenset({"yuv420p", "yuvj420p"})
 LONG_STEP_S, _LONG_STEPS = 1.0, 3
 """From one frame to the next: more than both, in seconds and in usual steps, is a jump of the time stamps."""
 _OTHER_MATRICES = frozenset({4, 5, 6, 7, 9})
-"""Of ITU-T H.273, table 4: BT.601 in its variants, SMPTE 240M and BT.2020. Who says nothing means BT.709."""
+"""Of ITU-T H.273, table 4: BT.601 in its variants, SMPTE 240M and BT.2020."""
 
 
 def without_jumps(units: Sequence[SeenUnit]) -> tuple[SeenUnit, ...]:
@@ -167,12 +168,10 @@ def check_picture(name: str, picture: av.VideoFrame, *, size: BaseSize) -> str:
         check_shape(size=has, fps=1)
     except UserError as error:
         raise UserError(f"source {name}: {error}; {REENCODE}") from error
-    quarters = round(picture.rotation / 90) % 4
-    if quarters:
+    if turn := turn_of(picture):
         raise UserError(
-            f"source {name} is to be shown turned by {90 * quarters} degrees, and --encoder passthrough sends it as "
-            f"it is coded: {REENCODE}"
+            f"source {name} is to be shown {turn}, and --encoder passthrough sends it as it is coded: {REENCODE}"
         )
-    if picture.color_range == ColorRange.JPEG or picture.colorspace in _OTHER_MATRICES:
+    if picture.color_range == ColorRange.JPEG or matrix_of(picture) in _OTHER_MATRICES:
         return f"source {name} is not BT.709 in limited range: grounds show its colours a little off"
     return ""

@@ -11,7 +11,7 @@ import av
 import av.error
 
 from hvt_common.errors import UserError
-from hvt_common.units import SECOND_NS
+from hvt_common.units import SECOND_NS, exact_rate
 from hvt_common.values import Fit, Frame
 from hvt_edge.source.camera_stream import (
     LONG_STEP_S,
@@ -24,8 +24,10 @@ from hvt_edge.source.camera_stream import (
 )
 from hvt_edge.source.camera_units import CameraUnits
 from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit, Source
+from hvt_edge.source.decoding.container import name_of, open_video, said_rate, survey, without_stamps
+from hvt_edge.source.decoding.notes import Notes
+from hvt_edge.source.decoding.timeline import Stamps, Timeline
 from hvt_edge.source.resample import Resizer
-from hvt_edge.source.video import open_video, without_password
 
 __all__ = ["CodedVideoSource"]
 
@@ -52,12 +54,15 @@ class CodedVideoSource(Source):
         max_frames: int | None = None,
         source_fps: float | None = None,
     ) -> None:
-        self._spec, self._name = spec, without_password(spec)
-        self._source_fps, self._limit = source_fps, max_frames
-        container, stream = open_video(spec)
+        self._spec, self._name = spec, name_of(spec)
+        self._limit = max_frames
+        notes = Notes(self._name)
+        container, stream = open_video(spec, note=notes)
         with container:
             check_stream(self._name, stream)
-            first = _first_picture(container, stream)
+            self._stamps, first = survey(container, stream)
+            if source_fps is not None:
+                self._stamps = Stamps(1 / exact_rate(source_fps), usable=False)
         if first is None:
             raise UserError(f"source {self._name!r} holds a video stream of which no frame can be decoded")
         self.warning = check_picture(self._name, first, size=size)
@@ -66,12 +71,18 @@ class CodedVideoSource(Source):
         self.view = self._resizer.view
         container, stream = open_video(spec)
         with container:
-            said = source_fps or float(stream.guessed_rate or stream.average_rate or 0) or None
-            seen = _seen(_timed(container, stream, fps=source_fps, said=said), open_units(self._name, stream))
+            said = float(1 / self._stamps.period_s)
+            seen = _seen(self._timed(container, stream), open_units(self._name, stream))
             if len(seen) < 2:
                 raise UserError(f"source {self._name!r} holds no keyframe that a ground could begin with")
             self.fps = rate_of(self._name, seen, said=said)
             self.frame_count = None if not stream.frames else min(stream.frames, max_frames or stream.frames)
+            if without_stamps(stream) and source_fps is None:
+                source = "as the stream itself says" if said_rate(stream) else "which is a guess"
+                notes(
+                    f"it has no time stamps: {said:.4g} frames a second, {source}; --source-fps N says another"
+                )
+        self.notes = notes.taken()
         self.camera_stream = CameraStream(without_jumps(seen), self.fps)
         self._running: Generator[Frame, None, None] | None = None
 
@@ -91,7 +102,7 @@ class CodedVideoSource(Source):
         container, stream = open_video(self._spec)
         left_out, before, count, zero_s, begun, last_ns = 0, 0, 0, 0.0, False, -1
         decoder = CameraDecoder(open_units(self._name, stream), size=self._size)
-        packets = _timed(container, stream, fps=self._source_fps, said=self.fps)
+        packets = self._timed(container, stream, say=True)
         with container, closing(packets):
             for at_s, packet in packets:
                 if count == self._limit:
@@ -114,27 +125,25 @@ class CodedVideoSource(Source):
             why = f" ({decoder.trouble})" if decoder.trouble else ""
             _log.warning("%s: %d units could not be passed on%s", self._name, left_out, why)
 
-
-def _timed(
-    container: Any, stream: Any, *, fps: float | None, said: float | None
-) -> Generator[tuple[float, bytes], None, None]:
-    """(seconds, packet) in order; ``fps`` overrides time stamps, ``said`` stands in where there are none."""
-    at_s, period_s = 0.0, 1 / (fps or said or 25.0)
-    packets = container.demux(stream)
-    count = 0
-    while True:
-        try:
-            packet = next(packets)
-        except (StopIteration, av.error.FFmpegError):  # what breaks off is played up to there
-            return
-        if not packet.size:
-            continue
-        if fps is None and packet.pts is not None:
-            at_s = float(packet.pts * packet.time_base)
-        elif count:
-            at_s += period_s
-        count += 1
-        yield at_s, bytes(packet)
+    def _timed(
+        self, container: Any, stream: Any, *, say: bool = False
+    ) -> Generator[tuple[float, bytes], None, None]:
+        """(seconds, packet) in order; a jump of the time stamps is mended, and told of in the log if ``say``."""
+        timeline = Timeline(
+            self._stamps.period_s, quantum_s=stream.time_base if self._stamps.usable else None
+        )
+        packets = container.demux(stream)
+        while True:
+            try:
+                packet = next(packets)
+            except (StopIteration, av.error.FFmpegError):  # what breaks off is played up to there
+                break
+            if not packet.size:
+                continue
+            usable = self._stamps.usable and packet.pts is not None
+            yield float(timeline.at(packet.pts * packet.time_base if usable else None)), bytes(packet)
+        if say and (sentence := timeline.says):
+            _log.warning("%s: %s", self._name, sentence)
 
 
 def _seen(packets: Iterator[tuple[float, bytes]], units: CameraUnits) -> list[SeenUnit]:
@@ -153,12 +162,3 @@ def _seen(packets: Iterator[tuple[float, bytes]], units: CameraUnits) -> list[Se
         if len(seen) == _MOST_SURVEYED or surveyed_s > _MOST_SURVEY_S:
             break
     return seen
-
-
-def _first_picture(container: Any, stream: Any) -> av.VideoFrame | None:
-    """As the container says that it is to be shown."""
-    try:
-        picture: av.VideoFrame | None = next(container.decode(stream), None)
-    except av.error.FFmpegError:
-        return None
-    return picture

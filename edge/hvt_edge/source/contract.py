@@ -73,6 +73,8 @@ class Source(ABC):
     camera_stream: CameraStream | None = None
     """The camera's own HEVC, where each frame comes with its unit of it (`Frame.camera_unit`). An index that is left
     out is a unit that was lost."""
+    notes: tuple[str, ...] = ()
+    """What was decided about it before the flight and why, a sentence each; what is guessed is here."""
     warning: str = ""
     """What the camera's own stream does to what is shown, in a sentence; empty for nothing."""
 

@@ -15,6 +15,8 @@ from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_common.values import Fit, Frame, Image
 from hvt_edge.source.contract import BaseSize, Source
+from hvt_edge.source.decoding.levels import DEEP_GREY, Stretch
+from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
 __all__ = ["FolderSource", "sequence_files"]
@@ -60,15 +62,21 @@ class FolderSource(Source):
         if not self._files:
             endings = ", ".join(sorted(ending[1:] for ending in _ENDINGS))
             raise UserError(f"source folder {spec!r} holds no images; accepted endings are {endings}")
-        first = next((image for image in map(_read, self._files) if image is not None), None)
+        notes = Notes(spec)
+        self._reader = _Reader(notes)
+        images = (self._reader.bgr(file, at_s=0.0) for file in self._files)
+        first = next((image for image in images if image is not None), None)
         if first is None:
             raise UserError(
                 f"source folder {spec!r} holds {len(self._files)} image files, none of which can be read"
             )
+        if source_fps is None:
+            notes(f"images have no time: {fps:g} a second, as --fps says; --source-fps N says another rate")
+        self.notes = notes.taken()
         self._first = first
         self.fps = fps
         self._period_s = 1 / exact_rate(fps if source_fps is None else source_fps)
-        self._resizer = Resizer((first.shape[1], first.shape[0]), size, fit=fit)
+        self._resizer = Resizer((first.shape[1], first.shape[0]), size, fit=fit, name=spec)
         self.view = self._resizer.view
         whole = base_frame_count(len(self._files) * self._period_s, fps=exact_rate(fps))
         self.frame_count = whole if max_frames is None else min(whole, max_frames)
@@ -88,7 +96,7 @@ class FolderSource(Source):
             yield replace(frame, index=index, capture_ns=capture_ns)
 
     def _readable(self, place: int, *, held: Image) -> Image:
-        image = _read(self._files[place])
+        image = self._reader.bgr(self._files[place], at_s=float(place * self._period_s))
         if image is None:
             _log.warning(
                 "%s cannot be read as an image; the one before is shown in its place", self._files[place]
@@ -96,11 +104,25 @@ class FolderSource(Source):
         return held if image is None else image
 
 
-def _read(file: Path) -> Image | None:
-    """The image as BGR, 8 bits; None if it cannot be read or decoded."""
-    try:
-        data = np.fromfile(file, np.uint8)
-    except OSError:  # it was there a moment ago
-        return None
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    return None if image is None else np.asarray(image, np.uint8)
+class _Reader:
+    """Reads one folder, whose deep grey is a sensor's levels (`Stretch`)."""
+
+    def __init__(self, notes: Notes) -> None:
+        self._notes = notes
+        self._stretch = Stretch()
+
+    def bgr(self, file: Path, *, at_s: float) -> Image | None:
+        """The image as BGR, 8 bits; None if it cannot be read or decoded. ``at_s`` is when it is shown."""
+        try:
+            data = np.fromfile(file, np.uint8)
+            if not data.size:
+                return None
+            image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+            if image is not None and image.dtype == np.uint16 and image.ndim == 2:
+                self._notes(DEEP_GREY.format(bits=16))
+                return self._stretch.bgr(np.asarray(image, np.uint16), at_s=at_s)
+            # All else as OpenCV takes it: without transparency, in 8 bits, turned as its EXIF data say.
+            image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        except (OSError, cv2.error):  # it was there a moment ago, or its header says what no memory holds
+            return None
+        return None if image is None else np.asarray(image, np.uint8)

@@ -17,6 +17,7 @@ from hvt_common.values import Fit, Frame, Image
 from hvt_edge.source.camera_clock import CameraClock
 from hvt_edge.source.camera_stream import CameraDecoder
 from hvt_edge.source.contract import BaseSize, Source
+from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.resample import Gate, Resizer
 
 __all__ = ["SOURCE_PART", "CameraPacket", "Grabber", "LiveSource", "Shot", "SignalLost", "closing_on"]
@@ -61,6 +62,11 @@ class Grabber(Protocol):
     """A device that delivers frames as they happen. Used from one thread at a time; no call blocks for ever."""
 
     name: str
+
+    @property
+    def notes(self) -> Notes | None:
+        """What was decided about it."""
+        ...
 
     def open(self) -> None:
         """Open for the first time: raises UserError where there is nothing."""
@@ -111,7 +117,8 @@ class LiveSource(Source):
         except UserError:
             grabber.close()
             raise
-        self._resizer = Resizer(first_size, size, fit=fit)
+        self._resizer = Resizer(first_size, size, fit=fit, name=grabber.name)
+        self.notes = () if grabber.notes is None else grabber.notes.taken()
         self.view = self._resizer.view
         self._pause = RetryPause(_FIRST_WAIT_NS, _LONGEST_WAIT_NS)
         self._news = threading.Condition()

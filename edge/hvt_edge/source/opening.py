@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from hvt_common.errors import UserError
+from hvt_common.redaction import HIDDEN, redacted
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Fit
 from hvt_edge.source.camera import CameraGrabber
@@ -15,20 +16,21 @@ from hvt_edge.source.camera_stream import REENCODE
 from hvt_edge.source.coded_live import CodedLiveSource, CodedStreamGrabber
 from hvt_edge.source.coded_video import CodedVideoSource
 from hvt_edge.source.contract import BaseSize, Source, check_shape
+from hvt_edge.source.decoding.container import is_local
 from hvt_edge.source.demo import DemoSource, is_demo
 from hvt_edge.source.folder import FolderSource
 from hvt_edge.source.live import LiveSource
 from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber
-from hvt_edge.source.video import VideoSource, without_password
+from hvt_edge.source.video import VideoSource
 
-__all__ = ["REENCODE", "Source", "check_shape", "open_source", "without_password"]
+__all__ = ["REENCODE", "Source", "check_shape", "open_source", "shown"]
 
 _ACCEPTED = (
     "a video file, a folder of images, rtsp://…, http://…, udp://…, /dev/videoN, demo or demo:codes,4k"
 )
 
 
-def open_source(
+def open_source(  # noqa: PLR0911 - one return a kind of source
     spec: str,
     *,
     size: BaseSize,
@@ -38,6 +40,7 @@ def open_source(
     max_frames: int | None = None,
     source_fps: float | None = None,
     coded: bool = False,
+    growing: bool = False,
     clock: Callable[[], int] | None = None,
     failures: Failures | None = None,
 ) -> Source:
@@ -47,7 +50,8 @@ def open_source(
     ``fps`` is above 0 and at most 240; for ``fit`` see `View.fitted`. ``source_fps`` is the rate at which the
     images of a folder were taken (default: the base rate), or overrides a video file's own time stamps. ``clock``
     is a live source's, Unix nanoseconds without steps, and ``failures`` is told when it is away; None for its own.
-    With ``coded`` each frame comes with the camera's own unit of it, at the camera's rate, whatever ``fps`` is.
+    A file that is ``growing`` is read as it does. With ``coded`` each frame comes with the camera's own unit of it,
+    at the camera's rate, whatever ``fps`` is.
     Raises `UserError` if nothing usable is there, or size or rate are impossible.
     """
     check_shape(size=size, fps=fps, source_fps=source_fps)
@@ -58,7 +62,7 @@ def open_source(
     live = partial(
         LiveSource, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock, failures=failures
     )
-    scheme = urlsplit(spec).scheme if "://" in spec else ""
+    scheme = "" if is_local(spec) else spec.partition("://")[0].lower()
     if scheme in LIVE_SCHEMES:
         stream = CodedStreamGrabber(spec) if coded else StreamGrabber(spec)
         stream.open()
@@ -69,16 +73,38 @@ def open_source(
         if not stream.holds_a_clip:
             return live(stream)
         stream.close()
-    elif scheme:
-        raise UserError(f"source {spec!r} has the unknown scheme {scheme!r}; accepted is {_ACCEPTED}")
-    if spec.startswith("/dev/"):
+    elif spec.startswith("/dev/"):
         return live(CameraGrabber(spec, fps=fps))
-    if not scheme and not Path(spec).exists():
-        raise UserError(f"source {spec!r} does not exist; accepted is {_ACCEPTED}")
+    else:
+        _check_there(spec, scheme)
     if coded:
         return CodedVideoSource(spec, size=size, fit=fit, max_frames=max_frames, source_fps=source_fps)
-    kind = FolderSource if not scheme and Path(spec).is_dir() else VideoSource
-    return kind(spec, size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps)
+    if not scheme and Path(spec).is_dir():
+        return FolderSource(spec, size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps)
+    return VideoSource(
+        spec, size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps, growing=growing
+    )
+
+
+def _check_there(spec: str, scheme: str) -> None:
+    """Raise `UserError` for a scheme that is not known, or a file or folder that does not exist."""
+    if scheme:
+        known = scheme if re.fullmatch(r"[a-z][a-z0-9+.-]{0,15}", scheme) else HIDDEN
+        raise UserError(f"source {shown(spec)!r} has the unknown scheme {known!r}; accepted is {_ACCEPTED}")
+    if not _is_there(spec):
+        raise UserError(f"source {shown(spec)!r} does not exist; accepted is {_ACCEPTED}")
+
+
+def shown(spec: str) -> str:
+    """What ``--source`` names as it may be printed: a file, a device and the demo as they are."""
+    return spec if is_demo(spec) or _is_there(spec) else redacted(spec)
+
+
+def _is_there(spec: str) -> bool:
+    try:
+        return Path(spec).exists()
+    except (OSError, ValueError):  # too long for a name, or with a character that none has
+        return False
 
 
 def _check_coded(spec: str) -> None:
@@ -91,6 +117,6 @@ def _check_coded(spec: str) -> None:
     for kind, is_it in kinds:
         if is_it:
             raise UserError(
-                f"source {spec!r} is {kind}, and --encoder passthrough takes a video file or a stream that is HEVC "
-                f"already: {REENCODE}"
+                f"source {shown(spec)!r} is {kind}, and --encoder passthrough takes a video file or a stream that "
+                f"is HEVC already: {REENCODE}"
             )

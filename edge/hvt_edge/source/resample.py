@@ -7,6 +7,7 @@ both axes and centred: whole between black borders (letterbox) or filling the fr
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from fractions import Fraction
@@ -17,6 +18,7 @@ import numpy as np
 
 from hvt_common.values import CameraUnit, Fit, Frame, Image, View
 from hvt_edge.source.contract import BaseSize
+from hvt_edge.source.decoding.condition import PictureCondition
 
 __all__ = [
     "Gate",
@@ -26,6 +28,8 @@ __all__ = [
     "hold",
     "into_canvas",
 ]
+
+_log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
@@ -99,12 +103,17 @@ class Resizer:
     Attributes:
         view: the map from source to base pixels. Pictures follow it to within half a pixel of the base, because
             borders and cuts lie on whole pixels.
+
+    Pictures that are black or the same for long are told of in the log, under ``name``.
     """
 
-    def __init__(self, source_size: tuple[int, int], base_size: BaseSize, *, fit: Fit) -> None:
+    def __init__(
+        self, source_size: tuple[int, int], base_size: BaseSize, *, fit: Fit, name: str = "source"
+    ) -> None:
         size = base_size(source_size) if callable(base_size) else base_size
         self.view = View.fitted(source_size, size, fit=fit)
-        self._fit = fit
+        self._fit, self._name = fit, name
+        self._condition = PictureCondition()
 
     def frame(self, source_bgr: Image, *, index: int, capture_ns: int) -> Frame:
         """The base frame of a picture, which is first fitted to the source size if it has another. Both read-only."""
@@ -112,6 +121,8 @@ class Resizer:
         whole.flags.writeable = False
         base = self._resized(whole)
         base.flags.writeable = False
+        if said := self._condition.note(base, at_ns=capture_ns):
+            _log.warning("%s: %s", self._name, said)
         return Frame(index=index, capture_ns=capture_ns, source_bgr=whole, base_bgr=base)
 
     def coded_frame(self, picture: Image, unit: CameraUnit, *, index: int, capture_ns: int) -> Frame:

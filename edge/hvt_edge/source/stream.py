@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
+from fractions import Fraction
 from functools import partial
 from typing import Any
 
@@ -10,8 +12,11 @@ import av
 import av.error
 
 from hvt_common.errors import UserError
+from hvt_common.redaction import redacted
+from hvt_edge.source.decoding.container import cause_of, choose_stream
+from hvt_edge.source.decoding.notes import Notes
+from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.live import Shot, SignalLost
-from hvt_edge.source.video import upright_bgr, without_password
 
 __all__ = ["LIVE_SCHEMES", "StreamGrabber", "camera_time_ns"]
 
@@ -36,10 +41,15 @@ class StreamGrabber:
     A password in ``url`` is never printed; ``open_s`` bounds the first opening.
     """
 
+    notes: Notes | None = None
+
     def __init__(self, url: str, *, open_s: float = _OPEN_S) -> None:
-        self.name = without_password(url)
+        self.name = redacted(url)
         self._url, self._open_s = url, open_s
         self._container: Any = None
+        self.notes = notes = Notes(self.name)
+        self._choose = partial(choose_stream, note=notes)
+        self._pictures = Pictures(notes)
         self._shots: Iterator[Shot] = iter(())
 
     def open(self) -> None:
@@ -65,7 +75,7 @@ class StreamGrabber:
         try:
             shot = next(self._shots, None)
         except (av.error.FFmpegError, OSError) as error:
-            raise SignalLost(_cause(error)) from error
+            raise SignalLost(cause_of(error)) from error
         if shot is None:
             raise SignalLost("it ended")
         return shot
@@ -79,7 +89,7 @@ class StreamGrabber:
 
     def _start(self, open_s: float) -> None:
         container = _open(self._url, open_s=open_s)
-        stream = next(iter(container.streams.video), None)
+        stream = self._choose(container)
         if stream is None:
             container.close()
             raise UserError(f"source {self.name} holds no video stream")
@@ -93,18 +103,23 @@ class StreamGrabber:
     def _read(self, container: Any, stream: Any) -> Iterator[Shot]:
         """What comes from now on; raises UserError where the stream is not taken."""
         stream.thread_type = "SLICE"
-        return _decoded(container, stream)
+        self._pictures.begin(stream)
+        return _decoded(container, stream, self._pictures)
 
 
-def _decoded(container: Any, stream: Any) -> Iterator[Shot]:
+def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
     """Frames, each with its time by the camera's clock."""
-    times: dict[int, int] = {}
+    times: dict[Fraction, int] = {}
     for packet in container.demux(stream):
         camera_ns = camera_time_ns(packet)
         if packet.pts is not None and camera_ns is not None:
-            times[packet.pts] = camera_ns
-        for frame in packet.decode():
-            yield Shot(partial(upright_bgr, frame), times.pop(frame.pts, None))
+            times[packet.pts * packet.time_base] = camera_ns
+        for coded in packet.decode():
+            for frame in pictures.frames(coded):
+                base = frame.time_base
+                at_s = None if frame.pts is None or base is None else frame.pts * base
+                camera_ns = None if at_s is None else times.pop(at_s, None)
+                yield Shot(partial(pictures.bgr, frame), camera_ns)
         if len(times) > _MOST_TIMES:
             times.clear()
 
@@ -120,11 +135,27 @@ def _open(url: str, *, open_s: float) -> Any:
     try:
         return av.open(url, options=_OPTIONS, timeout=(open_s, _READ_S))
     except (av.error.FFmpegError, OSError, ValueError) as error:
-        name = without_password(url)
-        raise UserError(f"source {name} cannot be opened within {open_s:g} s ({_cause(error)})") from error
+        name, cause = redacted(url), cause_of(error)
+        if isinstance(error, av.error.InvalidDataError) and url.lower().startswith("http"):
+            # A camera's JPEGs without the boundary before the first: FFmpeg finds them by their own beginnings.
+            with suppress(av.error.FFmpegError, OSError):
+                return _pictures_of(av.open(url, format="mjpeg", options=_OPTIONS, timeout=(open_s, _READ_S)))
+    raise UserError(f"source {name} cannot be opened within {open_s:g} s ({cause}){_spelt(url)}")
 
 
-def _cause(error: Exception) -> str:
-    if isinstance(error, av.error.ExitError):
-        return "no answer in time"
-    return str(getattr(error, "strerror", None) or error)
+def _pictures_of(container: Any) -> Any:
+    """The same, if it holds pictures; raises `OSError` where anything else was taken for some."""
+    codec = next(iter(container.streams.video)).codec_context
+    if codec.width and codec.height:
+        return container
+    container.close()
+    raise OSError
+
+
+def _spelt(url: str) -> str:
+    """How to spell it where a password is likely to have been taken for something else; empty where it is not."""
+    body = url.partition("://")[2]
+    odd = set("/?#[]") & set(body.rpartition("@")[0])
+    if not odd:
+        return ""
+    return "; in a password write / ? # [ ] as %2F %3F %23 %5B %5D"

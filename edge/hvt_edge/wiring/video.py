@@ -16,7 +16,7 @@ from hvt_common.values import Fit, Frame
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
 from hvt_edge.source.contract import BaseSize, Source, size_within
-from hvt_edge.source.opening import REENCODE, without_password
+from hvt_edge.source.opening import REENCODE, shown
 from hvt_edge.video.encoder_settings import (
     encoder_settings,
     keyframe_floor_bytes,
@@ -206,7 +206,7 @@ def scene(
 
 def as_the_camera_is(config: EdgeConfig, source: Source) -> EdgeConfig:
     """The settings with the camera's frame rate, where its own units are sent; `UserError` where they cannot be."""
-    stream, name = source.camera_stream, without_password(str(config.source))
+    stream, name = source.camera_stream, shown(str(config.source))
     if not config.passes_through:
         return config
     if stream is None:
@@ -224,7 +224,7 @@ def as_the_camera_is(config: EdgeConfig, source: Source) -> EdgeConfig:
 
 def _qualify_camera(config: EdgeConfig, source: Source) -> None:
     """Say what the camera takes; `UserError` where that is more than the budget leaves it."""
-    stream, name = source.camera_stream, without_password(str(config.source))
+    stream, name = source.camera_stream, shown(str(config.source))
     assert stream is not None, "checked by as_the_camera_is"
     limit = allowed(
         size=source.view.base_size,

@@ -107,7 +107,9 @@ def _ttl(parts: SplitResult, text: str) -> int:
     given = parse_qs(parts.query, keep_blank_values=True)
     ttl = given.pop("ttl", ["1"])[-1]
     if given or not ttl.isdecimal() or not 1 <= int(ttl) <= 255:
-        raise UserError(f"--ts {text} says behind the question mark what is not known: ttl=1 to ttl=255 is")
+        raise UserError(
+            f"--ts {Address(text).shown} says behind the question mark what is not known: ttl=1 to ttl=255 is"
+        )
     return int(ttl)
 
 

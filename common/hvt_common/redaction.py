@@ -1,0 +1,135 @@
+"""Keeps the secrets of addresses in memory: what is printed, logged, written or sent of one goes through here. Pure.
+
+Of an address scheme, host and port are shown, and a path of plain words. A password, a token, a stream key may stand
+in its user, its query, its path or its fragment, and an address with a typing error has them anywhere.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+from urllib.parse import quote, unquote
+
+__all__ = ["HIDDEN", "Redaction", "redacted"]
+
+HIDDEN = "…"
+
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{0,15}):[/\\]+", re.ASCII)
+_HOST = re.compile(r"(\[[0-9A-Fa-f:.]*(?:%\w{1,16})?\]|[\w*-]+(?:\.[\w*-]+)*)(?::(\d{1,5}))?", re.ASCII)
+_FILE = re.compile(r"[^@?&=#:\\]+|[^@?&=#\\]*\d:\d[^@?&=#\\]*")
+"""What may be the name of a file: a colon stands between the digits of a time alone."""
+_SCHEMELESS = re.compile(
+    r"\s*(?:(?:rtsps?|rtmps?|https?|srt|udp|tcp|rtp)\b[:/\\]|\w*//|[^/]*:\d+/|(?:\d{1,3}\.){3}\d)|.*:[/\\]",
+    re.IGNORECASE | re.DOTALL,
+)
+"""What looks like an address with a typing error, and like no file."""
+_BEGIN = re.compile(r":[/\\]+|\w//")
+_WORD = re.compile(
+    r"(?:[A-Za-z]{0,12}[0-9]{0,4}|h26[45][A-Za-z]{0,12})(?:[._-](?:[A-Za-z]{0,12}[0-9]{0,4}|mp4))*", re.ASCII
+)
+_SEPARATOR = re.compile(r"[/?#\\]")
+_MOST_PORT = 65535
+
+_KEY = r"[\w.-]{0,32}(?:pass|pwd|pw|key|token|auth|secret|sig|user|cred|streamid|session|code)[\w.-]{0,32}"
+_PAIR = re.compile(rf"(?<![\w.-])({_KEY})=([^&\s\"'<>)\],;…]+)", re.IGNORECASE)
+_LEAST = 3
+"""A secret of fewer characters would blot out half of every sentence; in an address it is hidden all the same."""
+_ANYWHERE = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{0,15}:[/\\]{1,4})(?:[^\n]*@|[^\s\"'@]*@)")
+
+
+def redacted(address: str) -> str:
+    """An address as it may be shown, such as ``rtsp://…@10.0.0.5/stream1?…``; the path of a file stays as it is.
+
+    Where it cannot be told what is the host, as with a ``#`` in a password, nothing but the scheme is shown.
+    """
+    found = _SCHEME.match(address)
+    if found is None:
+        if _SCHEMELESS.match(address) or not _FILE.fullmatch(address):
+            return HIDDEN
+        return address
+    scheme, body = found[0], address[found.end() :]
+    if _SEPARATOR.search(scheme.removesuffix("//").rstrip(":")) or not scheme.endswith("://"):
+        return f"{found[1]}:{HIDDEN}"
+    end = _SEPARATOR.search(body)
+    authority, rest = (body, "") if end is None else (body[: end.start()], body[end.start() :])
+    _, at, host = authority.rpartition("@")
+    if "@" in rest:  # a password with a slash, or a path with an @
+        return f"{scheme}{HIDDEN}"
+    good = _HOST.fullmatch(host)
+    if good is None or int(good[2] or 0) > _MOST_PORT:
+        return f"{scheme}{HIDDEN}"
+    if good[2] and not at and "." not in good[1] and good[1] not in ("localhost", "") and good[1][0] != "[":
+        host = f"{good[1]}:{HIDDEN}"  # admin:12345 with the host left out
+    return (
+        f"{scheme}{f'{HIDDEN}@' if at else ''}{host}{_path(rest, hidden=found[1].lower().startswith('rtmp'))}"
+    )
+
+
+def _path(rest: str, *, hidden: bool) -> str:
+    """What of a path may be shown: words as cameras name their streams. RTMP has a stream key there."""
+    path = re.split(r"[?#\\]", rest, maxsplit=1)[0]
+    parts = (part if not hidden and _WORD.fullmatch(part) else part and HIDDEN for part in path.split("/"))
+    return "/".join(parts) + (f"?{HIDDEN}" if path != rest else "")
+
+
+class Redaction:
+    """Hides in any text what the ``addresses`` of a process hold, however a library has quoted it."""
+
+    def __init__(self, addresses: Iterable[str] = ()) -> None:
+        words = list(addresses)
+        self._whole = {
+            spelt: redacted(one) for one in words if _BEGIN.search(one) for spelt in _spellings(one)
+        }
+        found = {one for word in words for one in _secrets(word)}
+        variants = {spelt for one in found for spelt in _spellings(one)}
+        self._literal = sorted((one for one in variants if len(one) >= _LEAST), key=len, reverse=True)
+
+    def text(self, text: str) -> str:
+        """The text without them, and without the user of any other address, or a ``password=…`` in one."""
+        for whole, shown in self._whole.items():
+            text = text.replace(whole, shown)
+        for one in self._literal:
+            text = text.replace(one, HIDDEN)
+        if "://" in text or ":/" in text:
+            text = _ANYWHERE.sub(lambda found: f"{found[1]}{HIDDEN}@", text)
+            text = _PAIR.sub(lambda found: f"{found[1]}={HIDDEN}", text)
+        return text
+
+    def value(self, value: Any) -> Any:
+        """The same for each text within lists and tables; other values stay as they are."""
+        if isinstance(value, str):
+            return self.text(value)
+        if isinstance(value, Mapping):
+            return {key: self.value(one) for key, one in value.items()}
+        return [self.value(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+def _secrets(word: str) -> Iterable[str]:
+    """What of a word, an address or ``--source=`` and one, nobody may read; of a typing error rather too much."""
+    found = _BEGIN.search(word)
+    if found is None and not re.search(r":.*@", word) and not _PAIR.search(word):
+        return
+    address = word.partition("=")[2] if word.startswith("--") else word
+    body = word if found is None else word[found.end() :]
+    user, at, _ = body.rpartition("@")
+    if at:
+        name, colon, password = user.partition(":")
+        yield from (user, password if colon else name)
+    yield from (value for _, value in _PAIR.findall(body))
+    # A library may take it apart at any of these; what of an address is shown need not be hidden.
+    shown = redacted(address)
+    for part in re.split(r"[/?#&;@\[\]\\]", body):
+        for one in (part, *part.split("=", 1)[1:], *part.split(":")):
+            if one not in shown and not (_WORD.fullmatch(one) and not at):
+                yield one
+
+
+def _spellings(secret: str) -> Iterable[str]:
+    plain = unquote(secret)
+    for one in (secret, plain, quote(plain, safe=""), quote(plain)):
+        yield one
+        yield repr(one)[1:-1]
+        yield json.dumps(one)[1:-1]
+        yield json.dumps(one, ensure_ascii=False)[1:-1]

@@ -1,0 +1,315 @@
+"""Opens files and streams through PyAV, and reads what can be read of damaged ones."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import av.error
+from av.stream import Disposition
+
+from hvt_common.errors import UserError
+from hvt_common.redaction import redacted
+from hvt_edge.source.decoding.timeline import Stamps, Timeline, surveyed
+
+__all__ = [
+    "cause_of",
+    "choose_stream",
+    "decoded",
+    "is_local",
+    "name_of",
+    "open_video",
+    "said_rate",
+    "survey",
+    "without_stamps",
+]
+
+_log = logging.getLogger(__name__)
+
+_TEXT_CODECS = frozenset({"ansi", "bintext", "xbin", "idf"})
+"""FFmpeg plays text files as a terminal's screen; nobody means that."""
+_PICTURE_CODECS = frozenset({"mjpeg", "png", "bmp", "gif", "tiff", "webp", "jpegxl"})
+_NO_FILM = Disposition.attached_pic | Disposition.still_image | Disposition.timed_thumbnails
+_OPEN_S, _READ_S = 10.0, 10.0
+_NO_STAMPS = 0x80
+"""``AVFMT_NOTIMESTAMPS`` of libavformat: a raw stream, whose times FFmpeg invents at 25 frames a second."""
+_SURVEYED = 256
+"""Packets at the start of a clip whose stamps are looked at."""
+_QUIET_S, _POLL_S = 10.0, 0.1
+"""A file that has not grown for so long has ended."""
+_MOST_BOXES = 64
+_PACKET_BYTES = {"mpegts": 188}
+
+
+def is_local(spec: str) -> bool:
+    """Whether it is a path. What is there is one, whatever its name looks like."""
+    with suppress(OSError, ValueError):
+        return "://" not in spec or Path(spec).exists()
+    return "://" not in spec
+
+
+def name_of(spec: str) -> str:
+    """As it may be printed; `is_local` ones are known to be there."""
+    return spec if is_local(spec) else redacted(spec)
+
+
+class _GrowingFile:
+    """A file that is still written: a read at its end waits for more."""
+
+    def __init__(self, path: str) -> None:
+        self._file = os.open(path, os.O_RDONLY)
+
+    def __del__(self) -> None:
+        os.close(self._file)  # PyAV lets go of it, and does not close it
+
+    def read(self, size: int) -> bytes:
+        """At most ``size`` bytes; nothing once it has not grown for ten seconds."""
+        until_s = time.monotonic() + _QUIET_S
+        while not (data := os.read(self._file, size)) and time.monotonic() < until_s:
+            time.sleep(_POLL_S)
+        return data
+
+
+def open_video(
+    spec: str, *, growing: bool = False, note: Callable[[str], None] = lambda _: None
+) -> tuple[Any, Any]:
+    """Open a file or a URL, and the stream that is its film. ``note`` is told which, where there are several.
+
+    With ``growing`` a file that grows is read as it does. Raises `UserError` where there is none.
+    """
+    name, local = name_of(spec), is_local(spec)
+    if local and Path(spec).stat().st_size == 0 and not growing:
+        raise UserError(f"source {spec!r} is an empty file; accepted is a video file")
+    try:
+        # By its own name a file may look like an address.
+        where: Any = f"file:{spec}" if local else spec
+        container = av.open(_GrowingFile(spec) if local and growing else where, timeout=(_OPEN_S, _READ_S))
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        unfinished = _lacks_index(Path(spec)) if local else ""
+        raise UserError(
+            f"source {name!r} is {unfinished}"
+            if unfinished
+            else f"source {name!r} is not a video that can be read ({cause_of(error)}); accepted is any video file "
+            "that FFmpeg decodes"
+        ) from None
+    stream = choose_stream(container, note=note)
+    if stream is None:
+        container.close()
+        raise UserError(f"source {name!r} holds no video; accepted is any video file that FFmpeg decodes")
+    stream.thread_type = "AUTO"
+    return container, stream
+
+
+def choose_stream(container: Any, *, note: Callable[[str], None] = lambda _: None) -> Any | None:
+    """The film: no cover picture, the one marked as default, then the largest. None where there is no video.
+
+    ``note`` is told which it is where there is a choice.
+    """
+    able = [one for one in container.streams.video if one.codec_context is not None]
+    able = [one for one in able if one.codec_context.name not in _TEXT_CODECS]
+    films = [one for one in able if _is_film(one)] or able
+    if not films:
+        return None
+    best = container.streams.best("video")
+
+    def rank(stream: Any) -> tuple[bool, bool, int, int]:
+        codec = stream.codec_context
+        is_default = bool(stream.disposition & Disposition.default)
+        return is_default, stream is best, codec.width * codec.height, -stream.index
+
+    moving = [one for one in films if one.codec_context.name not in _PICTURE_CODECS] or films
+    chosen = max(moving, key=rank)
+    if len(able) > 1:
+        codec = chosen.codec_context
+        note(
+            f"of its {len(able)} video streams number {chosen.index} is the film "
+            f"({codec.name}, {codec.width}x{codec.height}): no cover picture, then the default, then the largest"
+        )
+    return chosen
+
+
+def _is_film(stream: Any) -> bool:
+    return not stream.disposition & _NO_FILM and stream.frames != 1
+
+
+def without_stamps(stream: Any) -> bool:
+    """Whether the container has no time stamps at all."""
+    return bool(stream.container.format.flags & _NO_STAMPS)
+
+
+def said_rate(stream: Any) -> Fraction | None:
+    """Frames a second as the container says, or the stream itself where the container invents them."""
+    rate = None if without_stamps(stream) else stream.average_rate
+    rate = rate or stream.guessed_rate or stream.base_rate
+    return Fraction(rate) if rate else None
+
+
+def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
+    """What the stream's first packets say of its times, and its first frame; None where none decodes there."""
+    times: list[tuple[Fraction | None, Fraction | None]] = []
+    first: av.VideoFrame | None = None
+    for packet in _packets(container, stream):
+        if first is None:
+            with suppress(av.error.FFmpegError):
+                first = next(iter(_decode(stream, packet)), None)
+        if not isinstance(packet, Exception) and packet.size:
+            base = packet.time_base
+            times.append((_seconds(packet.pts, base), _seconds(packet.dts, base)))
+        if len(times) >= _SURVEYED and first is not None:
+            break
+    rate = said_rate(stream)
+    if without_stamps(stream):
+        return Stamps(1 / (rate or Fraction(25)), usable=False), first
+    reorders = bool(stream.codec_context.has_b_frames)
+    return surveyed(times, said_fps=rate, reorders=reorders), first
+
+
+def decoded(
+    container: Any, stream: Any, *, name: str, stamps: Stamps
+) -> Generator[tuple[Fraction, av.VideoFrame], None, None]:
+    """Every frame that decodes with its time in seconds, in presentation order.
+
+    Damage is skipped and reported once, at the end; a jump of the time stamps is mended and reported when it comes.
+    """
+    timeline = Timeline(stamps.period_s, quantum_s=stream.time_base if stamps.usable else None)
+    reading = _Reading(container, stream)
+    for frame in reading.frames():
+        stamp = frame.pts if stamps.ordered else frame.dts
+        jumped = bool(timeline.jumps)
+        yield timeline.at(_seconds(stamp, frame.time_base) if stamps.usable else None), frame
+        if timeline.jumps and not jumped:
+            _log.warning("%s: %s", name, timeline.says)
+    if len(timeline.jumps) > 1:
+        _log.warning("%s: its time stamps jumped %d times in all", name, len(timeline.jumps))
+    for sentence in reading.faults():
+        _log.warning("%s %s", name, sentence)
+
+
+class _Reading:
+    """One pass over a stream, which counts what is damaged."""
+
+    def __init__(self, container: Any, stream: Any) -> None:
+        self._container, self._stream = container, stream
+        self._size = _size_of(container)
+        self._damaged = self._count = 0
+        self._ended = ""
+        self._end_s: Fraction | None = None
+
+    def frames(self) -> Iterator[av.VideoFrame]:
+        """As they are decoded."""
+        for packet in _packets(self._container, self._stream):
+            if isinstance(packet, Exception):
+                self._ended = f"it breaks off ({cause_of(packet)})"
+            elif packet.dts is not None:
+                self._end_s = _seconds(packet.dts + (packet.duration or 0), packet.time_base)
+            try:
+                frames = _decode(self._stream, packet)
+            except av.error.FFmpegError:
+                self._damaged += 1
+                continue
+            self._count += len(frames)
+            yield from frames
+
+    def faults(self) -> Iterator[str]:
+        """What is to be said at the end."""
+        if self._damaged:
+            yield f"has {self._damaged} damaged packets, which were skipped"
+        why = self._ended or self._unfinished()
+        if why:
+            yield f"is unfinished: {why}"
+
+    def _unfinished(self) -> str:
+        """Why what was played is not all that there should be; empty where nothing says so."""
+        container, stream = self._container, self._stream
+        if (size := _size_of(container)) != self._size:
+            return f"it has grown by {(size or 0) - (self._size or 0)} bytes since: --follow waits for more"
+        # An edit list may hide a few on purpose.
+        if self._count < stream.frames and (self._lacks_bytes() or self._count < 0.98 * stream.frames - 2):
+            return f"{self._count} of its {stream.frames} frames are there"
+        unit = _PACKET_BYTES.get(container.format.name)
+        if unit and self._size and self._size % unit:
+            return "its last packet is cut"
+        begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)
+        said_s = _seconds(stream.duration, stream.time_base)
+        said_s = said_s or _seconds(container.duration, Fraction(1, 1_000_000))
+        if said_s is not None and self._end_s is not None and unit is None:
+            missing_s = said_s - (self._end_s - begin_s)
+            if missing_s > 1 and missing_s > said_s / 50:
+                return f"it ends {float(missing_s):.1f} s before the end that its header says"
+        return ""
+
+    def _lacks_bytes(self) -> bool:
+        """Whether its index names places beyond its end."""
+        return bool(self._size) and any(
+            one.pos + one.size > (self._size or 0) for one in self._stream.index_entries
+        )
+
+
+def _packets(container: Any, stream: Any) -> Iterator[Any]:
+    """All of a stream; where it breaks off, the error is the last."""
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets)
+        except StopIteration:
+            return
+        except av.error.FFmpegError as error:
+            yield error
+            return
+        yield packet
+
+
+def _decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
+    """Of a packet; of an error what the decoder has held back until then."""
+    if isinstance(packet, Exception):
+        return list(stream.codec_context.decode(None))
+    return list(packet.decode())
+
+
+def _lacks_index(path: Path) -> str:
+    """What is wrong with an MP4 whose index is missing; empty for anything else (ISO/IEC 14496-12, 4.2)."""
+    kinds: list[bytes] = []
+    with suppress(OSError), path.open("rb") as file:
+        end = path.stat().st_size
+        at = 0
+        while at + 8 <= end and len(kinds) < _MOST_BOXES:
+            file.seek(at)
+            head = file.read(16)
+            size, kind = int.from_bytes(head[:4], "big"), head[4:8]
+            kinds.append(kind)
+            size = int.from_bytes(head[8:16], "big") if size == 1 else size
+            if size < 8:
+                break
+            at += size
+    if kinds[:1] != [b"ftyp"] or b"moov" in kinds:
+        return ""
+    return (
+        "unfinished: an MP4 has its index (moov) at its end, and this one has none, because it was cut or is still "
+        "recorded; Matroska, MPEG-TS and fragmented MP4 can be read so far, and while they grow with --follow"
+    )
+
+
+def _seconds(stamp: int | None, base: Fraction | None) -> Fraction | None:
+    return None if stamp is None or base is None else stamp * base
+
+
+def _size_of(container: Any) -> int | None:
+    """Bytes of a file now; None for what is none."""
+    name = str(container.name or "")
+    with suppress(OSError, ValueError):
+        return Path(name.removeprefix("file:")).stat().st_size if name.startswith("file:") else None
+    return None
+
+
+def cause_of(error: Exception) -> str:
+    """Of FFmpeg's or the system's error, without the address that it may hold."""
+    if isinstance(error, av.error.ExitError):
+        return "no answer in time"
+    return redacted(str(getattr(error, "strerror", None) or error))

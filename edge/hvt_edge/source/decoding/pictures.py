@@ -1,0 +1,184 @@
+"""Decoded frames as a player shows them: deinterlaced, of square pixels, upright, in their colours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import Any
+
+import av
+import av.error
+import numpy as np
+from av.filter import Graph
+from av.video.reformatter import ColorPrimaries, Colorspace, ColorTrc, Interpolation, VideoReformatter
+
+from hvt_common.values import Image
+from hvt_edge.source.decoding.levels import DEEP_GREY, Stretch
+from hvt_edge.source.decoding.notes import Notes
+
+__all__ = ["Pictures", "matrix_of", "turn_of"]
+
+_UNTAGGED_SD_PX = 576
+"""A picture that says no colour matrix is BT.601 with at most so many lines, else BT.709: as players take it."""
+_DEEP_BITS = 10
+"""Grey of more is a sensor's levels, not brightness."""
+_HDR = {16: "PQ", 18: "HLG"}
+"""Transfers of ITU-T H.273, table 3."""
+_BT709, _BT601 = 1, 6
+_UNSAID = (0, 2, 3)
+"""Matrices of H.273, table 4: 0 is RGB, which no YUV is, 2 says nothing, 3 is reserved."""
+_MOST_ASPECT = 8
+_Turn = tuple[bool, bool, bool]
+"""Whether rows become columns, and whether it is then mirrored left to right, and upside down."""
+_TURNS = {
+    (False, False, False): "",
+    (False, True, False): "mirrored left to right",
+    (False, False, True): "mirrored upside down",
+    (False, True, True): "turned by 180 degrees",
+    (True, False, False): "mirrored and turned by 90 degrees",
+    (True, True, False): "turned by 90 degrees clockwise",
+    (True, False, True): "turned by 90 degrees anticlockwise",
+    (True, True, True): "mirrored and turned by 270 degrees",
+}
+
+
+class Pictures:
+    """Of one stream, for as long as it is read; ``notes`` has what was decided, and why."""
+
+    def __init__(self, notes: Notes) -> None:
+        self._say = notes
+        self._reformatter = VideoReformatter()
+        """Kept: the table of an HDR picture takes seconds to make."""
+        self._stretch = Stretch()
+        self._aspect = Fraction(1)
+        self._graph: Graph | None = None
+        self._shape: tuple[int, int, str] | None = None
+        """(width, height, format) for which the graph was made."""
+        self._stream: Any = None
+
+    def begin(self, stream: Any) -> None:
+        """Read ``stream`` from here on; the container's word on its pixels goes before the codec's."""
+        self._stream, self._graph = stream, None
+        aspect = Fraction(stream.sample_aspect_ratio or 1)
+        if not Fraction(1, _MOST_ASPECT) <= aspect <= _MOST_ASPECT:
+            self._say(
+                f"pixels {float(aspect):g} times as wide as high are taken for a fault: they are square"
+            )
+            aspect = Fraction(1)
+        self._aspect = aspect
+        if aspect != 1:
+            self._say(f"its pixels are {float(aspect):.3g} times as wide as high: made square")
+
+    def frames(self, frame: av.VideoFrame | None) -> Iterator[av.VideoFrame]:
+        """What is to be shown of a decoded frame: without combs, and then one frame later; None at the end.
+
+        Frames of interlaced film are interpolated in time (bwdif); others pass as they are.
+        """
+        if frame is not None and not frame.interlaced_frame and self._graph is None:
+            yield frame
+            return
+        if frame is not None and self._shape_of(frame) != (self._shape if self._graph else None):
+            yield from self._drained()
+            self._say("its film is interlaced: bwdif makes whole pictures of it")
+            self._make_graph(frame)
+        if frame is None:
+            yield from self._drained()
+        elif self._graph is not None:
+            self._graph.vpush(frame)
+            yield from self._pulled()
+
+    def bgr(self, frame: av.VideoFrame) -> Image:
+        """(height, width, 3) uint8, with square pixels, turned and mirrored as the display matrix says."""
+        picture = self._upright_colours(frame)
+        if said := turn_of(frame):
+            self._say(f"it is to be shown {said}, and is")
+            picture = _turned(picture, _turn_of(frame))
+        return np.ascontiguousarray(picture)
+
+    def _upright_colours(self, frame: av.VideoFrame) -> Image:
+        wide, high = self._square(frame)
+        name, components = frame.format.name, frame.format.components
+        if name.startswith("gray") and not name.startswith("grayf") and components[0].bits > _DEEP_BITS:
+            self._say(DEEP_GREY.format(bits=components[0].bits))
+            levels = self._reformatter.reformat(
+                frame, width=wide, height=high, format="gray16le"
+            ).to_ndarray()
+            return self._stretch.bgr(np.asarray(levels, np.uint16), at_s=frame.time or 0.0)
+        more: dict[str, Any] = {}
+        if not frame.format.is_rgb and not name.startswith("gray"):
+            if frame.colorspace in _UNSAID:
+                matrix = matrix_of(frame)
+                standard = "BT.709" if matrix == _BT709 else "BT.601"
+                self._say(f"it says no colour matrix: {standard}, because it has {frame.height} lines")
+                more["src_colorspace"] = Colorspace.ITU709 if matrix == _BT709 else Colorspace.ITU601
+            if frame.color_trc in _HDR:
+                self._say(f"it is HDR ({_HDR[frame.color_trc]}): tone-mapped to BT.709")
+                more |= {"dst_color_trc": ColorTrc.BT709, "dst_color_primaries": ColorPrimaries.BT709}
+        how = Interpolation.BICUBIC if (wide, high) != (frame.width, frame.height) else Interpolation.BILINEAR
+        converted = self._reformatter.reformat(
+            frame, width=wide, height=high, format="bgr24", interpolation=how, **more
+        )
+        return np.asarray(converted.to_ndarray(), np.uint8)
+
+    def _square(self, frame: av.VideoFrame) -> tuple[int, int]:
+        """(width, height) with square pixels: one side grows, so that no detail is lost."""
+        if self._aspect >= 1:
+            return max(2, round(frame.width * self._aspect)), frame.height
+        return frame.width, max(2, round(frame.height / self._aspect))
+
+    @staticmethod
+    def _shape_of(frame: av.VideoFrame) -> tuple[int, int, str]:
+        return frame.width, frame.height, frame.format.name
+
+    def _make_graph(self, frame: av.VideoFrame) -> None:
+        graph = Graph()
+        source = graph.add_buffer(
+            width=frame.width, height=frame.height, format=frame.format, time_base=self._stream.time_base
+        )
+        deinterlace = graph.add("bwdif", "mode=send_frame:parity=auto:deint=interlaced")
+        graph.link_nodes(source, deinterlace, graph.add("buffersink")).configure()
+        self._graph, self._shape = graph, self._shape_of(frame)
+
+    def _drained(self) -> Iterator[av.VideoFrame]:
+        if self._graph is not None:
+            self._graph.vpush(None)
+            yield from self._pulled()
+            self._graph = None
+
+    def _pulled(self) -> Iterator[av.VideoFrame]:
+        while self._graph is not None:
+            try:
+                frame = self._graph.vpull()
+            except (av.error.BlockingIOError, av.error.EOFError):
+                return
+            yield frame
+
+
+def matrix_of(frame: av.VideoFrame) -> int:
+    """The colour matrix of a YUV frame (H.273, table 4): what it says, else by its height."""
+    if frame.colorspace not in _UNSAID:
+        return int(frame.colorspace)
+    return _BT709 if frame.height > _UNTAGGED_SD_PX else _BT601
+
+
+def turn_of(frame: av.VideoFrame) -> str:
+    """How a frame is to be shown by its display matrix, to the nearest right angle, in words; empty for as it is."""
+    return _TURNS[_turn_of(frame)]
+
+
+def _turn_of(frame: av.VideoFrame) -> _Turn:
+    """By the display matrix (ISO/IEC 14496-12, 8.3.2)."""
+    said: Any = frame.side_data.get("DISPLAYMATRIX")
+    if said is None:
+        return False, False, False
+    matrix = np.frombuffer(bytes(said), np.int32)
+    a, b, c, d = (int(matrix[place]) for place in (0, 1, 3, 4))
+    if abs(b) + abs(c) > abs(a) + abs(d):
+        return True, c < 0, b < 0
+    return False, a < 0, d < 0
+
+
+def _turned(picture: Image, turn: _Turn) -> Image:
+    swap, mirror, flip = turn
+    turned = np.swapaxes(picture, 0, 1) if swap else picture
+    return turned[:: -1 if flip else 1, :: -1 if mirror else 1]

@@ -1,0 +1,113 @@
+"""Times of decoded frames as a player gives them: every frame once, in order. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise
+from statistics import median
+
+__all__ = ["LONG_STEP_S", "Stamps", "Timeline", "surveyed"]
+
+LONG_STEP_S = Fraction(10)
+"""A step of more than this, and than three usual ones, is a jump (``max_frame_duration`` of ffplay)."""
+_LONG_STEPS = 3
+_FEW = 8
+"""So many stamps that do not rise say that there are none."""
+_SAME = Fraction(2, 100)
+
+
+@dataclass(frozen=True, slots=True)
+class Stamps:
+    """What the first packets of a stream say, in decoding order."""
+
+    period_s: Fraction
+    """The usual step from one frame to the next."""
+    usable: bool
+    """Whether they rise at all; else frames follow each other by ``period_s``."""
+    ordered: bool = True
+    """Whether they are of the presentation; else of the decoding, as in AVI: the n-th frame shown has the n-th."""
+
+
+def surveyed(
+    packets: Sequence[tuple[Fraction | None, Fraction | None]], *, said_fps: Fraction | None, reorders: bool
+) -> Stamps:
+    """From (presentation, decoding) seconds of packets; ``reorders`` says whether the decoder has B-frames to sort.
+
+    ``said_fps`` is the container's rate. It counts where the stamps bear it out within 2 %, and where there are none.
+    """
+    said_s = 1 / (said_fps or Fraction(25))
+    shown = [one for one, _ in packets if one is not None]
+    either = (one if two is None else two for one, two in packets)
+    coded = [one for one in either if one is not None]
+    steps = [later - earlier for earlier, later in pairwise(coded)]
+    rising = [step for step in steps if step > 0]
+    if not rising:
+        return Stamps(said_s, usable=len(coded) > 0 and len(coded) < _FEW)
+    usual_s = Fraction(median(rising))
+    most_s = max(LONG_STEP_S, _LONG_STEPS * usual_s)
+    near = [step for step in steps if 0 <= step <= most_s]
+    # Of stamps in whole seconds the mean tells the rate, of uneven ones the median.
+    usual_s = min(usual_s, sum(near, Fraction(0)) / len(near)) if near else said_s
+    if abs(usual_s / said_s - 1) < _SAME:
+        usual_s = said_s
+    unsorted = reorders and len(shown) >= _FEW and all(a < b for a, b in pairwise(shown))
+    return Stamps(usual_s, usable=True, ordered=not unsorted and len(shown) * 2 > len(packets))
+
+
+class Timeline:
+    """One reading of a stream, whose stamps are whole ``quantum_s``.
+
+    What steps back, or further than a frame takes, follows its predecessor as usual.
+
+    Such a step is a clock that was set or ran over, a damaged stamp, or two recordings put together. Two frames of
+    one time are both shown: the second comes a little later.
+    """
+
+    def __init__(self, period_s: Fraction, *, quantum_s: Fraction | None = None) -> None:
+        # A mended step is one that the stamps can say, whole ones, as those around it.
+        self._period_s = period_s if not quantum_s else math.ceil(period_s / quantum_s) * quantum_s
+        self._most_s = max(LONG_STEP_S, _LONG_STEPS * period_s)
+        self._stamp_s: Fraction | None = None
+        self._at_s: Fraction | None = None
+        self._offset_s = Fraction(0)
+        self.jumps: list[tuple[Fraction, Fraction]] = []
+        """Where in the presentation one was mended, and how far the stamp went; seconds."""
+
+    @property
+    def says(self) -> str:
+        """What was mended, in a sentence; empty for nothing."""
+        if not self.jumps:
+            return ""
+        at_s, step_s = self.jumps[0]
+        times = "" if len(self.jumps) == 1 else f", the first of {len(self.jumps)} jumps"
+        return (
+            f"its time stamps jump by {float(step_s):+.3f} s at {float(at_s):.3f} s{times}: the frames go on as "
+            "before, and --source-fps N ignores all its time stamps"
+        )
+
+    def at(self, stamp_s: Fraction | None) -> Fraction:
+        """When the next frame is shown, in seconds; ``stamp_s`` is None where it has none."""
+        at_s = self._next(stamp_s)
+        if stamp_s is not None:
+            self._stamp_s = stamp_s
+        self._at_s = at_s
+        return at_s
+
+    def _next(self, stamp_s: Fraction | None) -> Fraction:
+        if self._at_s is None:
+            return Fraction(0) if stamp_s is None else stamp_s
+        if stamp_s is None:
+            return self._at_s + self._period_s
+        expected_s = self._at_s + self._period_s
+        if self._stamp_s is None:  # the first that is stamped
+            self._offset_s = expected_s - stamp_s
+            return expected_s
+        step_s = stamp_s - self._stamp_s
+        if step_s > self._most_s or step_s < -_LONG_STEPS * self._period_s:
+            self.jumps.append((self._at_s, step_s))
+            self._offset_s = expected_s - stamp_s
+        at_s = stamp_s + self._offset_s
+        return at_s if at_s > self._at_s else self._at_s + self._period_s / 2

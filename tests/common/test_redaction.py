@@ -1,0 +1,149 @@
+"""Secrets of addresses stay in memory."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.redaction import Redaction, redacted
+from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.log import start_log
+
+SECRET = "s3cr!t" + "Zq9"
+ODD = st.text(st.characters(codec="ascii", categories=["L", "N", "P", "S"]), max_size=6)
+PASSWORDS = st.builds(lambda before, after: f"{before}{SECRET}{after}", ODD, ODD)
+SCHEMES = st.sampled_from(
+    ["rtsp", "rtsps", "http", "rtmp", "srt", "udp", "tcp", "rtp", "RTSP", "rstp", "gopher"]
+)
+HOSTS = st.sampled_from(["10.0.0.5", "cam", "cam.lan:8554", "[fe80::1]:554", "127.0.0.1:1", "localhost"])
+PATHS = st.sampled_from(["", "/", "/cam", "/Streaming/Channels/101", "/a@b", "/live?x=1#y"])
+
+
+@st.composite
+def addresses(draw):
+    """An address with a secret in it, at any of the places where cameras have one."""
+    scheme, host, path, password = draw(SCHEMES), draw(HOSTS), draw(PATHS), draw(PASSWORDS)
+    user = draw(st.sampled_from(["admin:", "", ":", "a@b.c:"]))
+    key = draw(
+        st.sampled_from(["password", "pwd", "passphrase", "token", "auth", "streamid", "api_key", "user"])
+    )
+    return draw(
+        st.sampled_from(
+            [
+                f"{scheme}://{user}{password}@{host}{path}",
+                f"{scheme}://{host}{path}?{key}={password}",
+                f"{scheme}://{host}/x?channel=1&{key}={password}&subtype=0",
+                f"{scheme}://{host}/user=admin&password={password}&channel=1",
+                f"{scheme}://{host}/{password}/main",
+                f"{scheme}://{host}#{password}",
+            ]
+        )
+    )
+
+
+def mistyped(address: str, place: int, kind: str) -> str:
+    """The address with one typing error that leaves the secret whole."""
+    begin, end = address.index(SECRET), address.index(SECRET) + len(SECRET)
+    place %= len(address)
+    # Without a scheme nothing tells the path of a camera, with a word in it, from that of a file.
+    assume(kind != "no scheme" or set("@?#=") & set(address))
+    assume(not begin <= place < end)
+    return {
+        "left out": address[:place] + address[place + 1 :],
+        "twice": address[: place + 1] + address[place:],
+        "space": address[:place] + " " + address[place:],
+        "slash": address.replace("://", ":/", 1),
+        "no colon": address.replace("://", "//", 1),
+        "backslash": address.replace("//", "\\\\", 1),
+        "no scheme": address.partition("://")[2],
+    }[kind]
+
+
+TYPOS = st.sampled_from(["left out", "twice", "space", "slash", "no colon", "backslash", "no scheme"])
+
+
+@given(addresses())
+def test_no_secret_of_an_address_is_shown(address):
+    """It would stand in the log, in the summary, and at every ground."""
+    assert SECRET not in redacted(address)
+
+
+@given(addresses(), st.integers(0, 200), TYPOS)
+def test_nor_of_one_with_a_typing_error(address, place, kind):
+    """Who mistypes an address would publish it with the error message."""
+    assert SECRET not in redacted(mistyped(address, place, kind))
+
+
+@given(addresses(), st.sampled_from(["{}", "'{}' is wrong", "[Errno 2] No such file: '{}'", "{} (a b c): x"]))
+def test_nor_in_what_libraries_say_of_it(address, words):
+    """A library's own error would quote it."""
+    hidden = Redaction([address])
+    for said in (address, repr(address)[1:-1], json.dumps(address)[1:-1]):
+        assert SECRET not in hidden.text(words.format(said))
+    if "@" in address.rpartition(SECRET)[2]:
+        assert SECRET not in Redaction().text(words.format(address)), (
+            "not even of an address that is not known"
+        )
+
+
+@pytest.mark.parametrize(
+    ("address", "shown"),
+    [
+        (
+            "rtsp://admin:pw@10.0.0.5:554/Streaming/Channels/101",
+            "rtsp://…@10.0.0.5:554/Streaming/Channels/101",
+        ),
+        ("http://cam.lan/video.mjpg?token=x", "http://cam.lan/video.mjpg?…"),
+        ("rtsps://10.0.0.1:7441/xKz9Qw2pLmN4vB7c", "rtsps://10.0.0.1:7441/…"),
+        ("rtmp://a.example/live2/abcd-efgh", "rtmp://a.example/…/…"),
+        ("udp://239.0.0.1:5000", "udp://239.0.0.1:5000"),
+        ("rtsp://admin:p#w@10.0.0.5/x", "rtsp://…"),
+        ("/media/2026-01-26T20:57:04Z.mp4", "/media/2026-01-26T20:57:04Z.mp4"),
+        ("clip.mp4", "clip.mp4"),
+        ("admin:pw@10.0.0.5/x", "…"),
+    ],
+)
+def test_what_is_left_says_which_camera_it_is(address, shown):
+    """With everything hidden nobody could tell two cameras apart."""
+    assert redacted(address) == shown
+
+
+def test_other_words_stay_as_they_are():
+    """A log would be full of holes."""
+    line = "source: clip.mp4 stopped (it ended); tcp/127.0.0.1:7447 12:30:05 a=b user@host"
+    assert Redaction(["--source", "clip@2x.mp4", "--budget", "800kbps"]).text(line) == line
+
+
+@pytest.mark.parametrize("form", ["text", "json"])
+def test_neither_log_nor_traceback_nor_sentence_has_it(capsys, form):
+    """The one line that nobody has thought of would give the camera away."""
+    address = f"rtsp://admin:{SECRET}#1[@10.0.0.5/x"
+    hooks = sys.excepthook
+
+    def run(_words):
+        log = start_log("program", quiet=False, form=form, redaction=Redaction([address]))
+        log.release()
+        logging.getLogger("x").warning("cannot open %s", address)
+        failures = Failures(lambda: 0)
+        failures.failed("source", f"rtsp://admin:{SECRET}@h/x stopped")
+        assert SECRET not in failures.parts[0].reason
+        bug = ValueError(f"no port in {SECRET}#1")
+        sys.excepthook(type(bug), bug, bug.__traceback__)
+        raise UserError(f"source {address!r} is wrong")
+
+    try:
+        assert exit_with_sentence(run, program="program", argv=["--source", address]) == 2
+    finally:
+        sys.excepthook = hooks
+        logging.basicConfig(force=True)
+    said = "".join(capsys.readouterr())
+    assert "cannot open" in said
+    assert "ValueError" in said
+    assert "is wrong" in said
+    assert SECRET not in said

@@ -1,0 +1,351 @@
+"""Clips as cameras, recorders and phones leave them, against what a player shows."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from fractions import Fraction
+
+import av
+import cv2
+import numpy as np
+import pytest
+from av.stream import Disposition
+
+from hvt_common.errors import UserError
+from hvt_edge.source.decoding.container import open_video
+from hvt_edge.source.opening import open_source
+from media.numbered import disc, number_of, numbered, patch, write_numbered
+
+
+def play(spec, *, fps=30.0, **settings):
+    """Play it at the source's own size; returns the source and its pictures."""
+    with open_source(str(spec), size=lambda size: size, fps=fps, **settings) as source:
+        return source, [frame.source_bgr for frame in source.frames(start_ns=0)]
+
+
+def numbers(pictures):
+    """Of `numbered` ones."""
+    return [number_of(one) for one in pictures]
+
+
+# -- time -------------------------------------------------------------------
+
+
+def test_avi_with_b_frames_plays_every_frame_once(tmp_path):
+    """AVI says no time of presentation: half of the frames would be left out, and the rest judder."""
+    clip = write_numbered(tmp_path / "a.avi", 60, bf="3", **{"x264-params": "b-adapt=0"})
+    source, pictures = play(clip)
+    assert numbers(pictures) == list(range(60))
+    assert "AVI has time stamps of the decoding alone" in " ".join(source.notes)
+
+
+def test_recordings_put_together_play_whole(tmp_path, caplog):
+    """The first of two would be lost, as their time begins anew in the middle."""
+    parts = [
+        write_numbered(
+            tmp_path / f"{turn}.ts", pictures=[numbered(60 * turn + one) for one in range(60)], bf="0"
+        )
+        for turn in range(2)
+    ]
+    both = tmp_path / "both.ts"
+    both.write_bytes(b"".join(one.read_bytes() for one in parts))
+    _, pictures = play(both)
+    assert numbers(pictures) == list(range(120))
+    assert "both.ts: its time stamps jump by -1.967 s" in caplog.text
+
+
+@pytest.mark.parametrize("late", [1, 30, 59])
+def test_a_stamp_far_ahead_repeats_no_picture(tmp_path, late):
+    """A picture would be shown for ten hours."""
+    times = [33 * one + 37_600_000 * (one >= late) for one in range(60)]
+    clip = write_numbered(tmp_path / "a.mkv", 60, times_ms=times, bf="0")
+    assert len(play(clip)[1]) in range(58, 62)
+
+
+@pytest.mark.parametrize(("name", "codec"), [("a.h264", "libx264"), ("a.hevc", "libx265")])
+def test_a_raw_stream_runs_at_its_own_rate(tmp_path, name, codec):
+    """Its film would be slow: FFmpeg takes 25 frames a second for any."""
+    source, pictures = play(write_numbered(tmp_path / name, 60, codec=codec))
+    assert numbers(pictures) == list(range(60))
+    assert "30 frames a second, as the stream itself says" in " ".join(source.notes)
+
+
+# -- which stream, which shape ----------------------------------------------
+
+
+@pytest.mark.parametrize("attached", [False, True])
+def test_a_cover_picture_is_no_film(tmp_path, attached):
+    """A grey picture would be flown in place of the film."""
+    clip = tmp_path / "a.mp4"
+    with av.open(str(clip), "w") as container:
+        cover, film = container.add_stream("mjpeg", rate=30), container.add_stream("libx264", rate=30)
+        cover.width, cover.height, cover.pix_fmt = 640, 480, "yuvj420p"
+        film.width, film.height, film.pix_fmt = 320, 240, "yuv420p"
+        if attached:
+            cover.disposition = Disposition.attached_pic
+        grey = av.VideoFrame.from_ndarray(np.full((480, 640, 3), 60, np.uint8), format="bgr24")
+        container.mux(cover.encode(grey.reformat(format="yuvj420p")))
+        container.mux(cover.encode(None))
+        for one in range(30):
+            container.mux(film.encode(av.VideoFrame.from_ndarray(numbered(one), format="bgr24")))
+        container.mux(film.encode(None))
+    source, pictures = play(clip)
+    assert numbers(pictures) == list(range(30))
+    assert "is the film (h264, 320x240)" in source.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("aspect", "size"), [(Fraction(16, 11), (1024, 576)), (Fraction(10, 11), (704, 634)), (None, (704, 576))]
+)
+@pytest.mark.parametrize("name", ["a.mkv", "a.mp4"])
+def test_pixels_are_made_square(tmp_path, aspect, size, name):
+    """A round tank would be an ellipse, and every angle wrong."""
+
+    def setup(stream):
+        if aspect is not None:
+            stream.codec_context.sample_aspect_ratio = aspect
+
+    squeezed = cv2.resize(numbered(1, size=size), (704, 576), interpolation=cv2.INTER_AREA)
+    source, pictures = play(write_numbered(tmp_path / name, pictures=[squeezed] * 3, setup=setup))
+    assert source.view.source_size == size
+    wide, high = disc(pictures[0])
+    assert wide == pytest.approx(high, abs=3)
+    assert any("made square" in one for one in source.notes) is (aspect is not None)
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+@pytest.mark.parametrize("mirror", [False, True])
+def test_a_picture_is_turned_and_mirrored_as_it_says(tmp_path, degrees, mirror):
+    """A mirrored phone or a camera that hangs upside down would show the world on its head."""
+
+    def setup(stream):
+        stream.set_display_rotation(degrees, hflip=mirror)
+
+    clip = write_numbered(tmp_path / "a.mp4", pictures=[numbered(1)] * 3, setup=setup)
+    _, (picture, *_) = play(clip)
+    with av.open(str(clip)) as container:
+        said = next(container.decode(video=0)).side_data.get("DISPLAYMATRIX")
+    upright = [65536, 0, 0, 0, 65536]
+    matrix = np.array(upright) if said is None else np.frombuffer(bytes(said), np.int32)
+    # Where the matrix takes the middle of the red patch, from the middle of the picture.
+    way = matrix[[0, 1, 3, 4]].reshape(2, 2).T / 65536 @ np.array([-120, -90])
+    high, wide = picture.shape[:2]
+    blue, green, red = picture[round(high / 2 + way[1]), round(wide / 2 + way[0])]
+    assert red > 150
+    assert max(int(blue), int(green)) < 60
+
+
+def test_interlaced_film_has_no_combs(tmp_path):
+    """What moves would have teeth, which a detector takes for anything."""
+
+    def field(place):
+        picture = np.full((576, 720, 3), 90, np.uint8)
+        picture[200:380, 40 + 6 * place : 160 + 6 * place] = (0, 0, 191)
+        return picture
+
+    def woven(place):
+        picture = field(2 * place)
+        picture[1::2] = field(2 * place + 1)[1::2]
+        return picture
+
+    clip = tmp_path / "a.mp4"
+    write_numbered(clip, pictures=[woven(one) for one in range(12)], rate=25, **{"x264-params": "tff=1"})
+    source, pictures = play(clip, fps=25)
+    assert len(pictures) == 12
+    rows = pictures[6][210:370].astype(int)
+    assert np.abs(rows[1::2] - rows[::2]).mean() < 1
+    assert "interlaced" in " ".join(source.notes)
+
+
+# -- range and colour ---------------------------------------------------------
+
+
+def grey16(path, pictures):
+    """A lossless film of sixteen bits."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=30)
+        stream.height, stream.width = pictures[0].shape
+        stream.pix_fmt = "gray16le"
+        for picture in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray16le")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def heat(*, body=30_500):
+    """A wall of 29,300 to 29,500 levels, and a body."""
+    rng = np.random.default_rng(3)
+    levels = rng.integers(29_300, 29_500, (120, 160)).astype(np.uint16)
+    levels[40:80, 60:80] = body
+    return levels
+
+
+def test_a_warm_body_shows_in_sixteen_bits_and_pulls_the_picture_slowly(tmp_path):
+    """It would be five levels of 255 brighter than the wall, or the wall turn black at once when it comes in."""
+    source, pictures = play(grey16(tmp_path / "a.mkv", [heat()] * 3))
+    grey = pictures[0][..., 0].astype(int)
+    assert grey[60, 70] - np.median(grey) > 150
+    assert "stretched" in " ".join(source.notes)
+    frames = [heat(body=29_400)] * 5 + [heat()] * 150
+    _, pictures = play(grey16(tmp_path / "b.mkv", frames))
+    wall = [float(one[:30].mean()) for one in pictures]
+    steps = np.abs(np.diff(wall))
+    assert steps.max() < 15, "from one picture to the next"
+    assert wall[4] - wall[-1] > 40, "in five seconds"
+
+
+def test_sixteen_bit_pictures_of_a_folder_are_stretched_too(tmp_path):
+    """Of a thermal camera's TIFF files nothing would be seen."""
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{number}.tiff"), heat())
+    source, pictures = play(tmp_path)
+    assert pictures[0][60, 70, 0] - np.median(pictures[0]) > 150
+    assert "stretched" in " ".join(source.notes)
+
+
+@pytest.mark.parametrize("transfer", ["smpte2084", "arib-std-b67"])
+def test_hdr_is_as_bright_as_its_white(tmp_path, transfer):
+    """Everything would be grey."""
+    clip = tmp_path / "a.mp4"
+    white = {"smpte2084": 0.581, "arib-std-b67": 0.75}[transfer]  # 203 nits, ITU-R BT.2408, table 1
+    with av.open(str(clip), "w") as container:
+        stream = container.add_stream("libx265", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 128, 128, "yuv420p10le"
+        tags = f"colorprim=bt2020:colormatrix=bt2020nc:transfer={transfer}"
+        stream.options = {"x265-params": f"log-level=none:{tags}"}
+        for _ in range(3):
+            frame = av.VideoFrame(128, 128, "yuv420p10le")
+            for place, plane in enumerate(frame.planes):
+                level = 512 if place else round(64 + 876 * white)
+                plane.update(np.full(plane.buffer_size // 2, level, np.uint16).tobytes())
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    source, pictures = play(clip)
+    assert pictures[0].mean() > 235
+    assert "tone-mapped" in " ".join(source.notes)
+
+
+@pytest.mark.parametrize(("size", "standard"), [((640, 480), "BT.601"), ((1280, 720), "BT.709")])
+def test_untagged_colour_goes_by_height(tmp_path, size, standard):
+    """The same car would be of another red in every second clip."""
+    green = np.full((size[1], size[0], 3), (0, 191, 0), np.uint8)
+    frame = av.VideoFrame.from_ndarray(green, format="bgr24")
+    matrix = 1 if standard == "BT.709" else 5
+    coded = frame.reformat(format="yuv420p", dst_colorspace=matrix)
+    clip = tmp_path / "a.mkv"
+    with av.open(str(clip), "w") as container:
+        stream = container.add_stream("ffv1", rate=30)
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        coded.colorspace = 2
+        container.mux(stream.encode(coded))
+        container.mux(stream.encode(None))
+    source, pictures = play(clip)
+    assert patch(pictures[0], right=False) == pytest.approx((0, 191, 0), abs=6)
+    assert f"no colour matrix: {standard}, because it has {size[1]} lines" in " ".join(source.notes)
+
+
+# -- damage -------------------------------------------------------------------
+
+
+def test_a_picture_whose_header_is_damaged_is_held_over(tmp_path, caplog):
+    """One of four would end the flight in a traceback."""
+    for number in range(4):
+        data = bytearray(cv2.imencode(".jpg", numbered(number))[1].tobytes())
+        if number == 2:
+            at = data.index(b"\xff\xc0") + 5
+            data[at : at + 4] = b"\xff\xdc\xff\xdc"
+        (tmp_path / f"{number}.jpg").write_bytes(data)
+    _, pictures = play(tmp_path)
+    assert numbers(pictures) == [0, 1, 1, 3]
+    assert "2.jpg cannot be read" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["2026-01-26T20:57:04Z.mp4", "rtsp: a & b.mp4", "100%.mp4", "clip@2x.mp4"])
+def test_what_is_there_is_a_file_whatever_its_name(tmp_path, monkeypatch, name):
+    """A recorder's own names would be taken for addresses."""
+    shutil.move(write_numbered(tmp_path / "a.mp4", 5), tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert numbers(play(name)[1]) == list(range(5))
+
+
+def test_an_mp4_without_its_index_says_what_it_is(tmp_path):
+    """Whose drone fell would hear that the file is no video."""
+    whole = write_numbered(tmp_path / "a.mp4", 30).read_bytes()
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(whole[: whole.index(b"moov") - 4])
+    with pytest.raises(UserError, match=r"cut\.mp4' is unfinished: .*index \(moov\)"):
+        play(cut)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("a.mp4", {"movflags": "faststart"}), ("a.mkv", {}), ("a.ts", {})]
+)
+def test_a_cut_clip_says_that_it_is_unfinished(tmp_path, caplog, name, options):
+    """Half of a clip would pass for a whole one."""
+    clip = tmp_path / name
+    with av.open(str(clip), "w", options=options) as container:
+        stream = container.add_stream("libx264", rate=30, options={"g": "10", "bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        for number in range(150):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
+        container.mux(stream.encode(None))
+    play(clip)
+    assert "unfinished" not in caplog.text
+    data = clip.read_bytes()
+    clip.write_bytes(data[: len(data) * 6 // 10 | 1])
+    _, pictures = play(clip)
+    assert 30 < len(pictures) < 150
+    assert f"{name} is unfinished: " in caplog.text
+
+
+def test_a_file_that_grows_is_followed(tmp_path):
+    """Who flies what is still recorded would get its first second."""
+    whole = write_numbered(tmp_path / "whole.ts", 90, g="10", bf="0").read_bytes()
+    growing = tmp_path / "growing.ts"
+    half = len(whole) // 2 // 188 * 188
+    growing.write_bytes(whole[:half])
+
+    def grow():
+        time.sleep(0.5)
+        with growing.open("ab") as file:
+            file.write(whole[half:])
+
+    writer = threading.Thread(target=grow)
+    with open_source(str(growing), size=lambda size: size, fps=30, growing=True) as source:
+        writer.start()
+        played = [number_of(frame.source_bgr) for frame in source.frames(start_ns=0)]
+    writer.join()
+    assert played == list(range(90))
+
+
+def test_a_file_that_has_grown_says_how_to_follow_it(tmp_path, caplog):
+    """It would end early, and nobody know why."""
+    clip = write_numbered(tmp_path / "a.ts", 60, bf="0")
+    with open_source(str(clip), size=lambda size: size, fps=30) as source:
+        frames = source.frames(start_ns=0)
+        next(frames)
+        with clip.open("ab") as file:
+            file.write(bytes(188))
+        list(frames)
+    assert "it has grown by 188 bytes since: --follow waits for more" in caplog.text
+
+
+@pytest.mark.parametrize(("level", "says"), [(0, "is black"), (120, "has not changed")])
+def test_black_and_frozen_pictures_are_told_of_once(tmp_path, caplog, level, says):
+    """A camera that shows nothing would pass for an empty scene."""
+    same = np.full((64, 96, 3), level, np.uint8)
+    pictures = [same] * 24 + [numbered(3, size=(96, 64))] * 2
+    with caplog.at_level(logging.WARNING):
+        play(write_numbered(tmp_path / "a.mkv", pictures=pictures, rate=2), fps=2)
+    assert caplog.text.count(f"its picture {says} for 10 s") == 1
+    assert "alive again" in caplog.text
+
+
+def test_nothing_is_opened_where_there_is_no_film(tmp_path):
+    """A text would be played as a terminal's screen."""
+    (tmp_path / "a.txt").write_text("words\n" * 50)
+    with pytest.raises(UserError, match=r"holds no video|not a video"):
+        open_video(str(tmp_path / "a.txt"))
