@@ -80,7 +80,7 @@ def title(content: dict[str, Any]) -> str:
     if in_vain(content):
         return f"{edge}: NOT SENT ({why}): 0 bytes received"
     if why and not content["frames_stored"]:
-        return f"{edge}: ended before its first picture ({why})"
+        return f"{edge}: NOT SENT ({why}): it ended before its first picture"
     return f"{edge}: stored for later ({why})" if why else f"{edge}: sent"
 
 

@@ -79,4 +79,6 @@ def test_what_is_stored_for_later_is_no_flight_in_vain():
     assert title(stored) == "uav-1: stored for later (nobody subscribed to its video)"
     unborn = summary_of(frames=FrameAccount(), unreached="nobody subscribed to its video")
     assert not in_vain(unborn)
-    assert title(unborn) == "uav-1: ended before its first picture (nobody subscribed to its video)"
+    assert title(unborn) == (
+        "uav-1: NOT SENT (nobody subscribed to its video): it ended before its first picture"
+    )

@@ -136,8 +136,10 @@ class Running:
     def finish(self, *, within_s: float = 90.0) -> dict[str, Any]:
         """Wait for a good end; return the summary. Of an edge that nobody received 1 is the code of a good end."""
         code = self.wait(within_s=within_s)
-        summary = self.summary() if code in (0, 1) and self._summary.exists() else {}
-        in_vain = bool(summary.get("unreached") and summary["frames"] and not summary["frames_stored"])
+        summary = self.summary() if code == 1 and self._summary.exists() else {}
+        in_vain = bool(
+            summary and summary["unreached"] and summary["frames"] and not summary["frames_stored"]
+        )
         assert code == in_vain, f"{self.name} ended with {code}:\n{self.said}"
         assert "Traceback" not in self.said, self.said
         return self.summary()
