@@ -1,8 +1,10 @@
 """Which ground steers: whose reports count where several may report, decided once for each report.
 
 Several grounds see the same thin link, and what one of them has says nothing of the others. So one is the primary
-receiver: the first that reports, until it is silent for a second or names nothing new for as long. Numbers of reports
-cost a forger nothing, so one that is too high silences a receiver for that second and no longer.
+receiver: the first that reports, until it is silent for a second, or names nothing new for as long although another
+has had several messages since. At one frame a second there is nothing new for a second, and whichever of two healthy
+grounds reports first would be the only one that has the newest. Numbers of reports cost a forger nothing, so one that
+is too high silences a receiver for that second and no longer.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ from hvt_common.protocol.messages import Feedback
 __all__ = ["PrimaryReceiver", "Report"]
 
 _OTHER_RECEIVER_NS = 1_000_000_000
+_MISSED = 3
+"""Base messages: one or two may be lost, or reported a moment later than by another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +55,7 @@ class PrimaryReceiver:
         with self._lock:
             if feedback.base_sequence > sent[0] or feedback.still_sequence > sent[1]:
                 return Report(feedback, now_ns, primary=False)
-            first = self._begins(feedback, now_ns)
+            first = self._begins(feedback, sent, now_ns)
             if first is None:
                 return Report(feedback, now_ns, primary=False)
             if first:
@@ -74,14 +78,18 @@ class PrimaryReceiver:
         with self._lock:
             self._receiver_id, self._sequence = None, -1
 
-    def _begins(self, feedback: Feedback, now_ns: int) -> bool | None:
+    def _begins(self, feedback: Feedback, sent: tuple[int, int], now_ns: int) -> bool | None:
         """Whether the receiver begins (anew) with this report; None where it does not count."""
         if self._receiver_id is None:
             return True
         quiet_ns = now_ns - self._reported_ns
         if feedback.receiver_id != self._receiver_id:
-            # One that reports and never names anything new must not keep the edge from all the others.
-            return True if max(quiet_ns, now_ns - self._progress_ns) >= _OTHER_RECEIVER_NS else None
+            # One that reports and never names anything new must not keep the edge from all the others; as long as it
+            # has named nothing at all, everything that was sent counts.
+            there = sent[0] if self._named == (-1, -1) else feedback.base_sequence
+            if there - self._named[0] >= _MISSED:
+                quiet_ns = max(quiet_ns, now_ns - self._progress_ns)
+            return True if quiet_ns >= _OTHER_RECEIVER_NS else None
         if feedback.sequence > self._sequence:
             return False
         # Old, or a number was forged that the receiver itself will not reach for years.

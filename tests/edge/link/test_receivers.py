@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import random
+from collections import Counter
+
+import pytest
+
 from hvt_edge.link.receivers import PrimaryReceiver
 from rigs.messages import feedback
 
@@ -44,6 +49,50 @@ def test_another_takes_over_when_the_first_is_silent_or_has_no_news():
         named = {"base": tenth} if tenth % 2 else {"base": tenth - 1, "still": tenth}
         judged(primary, 1, tenth, now_ns=tenth * S // 10, **named)
         assert judged(primary, 2, tenth, now_ns=tenth * S // 10) == "ignored"
+
+
+@pytest.mark.parametrize("fps", [0.5, 1.0, 2.0, 3.0, 15.0])
+@pytest.mark.parametrize(("held", "lost"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.03)])
+@pytest.mark.parametrize("delay_s", [0.03, 0.4, 1.3])
+def test_of_two_healthy_grounds_one_steers(fps, held, lost, delay_s):
+    """At a frame a second they took turns, and each turn threw away what was known of the path."""
+    rng, primary, changes = random.Random(1), PrimaryReceiver(), 0
+    sent, came, named, reported, numbers = -1, [], {1: -1, 2: -1}, {1: -1.0, 2: -1.0}, Counter[int]()
+    next_s = 0.5
+    for step in range(60_000):
+        now_s = step / 200
+        if now_s >= next_s:
+            next_s += 1 / fps + rng.uniform(-0.01, 0.01)
+            if rng.random() >= held:
+                sent += 1
+                came += [
+                    (now_s + delay_s + rng.uniform(0, 0.02), one, sent)
+                    for one in (1, 2)
+                    if rng.random() >= lost
+                ]
+        for one in (1, 2):
+            newest = max((number for at_s, who, number in came if who == one and at_s <= now_s), default=-1)
+            if now_s - reported[one] >= (0.1 if newest > named[one] else 0.5):
+                named[one], reported[one] = max(named[one], newest), now_s
+                numbers[one] += 1
+                said = feedback(receiver_id=one, sequence=numbers[one], base_sequence=named[one])
+                report = primary.judge(said, sent=(sent, -1), now_ns=round((now_s + 1) * S))
+                changes += report.first and now_s > 10  # at the start nothing is known yet
+        came = [one for one in came if one[0] > now_s - 0.6]
+    assert changes == 0
+
+
+def test_who_reports_and_receives_nothing_makes_way_at_any_frame_rate():
+    """A ground whose picture has stopped would steer for all the others."""
+    for fps in (1, 5, 15):
+        primary, now_ns = PrimaryReceiver(), 0
+        judged(primary, 1, 0, now_ns=0, base=0)
+        for number in range(1, 8 * fps):
+            now_ns = number * S // fps
+            judged(primary, 1, number, now_ns=now_ns, base=0)
+            if judged(primary, 2, number, now_ns=now_ns, base=number) == "first":
+                break
+        assert now_ns <= max(S, 3 * S // fps)
 
 
 def test_who_names_what_was_never_sent_does_not_count():
