@@ -70,6 +70,8 @@ class Backfill:
         self._on_done = on_done
         self._line: OrderedDict[ObjectKey, _Transfer] = OrderedDict()
         self._data: tuple[ObjectKey, bytes] | None = None
+        self._in_hand: ObjectKey | None = None
+        """Of which chunks were being made last."""
         self._informed: set[int] = set()
         """Sessions whose facts the ground has."""
         self._requested: set[int] = set()
@@ -140,6 +142,13 @@ class Backfill:
         self._line.clear()
         self._data = None
         self._forget()
+
+    def put_aside(self) -> None:
+        """Making or sending chunks has failed: the object in hand waits for another ground or the next start."""
+        if self._in_hand is not None:
+            self._refused.add(self._in_hand)
+        self._line.clear()
+        self._data = None
 
     def _forget(self) -> None:
         """Forget objects that are not here any more."""
@@ -240,11 +249,13 @@ class Backfill:
         """The object of which chunks are made now: one that is not all on its way, or the next one."""
         for transfer in self._line.values():
             if transfer.sent_bytes < transfer.total_bytes:
+                self._in_hand = transfer.entry.key
                 ahead = transfer.sent_bytes - transfer.acknowledged_bytes
                 return transfer if ahead < _MOST_AHEAD_BYTES else None
         if len(self._line) >= _MOST_OBJECTS:
             return None
         while (entry := next(self._open_entries(), None)) is not None:
+            self._in_hand = entry.key
             data = self._store.read(entry)
             if data is not None:
                 self._data = (entry.key, data)

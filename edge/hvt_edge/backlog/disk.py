@@ -32,12 +32,14 @@ from hvt_common.protocol.messages import (
     BacklogKind,
     BacklogUnit,
     ObjectKey,
+    WireError,
     pack_backlog_units,
+    parse_backlog_units,
 )
 from hvt_common.runtime.clock import Moment, boot_id, since_boot_ns, unwitnessed_ns
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.entry import Entry, OpenSegment, moved_rank, worth
+from hvt_edge.backlog.entry import Entry, OpenSegment, entry_of, moved_rank, worth
 
 __all__ = ["FILE_NAME", "Store"]
 
@@ -253,9 +255,7 @@ class Store:
             parts.append((*facts, data))
         whole: bytes = parts[0][-1] if parts else b""
         if entry.kind is BacklogKind.BASE and parts:
-            whole = pack_backlog_units(
-                [BacklogUnit(index, at, bool(key), unit) for index, at, key, unit in parts]
-            )
+            whole = _packed(parts)
         if 0 < len(whole) <= MAX_BACKLOG_BYTES:
             return whole
         self._note_damaged(f"{entry} cannot be read")
@@ -299,8 +299,17 @@ class Store:
         )
 
     def _entries(self, select: str, *values: Any) -> Iterator[Entry]:
-        for row, session, kind, *rest in self._rows(select, *values):
-            yield Entry(row, int(session, 16), BacklogKind(kind), *rest)
+        for row in self._rows(select, *values):
+            try:
+                entry = entry_of(row)
+            except ValueError as error:  # somebody else has written it
+                self._note_damaged(f"{self._file}: {error}")
+                with self._disk():  # not seen again; it is deleted with what has arrived
+                    assert self._db is not None, "it was just read"
+                    self._db.execute("INSERT OR IGNORE INTO gone VALUES (?)", (row[0],))
+                self._count()
+            else:
+                yield entry
 
     def _rows(self, select: str, *values: Any) -> Iterator[Any]:
         if self._db is not None:
@@ -447,3 +456,14 @@ class Store:
         self.damaged += 1
         if self.damaged.bit_count() == 1:  # 1, 2, 4, 8 …
             _log.warning("the store skips what it cannot read (%d so far): %s", self.damaged, what)
+
+
+def _packed(parts: list[tuple[Any, ...]]) -> bytes:
+    """A segment's bytes; none where no ground would read its frames: somebody else has written them."""
+    units = [BacklogUnit(index, at_ns, bool(key), unit) for index, at_ns, key, unit in parts]
+    try:
+        packed = pack_backlog_units(units)
+        parse_backlog_units(packed)
+    except (ValueError, TypeError, OverflowError, WireError):
+        return b""
+    return packed

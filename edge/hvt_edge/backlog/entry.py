@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from hvt_common.protocol.messages import MAX_BACKLOG_BYTES, BacklogKind, ObjectKey
 from hvt_common.units import SECOND_NS
@@ -42,6 +43,18 @@ class Entry:
 
     def __str__(self) -> str:
         return f"{self.kind} {self.number} of session {self.session_id:016x}"
+
+
+def entry_of(values: tuple[Any, ...]) -> Entry:
+    """What one row of the file says, in the order of `Entry`; `ValueError` for one that no edge has written."""
+    row, session, kind, number, rank, span_ns = values
+    kinds = [type(one) for one in (session, kind, number, rank, span_ns)]
+    if kinds != [str, str, int, float, int] or not (0 <= number < 2**32 and span_ns >= 0):
+        raise ValueError(f"row {row} holds what no edge writes")
+    session_id = int(session, 16)
+    if not 0 <= session_id < 2**64:
+        raise ValueError(f"row {row} is of no session")
+    return Entry(row, session_id, BacklogKind(kind), number, rank, span_ns)
 
 
 @dataclass(slots=True)

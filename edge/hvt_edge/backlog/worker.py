@@ -2,7 +2,8 @@
 
 What comes to it waits in a bounded queue (`intake`). Where that is full the disk is too slow: what comes then is not
 stored, and said once. While a disk is full, cannot be written or is gone, nothing is stored; what is there already is
-sent all the same. Chunks leave in a thread of their own (`ChunkThread`).
+sent all the same. Any other error, of a file that somebody has changed or of this program, stops storing or sending
+alone, and it is tried again: video needs neither. Chunks leave in a thread of their own (`ChunkThread`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 from queue import SimpleQueue
 
 from hvt_common.protocol.messages import BacklogKind, pack_backlog_still
-from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.runtime.process import lower_priority
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
@@ -27,8 +28,8 @@ __all__ = ["ChunkAllowance", "ChunkThread", "StoreNumbers", "StoreWorker"]
 
 _log = logging.getLogger(__name__)
 
-_PART = "store"
-"""Its name among the parts that may fail."""
+_PART, _SENDING_PART = "store", "backlog"
+"""The names of storing and of sending among the parts that may fail."""
 _QUEUE = 512
 _BUSY_S = 0.02
 _IDLE_S = 0.25
@@ -76,7 +77,7 @@ class StoreNumbers:
 class StoreWorker:
     """Stores, sends, and leaves the store in order; everything on disk runs in its thread.
 
-    `check` and `close` raise a bug in it; a disk that refuses goes to ``failures`` and is tried again.
+    Whatever storing or sending raises goes to ``failures``, and is tried again.
     ``on_sent(entry)`` is called for each object that a ground has whole. `close` waits ``close_s`` for the disk.
     """
 
@@ -108,7 +109,7 @@ class StoreWorker:
         self._sending = ChunkThread(send, on_done=self.intake.signal)
         self._sent_stills = self._sent_ns = self._trickle_ns = 0
         self._slow = False
-        self._retry = RetryPause()
+        self._retry, self._sending_retry = RetryPause(), RetryPause()
         self.failed = False
         """The disk refuses: nothing is stored until it takes something again."""
         self._error: BaseException | None = None
@@ -189,27 +190,47 @@ class StoreWorker:
     def _turn(self) -> None:
         busy = self._store.stills or self._store.segments
         news, item = self.intake.take(_BUSY_S if busy else _IDLE_S)
-        self._attempt(lambda: self._note(news))
+        self._attempt_sending(lambda: self._note(news))
         if self.failed and self._retry.due(self._clock()) and self._attempt(self._store.trial):
             self.failed = False
             self._failures.works(_PART)
         if isinstance(item, EndSegment):
             self._attempt(self._store.end_segment)
         elif item is None:
-            self._attempt(self._send_chunk)
+            if self._sending_retry.due(self._clock()):
+                self._attempt_sending(self._send_chunk)
         elif not self.failed and not self._attempt(lambda: self._add(item)):
             self._attempt(self._store.end_segment)
 
     def _attempt(self, do: Callable[[], None]) -> bool:
-        """Whether the disk took it; else nothing is stored until a trial succeeds."""
+        """Whether it was done; else nothing is stored until a trial succeeds."""
         try:
             do()
         except OSError as error:
-            self.failed = True
-            self._retry.failed(self._clock())
-            self._failures.failed(_PART, f"--store-folder {error.filename or ''}: {error.strerror or error}")
-            return False
-        return True
+            self._fail(f"--store-folder {error.filename or ''}: {error.strerror or error}")
+        except Exception as error:  # noqa: BLE001 - it stops storing, never the flight
+            _log.debug("storing failed", exc_info=error)
+            self._fail(f"storing stopped ({reason_of(error)})")
+        else:
+            return True
+        return False
+
+    def _fail(self, reason: str) -> None:
+        self.failed = True
+        self._retry.failed(self._clock())
+        self._failures.failed(_PART, reason)
+
+    def _attempt_sending(self, do: Callable[[], None]) -> None:
+        """Where it cannot be done, the disk apart, what was in hand is put aside, and nothing sent for a while."""
+        try:
+            do()
+        except OSError as error:
+            self._fail(f"--store-folder {error.filename or ''}: {error.strerror or error}")
+        except Exception as error:  # noqa: BLE001 - it stops sending, never storing nor the flight
+            _log.debug("sending what was stored failed", exc_info=error)
+            self._backfill.put_aside()
+            self._sending_retry.failed(self._clock())
+            self._failures.failed(_SENDING_PART, f"what was stored is not sent ({reason_of(error)})")
 
     def _note(self, news: News) -> None:
         if news.interrupted:
@@ -232,6 +253,7 @@ class StoreWorker:
             return
         now_ns = self._clock()
         if done is not None:
+            self._failures.works(_SENDING_PART)
             pause_ns = 8 * SECOND_NS * done[1] / (_TRICKLE_SHARE * self._total_bps())
             self._trickle_ns = now_ns + round(pause_ns)
         allowance = self._allowance(now_ns) if self._sending.ready else None

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -213,7 +214,7 @@ def test_the_oldest_goes_first_whatever_the_clocks_said(tmp_path, ahead_s):
         add_units(folder, UNITS)
     with opened(tmp_path, session_id=8, at_s=(ahead_s + 60, 60)) as folder:
         add_stills(folder, {2: 1.0}, capture_ns=START_NS + (ahead_s + 60) * S)
-        add_units(folder, [shifted(one, ahead_s + 60) for one in UNITS])
+        add_units(folder, [replace(shifted(one, ahead_s + 60), frame_index=one.frame_index) for one in UNITS])
     with opened(tmp_path, session_id=9, at_s=(300, 300)) as folder:
         assert [one.session_id for one in folder.newest_segments()] == [8, 7]
         assert numbers(folder.best_stills()) == [2, 1]

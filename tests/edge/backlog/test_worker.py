@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import sqlite3
 import threading
 import time
 from itertools import pairwise
@@ -18,7 +19,7 @@ from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.intake import EndSegment, Intake
-from hvt_edge.backlog.worker import ChunkAllowance, ChunkThread, StoreWorker
+from hvt_edge.backlog.worker import ChunkAllowance, StoreWorker
 from media.clips import START_NS
 from programs.processes import eventually
 from rigs.keeping import Rig
@@ -61,14 +62,16 @@ class Link:
         return len(chunk.data) + 60
 
 
-def worker_of(path: Path, link: Link, *, info=INFO.pack, close_s: float = 5.0) -> StoreWorker:
+def worker_of(
+    path: Path, link: Link, *, info=INFO.pack, close_s: float = 5.0, send=None, session_id: int = 7
+) -> StoreWorker:
     """A store with its thread."""
     return StoreWorker(
-        Store(path, max_bytes=50_000_000, session_id=7, info=info),
-        session_id=7,
+        Store(path, max_bytes=50_000_000, session_id=session_id, info=info),
+        session_id=session_id,
         clock=lambda: link.now_ns,
         allowance=link.allowance,
-        send=link.send,
+        send=send or link.send,
         round_trip_ns=lambda: S // 10,
         total_bps=lambda: 800_000,
         failures=link.failures,
@@ -316,19 +319,73 @@ def test_what_a_dying_run_had_kept_is_sent_by_the_next(tmp_path, caplog):
     worker.close()
 
 
-def test_an_error_in_sending_ends_the_process_too():
-    """Nothing would come back any more, and nobody would know."""
+def test_an_error_in_sending_stops_sending_alone(tmp_path, caplog):
+    """A bug in what nobody watches would end the flight; or one object would hold up all others."""
+    link, number_of_bad = Link(), 2
 
-    def broken(_chunk: Chunk) -> int:
-        raise ZeroDivisionError
+    def broken(chunk: Chunk) -> int:
+        if chunk.key[2] == number_of_bad:
+            raise ZeroDivisionError
+        return link.send(chunk)
 
-    woken = threading.Event()
-    sending = ChunkThread(broken, on_done=woken.set)
-    sending.put(Chunk((7, BacklogKind.STILL, 1), 0, 3, b"abc"))
-    assert woken.wait(timeout=10)
-    with pytest.raises(ZeroDivisionError):
-        sending.take()
-    sending.close(5.0)
+    with opened(tmp_path) as store:
+        add_stills(store, {1: 1.0, 2: 2.0, 3: 3.0})
+    worker = worker_of(tmp_path, link, send=broken)
+    eventually(lambda: "what was stored is not sent" in caplog.text, within_s=10, what="it says so")
+    assert worker.offer(UNITS[0]), "storing goes on"
+    link.now_ns += 2 * S
+    eventually(
+        lambda: {1, 3} <= {chunk.key[2] for _, chunk in link.sent}, within_s=10, what="the others are sent"
+    )
+    worker.check()
+    worker.close()
+    (part,) = (one for one in link.failures.parts if one.part == "backlog")
+    assert part.working
+    with opened(tmp_path, session_id=8) as store:
+        assert store.find((7, BacklogKind.STILL, 2)) is not None, "it is not lost"
+
+
+ROWS = {
+    "session": "UPDATE object SET session = '00000000000000g1' WHERE kind = 'still'",
+    "negative session": "UPDATE object SET session = '-1' WHERE kind = 'still'",
+    "kind": "UPDATE object SET kind = 'stilm' WHERE kind = 'still'",
+    "rank": "UPDATE object SET rank = 'a' WHERE kind = 'still'",
+    "number": "UPDATE object SET number = 'a' WHERE kind = 'still'",
+    "negative number": "UPDATE object SET number = -4 WHERE kind = 'still'",
+    "span": "UPDATE object SET span_ns = 'a' WHERE kind = 'still'",
+    "size": "UPDATE object SET bytes = 'a' WHERE kind = 'still'",
+    "time of a frame": "UPDATE part SET capture_ns = 'x' WHERE frame_index = 3",
+    "index of a frame": "UPDATE part SET frame_index = -5 WHERE frame_index = 3",
+    "no table": "DROP TABLE part",
+}
+
+
+@pytest.mark.parametrize("what", ROWS)
+def test_a_file_that_somebody_has_changed_ends_nothing(tmp_path, what):
+    """One row that no edge has written would end each flight, until somebody deletes the file."""
+    link = Link()
+    with opened(tmp_path) as store:
+        for unit in UNITS[:20]:
+            store.add_unit(unit)
+        store.end_segment()
+        add_stills(store, {1: 1.0})
+    db = sqlite3.connect(tmp_path / "backlog.sqlite")
+    db.execute(ROWS[what])
+    db.commit()
+    db.close()
+    worker = worker_of(tmp_path, link, session_id=8)
+    for _ in range(3):  # whatever had to wait for another try
+        eventually(lambda: worker.intake.idle, within_s=10, what="it reads")
+        link.now_ns += 70 * S
+    worker.offer(shifted(UNITS[0], 1000))
+
+    def stores() -> bool:
+        worker.check()
+        link.now_ns += 70 * S
+        return worker.offer(shifted(UNITS[0], 1000)) and worker.numbers.segments > 0
+
+    eventually(stores, within_s=20, what="frames are stored all the same")
+    worker.close()
 
 
 def test_the_link_that_blocks_is_the_edges_own(tmp_path):
