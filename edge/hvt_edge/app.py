@@ -42,6 +42,7 @@ from hvt_edge.wiring import (
     check_codecs,
     check_files,
     check_store,
+    open_for_flight,
     qualify_encoder,
     track_confidence,
     try_scene,
@@ -110,8 +111,13 @@ class Edge:
             check_rate(config, source.view.base_size)
             headroom = qualify_encoder(config, source, clock=world.clock, stop=self._stop)
             background = (lambda call: call()) if self._lockstep else with_lower_priority
-            opened = background(lambda: world.open_detector(config))
-            background(lambda: world.warm_up(config, opened, source))
+            opened = background(
+                lambda: open_for_flight(
+                    config,
+                    lambda: world.open_detector(config),
+                    lambda detector: world.warm_up(config, detector, source),
+                )
+            )
             detector: FailingDetector = opened
             if not self._lockstep:  # whose result would be of something else
                 detector = GuardedDetector(

@@ -344,6 +344,11 @@ class EdgeConfig:
         return self.profile == "auto"
 
     @property
+    def tracks_used(self) -> bool:
+        """Whether the edge's tracks are sent, or decide where the encoder spends its bits; stills need them too."""
+        return self.send_tracks or self.roi_depth > 0
+
+    @property
     def passes_through(self) -> bool:
         """Whether the camera's own units are the base stream: its size, rate and keyframes are not the edge's."""
         return self.encoder == PASSTHROUGH

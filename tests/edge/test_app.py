@@ -9,8 +9,10 @@ from itertools import pairwise
 
 import pytest
 
+from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import BaseHeader
 from hvt_common.values import Frame
+from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.source.contract import Source
@@ -101,3 +103,47 @@ def test_a_clip_that_this_machine_cannot_play_in_time_is_played_slower(tmp_path,
         f"the clip took {summary['clip_paused_s']:.0f} s longer than it is: this machine is too slow for it"
     )
     assert said in [text for _, text in table(summary)]
+
+
+class CountingWorld(World):
+    """Notes each detector that is opened."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.opened = 0
+
+    def open_detector(self, config: EdgeConfig) -> Detector:
+        """See there."""
+        self.opened += 1
+        return super().open_detector(config)
+
+
+@pytest.mark.parametrize(("settings", "opened"), [({}, 0), ({"send_tracks": True}, 1), ({"method": "M2"}, 1)])
+@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+def test_video_alone_opens_no_detector_and_decodes_nothing(tmp_path, monkeypatch, pace, settings, opened):
+    """A third of the processor would go to tracks that nobody is sent."""
+    write_scene(tmp_path, frames=10)
+    decoded = []
+    decode = BaseDecoder.decode_yuv
+    monkeypatch.setattr(
+        BaseDecoder, "decode_yuv", lambda self, data: decoded.append(len(data)) or decode(self, data)
+    )
+    config = EdgeConfig(
+        source=str(tmp_path),
+        source_fps=10.0,
+        fps=10,
+        size="320x192",
+        preset="ultrafast",
+        connect=("tcp/127.0.0.1:9",),
+        wait=0.0,
+        quiet=True,
+        store=0,
+        pace=pace,
+        **({"method": "M0"} | settings),
+    )
+    world = CountingWorld()
+    summary = Edge(check(config), stop=threading.Event(), world=world).run()
+    assert world.opened == opened
+    assert bool(decoded) is bool(opened)
+    assert summary["frames"] > 0
+    assert not summary.get("failed")

@@ -214,3 +214,26 @@ def test_both_ledgers_know_what_was_asked_for(flight):
     # A copy counts at the ground as well, if it comes before the end.
     assert flight.ground["roi_bytes"] <= flight.edge["roi_bytes"]
     assert copies or flight.ground["roi_bytes"] == flight.edge["roi_bytes"]
+
+
+def test_video_alone_follows_objects_once_somebody_asks_for_them(tmp_path):
+    """A pilot who flies video alone would never get a list of objects, or the edge would follow them for nobody."""
+    with Link(tmp_path) as link:
+        link.ground("--detector", "motion", "--classifier", "none")
+        link.edge(
+            *("--source", "demo", "--fps", "10", "--size", "640x384", "--preset", "ultrafast"),
+            *("--method", "M0", "--store", "0", "--edge-id", "uav-1"),
+        )
+        with EdgeClient.connect(link.ground_endpoint) as edges:
+            eventually(lambda: edges.names() == ["uav-1"], within_s=40, what="it flies")
+            one, said, listed = edges["uav-1"], [], []
+
+            def followed() -> bool:
+                try:
+                    listed.extend(patiently(one))
+                except RefusedError as error:
+                    said.append(str(error))
+                return bool(listed)
+
+            eventually(followed, within_s=60, what="objects are followed")
+    assert any("request again in a second" in one for one in said)

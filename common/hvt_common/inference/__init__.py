@@ -1,7 +1,6 @@
 """Detectors and classifiers: others use `detect`, `tiles`, `motion`, `classify`, `class_names`, `labels`, `nms`.
 
-`few_found` says when the embedded one finds little, `scores` from where scores count and whether they mean
-probabilities.
+`few_found` says when the embedded one finds little, `scores` what a model's file says of its classes and scores.
 
 The room `runtimes` runs a network, `store` gives paths of models.
 """

@@ -1,4 +1,4 @@
-"""What a model's metadata say of its scores: from where they count, and whether they are probabilities."""
+"""What a model's metadata say, which opens no network: its classes, and what its scores mean."""
 
 from __future__ import annotations
 
@@ -7,15 +7,24 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import MOTION, USUAL_CONFIDENCE
+from hvt_common.inference.labels import metadata_labels
 from hvt_common.inference.runtimes.onnx_file import onnx_metadata
 from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
 from hvt_common.inference.store import resolve_model
 
-__all__ = ["default_confidence", "is_calibrated", "uncalibrated"]
+__all__ = ["declared_class_names", "default_confidence", "is_calibrated", "uncalibrated"]
 
 _CONFIDENCE = "hvt.confidence"
 _CALIBRATION = "hvt.calibration"
 _LEAST_CONFIDENCE = 0.01
+
+
+def declared_class_names(spec: str) -> tuple[str, ...] | None:
+    """A detector's class names, where its file says them; None for others, the motion detector and plug-ins.
+
+    Raises `UserError` where there is no such model.
+    """
+    return metadata_labels(_metadata(spec, role="detector"))
 
 
 def default_confidence(spec: str) -> float:

@@ -13,6 +13,7 @@ from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
+from hvt_edge.perception.skipped_units import SkippedUnits
 
 __all__ = ["AnalyzedFrame", "Analyzer", "AnalyzerSettings", "FailingDetector"]
 
@@ -42,6 +43,8 @@ class AnalyzedFrame:
     """A decision step: the detector ran on this frame."""
     picture: YuvPicture | None = None
     """The same as `base_bgr`, as it was decoded: what a still may build on."""
+    followed: bool = True
+    """False where nobody used what would be known of it: it was neither decoded nor searched, and has no tracks."""
 
 
 class _Decoder(Protocol):
@@ -84,6 +87,7 @@ class Analyzer:
         """Capture time of the newest picture that was searched for objects; None before the first."""
         self._coded_index: int | None = None
         self._coded_gap = 1
+        self._passed_over = SkippedUnits()
         self._track_ids = DistinctIds()
         self.spent_ns = 0
         """Time to decode, detect and track so far."""
@@ -124,12 +128,39 @@ class Analyzer:
         """
         began_ns = time.perf_counter_ns()
         for one in skipped:
+            self._passed_over.add(one)
+        unit, before = self._passed_over.take(unit)
+        for one in before:
             self._decode(one.frame_index, one)
         analyzed = self._analyze(frame, unit, hurry=hurry)
         self.spent_ns += time.perf_counter_ns() - began_ns
         self.frames += 1
         self._track_ids.add(analyzed.tracks.ids.tolist())
         return analyzed
+
+    def pass_over(
+        self, frame: Frame, unit: AccessUnit | None, *, skipped: Sequence[AccessUnit] = ()
+    ) -> AnalyzedFrame:
+        """Take in the next source frame for nobody: nothing is decoded, searched or tracked.
+
+        What is coded is kept, as far as it is not too much, so that `analyze` can go on from any frame.
+        """
+        for one in skipped:
+            self._passed_over.add(one)
+        self._passed_over.add(unit)
+        self.detected_ns = None
+        none = np.empty(0, np.int64)
+        tracks = Tracks(
+            frame_index=frame.index,
+            ids=none,
+            boxes_xyxy_px=np.empty((0, 4), np.float32),
+            confidences=np.empty(0, np.float32),
+            class_ids=np.empty(0, np.int32),
+            born_frames=none,
+            seen_frames=none,
+            started=np.empty(0, np.bool_),
+        )
+        return AnalyzedFrame(frame, None, tracks, detected=False, followed=False)
 
     def _analyze(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool) -> AnalyzedFrame:
         picture = None if unit is None else self._decode(frame.index, unit)

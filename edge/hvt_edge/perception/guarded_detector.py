@@ -10,7 +10,21 @@ from hvt_common.inference.tiles import detect_whole
 from hvt_common.runtime.failures import Failures, Retried, RetryPause
 from hvt_common.values import Detections, Image
 
-__all__ = ["GuardedDetector"]
+__all__ = ["GuardedDetector", "OpenedOnUse"]
+
+
+class OpenedOnUse:
+    """A detector that is opened when it is first used, for who may never use it; its class names are known."""
+
+    def __init__(self, open_detector: Callable[[], Detector], class_names: tuple[str, ...]) -> None:
+        self._open = open_detector
+        self._opened: Detector | None = None
+        self.class_names = class_names
+
+    def detect(self, image_bgr: Image) -> Detections:
+        """As the detector does. Raises what opening it raises."""
+        self._opened = self._opened or self._open()
+        return self._opened.detect(image_bgr)
 
 
 class GuardedDetector(Retried[Detector]):

@@ -50,6 +50,8 @@ _PATIENCE_NS = 2_000_000_000
 """For so long the first waits for its full size."""
 _RETRY_NS = 250_000_000
 """Between two tries to fit one that is too large: each codes it several times."""
+_TRACKED_NS = 30_000_000_000
+"""For so long after a request for tracks they are followed, where nothing else needs them."""
 _REFUSALS = {
     "stale": "in 10 s the budget had no room for it",
     "ended": "the session ended before there was room for it",
@@ -92,10 +94,15 @@ class OnDemand:
         self._refusals: OrderedDict[int, str] = OrderedDict()
         """Number → why it was given up, or nothing where it is pending or was sent; of the last ones."""
         self._next_number = 0
+        self._tracks_requested_ns: int | None = None
+        """Capture time of the newest frame then."""
+        self._followed = True
+        """Objects were, in the newest frame."""
         self._ended = False
 
     def add(self, analyzed: AnalyzedFrame) -> None:
         """Hold a frame with its tracks."""
+        self._followed = analyzed.followed
         self.ring.add(analyzed.frame, analyzed.tracks)
 
     # From any thread
@@ -108,6 +115,8 @@ class OnDemand:
         if self.most_bytes() < _LEAST_BYTES:
             raise RefusedError("the budget leaves nothing for stills: raise it, or lower --video-share")
         frame = frame_for(request, self.ring)
+        if request.track_id is not None:
+            self._follow(frame.capture_ns)
         job = crop_job_for(request, frame, maker=self._maker, view=self.view, class_names=self.class_names)
         quality_pct = self._maker.quality_pct if request.quality_pct is None else request.quality_pct
         maker = replace(self._maker, quality_pct=quality_pct, floor_pct=min(_FLOOR_PCT, quality_pct))
@@ -140,6 +149,7 @@ class OnDemand:
         newest = self.ring.newest
         if newest is None:
             raise RefusedError("there is no frame yet, or none is kept (--ring)")
+        self._follow(newest.capture_ns)
         tracks = newest.tracks
         width, height = self.view.source_size  # a box that is only predicted may be far outside
         boxes = np.clip(self.view.to_source(tracks.boxes_xyxy_px), 0, (width, height, width, height))
@@ -156,6 +166,11 @@ class OnDemand:
         return newest.frame_index, tuple(listed)
 
     # In the stills' thread
+
+    def wants_tracks(self, capture_ns: int) -> bool:
+        """Whether a ground has requested tracks shortly before this frame."""
+        requested_ns = self._tracks_requested_ns
+        return requested_ns is not None and capture_ns - requested_ns < _TRACKED_NS
 
     def code(
         self, pending: OnDemandStill, *, now_ns: int, allowance: Allowance, sequence: int
@@ -191,6 +206,14 @@ class OnDemand:
     def close(self) -> None:
         """No more is accepted."""
         self._ended = True
+
+    def _follow(self, capture_ns: int) -> None:
+        """Tracks are wanted; raises `RefusedError` where there are none because nobody wanted them until now."""
+        self._tracks_requested_ns = capture_ns
+        if not self._followed:
+            raise RefusedError(
+                "this edge sends video alone and followed no objects; it does from now on: request again in a second"
+            )
 
     def _check_queue(self) -> None:
         pending = self.outbox.on_demand_pending

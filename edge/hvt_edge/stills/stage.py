@@ -42,6 +42,8 @@ class StillStage:
     keyframes: KeyframeRequests
     reporter: TrackReporter | None = None
     shadow: ShadowGround | None = None
+    tracks_used: bool = True
+    """By the encoder, by whoever is sent them; else only a method that sends stills, or a ground's request, does."""
     levers: LeverControl | None = None
     """Decides by what ``shadow`` and the grounds say; None: tracks and stills are sent as the settings allow."""
 
@@ -79,12 +81,21 @@ class StillStage:
     ) -> AnalyzedFrame:
         """Decode, detect and track one frame; ``unit`` is None for one that is not part of the base stream.
 
-        ``skipped`` are units before it, of frames that were not analyzed.
+        ``skipped`` are units before it, of frames that were not analyzed. Where nobody uses what would come of it,
+        nothing of this is done.
         """
+        if not self._has_user(frame.capture_ns):
+            return self.analyzer.pass_over(frame, unit, skipped=skipped)
         analyzed = self.analyzer.analyze(frame, unit, skipped=skipped, hurry=hurry)
         if self.shadow is not None and not hurry:
             self.shadow.compare(analyzed)
         return analyzed
+
+    def _has_user(self, capture_ns: int) -> bool:
+        chooser = self.chooser
+        if self.tracks_used or not chooser.method.video_only:
+            return True
+        return chooser.on_demand is not None and chooser.on_demand.wants_tracks(capture_ns)
 
     def send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Choose, and send the stills that may go now; return their sequence numbers.

@@ -1,7 +1,7 @@
 """Builds every part of an edge once, each from the settings and from what it needs."""
 
 from hvt_edge.wiring.link import make_link_settings
-from hvt_edge.wiring.perception import make_detector, track_confidence, warm_up_for
+from hvt_edge.wiring.perception import make_detector, open_for_flight, track_confidence, warm_up_for
 from hvt_edge.wiring.stages import Stages, build_stages
 from hvt_edge.wiring.stills import check_codecs
 from hvt_edge.wiring.storing import check_files, check_store, store_folder
@@ -29,6 +29,7 @@ __all__ = [
     "make_detector",
     "make_encoder",
     "make_link_settings",
+    "open_for_flight",
     "qualify_encoder",
     "store_folder",
     "track_confidence",

@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Literal, cast
 
 from hvt_common.inference.detect import MOTION, Detector, detect_every, open_detector, warm_up
-from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
+from hvt_common.inference.scores import (
+    declared_class_names,
+    default_confidence,
+    is_calibrated,
+    uncalibrated,
+)
 from hvt_common.inference.tiles import detect_whole, tiled
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings, FailingDetector
-from hvt_edge.perception.guarded_detector import GuardedDetector
+from hvt_edge.perception.guarded_detector import GuardedDetector, OpenedOnUse
 from hvt_edge.perception.shadow import UNMEASURED, Shadow, ShadowGround, ShadowSettings
+from hvt_edge.stills.policy.registry import method
 
 _log = logging.getLogger(__name__)
 
@@ -32,6 +39,22 @@ def make_detector(config: EdgeConfig) -> Detector:
         provider="cpu" if config.pace == "lockstep" and config.provider == "auto" else config.provider,
     )
     return tiled(detector, config.tiles) if config.candidates == "source" else detector
+
+
+def open_for_flight(
+    config: EdgeConfig, open_detector: Callable[[], Detector], warm_up: Callable[[Detector], None]
+) -> Detector:
+    """Open the detector and warm it up, or leave that for when it is first used, where that may be never.
+
+    A method without stills needs no tracks, unless they are sent, or a ground requests them in flight.
+    """
+    needed = config.tracks_used or not method(config.method).video_only or config.labels is not None
+    class_names = None if needed else declared_class_names(config.detector)
+    if class_names is not None:
+        return OpenedOnUse(open_detector, class_names)
+    detector = open_detector()
+    warm_up(detector)
+    return detector
 
 
 def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:

@@ -258,6 +258,7 @@ def build_stages(
         sender=still_sender,
         transmitter=transmitter,
         keyframes=keyframes,
+        tracks_used=config.tracks_used,
         reporter=TrackReporter(transmitter, session_id=session_id) if config.send_tracks else None,
         shadow=make_shadow(config, detector, before=beginning.shadow),
         levers=make_levers(config, operating, view),

@@ -67,6 +67,26 @@ def test_every_frame_is_decoded_and_each_nth_is_searched():
         assert 0 < np.abs(error).mean() < 6, "the decoded picture, not the camera's"
 
 
+def test_what_nobody_uses_is_not_decoded_and_goes_on_from_any_frame():
+    """Video alone would pay for tracks that nobody sees; or a request for them would find no picture to build on."""
+    detector = RedSquares()
+    used, always = make(detector=detector, detect_every=5), make(detect_every=5)
+    for frame, unit in zip(FRAMES[:11], UNITS, strict=False):
+        passed = used.pass_over(frame, unit)
+        expected = always.analyze(frame, unit)
+        assert (passed.base_bgr, len(passed.tracks), passed.detected, passed.followed) == (
+            None,
+            0,
+            False,
+            False,
+        )
+    assert (used.frames, used.spent_ns, used.detected_ns) == (0, 0, None)
+    for frame, unit in zip(FRAMES[11:20], UNITS[11:20], strict=True):
+        seen, expected = used.analyze(frame, unit), always.analyze(frame, unit)
+        np.testing.assert_array_equal(seen.base_bgr, expected.base_bgr)
+    assert seen.tracks.ids.tolist() == expected.tracks.ids.tolist()
+
+
 def test_in_a_hurry_detection_is_put_off_and_made_up_for():
     """A slow detector would fall behind more and more; or a busy second would leave it blind for another."""
     analyzer = make(detect_every=5)
