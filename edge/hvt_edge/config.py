@@ -250,7 +250,7 @@ class EdgeConfig:
     camera_motion: str = _MODELS_RARE.option(
         choice("off", "flow"), "flow", "how the tracker follows the camera's own motion"
     )
-    threads: int = _MODELS_RARE.option(integer(1, 64), 2, "threads of the detector")
+    threads: int = _MODELS_RARE.option(integer(1, 64), 1, "threads of the detector")
     provider: str = _MODELS.option(
         choice(*PROVIDERS), "auto", "what runs the detector; auto says what it took and why"
     )

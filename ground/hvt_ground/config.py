@@ -123,7 +123,7 @@ class GroundConfig:
         "fuse",
         "a still's class replaces the track's, or is weighed with the others",
     )
-    threads: int = _MODELS_RARE.option(integer(1, 64), 2, "threads of the detector and the classifier")
+    threads: int = _MODELS_RARE.option(integer(1, 64), 1, "threads of the detector and the classifier")
     provider: str = _MODELS.option(
         choice(*PROVIDERS), "auto", "what runs the networks; auto says what it took and why"
     )

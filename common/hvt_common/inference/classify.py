@@ -66,7 +66,7 @@ _TORCHVISION = Preparation(mean=(123.675, 116.28, 103.53), scale=(1 / 58.395, 1 
 
 
 def open_classifier(
-    spec: str, *, labels: Path | None = None, threads: int = 2, provider: str = "cpu"
+    spec: str, *, labels: Path | None = None, threads: int = 1, provider: str = "cpu"
 ) -> Classifier:
     """Open an ONNX classifier by the name of a model (see `resolve_model`) or the path of a file.
 

@@ -73,7 +73,7 @@ def open_detector(
     confidence: float = USUAL_CONFIDENCE,
     nms_iou: float = 0.45,
     size: tuple[int, int] | None = None,
-    threads: int = 2,
+    threads: int = 1,
     provider: str = "cpu",
 ) -> Detector:
     """Open a detector: ``motion``, the name of a model (see `resolve_model`), an ONNX file, or a plug-in's name.

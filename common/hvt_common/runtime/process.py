@@ -1,5 +1,7 @@
 """What a process sets up for itself: the signals that stop it, its threads' priority, its memory allocator.
 
+Priorities, as Linux's niceness: 0 for what the operator sees move, 10 for perception, 19 for the networks in it.
+
 And what it tells systemd.
 """
 
@@ -17,12 +19,18 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import NoReturn, TypeVar
+from pathlib import Path
+from typing import NoReturn, Self, TypeVar
+
+import cv2
 
 __all__ = [
+    "NETWORK_NICENESS",
     "STOP_SIGNALS",
+    "NewThreads",
     "join_threads_at_exit",
     "leave",
+    "leave_room_for_video",
     "limit_malloc_arenas",
     "lower_priority",
     "notify_systemd",
@@ -34,6 +42,9 @@ T = TypeVar("T")
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _NICENESS = 10
+NETWORK_NICENESS = 19
+"""x265 sets its own workers to 10 (threadpool.cpp): networks of 10 would have as much of the cores."""
+_SWITCH_S = 0.0005
 _ZENOH_CALLBACK = "(pyo3-closure)"
 """Zenoh's Python package runs each callback in a thread of such a name, and joins none."""
 _JOIN_WITHIN_S = 30.0
@@ -105,14 +116,62 @@ def _join_threads() -> None:
             thread.join(max(0.0, until_s - time.monotonic()))
 
 
-def lower_priority() -> None:
+def lower_priority(niceness: int = _NICENESS) -> None:
     """Let other threads go before the calling one, and before those that it starts; on Linux only.
 
     Encoding and decoding are what the operator sees move; detection and stills may come a little later.
     """
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+
+
+class NewThreads:
+    """The threads that a library starts within ``with``, so that they can be given the caller's priority.
+
+    Where a library lowers that of its own workers. To raise it again takes a right (``RLIMIT_NICE``, ``LimitNICE=+0``
+    of systemd): without, they stay as they are.
+    """
+
+    def __init__(self) -> None:
+        self._before: set[str] = set()
+        self._threads: set[str] = set()
+
+    def __enter__(self) -> Self:
+        self._before = _threads()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._threads = _threads() - self._before
+
+    def raise_priority(self) -> None:
+        """Let them go like the calling thread, whatever they have made of themselves meanwhile."""
+        for thread in list(self._threads):
+            try:
+                own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+                if os.getpriority(os.PRIO_PROCESS, int(thread)) > own:
+                    os.setpriority(os.PRIO_PROCESS, int(thread), own)
+            except OSError:  # it has ended, or this is not allowed
+                self._threads.discard(thread)
+
+
+def _threads() -> set[str]:
+    """Of this process, where the system says them."""
+    try:
+        return {one.name for one in Path("/proc/self/task").iterdir()}
+    except OSError:
+        return set()
+
+
+def leave_room_for_video() -> None:
+    """Have nothing in this process hold up a frame on its way: not the interpreter, not OpenCV's workers.
+
+    A frame comes back from native code a dozen times, and waits each time for whoever tracks or reads a message: half
+    a millisecond at most from now on, instead of five. OpenCV works in the thread that calls it; workers of its own
+    have the priority of whoever called it first.
+    """
+    sys.setswitchinterval(_SWITCH_S)
+    cv2.setNumThreads(1)
 
 
 def with_lower_priority(call: Callable[[], T]) -> T:

@@ -6,8 +6,11 @@ import os
 import platform
 import subprocess
 import sys
+import threading
 
 import pytest
+
+from hvt_common.runtime.process import NewThreads, lower_priority
 
 only_with_glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is about glibc's heaps")
 
@@ -96,3 +99,59 @@ def test_a_process_ends_with_its_code_while_a_detection_runs():
         [sys.executable, "-c", DETECTING], capture_output=True, text=True, check=False, timeout=60
     )
     assert (done.returncode, done.stdout, done.stderr) == (3, "all was written", "")
+
+
+def niceness(thread: int) -> int:
+    """Of a thread by its native id."""
+    return os.getpriority(os.PRIO_PROCESS, thread)
+
+
+def may_raise_priority() -> bool:
+    """Whether a thread that has lowered its priority may take it back here."""
+
+    def tried() -> bool:
+        lower_priority()
+        try:
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness(os.getpid()))
+        except OSError:
+            return False
+        return True
+
+    answers: list[bool] = []
+    thread = threading.Thread(target=lambda: answers.append(tried()))
+    thread.start()
+    thread.join()
+    return answers == [True]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it is about Linux's niceness")
+def test_a_library_that_lowers_its_own_workers_gets_them_back():
+    """x265 does: each frame would wait behind the detector."""
+    lowered, end = threading.Event(), threading.Event()
+
+    def work() -> None:
+        lower_priority()
+        lowered.set()
+        end.wait()
+
+    other = threading.Thread(target=work)
+    other.start()
+    lowered.wait()
+    lowered.clear()
+    workers = NewThreads()
+    with workers:
+        worker = threading.Thread(target=work)
+        worker.start()
+    lowered.wait()
+    try:
+        workers.raise_priority()
+        own = niceness(threading.get_native_id())
+        assert worker.native_id is not None
+        assert other.native_id is not None
+        assert niceness(worker.native_id) == (own if may_raise_priority() else max(own, 10))
+        assert niceness(other.native_id) == max(own, 10), "it was there before"
+    finally:
+        end.set()
+        worker.join()
+        other.join()
+    workers.raise_priority()  # of threads that have ended

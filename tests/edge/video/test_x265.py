@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -76,6 +81,28 @@ def test_a_keyframe_comes_when_it_is_asked_for_and_only_then(preset):
     for start in asked:
         decoder = BaseDecoder()
         assert all(decoder.decode(unit.data) is not None for unit in units[start : start + 3])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it is about Linux's niceness")
+def test_its_workers_have_the_priority_of_the_frame_loop(monkeypatch):
+    """x265 lowers it by 10, to that of detection: each frame would wait behind a network."""
+    raised: dict[int, int] = {}
+    set_priority = os.setpriority
+
+    def noted(which: int, thread: int, niceness: int) -> None:
+        raised[thread] = niceness
+        set_priority(which, thread, niceness)
+
+    monkeypatch.setattr(os, "setpriority", noted)
+    own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    before = {one.name for one in Path("/proc/self/task").iterdir()}
+    encoder = BaseEncoder(EncoderSettings(size=(1280, 720), fps=15, bitrate_bps=400_000, threads=2))
+    workers = {int(one.name) for one in Path("/proc/self/task").iterdir() if one.name not in before}
+    for frame in framed(smooth_pictures(4, size=(1280, 720))):
+        encoder.encode(frame, keyframe=True)
+    assert raised, "a worker was found at a lower priority"
+    assert set(raised) <= workers
+    assert set(raised.values()) == {own}
 
 
 def test_the_same_pictures_give_the_same_bytes():

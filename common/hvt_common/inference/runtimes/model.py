@@ -10,10 +10,12 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +26,11 @@ from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.onnx_file import check_onnx_file
 from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
 from hvt_common.inference.runtimes.providers import ONNXRUNTIME_PROVIDERS, ProviderChoice, choose_provider
+from hvt_common.runtime.process import NETWORK_NICENESS, lower_priority
 
 __all__ = ["ModelSettings", "OnnxModel", "Port", "open_model"]
+
+_T = TypeVar("_T")
 
 _log = logging.getLogger(__name__)
 
@@ -68,7 +73,7 @@ _ORT_ERRORS: tuple[type[Exception], ...] = tuple(
 class ModelSettings:
     """How a model is run."""
 
-    threads: int = 2
+    threads: int = 1
     """CPU threads inside one operator, 1 or more."""
     provider: str = "cpu"
     """One of `hvt_common.inference.runtimes.providers.PROVIDERS`."""
@@ -125,6 +130,32 @@ class OnnxModel:
             shape = "x".join(map(str, feed.shape))
             raise UserError(f"model {self.path} does not run on a {shape} input: it takes {port}")
         return self._runner.run(feed)
+
+
+class _Background:
+    """A thread of the lowest priority that opens and runs one network, and whose workers have that priority too.
+
+    Whoever waits for the answer keeps its own: what it computes with the interpreter's lock held may hold up video.
+    """
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(
+            1, thread_name_prefix="hvt-network", initializer=partial(lower_priority, NETWORK_NICENESS)
+        )
+
+    def do(self, call: Callable[[], _T]) -> _T:
+        return self._thread.submit(call).result()
+
+
+@dataclass(frozen=True, slots=True)
+class _InBackground:
+    """Another runner, there."""
+
+    background: _Background
+    runner: _Runner
+
+    def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        return self.background.do(lambda: self.runner.run(feed))
 
 
 class _OnnxRuntimeRunner:
@@ -202,18 +233,21 @@ def _seconds(model: OnnxModel, feed: npt.NDArray[Any]) -> Iterator[float]:
 
 
 def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxModel:
+    background = _Background()
     if choice.provider == "openvino":
         described = _session(path, settings, ("CPUExecutionProvider",), optimised=False)
         found = find_openvino()
-        runner = OpenVinoRunner(path, threads=settings.threads, bf16=found is not None and found.bf16)
-        return OnnxModel(path, described, runner=runner, provider=choice)
+        bf16 = found is not None and found.bf16
+        openvino = background.do(lambda: OpenVinoRunner(path, threads=settings.threads, bf16=bf16))
+        return OnnxModel(path, described, runner=_InBackground(background, openvino), provider=choice)
     names = ONNXRUNTIME_PROVIDERS[choice.provider]
-    session = _session(path, settings, names)
+    session = background.do(lambda: _session(path, settings, names))
     if session.get_providers()[0] != names[0]:
         raise UserError(
             f"--provider {choice.provider} did not start (its driver or libraries are missing): choose cpu"
         )
-    return OnnxModel(path, session, runner=_OnnxRuntimeRunner(path, session), provider=choice)
+    runner = _InBackground(background, _OnnxRuntimeRunner(path, session))
+    return OnnxModel(path, session, runner=runner, provider=choice)
 
 
 def _session(

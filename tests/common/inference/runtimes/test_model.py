@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +33,22 @@ def test_a_model_says_its_ports_and_metadata_and_runs(tmp_path: Path) -> None:
     first, second = model.run(np.zeros((1, 3, 64, 64), np.float32))
     assert first.tolist() == [[1, 1]]
     assert second.shape == (1, 3)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it is about Linux's niceness")
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_network_runs_below_everything_else(tmp_path: Path, threads: int) -> None:
+    """Video would wait for it, or for whoever waits for it with the interpreter's lock in hand."""
+    others = {one.name for one in Path("/proc/self/task").iterdir()}
+    own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    model = open_model(
+        colour_detector(tmp_path / "m.onnx", "yolox", size=None), settings=ModelSettings(threads=threads)
+    )
+    model.run(np.zeros((1, 3, 64, 64), np.float32))
+    started = {one.name for one in Path("/proc/self/task").iterdir()} - others
+    assert len(started) >= threads
+    assert {os.getpriority(os.PRIO_PROCESS, int(one)) for one in started} == {19}
+    assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == own
 
 
 def test_free_sizes_are_none(tmp_path: Path) -> None:
