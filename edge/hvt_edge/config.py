@@ -24,6 +24,7 @@ from hvt_common.config import (
     or_auto,
 )
 from hvt_common.errors import UserError
+from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import parse_tiles
@@ -223,9 +224,17 @@ class EdgeConfig:
     detector: str = _MODELS.option(
         TEXT,
         EMBEDDED_DETECTOR,
-        "FILE.onnx, a name of hvt-models list (NAME:TEXT for a plug-in), or motion, which needs no model",
+        "FILE.onnx or .xml, a name of hvt-models list (NAME:TEXT for a plug-in), or motion, which needs no model",
     )
-    labels: Path | None = _MODELS.option(PATH, None, "class names of the detector, one a line")
+    labels: Path | None = _MODELS.option(
+        PATH, None, "class names of the detector: a file of one a line, or coco or visdrone"
+    )
+    head: str | None = _MODELS_RARE.option(
+        choice(*HEAD_NAMES),
+        None,
+        "what the detector's outputs mean, where neither its file nor its answers tell",
+        shown_default="found",
+    )
     candidates: str = _MODELS.option(
         choice("decoded", "source"), "decoded", "detect on the decoded base stream or on the source frame"
     )

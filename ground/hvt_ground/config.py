@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 from hvt_common.config import BYTES, DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
 from hvt_common.errors import UserError
+from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
 from hvt_common.protocol.channels import GroupKeys
@@ -90,10 +91,18 @@ class GroundConfig:
     detector: str = _MODELS.option(
         TEXT,
         EMBEDDED_DETECTOR,
-        "FILE.onnx, a name of hvt-models list (NAME:TEXT for a plug-in), or motion, which needs no model",
+        "FILE.onnx or .xml, a name of hvt-models list (NAME:TEXT for a plug-in), or motion, which needs no model",
     )
     labels: Path | None = _MODELS.option(PATH, None, "class names of the classifier, one a line")
-    detector_labels: Path | None = _MODELS_RARE.option(PATH, None, "class names of the detector, one a line")
+    detector_labels: Path | None = _MODELS_RARE.option(
+        PATH, None, "class names of the detector: a file of one a line, or coco or visdrone"
+    )
+    head: str | None = _MODELS_RARE.option(
+        choice(*HEAD_NAMES),
+        None,
+        "what the detector's outputs mean, where neither its file nor its answers tell",
+        shown_default="found",
+    )
     detect_every: int | None = _MODELS.option(
         integer(1, 1000, unit=" frames"),
         None,

@@ -2,5 +2,6 @@
 
 `few_found` says when the embedded one finds little, `scores` what a model's file says of its classes and scores.
 
-The room `runtimes` runs a network, `store` gives paths of models.
+`preparation` is what a network sees of a pixel. The room `runtimes` runs a network, `heads` tells what its outputs
+mean, `store` gives paths of models.
 """

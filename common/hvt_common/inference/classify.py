@@ -5,9 +5,11 @@ How pixels are prepared, first rule that applies:
 1. The model's metadata says it: ``hvt.mean`` and ``hvt.scale`` (one number or three, network value =
    (pixel - mean) * scale, pixels 0…255, numbers in the order of the network's channels) and ``hvt.channel_order``
    (``RGB`` or ``BGR``).
-2. 1001 classes, TensorFlow's ImageNet with a background class: RGB, (pixel - 128) / 128.
-3. Anything else, as torchvision and the ONNX model zoo train (ResNet-50): RGB, mean 123.675 116.28 103.53, scale
-   1/58.395 1/57.12 1/57.375.
+2. The metadata say Ultralytics' classify (``author``, ``task``): RGB, pixel / 255.
+3. 1001 classes, TensorFlow's ImageNet with a background class: RGB, (pixel - 128) / 128.
+4. An OpenVINO model (``.xml``): BGR 0…255, as the Open Model Zoo takes them.
+5. Anything else, as torchvision and the ONNX model zoo train (ResNet-50): RGB, mean 123.675 116.28 103.53, scale
+   1/58.395 1/57.12 1/57.375. The last two are guesses, and are said.
 
 The crop is resized to the network's input as a whole, without keeping its shape. The usual "shorter side 256, centre
 crop 224" is meant for photographs; a crop around a box is already centred on its object and must not lose its ends.
@@ -15,8 +17,8 @@ crop 224" is meant for photographs; a crop around a box is already centred on it
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -26,13 +28,17 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import IMAGENET_NAMES
-from hvt_common.inference.labels import first_synonym, metadata_labels, read_labels
+from hvt_common.inference.labels import class_labels, first_synonym, read_labels
 from hvt_common.inference.letterbox import as_bgr
+from hvt_common.inference.preparation import Preparation, prepared_as
+from hvt_common.inference.runtimes.ir_file import is_ir
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Image, Posterior
 
-__all__ = ["Classifier", "OnnxClassifier", "Preparation", "open_classifier"]
+__all__ = ["Classifier", "OnnxClassifier", "open_classifier"]
+
+_log = logging.getLogger(__name__)
 
 _IMAGENET_CLASSES = 1000
 _BACKGROUND = "background"
@@ -52,17 +58,9 @@ class Classifier(Protocol):
         """One posterior a crop, in order."""
 
 
-@dataclass(frozen=True, slots=True)
-class Preparation:
-    """Network value = (pixel - mean) * scale, channel by channel."""
-
-    mean: tuple[float, float, float]
-    scale: tuple[float, float, float]
-    rgb: bool = True
-
-
 _TENSORFLOW = Preparation(mean=(128.0,) * 3, scale=(1 / 128,) * 3)
-_TORCHVISION = Preparation(mean=(123.675, 116.28, 103.53), scale=(1 / 58.395, 1 / 57.12, 1 / 57.375))
+_OPEN_MODEL_ZOO = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=False)
+_ULTRALYTICS = Preparation(mean=(0.0,) * 3, scale=(1 / 255,) * 3)
 
 
 def open_classifier(
@@ -90,9 +88,11 @@ class OnnxClassifier:
     def __init__(self, model: OnnxModel, *, labels: Path | None = None) -> None:
         self.model = model
         self._channels_first, self._batch, self._size = _geometry(model)
-        self._output_index, classes, self._logits = self._try_out()
-        self.preparation = _preparation(model, classes)
-        self.class_names = _class_names(model, classes, labels)
+        names = read_labels(labels) if labels is not None else class_labels(model.path, model.metadata)
+        self._output_index, classes, self._logits = self._try_out(None if names is None else len(names))
+        self.preparation, self.why = _preparation(model, classes)
+        _log.info("%s is taken for a classifier; pixels %s: %s", model.path.name, self.preparation, self.why)
+        self.class_names = _class_names(model, classes, names, labels)
 
     def classify(self, crops_bgr: Sequence[Image]) -> list[Posterior]:
         """Classify (height, width, 3) uint8 crops of any size (or grey); a free batch takes all of them at once."""
@@ -137,17 +137,33 @@ class OnnxClassifier:
             probabilities=probabilities,
         )
 
-    def _try_out(self) -> tuple[int, int, bool]:
-        """Index of the output of scores, number of classes, and whether they are logits."""
+    def _try_out(self, names: int | None) -> tuple[int, int, bool]:
+        """Index of the output of scores, number of classes, and whether they are logits.
+
+        Of several outputs the one counts that has as many classes as there are ``names``.
+        """
         batch, (width, height) = self._batch or 1, self._size
         shape = (batch, 3, height, width) if self._channels_first else (batch, height, width, 3)
         noise = np.random.default_rng(0).normal(0, 1, shape).astype(self.model.inputs[0].dtype)
-        for index, output in enumerate(self.model.run(noise)):
-            if _is_scores(output, batch):
-                row = output.reshape(batch, -1)[0].astype(np.float64)
-                probabilities = row.min() >= 0 and abs(row.sum() - 1) < 1e-2
-                return index, row.size, not probabilities
-        raise UserError(_not_a_classifier(self.model, "no output is one row of scores an image"))
+        rows = {
+            index: output.reshape(batch, -1)[0].astype(np.float64)
+            for index, output in enumerate(self.model.run(noise))
+            if _is_scores(output, batch)
+        }
+        if not rows:
+            raise UserError(_not_a_classifier(self.model, "no output is one row of scores an image"))
+        sizes = {row.size for row in rows.values()}
+        fitting = (
+            [index for index, row in rows.items() if row.size == names] if len(sizes) > 1 else list(rows)
+        )
+        if not fitting:
+            raise UserError(
+                _not_a_classifier(
+                    self.model, "several outputs are scores, which --labels decides by their number"
+                )
+            )
+        row = rows[fitting[0]]
+        return fitting[0], row.size, not (row.min() >= 0 and abs(row.sum() - 1) < 1e-2)
 
 
 def _geometry(model: OnnxModel) -> tuple[bool, int | None, tuple[int, int]]:
@@ -179,44 +195,34 @@ def _not_a_classifier(model: OnnxModel, why: str) -> str:
     )
 
 
-def _preparation(model: OnnxModel, classes: int) -> Preparation:
-    usual = _TENSORFLOW if classes == _IMAGENET_CLASSES + 1 else _TORCHVISION
-    order = model.metadata.get("hvt.channel_order", "RGB").upper()
-    if order not in ("RGB", "BGR"):
-        raise UserError(
-            f"model {model.path} has hvt.channel_order '{order}' in its metadata; RGB or BGR is accepted"
-        )
-    return Preparation(
-        mean=_three_numbers(model, "hvt.mean", usual.mean),
-        scale=_three_numbers(model, "hvt.scale", usual.scale),
-        rgb=order == "RGB",
-    )
+def _preparation(model: OnnxModel, classes: int) -> tuple[Preparation, str]:
+    """How pixels are prepared, and what says so."""
+    said = model.metadata
+    if said.get("author") == "Ultralytics" or said.get("task") == "classify":
+        usual, why = _ULTRALYTICS, "its metadata say Ultralytics' classify"
+    elif classes == _IMAGENET_CLASSES + 1:
+        usual, why = _TENSORFLOW, "1001 classes, as TensorFlow trains"
+    elif is_ir(model.path):
+        usual, why = _OPEN_MODEL_ZOO, "assumed, as the Open Model Zoo takes them"
+    else:
+        usual, why = Preparation.torchvision(), "assumed, as torchvision trains"
+    if any(key.startswith("hvt.") for key in said):
+        why = "its metadata say so"
+    return prepared_as(model.path, said, usual), why
 
 
-def _three_numbers(
-    model: OnnxModel, key: str, usual: tuple[float, float, float]
-) -> tuple[float, float, float]:
-    """One number for all channels or three, separated by spaces or commas, with or without brackets."""
-    metadata: Mapping[str, str] = model.metadata
-    if key not in metadata:
-        return usual
-    try:
-        numbers = [float(word) for word in metadata[key].strip("[]() ").replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (1, 3) or not np.isfinite(numbers).all():
-        raise UserError(
-            f"model {model.path} has {key} '{metadata[key]}' in its metadata; one number or three do"
-        )
-    red, green, blue = numbers * 3 if len(numbers) == 1 else numbers
-    return red, green, blue
-
-
-def _class_names(model: OnnxModel, classes: int, labels: Path | None) -> tuple[str, ...]:
-    names = read_labels(labels) if labels is not None else metadata_labels(model.metadata)
+def _class_names(
+    model: OnnxModel, classes: int, names: tuple[str, ...] | None, labels: Path | None
+) -> tuple[str, ...]:
     if names is None and classes in (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):
+        _log.info("%s has no class names: its %d classes are taken for ImageNet's", model.path.name, classes)
         names = IMAGENET_NAMES
     if names is None:
+        _log.warning(
+            "%s has no class names: its classes are class 0 to class %d; --labels FILE names them",
+            model.path.name,
+            classes - 1,
+        )
         return tuple(f"class {index}" for index in range(classes))
     fit = (len(names), classes)
     if fit == (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):

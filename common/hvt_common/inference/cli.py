@@ -12,6 +12,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.table import Table
 
 from hvt_common.errors import Parser, UserError, exit_with_sentence
+from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.plug_in import plug_in_names
 from hvt_common.inference.store import (
     EMBEDDED_CLASSIFIER,
@@ -82,7 +83,11 @@ def _parser() -> argparse.ArgumentParser:
     one.set_defaults(run=_add)
 
     one = commands.add_parser("info", help="ports, adapter, classes and speed of a model")
-    one.add_argument("file", metavar="FILE", help="an ONNX file or the name of a model")
+    one.add_argument("file", metavar="FILE", help="an ONNX file, OpenVINO's .xml, or the name of a model")
+    one.add_argument("--head", metavar="NAME", help=f"as of --detector's programs: {', '.join(HEAD_NAMES)}")
+    one.add_argument(
+        "--labels", type=Path, metavar="FILE", help="class names, one a line, or coco or visdrone"
+    )
     one.add_argument("--provider", default="cpu", help="what runs it: auto, cpu, openvino … [cpu]")
     one.add_argument("--threads", type=int, choices=range(1, 65), default=2, metavar="N", help="threads [2]")
     one.set_defaults(run=_info)
@@ -169,7 +174,11 @@ def _info(arguments: argparse.Namespace) -> int:
     from hvt_common.inference.inspect import inspect_model  # noqa: PLC0415  (the other commands open no model)
 
     report = inspect_model(
-        resolve_model(arguments.file), provider=arguments.provider, threads=arguments.threads
+        resolve_model(arguments.file),
+        provider=arguments.provider,
+        threads=arguments.threads,
+        head=arguments.head,
+        labels=arguments.labels,
     )
     names = report.class_names
     shown = ", ".join(names[:_SHOWN_CLASSES]) + (" …" if len(names) > _SHOWN_CLASSES else "")
@@ -177,7 +186,7 @@ def _info(arguments: argparse.Namespace) -> int:
         ("file", str(report.path)),
         ("size", f"{report.size_bytes} bytes"),
         ("SHA-256", file_digest(report.path)),
-        ("opset", ", ".join(f"{domain or 'ai.onnx'} {version}" for domain, version in report.opsets.items())),
+        *(("opset", f"{domain or 'ai.onnx'} {version}") for domain, version in report.opsets.items()),
         *(("input", str(port)) for port in report.inputs),
         *(("output", str(port)) for port in report.outputs),
         *((f"metadata {key}", value[:80]) for key, value in report.metadata.items()),

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import logging
+import re
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES, group_of
-from hvt_common.inference.detect_heads import ACCEPTED_HEADS, Head, choose_head
-from hvt_common.inference.labels import metadata_labels, read_labels
+from hvt_common.inference.class_names import group_of
+from hvt_common.inference.heads.choose import HEAD_NAMES, check_head_name, choose_head
+from hvt_common.inference.heads.contract import Head
+from hvt_common.inference.heads.trial import Trial, trial_pictures
+from hvt_common.inference.labels import KNOWN_LABELS, class_labels, read_labels
 from hvt_common.inference.letterbox import Letterboxer, as_bgr
 from hvt_common.inference.motion import MotionDetector
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
+from hvt_common.inference.preparation import Preparation, prepared_as
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
 from hvt_common.inference.store import model_names, resolve_model
@@ -30,6 +35,8 @@ __all__ = [
     "warm_up",
 ]
 
+_log = logging.getLogger(__name__)
+
 MOTION = "motion"
 """The word that stands for the detector without weights."""
 
@@ -37,10 +44,17 @@ USUAL_CONFIDENCE = 0.25
 """From where detections count, where neither the user nor the model says."""
 
 _CELL = 32  # input sides are multiples of the largest usual stride
-_TRIAL_SIDE = 256
+_CELLS = (_CELL, 64, 128)
+"""Larger ones of networks with more levels (P6, P7)."""
+_TRIAL_CELLS = (9, 7)
+"""Odd: a network of a larger stride than assumed shows it."""
+_USUAL_SIDE = 640
+_UNNAMED = 100
+"""Classes that get a number for a name where a list of objects without names does not tell how many there are."""
 _MAX_FREE_SIDE = 1920
 _MAX_SIDE = 8192
 _ENLARGE_TO = "hvt.enlarge_to"
+_TASK = "detect"
 _MOST_ENLARGED = 2.0
 """Beyond that nothing more is found, and the time grows with the square."""
 _TWIN_IOU = 0.8
@@ -73,31 +87,36 @@ def open_detector(
     confidence: float = USUAL_CONFIDENCE,
     nms_iou: float = 0.45,
     size: tuple[int, int] | None = None,
+    head: str | None = None,
     threads: int = 1,
     provider: str = "cpu",
 ) -> Detector:
-    """Open a detector: ``motion``, the name of a model (see `resolve_model`), an ONNX file, or a plug-in's name.
+    """Open a detector: ``motion``, the name of a model (see `resolve_model`), a file, or a plug-in's name.
 
-    ``labels`` are class names, one a line; else those of the metadata, COCO (80), VisDrone (10), or "class 0" and
-    so on. ``confidence`` is the least of a detection, ``nms_iou`` the largest overlap of two of one class, both
-    0…1. ``size`` is (width, height) of the network's input where the model leaves it free; else each image gets the
-    multiples of 32 that hold it (at most 1920 on the longer side). A plug-in gets none of these; ``confidence`` is
-    applied to its answer. Raises `UserError` where there is no such model, it is not a detector, its labels do not
-    fit, or a setting is out of its range.
+    ``labels`` are class names, see `read_labels`; else those of the metadata, or "class 0" and so on, which is said.
+    ``head`` is one of `heads.choose.HEAD_NAMES`; else the file tells, or what it answers. ``confidence`` is the least
+    of a detection, ``nms_iou`` the largest overlap of two of one class, both 0…1. ``size`` is (width, height) of the
+    network's input where the model leaves it free; else each image gets the multiples of the network's stride that
+    hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). A plug-in gets none of these;
+    ``confidence`` is applied to its answer. Raises `UserError` where there is no such model, it is no detector, its
+    labels do not fit, or a setting is out of its range.
     """
     for name, value in (("confidence", confidence), ("NMS IoU", nms_iou)):
         if not 0 <= value <= 1:
             raise UserError(f"{name} {value} is not accepted; a number from 0 to 1 is")
+    check_head_name(head)
+    plug_in = None if spec == MOTION else plug_in_of(spec, taken=model_names)
+    if head is not None and (spec == MOTION or plug_in is not None):
+        raise UserError(f"--head {head} has no say: {spec!r} is no network of a file")
     if spec == MOTION:
         return MotionDetector(confidence=confidence)
-    plug_in = plug_in_of(spec, taken=model_names)
     if plug_in is not None:
         if labels is not None:
             raise UserError(f"labels file {labels} has no say: detector {spec!r} brings its own class names")
         return PlugInDetector(plug_in, spec, confidence=confidence)
     path = resolve_model(spec, role="detector", words=(MOTION, *plug_in_names()))
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
-    return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size)
+    return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size, head=head)
 
 
 def detect_every(given: int | None, *, fps: float) -> int:
@@ -120,8 +139,8 @@ def warm_up(detector: Detector, size: tuple[int, int]) -> None:
 class OnnxDetector:
     """A network with one of the known heads; arguments as of `open_detector`.
 
-    Construction runs the network once on grey: that tells the head by its values too, and warms it up. Raises
-    `UserError` where the model is not a detector, or the labels or the size do not fit it.
+    Construction runs the network on a few made pictures: that tells the head by its values too, and warms it up.
+    Raises `UserError` where the model is not a detector, its head is open, or the labels or the size do not fit it.
     """
 
     def __init__(
@@ -132,29 +151,54 @@ class OnnxDetector:
         confidence: float = USUAL_CONFIDENCE,
         nms_iou: float = 0.45,
         size: tuple[int, int] | None = None,
+        head: str | None = None,
     ) -> None:
         self.model = model
-        self.head: Head
         self._confidence = confidence
         self._nms_iou = nms_iou
-        self._fixed_size = _fixed_size(model, size)
-        self._enlarge_to = _enlarge_to(model)
-        self._output_index, self.head = _find_head(model, self._fixed_size or (_TRIAL_SIDE, _TRIAL_SIDE))
-        self.class_names = _class_names(model, self.head, labels)
-        self._group_ids = _group_ids(self.class_names)
+        task = model.metadata.get("task", _TASK)
+        if task != _TASK:
+            raise UserError(_not_a_detector(model, f"its task is '{task:.80}', and {_TASK} is accepted"))
+        self._channels_last, declared = _geometry(model)
+        names = read_labels(labels) if labels is not None else class_labels(model.path, model.metadata)
+        self._cells = _cells(model)
+        self._fixed_size = _fixed_size(model, declared, size, self._cells[0])
+        self._enlarge_to, self._trained_at = _enlarge_to(model), _trained_at(model)
+        trial = self._try_out(None if names is None else len(names))
+        try:
+            self.head = choose_head(trial, wanted=head)
+        except UserError as error:
+            raise UserError(_not_a_detector(model, str(error), channels_last=self._channels_last)) from None
+        self.preparation = prepared_as(model.path, model.metadata, self.head.preparation)
         dtype = model.inputs[0].dtype
         assert dtype is not None
+        if dtype == np.uint8:  # it scales the pixels itself
+            self.preparation = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=self.preparation.rgb)
+        self.class_names = _class_names(model, self.head, names, labels)
+        self._group_ids = _group_ids(self.class_names)
+        self._beyond_said = False
         self._letterboxer = Letterboxer(
-            anchor=self.head.anchor, rgb=self.head.rgb, gain=self.head.gain, dtype=dtype
+            anchor=self.head.anchor,
+            preparation=self.preparation,
+            dtype=dtype,
+            channels_last=self._channels_last,
         )
+        _log.info("%s is taken for %s: %s; %s", model.path.name, self.head.name, self.head.why, self.pixels)
+
+    @property
+    def pixels(self) -> str:
+        """How the network gets its pixels, in words."""
+        how = (
+            "stretched" if self.head.anchor == "stretch" else f"letterbox {self.head.anchor}, filled with 114"
+        )
+        return f"{self.preparation}, {how}{', channels last' if self._channels_last else ''}"
 
     def detect(self, image_bgr: Image) -> Detections:
         """Run the network on one (height, width, 3) uint8 image of any size; grey is accepted too."""
         image = as_bgr(image_bgr)
         input_size = self.input_size((image.shape[1], image.shape[0]))
         tensor, letterbox = self._letterboxer.fill(image, input_size)
-        output = self.model.run(tensor)[self._output_index].astype(np.float32, copy=False)
-        found = self.head.decode(output, confidence=self._confidence, input_size=input_size)
+        found = self.head.decode(self._run(tensor), confidence=self._confidence, input_size=input_size)
         if self.head.suppresses:
             group_ids = self._group_ids[np.minimum(found.class_ids, len(self._group_ids) - 1)]
             candidates = found.boxes_input_px, found.scores, group_ids
@@ -163,21 +207,97 @@ class OnnxDetector:
             selected = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
         boxes = letterbox.to_image(found.boxes_input_px[selected])
         class_ids = found.class_ids[selected]
-        inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & (class_ids < len(self.class_names))
+        named = class_ids < len(self.class_names)
+        if not named.all() and not self._beyond_said:
+            self._beyond_said = True
+            _log.warning(
+                "%s lists class %d, and has names up to class %d: what has no name is left out; --labels names all",
+                self.model.path.name,
+                int(class_ids.max()),
+                len(self.class_names) - 1,
+            )
+        inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & named
         return Detections(boxes[inside], found.scores[selected][inside], class_ids[inside])
 
     def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
         """(width, height) in pixels that the network gets for an image of this (width, height).
 
         A network that was trained for small objects may want small images enlarged (``hvt.enlarge_to`` in its
-        metadata): on a base stream of 640x360 a car is six pixels long, and lies within one cell.
+        metadata): on a base stream of 640x360 a car is six pixels long, and lies within one cell. One that says the
+        side that it was trained at (``imgsz``) gets that side.
         """
         if self._fixed_size is not None:
             return self._fixed_size
         longest = max(image_size)
-        scale = min(max(1.0, min(self._enlarge_to / longest, _MOST_ENLARGED)), _MAX_FREE_SIDE / longest)
-        width, height = (-int(-side * scale // _CELL) * _CELL for side in image_size)
-        return max(width, _CELL), max(height, _CELL)
+        wanted = self._enlarge_to or self._trained_at
+        scale = min(wanted / longest, _MOST_ENLARGED) if wanted else 1.0
+        if not self._trained_at or self._enlarge_to:
+            scale = max(1.0, scale)
+        scale = min(scale, _MAX_FREE_SIDE / longest)
+        cell = self._cells[0]
+        width, height = (-int(-side * scale // cell) * cell for side in image_size)
+        return max(width, cell), max(height, cell)
+
+    def _run(self, tensor: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        """All outputs; a second input is the size of the picture, in which boxes are then given."""
+        if len(self.model.inputs) == 1:
+            return self.model.run(tensor)
+        height, width = tensor.shape[1:3] if self._channels_last else tensor.shape[2:]
+        return self.model.run(tensor, np.array([[width, height]], self.model.inputs[1].dtype))
+
+    def _try_out(self, names: int | None) -> Trial:
+        """Run the network on `trial_pictures`; where its sides are free, at the least multiples that it takes."""
+        if self._fixed_size is not None:
+            return self._tried(self._fixed_size, names)
+        failure: UserError | None = None
+        for index, cell in enumerate(self._cells):
+            try:
+                trial = self._tried((_TRIAL_CELLS[0] * cell, _TRIAL_CELLS[1] * cell), names)
+            except UserError as error:
+                failure = failure or error
+                continue
+            self._cells = self._cells[index:]
+            return trial
+        side = self._trained_at or _USUAL_SIDE
+        try:  # its sides are free by name alone
+            trial = self._tried((side, side), names)
+        except UserError:
+            assert failure is not None
+            raise failure from None
+        self._fixed_size = (side, side)
+        _log.info("%s runs at %dx%d alone, though its file says any size", self.model.path.name, side, side)
+        return trial
+
+    def _tried(self, size: tuple[int, int], names: int | None) -> Trial:
+        dtype = self.model.inputs[0].dtype
+        assert dtype is not None
+        runs, tops = [], []
+        for picture, top in trial_pictures(size, dtype):
+            laid = np.ascontiguousarray(picture.transpose(0, 2, 3, 1)) if self._channels_last else picture
+            outputs = self._run(laid)
+            # Half precision may overflow where the range of the pixels is not the network's.
+            if not top or all(_is_finite(output) for output in outputs):
+                runs.append(outputs)
+                tops.append(top)
+        return Trial(self.model.outputs, runs, tops, size, self.model.metadata, names)
+
+
+def _is_finite(output: npt.NDArray[Any]) -> bool:
+    return not np.issubdtype(output.dtype, np.floating) or bool(np.isfinite(output).all())
+
+
+def _cells(model: OnnxModel) -> tuple[int, ...]:
+    """Of what the sides of a free input may be multiples, likeliest first: ``stride`` of the metadata, if it says."""
+    text = model.metadata.get("stride", "")
+    if text.isascii() and text.isdigit() and int(text) in (8, 16, *_CELLS):
+        return (max(_CELL, int(text)),)
+    return _CELLS
+
+
+def _trained_at(model: OnnxModel) -> int:
+    """The longer side of ``imgsz`` in the metadata, pixels: ``[640, 640]`` or ``640``; 0 where it does not say."""
+    sides = [int(word) for word in re.findall(r"\d{2,4}", model.metadata.get("imgsz", ""))]
+    return min(max(sides), _MAX_FREE_SIDE) if 1 <= len(sides) <= 2 else 0
 
 
 def _enlarge_to(model: OnnxModel) -> int:
@@ -200,22 +320,36 @@ def _group_ids(class_names: tuple[str, ...]) -> npt.NDArray[np.int32]:
     return np.array([groups.index(group) for group in groups], np.int32)
 
 
-def _fixed_size(model: OnnxModel, size: tuple[int, int] | None) -> tuple[int, int] | None:
-    """(width, height) of the input, from the model or the user; None where every image chooses its own."""
-    if len(model.inputs) != 1 or len(model.inputs[0].shape) != 4 or model.inputs[0].shape[1] not in (3, None):
+def _geometry(model: OnnxModel) -> tuple[bool, tuple[int | None, int | None]]:
+    """Whether channels come last, and the (width, height) that the file declares, None where free."""
+    image, *more = model.inputs
+    if len(image.shape) != 4 or (3 not in (image.shape[1], image.shape[3]) and image.shape[1] is not None):
         raise UserError(_not_a_detector(model, "its input is not one (1, 3, height, width) image"))
-    batch, _, height, width = model.inputs[0].shape
-    if batch not in (1, None):
-        raise UserError(_not_a_detector(model, f"it takes {batch} images at once"))
-    if model.inputs[0].dtype not in (np.float32, np.float16):
-        raise UserError(_not_a_detector(model, "its input is neither float32 nor float16"))
+    if len(more) > 1 or any(one.shape[1:] != (2,) or one.dtype is None for one in more):
+        raise UserError(
+            _not_a_detector(model, "its input is not one (1, 3, height, width) image, or that and its size")
+        )
+    if image.shape[0] not in (1, None):
+        raise UserError(_not_a_detector(model, f"it takes {image.shape[0]} images at once"))
+    if image.dtype not in (np.float32, np.float16, np.uint8):
+        raise UserError(_not_a_detector(model, "its input is neither float32, float16 nor uint8"))
+    channels_last = image.shape[3] == 3 and image.shape[1] != 3
+    height, width = image.shape[1:3] if channels_last else image.shape[2:]
+    return channels_last, (width, height)
+
+
+def _fixed_size(
+    model: OnnxModel, declared: tuple[int | None, int | None], size: tuple[int, int] | None, cell: int
+) -> tuple[int, int] | None:
+    """(width, height) of the input, from the model or the user; None where every image chooses its own."""
+    width, height = declared
     if size is None:
         # One free side gives a square; with both free, every image chooses.
         side = width or height
         return (width or side, height or side) if side else None
-    if any(side % _CELL or not 0 < side <= _MAX_SIDE for side in size):
+    if any(side % cell or not 0 < side <= _MAX_SIDE for side in size):
         raise UserError(
-            f"detector size {size[0]}x{size[1]} is not accepted; multiples of {_CELL} to {_MAX_SIDE} are"
+            f"detector size {size[0]}x{size[1]} is not accepted; multiples of {cell} to {_MAX_SIDE} are"
         )
     if size[0] != (width or size[0]) or size[1] != (height or size[1]):
         raise UserError(
@@ -224,40 +358,28 @@ def _fixed_size(model: OnnxModel, size: tuple[int, int] | None) -> tuple[int, in
     return size
 
 
-def _find_head(model: OnnxModel, trial_size: tuple[int, int]) -> tuple[int, Head]:
-    """Run the network once on grey and find the one output that a known head explains."""
-    width, height = trial_size
-    dtype = model.inputs[0].dtype
-    outputs = model.run(np.full((1, 3, height, width), 0.5, dtype))
-    task = model.metadata.get("task", "detect")
-    if task != "detect":
-        raise UserError(_not_a_detector(model, f"its task is '{task}'"))
-    heads = [(index, choose_head(output, trial_size)) for index, output in enumerate(outputs)]
-    known = [(index, head) for index, head in heads if head is not None]
-    if len(known) != 1:
-        raise UserError(
-            _not_a_detector(model, "of its outputs " + ("several" if known else "none") + " fit a known head")
-        )
-    return known[0]
-
-
-def _not_a_detector(model: OnnxModel, why: str) -> str:
+def _not_a_detector(model: OnnxModel, why: str, *, channels_last: bool = False) -> str:
+    inputs = "; ".join(map(str, model.inputs)) + (", channels last" if channels_last else "")
     outputs = "; ".join(map(str, model.outputs))
     return (
         f"model {model.path} is not a detector that is known here: {why}"
-        f" (outputs: {outputs}; accepted heads: {ACCEPTED_HEADS})"
+        f" (input: {inputs}; outputs: {outputs}; accepted heads: {', '.join(HEAD_NAMES)})"
     )
 
 
-def _class_names(model: OnnxModel, head: Head, labels: Path | None) -> tuple[str, ...]:
-    names = read_labels(labels) if labels is not None else metadata_labels(model.metadata)
+def _class_names(
+    model: OnnxModel, head: Head, names: tuple[str, ...] | None, labels: Path | None
+) -> tuple[str, ...]:
     origin = f"labels file {labels}" if labels is not None else f"metadata of {model.path}"
-    if head.classes is None:
-        if names is None:
-            raise UserError(f"model {model.path} does not say its class names; give them with a labels file")
-        return names
-    if names is not None and len(names) != head.classes:
+    if names is None:
+        count = head.classes or _UNNAMED
+        _log.warning(
+            "%s has no class names: its classes are class 0 to class %d; --labels FILE names them (or --labels %s)",
+            model.path.name,
+            count - 1,
+            ", ".join(KNOWN_LABELS),
+        )
+        return tuple(f"class {index}" for index in range(count))
+    if head.classes is not None and len(names) != head.classes:
         raise UserError(f"{origin} has {len(names)} class names; {model.path} has {head.classes} classes")
-    defaults = {len(COCO_NAMES): COCO_NAMES, len(VISDRONE_NAMES): VISDRONE_NAMES}
-    numbered = tuple(f"class {index}" for index in range(head.classes))
-    return names or defaults.get(head.classes, numbered)
+    return names

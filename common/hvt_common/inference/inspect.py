@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,13 +13,13 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import OnnxClassifier
 from hvt_common.inference.detect import OnnxDetector
-from hvt_common.inference.detect_heads import EndToEndHead, UltralyticsHead, YoloxHead
+from hvt_common.inference.heads.kinds import KINDS
+from hvt_common.inference.runtimes.ir_file import files_of, is_ir
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, Port, open_model
 from hvt_common.inference.runtimes.onnx_file import opset_versions
 
 __all__ = ["ModelReport", "inspect_model"]
 
-_HEADS: Mapping[type, str] = {YoloxHead: "YOLOX", UltralyticsHead: "Ultralytics", EndToEndHead: "end-to-end"}
 _ROUNDS = 9
 _TIME_LIMIT_S = 3.0
 _FREE_SIZE = (640, 384)
@@ -47,17 +47,24 @@ class ModelReport:
     median_ms: float | None
 
 
-def inspect_model(path: Path, *, provider: str = "cpu", threads: int = 2) -> ModelReport:
-    """Open a model, try it as a detector and as a classifier, and time it.
+def inspect_model(
+    path: Path,
+    *,
+    provider: str = "cpu",
+    threads: int = 2,
+    head: str | None = None,
+    labels: Path | None = None,
+) -> ModelReport:
+    """Open a model, try it as a detector and as a classifier, and time it; ``head`` and ``labels`` as of these.
 
-    Raises `UserError` where it is no ONNX model, or not one that this provider opens.
+    Raises `UserError` where it is no model, or not one that this provider opens, or of another head than is said.
     """
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
-    adapter, because, class_names, once, timing = _fitted(model)
+    adapter, because, class_names, once, timing = _fitted(model, head, labels)
     return ModelReport(
         path=path,
-        size_bytes=path.stat().st_size,
-        opsets=opset_versions(path),
+        size_bytes=sum(file.stat().st_size for file in files_of(path)),
+        opsets={} if is_ir(path) else opset_versions(path),
         inputs=model.inputs,
         outputs=model.outputs,
         metadata=model.metadata,
@@ -70,11 +77,13 @@ def inspect_model(path: Path, *, provider: str = "cpu", threads: int = 2) -> Mod
     )
 
 
-def _fitted(model: OnnxModel) -> tuple[str, str, tuple[str, ...], Callable[[], object] | None, str]:
+def _fitted(
+    model: OnnxModel, head: str | None, labels: Path | None
+) -> tuple[str, str, tuple[str, ...], Callable[[], object] | None, str]:
     noise = np.random.default_rng(0).integers(0, 256, (_FREE_SIZE[1], _FREE_SIZE[0], 3), dtype=np.uint8)
     refusals = []
     try:
-        detector = OnnxDetector(model)
+        detector = OnnxDetector(model, head=head, labels=labels)
         width, height = detector.input_size(_FREE_SIZE)
         return (
             "detector",
@@ -84,9 +93,11 @@ def _fitted(model: OnnxModel) -> tuple[str, str, tuple[str, ...], Callable[[], o
             f"one {_FREE_SIZE[0]}x{_FREE_SIZE[1]} image at a network input of {width}x{height}",
         )
     except UserError as error:
+        if head is not None:
+            raise
         refusals.append(_short(error))
     try:
-        classifier = OnnxClassifier(model)
+        classifier = OnnxClassifier(model, labels=labels)
         return (
             "classifier",
             _classifier_text(classifier),
@@ -101,18 +112,11 @@ def _fitted(model: OnnxModel) -> tuple[str, str, tuple[str, ...], Callable[[], o
 
 def _detector_text(detector: OnnxDetector) -> str:
     head = detector.head
-    order = "RGB" if head.rgb else "BGR"
-    pixels = "0…1" if head.gain < 1 else "0…255"
-    return f"{_HEADS[type(head)]} head; {order} {pixels}, letterbox {head.anchor}, filled with 114"
+    return f"head {head.name} ({KINDS[head.name].text}): {head.why}; {detector.pixels}"
 
 
 def _classifier_text(classifier: OnnxClassifier) -> str:
-    preparation = classifier.preparation
-    mean, divisor = (
-        " ".join(f"{value:.6g}" for value in values)
-        for values in (preparation.mean, tuple(1 / scale for scale in preparation.scale))
-    )
-    return f"one row of scores a crop; {'RGB' if preparation.rgb else 'BGR'}, (pixel - {mean}) / {divisor}, stretched"
+    return f"one row of scores a crop; {classifier.preparation} ({classifier.why}), stretched"
 
 
 def _short(error: UserError) -> str:

@@ -8,8 +8,21 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from hvt_common.errors import UserError
+from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
+from hvt_common.inference.store import known_classes
 
-__all__ = ["MAX_LABELS", "MAX_LABEL_CHARS", "first_synonym", "metadata_labels", "read_labels"]
+__all__ = [
+    "KNOWN_LABELS",
+    "MAX_LABELS",
+    "MAX_LABEL_CHARS",
+    "class_labels",
+    "first_synonym",
+    "metadata_labels",
+    "read_labels",
+]
+
+KNOWN_LABELS: Mapping[str, tuple[str, ...]] = {"coco": COCO_NAMES, "visdrone": VISDRONE_NAMES}
+"""What may be said in place of a file. A number of classes alone never means one of these."""
 
 MAX_LABELS = 100_000
 MAX_LABEL_CHARS = 200
@@ -18,12 +31,14 @@ _MAX_METADATA_CHARS = 1 << 20
 
 
 def read_labels(path: Path) -> tuple[str, ...]:
-    """Read class names: UTF-8 text, one name a line, the first line is class 0.
+    """Read class names: UTF-8 text, one name a line, the first line is class 0; or one of `KNOWN_LABELS`.
 
     Blank lines at the end are ignored; spaces around a name too. A name may occur twice (ImageNet has two
     cranes). Raises `UserError` where it is missing, not readable, not text, or empty, has a blank line in the
     middle, or too many or too long names.
     """
+    if str(path) in KNOWN_LABELS and not path.exists():
+        return KNOWN_LABELS[str(path)]
     names = [line.strip() for line in _read_text(path).rstrip().splitlines()]
     if names == []:
         raise UserError(f"labels file {path} is empty; one class name a line is expected")
@@ -43,6 +58,11 @@ def read_labels(path: Path) -> tuple[str, ...]:
                 f"labels file {path} is not text in line {number}; one class name a line is expected"
             )
     return tuple(names)
+
+
+def class_labels(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...] | None:
+    """The class names that a model carries, or that are known of this very file; None where there are none."""
+    return metadata_labels(metadata) or KNOWN_LABELS.get(known_classes(path))
 
 
 def metadata_labels(metadata: Mapping[str, str]) -> tuple[str, ...] | None:

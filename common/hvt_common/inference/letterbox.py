@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.inference.preparation import Preparation
 from hvt_common.values import Boxes, Image
 
 __all__ = ["Anchor", "Letterbox", "Letterboxer", "as_bgr"]
 
-Anchor = Literal["top-left", "centre"]
-"""Where the resized image lies on the network's input."""
+Anchor = Literal["top-left", "centre", "stretch"]
+"""Where the resized image lies on the network's input; ``stretch`` fills it, whatever becomes of the shape."""
 
 _FILL = 114  # the grey of YOLO letterboxes
 
@@ -32,8 +33,11 @@ class Letterbox:
     def fitted(cls, image_size: tuple[int, int], input_size: tuple[int, int], *, anchor: Anchor) -> Letterbox:
         """Fit the whole image, its shape kept, up to the rounding that the networks were trained with.
 
-        ``top-left`` cuts the size down to whole pixels as YOLOX does, ``centre`` rounds it as Ultralytics does.
+        ``top-left`` cuts the size down to whole pixels as YOLOX does, ``centre`` rounds it as Ultralytics does;
+        ``stretch`` keeps no shape.
         """
+        if anchor == "stretch":
+            return cls(image_size, (0, 0, *input_size))
         scale = min(input_size[0] / image_size[0], input_size[1] / image_size[1])
         whole = int if anchor == "top-left" else round
         width, height = (
@@ -61,25 +65,35 @@ class Letterbox:
 class Letterboxer:
     """Writes images into one reused network input; nothing is allocated while the geometry stays the same.
 
-    ``anchor`` is where the image lies; the network sees ``pixel * gain`` as float32 or float16, in RGB order where
-    ``rgb``.
+    ``anchor`` is where the image lies, ``preparation`` what the network sees of a pixel, as float32, float16 or,
+    where it is the pixel itself, uint8.
     """
 
-    def __init__(self, *, anchor: Anchor, rgb: bool, gain: float, dtype: np.dtype[Any]) -> None:
+    def __init__(
+        self, *, anchor: Anchor, preparation: Preparation, dtype: np.dtype[Any], channels_last: bool = False
+    ) -> None:
         self._anchor: Anchor = anchor
-        self._rgb = rgb
-        # A table of 256 values is exact and as fast as a multiplication; float16 passes through OpenCV as its bits.
-        table = (np.arange(256, dtype=np.float32) * np.float32(gain)).astype(dtype)
-        self._table = table if dtype == np.float32 else table.view(np.uint16)
+        self._rgb = preparation.rgb
+        # Tables of 256 values are exact and as fast as a multiplication; float16 passes through OpenCV as its bits.
+        pixels = np.arange(256, dtype=np.float32)
+        self._tables = [
+            _bits(((pixels - np.float32(mean)) * np.float32(scale)).astype(dtype))
+            for mean, scale in zip(preparation.mean, preparation.scale, strict=True)
+        ]
         self._dtype = dtype
+        self._channels_last = channels_last
         self._input_size = (0, 0)
         self._letterbox: Letterbox | None = None
         self._canvas: Image
         self._plane: npt.NDArray[np.uint8]
         self._tensor: npt.NDArray[Any]
+        self._last: npt.NDArray[Any]
 
     def fill(self, image_bgr: Image, input_size: tuple[int, int]) -> tuple[npt.NDArray[Any], Letterbox]:
-        """Return the (1, 3, height, width) input, valid until the next call, and how the image lies on it."""
+        """Return the (1, 3, height, width) input, valid until the next call, and how the image lies on it.
+
+        It is (1, height, width, 3) where channels come last.
+        """
         image_size = (image_bgr.shape[1], image_bgr.shape[0])
         if (
             self._letterbox is None
@@ -94,22 +108,32 @@ class Letterboxer:
             np.copyto(place, image_bgr)
         else:
             cv2.resize(image_bgr, (width, height), dst=place, interpolation=cv2.INTER_LINEAR)
-        for channel, target in enumerate(self._targets[::-1] if self._rgb else self._targets):
-            cv2.extractChannel(self._canvas, channel, dst=self._plane)
-            cv2.LUT(self._plane, self._table, dst=target)
-        return self._tensor, self._letterbox
+        for index, (target, table) in enumerate(zip(self._targets, self._tables, strict=True)):
+            cv2.extractChannel(self._canvas, 2 - index if self._rgb else index, dst=self._plane)
+            cv2.LUT(self._plane, table, dst=target)
+        if not self._channels_last:
+            return self._tensor, self._letterbox
+        np.copyto(self._last, self._tensor.transpose(0, 2, 3, 1))
+        return self._last, self._letterbox
 
     def _lay_out(self, image_size: tuple[int, int], input_size: tuple[int, int]) -> None:
         width, height = input_size
         self._letterbox = Letterbox.fitted(image_size, input_size, anchor=self._anchor)
         self._input_size = input_size
         # The former input goes before the new one comes: 33 MB for a 1080p source.
-        self._canvas = self._plane = self._tensor = np.empty(0, np.uint8)
+        self._canvas = self._plane = self._tensor = self._last = np.empty(0, np.uint8)
         self._targets: list[npt.NDArray[Any]] = []
         self._canvas = np.full((height, width, 3), _FILL, np.uint8)
         self._plane = np.empty((height, width), np.uint8)
         self._tensor = np.empty((1, 3, height, width), self._dtype)
-        self._targets = list(self._tensor.view(self._table.dtype)[0])
+        self._targets = list(_bits(self._tensor)[0])
+        if self._channels_last:
+            self._last = np.empty((1, height, width, 3), self._dtype)
+
+
+def _bits(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The same memory in a type that OpenCV knows."""
+    return values.view(np.uint16) if values.dtype == np.float16 else values
 
 
 def as_bgr(image: npt.NDArray[np.uint8]) -> Image:

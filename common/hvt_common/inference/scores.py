@@ -8,6 +8,7 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import MOTION, USUAL_CONFIDENCE
 from hvt_common.inference.labels import metadata_labels
+from hvt_common.inference.runtimes.ir_file import ir_metadata, is_ir
 from hvt_common.inference.runtimes.onnx_file import onnx_metadata
 from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
 from hvt_common.inference.store import resolve_model
@@ -59,7 +60,8 @@ def _metadata(spec: str, *, role: str) -> dict[str, str]:
     """Of a file; the motion detector and plug-ins have none."""
     if role == "detector" and (spec == MOTION or plug_in_of(spec) is not None):
         return {}
-    return onnx_metadata(resolve_model(spec, role=role, words=(MOTION, *plug_in_names())))
+    path = resolve_model(spec, role=role, words=(MOTION, *plug_in_names()))
+    return ir_metadata(path) if is_ir(path) else onnx_metadata(path)
 
 
 def uncalibrated(role: str, spec: str) -> str:

@@ -34,6 +34,7 @@ def make_detector(config: EdgeConfig) -> Detector:
         labels=config.labels,
         confidence=weak_confidence(track_confidence(config)),
         nms_iou=config.nms_iou,
+        head=config.head,
         threads=config.threads,
         # By its speed auto may choose one this time and another the next, and their answers differ a little.
         provider="cpu" if config.pace == "lockstep" and config.provider == "auto" else config.provider,

@@ -54,6 +54,7 @@ class Models:
             labels=config.detector_labels,
             confidence=weak_confidence(track_confidence(config)),
             nms_iou=config.nms_iou,
+            head=config.head,
             threads=config.threads,
             provider=config.provider,
         )

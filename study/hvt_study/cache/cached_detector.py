@@ -21,6 +21,7 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector
+from hvt_common.inference.runtimes.ir_file import files_of
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Detections, Image
@@ -51,7 +52,7 @@ class CachedDetector(OnnxDetector):
             open_model(path, settings=ModelSettings(threads=1, provider=provider)), confidence=confidence
         )
         said = (
-            _digest_of_file(path.resolve()),
+            *(_digest_of_file(file.resolve()) for file in files_of(path)),
             self.model.provider.provider,
             f"{confidence:g}",
             *_versions(),

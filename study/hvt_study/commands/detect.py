@@ -17,6 +17,7 @@ from rich.table import Table
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import kind_of
 from hvt_common.inference.detect import Detector, open_detector
+from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.scores import default_confidence
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import tiled
@@ -54,6 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, default=argparse.SUPPRESS, metavar="DIR")
     parser.add_argument("--detector", default=EMBEDDED_DETECTOR, metavar="FILE", help="as of hvt-edge")
+    parser.add_argument(
+        "--head", metavar="NAME", help=f"what its outputs mean, as of hvt-edge: {', '.join(HEAD_NAMES)}"
+    )
+    parser.add_argument(
+        "--labels", type=Path, metavar="FILE", help="class names of the detector, as of hvt-edge"
+    )
     parser.add_argument(
         "--size",
         default="1280x720",
@@ -93,6 +100,8 @@ def run(arguments: argparse.Namespace) -> int:
     detector = tiled(
         open_detector(
             arguments.detector,
+            labels=arguments.labels,
+            head=arguments.head,
             confidence=_LEAST_CONFIDENCE,
             threads=arguments.threads,
             provider=arguments.provider,

@@ -28,6 +28,8 @@ def scores(path: Path, crop: np.ndarray) -> np.ndarray:
     [
         (1001, {}, (np.array([50, 100, 200]) - 128) / 128),
         (1000, {}, (np.array([50, 100, 200]) / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]),
+        (9, {"author": "Ultralytics", "task": "classify"}, np.array([50, 100, 200]) / 255),
+        (9, {"task": "classify"}, np.array([50, 100, 200]) / 255),
         (7, {"hvt.mean": "1, 2, 3", "hvt.scale": "(0.01)"}, (np.array([50, 100, 200]) - [1, 2, 3]) / 100),
         (
             1001,
@@ -185,3 +187,13 @@ def test_a_real_detector_is_no_classifier(data: Path) -> None:
     """Swapping the two model options would go unnoticed."""
     with pytest.raises(UserError, match="is not a classifier"):
         open_classifier(str(data / "models/yolox_nano.onnx"))
+
+
+def test_of_several_outputs_the_names_tell_which(tmp_path: Path) -> None:
+    """A network that names kind and colour would call every car red, or the reverse."""
+    path = constant_model(tmp_path / "c.onnx", np.array([[0.1, 0.9]]), np.array([[0.2, 0.3, 0.5]]))
+    with pytest.raises(UserError, match="several outputs are scores, which --labels decides"):
+        open_classifier(str(path))
+    labels = tmp_path / "labels.txt"
+    labels.write_text("car\nbus\nvan\n")
+    assert open_classifier(str(path), labels=labels).classify([BLUE])[0].class_name == "van"

@@ -1,4 +1,4 @@
-"""Runs a network: `model` opens an ONNX file, `onnx_file` reads what is in one, `providers` names who runs it.
+"""Runs a network: `model` opens a file, `providers` names who runs it.
 
-`plug_in` takes detectors of other packages.
+`onnx_file` and `ir_file` read what is in a file, `plug_in` takes detectors of other packages.
 """

@@ -1,14 +1,16 @@
-"""ONNX models, on onnxruntime or another runtime: the only file that imports onnxruntime.
+"""Models, on onnxruntime or another runtime: the only file that imports onnxruntime.
 
 A model file comes from outside: `onnx_file` checks it first, and what it declares has bounds. It is read as ONNX
 whatever its name ends in, and no custom operator library is registered. A model that another runtime will run is
-opened by onnxruntime first: that gives ports and metadata, and no runtime gets a file that onnxruntime refuses.
+opened by onnxruntime first: that gives ports and metadata, and no runtime gets a file that onnxruntime refuses. An
+OpenVINO model (``.xml``) is run by OpenVINO alone.
 """
 
 from __future__ import annotations
 
 import logging
 import math
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +25,8 @@ import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from hvt_common.errors import UserError
-from hvt_common.inference.runtimes.onnx_file import check_onnx_file
+from hvt_common.inference.runtimes.ir_file import ir_metadata, is_ir
+from hvt_common.inference.runtimes.onnx_file import check_onnx_file, onnx_version, opset_versions
 from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
 from hvt_common.inference.runtimes.providers import ONNXRUNTIME_PROVIDERS, ProviderChoice, choose_provider
 from hvt_common.runtime.process import NETWORK_NICENESS, lower_priority
@@ -39,6 +42,7 @@ _MOST_AXES = 8
 _MOST_ELEMENTS = 1 << 26
 """Of one input or output with its free sizes taken as 1: 256 MiB of float32, a picture of 4096x4096 and more."""
 
+_MOST_CHARS = 300
 _TRIAL_SIDE = 256
 _TRIALS = 5
 _WORTH_SHARE = 0.8
@@ -95,7 +99,7 @@ class Port:
 
 
 class _Runner(Protocol):
-    def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]: ...
+    def run(self, feed: npt.NDArray[Any], *more: npt.NDArray[Any]) -> list[npt.NDArray[Any]]: ...
 
 
 class OnnxModel:
@@ -109,17 +113,24 @@ class OnnxModel:
     """
 
     def __init__(
-        self, path: Path, session: ort.InferenceSession, *, runner: _Runner, provider: ProviderChoice
+        self,
+        path: Path,
+        *,
+        inputs: tuple[Port, ...],
+        outputs: tuple[Port, ...],
+        metadata: Mapping[str, str],
+        runner: _Runner,
+        provider: ProviderChoice,
     ) -> None:
         self.path = path
-        self.inputs = tuple(_port(value) for value in session.get_inputs())
-        self.outputs = tuple(_port(value) for value in session.get_outputs())
-        self.metadata: dict[str, str] = dict(session.get_modelmeta().custom_metadata_map)
+        self.inputs = inputs
+        self.outputs = outputs
+        self.metadata: dict[str, str] = dict(metadata)
         self.provider = provider
         self._runner = runner
 
-    def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
-        """Run the model on its only input; return its outputs in their declared order.
+    def run(self, feed: npt.NDArray[Any], *more: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        """Run the model on its inputs, mostly one; return its outputs in their declared order.
 
         Raises `UserError` where this model cannot run on an input of this shape.
         """
@@ -129,7 +140,7 @@ class OnnxModel:
         ):
             shape = "x".join(map(str, feed.shape))
             raise UserError(f"model {self.path} does not run on a {shape} input: it takes {port}")
-        return self._runner.run(feed)
+        return self._runner.run(feed, *more)
 
 
 class _Background:
@@ -154,20 +165,21 @@ class _InBackground:
     background: _Background
     runner: _Runner
 
-    def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
-        return self.background.do(lambda: self.runner.run(feed))
+    def run(self, feed: npt.NDArray[Any], *more: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        return self.background.do(lambda: self.runner.run(feed, *more))
 
 
 class _OnnxRuntimeRunner:
     def __init__(self, path: Path, session: ort.InferenceSession) -> None:
         self._path = path
         self._session = session
-        self._input_name = session.get_inputs()[0].name if session.get_inputs() else ""
+        self._input_names = [port.name for port in session.get_inputs()]
         self._output_names = [port.name for port in session.get_outputs()]
 
-    def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+    def run(self, feed: npt.NDArray[Any], *more: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        feeds = dict(zip(self._input_names, (feed, *more), strict=False))
         try:
-            outputs: list[npt.NDArray[Any]] = self._session.run(self._output_names, {self._input_name: feed})
+            outputs: list[npt.NDArray[Any]] = self._session.run(self._output_names, feeds)
         except _ORT_ERRORS as error:
             shape = "x".join(map(str, feed.shape))
             raise UserError(
@@ -177,7 +189,7 @@ class _OnnxRuntimeRunner:
 
 
 def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxModel:
-    """Open an ONNX file; what runs it is logged, with the reason.
+    """Open an ONNX file, or OpenVINO's ``.xml``; what runs it is logged, with the reason.
 
     Raises `UserError` where there is no such file, or it is too large, no ONNX model or one that the runtime
     cannot load; or for a provider that is unknown, not installed or cannot start.
@@ -186,6 +198,8 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
     choice = choose_provider(
         settings.provider, onnxruntime=ort.get_available_providers(), openvino=find_openvino
     )
+    if is_ir(path):
+        return _open_ir(path, settings)
     check_onnx_file(path)
     try:
         model = _open(path, settings, choice)
@@ -199,6 +213,30 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
         raise UserError(f"model {path} cannot be opened: a name in it is not text") from error
     _log.info("%s runs on %s: %s", path.name, model.provider.provider, model.provider.why)
     return model
+
+
+def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
+    """An OpenVINO model, in float32 where the reference is asked for."""
+    if settings.provider not in ("auto", "cpu", "openvino"):
+        raise UserError(
+            f"model {path} is OpenVINO's: --provider {settings.provider} cannot run it; openvino can"
+        )
+    metadata = ir_metadata(path)
+    found = find_openvino()
+    if found is None:
+        raise UserError(
+            f"model {path} is OpenVINO's, which is not installed here: pip install 'hvt[openvino]'"
+        )
+    bf16 = found.bf16 and settings.provider != "cpu"
+    background = _Background()
+    openvino = background.do(lambda: OpenVinoRunner(path, threads=settings.threads, bf16=bf16))
+    inputs, outputs = (tuple(Port(*port) for port in ports) for ports in openvino.ports)
+    runner = _InBackground(background, openvino)
+    why = f"OpenVINO {found.version} in {'bf16' if bf16 else 'float32'}: the file is OpenVINO's"
+    choice = ProviderChoice("openvino", why, explicit=True)
+    _check_ports(path, inputs, outputs)
+    _log.info("%s runs on openvino: %s", path.name, why)
+    return OnnxModel(path, inputs=inputs, outputs=outputs, metadata=metadata, runner=runner, provider=choice)
 
 
 def _quicker(openvino: OnnxModel, path: Path, settings: ModelSettings) -> OnnxModel:
@@ -239,7 +277,7 @@ def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxMo
         found = find_openvino()
         bf16 = found is not None and found.bf16
         openvino = background.do(lambda: OpenVinoRunner(path, threads=settings.threads, bf16=bf16))
-        return OnnxModel(path, described, runner=_InBackground(background, openvino), provider=choice)
+        return _described(path, described, _InBackground(background, openvino), choice)
     names = ONNXRUNTIME_PROVIDERS[choice.provider]
     session = background.do(lambda: _session(path, settings, names))
     if session.get_providers()[0] != names[0]:
@@ -247,7 +285,21 @@ def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxMo
             f"--provider {choice.provider} did not start (its driver or libraries are missing): choose cpu"
         )
     runner = _InBackground(background, _OnnxRuntimeRunner(path, session))
-    return OnnxModel(path, session, runner=runner, provider=choice)
+    return _described(path, session, runner, choice)
+
+
+def _described(
+    path: Path, session: ort.InferenceSession, runner: _Runner, choice: ProviderChoice
+) -> OnnxModel:
+    """With the ports and metadata that onnxruntime finds."""
+    return OnnxModel(
+        path,
+        inputs=tuple(map(_port, session.get_inputs())),
+        outputs=tuple(map(_port, session.get_outputs())),
+        metadata=session.get_modelmeta().custom_metadata_map,
+        runner=runner,
+        provider=choice,
+    )
 
 
 def _session(
@@ -269,17 +321,17 @@ def _session(
         # Without its own fallback, which tries the same again and prints banners.
         session = ort.InferenceSession(str(path), options, providers=list(providers), enable_fallback=0)
     except _ORT_ERRORS as error:
-        raise UserError(f"model {path} cannot be opened: {_reason(error)}") from error
-    _check_ports(path, session)
+        raise UserError(f"model {path} cannot be opened: {_cause(path, error)}") from error
+    _check_ports(path, tuple(map(_port, session.get_inputs())), tuple(map(_port, session.get_outputs())))
     return session
 
 
-def _check_ports(path: Path, session: ort.InferenceSession) -> None:
+def _check_ports(path: Path, inputs: tuple[Port, ...], outputs: tuple[Port, ...]) -> None:
     """Refuse a model whose ports are out of bounds."""
-    for side, ports in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
+    for side, ports in (("inputs", inputs), ("outputs", outputs)):
         if not 1 <= len(ports) <= _MOST_PORTS:
             raise UserError(f"model {path} has {len(ports)} {side}; 1 to {_MOST_PORTS} are accepted")
-        for port in map(_port, ports):
+        for port in ports:
             elements = math.prod(size or 1 for size in port.shape)
             if len(port.shape) > _MOST_AXES or elements > _MOST_ELEMENTS:
                 raise UserError(
@@ -294,7 +346,50 @@ def _port(value: Any) -> Port:
     return Port(value.name, shape, None if element is None else np.dtype(element))
 
 
+def _cause(path: Path, error: Exception) -> str:
+    """Why onnxruntime does not open a file: what was found, what is supported here, and what to do."""
+    text = " ".join(str(error).split())
+    version, producer = onnx_version(path)
+    known = {
+        "here": f"onnxruntime {ort.__version__}",
+        "version": version,
+        "opset": opset_versions(path).get("", 0),
+        "by": f" (written by {producer})" if producer else "",
+    }
+    for pattern, sentence in _CAUSES.items():
+        if found := re.search(pattern, text):
+            return sentence.format(*found.groups(), **known)
+    return _reason(error)
+
+
+_NEWER = "pip install -U onnxruntime, or export the model anew"
+_WITHOUT = "export the model without it, such as without NMS inside"
+_CAUSES: Mapping[str, str] = {
+    r"max supported IR version: (\d+)": (
+        f"it has IR version {{version}}{{by}}, and {{here}} reads up to {{0}}: {_NEWER} for that version"
+    ),
+    r"(?:till|up to|is) opset (\d+)": (
+        f"it has opset {{opset}}{{by}}, and {{here}} knows up to {{0}}: {_NEWER} with opset_version={{0}}"
+    ),
+    r"([\w.]+):(\w+)\(-?\d+\) is not a registered function": (
+        f"it needs the operator {{1}} of {{0}}, which {{here}} does not have: {_WITHOUT}"
+    ),
+    r"No opset import for domain '([^']*)'": (
+        f"it needs operators of {{0}}, which {{here}} does not have: {_WITHOUT}"
+    ),
+    r"No Op registered for (\w+) with domain_version of (\d+)": (
+        "opset {1} has no operator {0}{by}: export the model anew with a higher opset_version"
+    ),
+    r"Could not find an implementation for (\w+)\((\d+)\)": (
+        "{here} has no {0} (opset {1}) for its type of numbers: export the model in float32"
+    ),
+}
+"""What onnxruntime says, and what is said instead."""
+
+
 def _reason(error: Exception) -> str:
-    """The first line of onnxruntime's message without its code prefix, at most 200 characters."""
+    """The first line of onnxruntime's message without its code prefix and its files, at most 300 characters."""
     lines = str(error).strip().splitlines()
-    return (lines[0] if lines else type(error).__name__).rpartition("] : ")[2][:200]
+    line = lines[0] if lines else type(error).__name__
+    line = re.sub(r"^(\[ONNXRuntimeError\] : \d+ : \w+ : )?(/\S+:\d+ .*?\) )?", "", line)
+    return line if len(line) <= _MOST_CHARS else line[:_MOST_CHARS].rpartition(" ")[0] + " …"

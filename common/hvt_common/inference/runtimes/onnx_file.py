@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 from hvt_common.errors import UserError
 
-__all__ = ["MAX_MODEL_BYTES", "check_onnx_file", "onnx_metadata", "opset_versions"]
+__all__ = ["MAX_MODEL_BYTES", "check_onnx_file", "onnx_metadata", "onnx_version", "opset_versions"]
 
 MAX_MODEL_BYTES = 1 << 30
 """1 GiB: the largest detectors are a fifth of it, and protobuf itself stops at 2 GiB."""
@@ -27,6 +27,7 @@ _EXTERNAL = 1
 
 # Field numbers of ModelProto in onnx.proto.
 _MODEL_FIELDS = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 14, 20, 25, 26})
+_VERSION_FIELD, _PRODUCER_FIELD, _PRODUCER_VERSION_FIELD = 1, 2, 3
 _GRAPH_FIELD = 7
 _OPSET_FIELD = 8
 _METADATA_FIELD = 14
@@ -78,6 +79,18 @@ def opset_versions(path: Path) -> dict[str, int]:
             for field, _, _, begin, end in _fields(data, 0, len(data))
             if field == _OPSET_FIELD
         )
+
+
+def onnx_version(path: Path) -> tuple[int, str]:
+    """The version of the file format (IR version) of a checked model, and who wrote it."""
+    version, producer = 0, ""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for field, _, value, begin, end in _fields(data, 0, len(data)):
+            if field == _VERSION_FIELD:
+                version = value
+            elif field in (_PRODUCER_FIELD, _PRODUCER_VERSION_FIELD):
+                producer = f"{producer} {data[begin:end][:80].decode(errors='replace')}".strip()
+    return version, producer
 
 
 def onnx_metadata(path: Path) -> dict[str, str]:

@@ -21,6 +21,7 @@ from hvt_common.inference.runtimes.providers import OpenVinoCpu
 __all__ = ["OpenVinoRunner", "find_openvino"]
 
 _MAX_SHAPES = 4
+_Port = tuple[str, tuple[int | None, ...], np.dtype[Any] | None]
 
 
 def find_openvino() -> OpenVinoCpu | None:
@@ -63,14 +64,20 @@ class OpenVinoRunner:
             raise UserError(f"model {path} cannot be read by openvino: {_reason(error)}") from error
         self._requests: OrderedDict[tuple[int, ...], Any] = OrderedDict()
 
-    def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
-        """Run on the only input; the outputs in their declared order, float tensors of their own.
+    @property
+    def ports(self) -> tuple[list[_Port], list[_Port]]:
+        """Inputs and outputs as the file declares them: name, shape with None where free, dtype."""
+        return [_port(one) for one in self._model.inputs], [_port(one) for one in self._model.outputs]
+
+    def run(self, feed: npt.NDArray[Any], *more: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        """Run on the inputs; the outputs in their declared order, tensors of their own.
 
         Raises `UserError` where OpenVINO cannot run this model on an input of this shape.
         """
         try:
             request = self._request(feed.shape)
-            results = request.infer({0: np.ascontiguousarray(feed)}, share_inputs=True)
+            feeds = {index: np.ascontiguousarray(one) for index, one in enumerate((feed, *more))}
+            results = request.infer(feeds, share_inputs=True)
             return [np.asarray(results[index]) for index in range(len(results))]
         except RuntimeError as error:
             shape = "x".join(map(str, feed.shape))
@@ -97,6 +104,15 @@ class OpenVinoRunner:
             ).create_infer_request()
         self._requests.move_to_end(key)
         return self._requests[key]
+
+
+def _port(value: Any) -> _Port:
+    shape = tuple(side.get_length() if side.is_static else None for side in value.get_partial_shape())
+    try:
+        dtype = np.dtype(value.element_type.to_dtype())
+    except (RuntimeError, TypeError):  # a type that numpy does not have
+        dtype = None
+    return min(value.names, default=value.node.friendly_name), shape, dtype
 
 
 def _reason(error: Exception) -> str:

@@ -7,8 +7,16 @@ from hvt_common.inference.store.resolve import (
     EMBEDDED_CLASSIFIER,
     EMBEDDED_DETECTOR,
     embedded_models,
+    known_classes,
     model_names,
     resolve_model,
 )
 
-__all__ = ["EMBEDDED_CLASSIFIER", "EMBEDDED_DETECTOR", "embedded_models", "model_names", "resolve_model"]
+__all__ = [
+    "EMBEDDED_CLASSIFIER",
+    "EMBEDDED_DETECTOR",
+    "embedded_models",
+    "known_classes",
+    "model_names",
+    "resolve_model",
+]

@@ -12,9 +12,17 @@ from importlib import resources
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_common.inference.store.store import Store
+from hvt_common.inference.store.manifest import builtin_manifest
+from hvt_common.inference.store.store import Store, file_digest
 
-__all__ = ["EMBEDDED_CLASSIFIER", "EMBEDDED_DETECTOR", "embedded_models", "model_names", "resolve_model"]
+__all__ = [
+    "EMBEDDED_CLASSIFIER",
+    "EMBEDDED_DETECTOR",
+    "embedded_models",
+    "known_classes",
+    "model_names",
+    "resolve_model",
+]
 
 EMBEDDED_DETECTOR = "aerial-nano"
 """Finds vehicles and people from straight above or aslant."""
@@ -32,6 +40,17 @@ def embedded_models() -> dict[str, Path]:
 def model_names() -> tuple[str, ...]:
     """Every name that `resolve_model` knows; of fetched models too, whether they are here or not."""
     return (*embedded_models(), *Store().entries)
+
+
+def known_classes(path: Path) -> str:
+    """The set whose classes a file has that the built-in manifest pins, in lower case (``coco``); "" for others."""
+    try:
+        size_bytes = path.stat().st_size
+    except OSError:
+        return ""
+    entries = [entry for entry in builtin_manifest().values() if entry.size_bytes == size_bytes]
+    same = [entry for entry in entries if file_digest(path) == entry.sha256]
+    return same[0].classes.partition(",")[0].lower() if same else ""
 
 
 def resolve_model(

@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -144,3 +145,60 @@ def test_an_input_of_the_wrong_shape_is_a_sentence(tmp_path: Path) -> None:
     model = open_model(constant_model(tmp_path / "m.onnx", np.ones((1, 2))))
     with pytest.raises(UserError, match="does not run on a 1x3x32x32 input"):
         model.run(np.zeros((1, 3, 32, 32), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (
+            {"ir_version": 99},
+            r"IR version 99 \(written by tool\), and onnxruntime .* reads up to \d+: pip install -U",
+        ),
+        ({"opset": 99}, r"it has opset 99 .* knows up to \d+: .* opset_version=\d+"),
+        (
+            {"domain": "mmdeploy"},
+            r"operator Relu of mmdeploy, which onnxruntime .* export the model without it",
+        ),
+        ({"operator": "Foo"}, r"opset 13 has no operator Foo .*export the model anew"),
+    ],
+)
+def test_what_the_runtime_does_not_read_is_said_with_what_to_do(
+    tmp_path: Path, settings: dict[str, Any], words: str
+) -> None:
+    """A model of a newer exporter would be refused with a line of C++."""
+    value = helper.make_tensor_value_info
+    domain = settings.get("domain", "")
+    graph = helper.make_graph(
+        [helper.make_node(settings.get("operator", "Relu"), ["x"], ["y"], domain=domain)],
+        "newer",
+        [value("x", TensorProto.FLOAT, [4])],
+        [value("y", TensorProto.FLOAT, [4])],
+    )
+    opsets = [helper.make_opsetid("", settings.get("opset", 13))]
+    opsets += [helper.make_opsetid(domain, 1)] if domain else []
+    model = helper.make_model(
+        graph, opset_imports=opsets, ir_version=settings.get("ir_version", 8), producer_name="tool"
+    )
+    (tmp_path / "m.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(UserError, match=words) as caught:
+        open_model(tmp_path / "m.onnx")
+    assert ".cc:" not in str(caught.value)
+
+
+def test_an_openvino_model_needs_its_weights_and_its_runtime(tmp_path: Path, monkeypatch) -> None:
+    """Half a copy would end in a traceback of openvino, and a machine without it in none at all."""
+    path = tmp_path / "net.xml"
+    path.write_text("<net name='n' version='11'></net>")
+    with pytest.raises(UserError, match=r"net\.xml has no net\.bin beside it"):
+        open_model(path)
+    path.with_suffix(".bin").write_bytes(b"1")
+    with pytest.raises(UserError, match=r"net\.xml (cannot be read by openvino|has 0 inputs)"):
+        open_model(path)
+    with pytest.raises(UserError, match="--provider cuda cannot run it"):
+        open_model(path, settings=ModelSettings(provider="cuda"))
+    monkeypatch.setattr("hvt_common.inference.runtimes.model.find_openvino", lambda: None)
+    with pytest.raises(UserError, match=r"pip install 'hvt\[openvino\]'"):
+        open_model(path)
+    path.write_text("<?xml version='1.0'?><!DOCTYPE net [<!ENTITY a 'b'>]><net></net>")
+    with pytest.raises(UserError, match="is not an OpenVINO model"):
+        open_model(path)

@@ -471,7 +471,11 @@ def test_the_manifest_and_the_adapters_prepare_pixels_alike(tmp_path: Path) -> N
         assert said is not None
         if entry.task == "detector":
             assert said["fit"] == f"letterbox, {head.anchor}, 114"
-            assert (said["channels"] == "RGB", said["mean"], said["scale"]) == (head.rgb, [0], [head.gain])
+            assert (said["channels"] == "RGB", said["mean"], said["scale"]) == (
+                head.preparation.rgb,
+                [0],
+                [head.preparation.scale[0]],
+            )
         else:
             assert said["channels"] == ("RGB" if preparation.rgb else "BGR")
             assert said["mean"] == list(preparation.mean)
@@ -534,17 +538,21 @@ def test_embedded_models_are_found_by_name(folder: Path) -> None:
 
 
 INFO: list[tuple[Callable[[Path], Path], str, str]] = [
-    (lambda path: colour_detector(path, "yolox"), "detector", "YOLOX head; BGR 0…255, letterbox top-left"),
+    (
+        lambda path: colour_detector(path, "yolox"),
+        "detector",
+        "head yolox .*counted from it; BGR 0…255, letterbox top-left",
+    ),
     (
         lambda path: colour_detector(path, "ultralytics"),
         "detector",
-        "Ultralytics head; RGB 0…1, letterbox centre",
+        "head yolov8 .*: a column a cell: .*; RGB 0…1, letterbox centre",
     ),
     (colour_classifier, "classifier", "RGB, .pixel - 123.675 116.28 103.53. / 58.395"),
     (
         lambda path: constant_model(path, np.ones((1, 2, 8, 8))),
         "none",
-        "fit a known head; no output is one row",
+        "fit no head that is known; no output is one row",
     ),
 ]
 

@@ -1,0 +1,72 @@
+"""Which head a network has: as the user says, else as its file says, else as all its outputs together prove."""
+
+from __future__ import annotations
+
+from hvt_common.errors import UserError
+from hvt_common.inference.heads.contract import Head
+from hvt_common.inference.heads.kinds import KINDS, Kind, Match
+from hvt_common.inference.heads.trial import Trial
+
+__all__ = ["HEAD_NAMES", "check_head_name", "choose_head"]
+
+HEAD_NAMES = tuple(KINDS)
+"""What ``--head`` takes."""
+_RT_DETR = ("rt-detr-rows", "rt-detr")
+_RAW_AXES = 5
+"""(1, 3, H, W, 5+C): what YOLOv5's levels say, beside all of them decoded."""
+
+
+def check_head_name(name: str | None) -> None:
+    """`UserError` for a name that no head has."""
+    if name is not None and name not in KINDS:
+        raise UserError(f"--head '{name}' is not known: choose one of {', '.join(KINDS)}")
+
+
+def choose_head(trial: Trial, *, wanted: str | None = None) -> Head:
+    """The head that the outputs belong to; ``wanted`` is as of ``--head``.
+
+    Raises:
+        UserError: the half sentence that says why none is certain, and what decides it.
+    """
+    check_head_name(wanted)
+    said = trial.metadata.get("head", "")
+    if wanted is not None or said in KINDS:
+        return _as_told(trial, wanted or said, "--head" if wanted else "its metadata: head")
+    kinds: dict[str, Kind] = dict(KINDS)
+    why = ""
+    if _says_rt_detr(trial):
+        kinds = {name: KINDS[name] for name in _RT_DETR}
+        why = f"its metadata say {'head ' + said if said else 'RT-DETR'}: "
+    found = {name: match for name, kind in kinds.items() if (match := kind.fits(trial)) is not None}
+    certain = {name: match for name, match in found.items() if match.proof and _explains(trial, match)}
+    if not certain and why:
+        certain = found
+    if len(certain) == 1:
+        ((name, match),) = certain.items()
+        return kinds[name].head(name, match, why + (match.proof or "its shape fits"))
+    if not found:
+        raise UserError("its outputs fit no head that is known")
+    likely = [name for name, match in found.items() if match.possible and _explains(trial, match)]
+    could = " or ".join(certain or likely or found)
+    raise UserError(f"its outputs could be {could}, which --head NAME decides")
+
+
+def _as_told(trial: Trial, name: str, by: str) -> Head:
+    kind = KINDS[name]
+    match = kind.fits(trial)
+    if match is None:
+        raise UserError(f"its outputs are not those of {by} {name}, which is {kind.text}")
+    return kind.head(name, match, f"{by} {name}")
+
+
+def _says_rt_detr(trial: Trial) -> bool:
+    """As Ultralytics writes it into ``head``, earlier into ``description``."""
+    said = trial.metadata.get("head", "") + trial.metadata.get("description", "")
+    return "rtdetr" in said.lower().replace("-", "")
+
+
+def _explains(trial: Trial, match: Match) -> bool:
+    """Whether every other output is the head's too: raw levels, or a second branch of the same shape."""
+    shapes = {trial.shape(index) for index in match.outputs}
+    rest = set(range(len(trial.ports))) - set(match.outputs)
+    return all(len(trial.shape(index)) == _RAW_AXES or trial.shape(index) in shapes for index in rest)

@@ -1,0 +1,506 @@
+"""The heads that are known, and what tells each of them from all others.
+
+A head *fits* where the outputs have its shape. It is *proven* where the values of the trial, the names of the outputs
+or the number of class names leave no other: then `Match.proof` says what. With ``--head`` a fit is enough.
+
+A is the number of cells of all strides for the input size, which no number of classes or objects equals by accident.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvt_common.inference.heads.contract import Array, Decoder, Head
+from hvt_common.inference.heads.decode import (
+    MOST_RELATIVE,
+    Corners,
+    Dense,
+    Listed,
+    Parallel,
+    PerQuery,
+    YoloxCells,
+    cell_grid,
+    rows_of,
+)
+from hvt_common.inference.heads.trial import Trial, anchor_count, are_probabilities, are_whole
+from hvt_common.inference.letterbox import Anchor
+from hvt_common.inference.preparation import Preparation
+
+__all__ = ["KINDS", "Kind", "Match"]
+
+_STRIDES: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32), (16, 32))
+_YOLOX_STRIDES: tuple[tuple[int, ...], ...] = (*_STRIDES[:2], (8, 16, 32, 12, 24, 48))
+_ANCHORS_A_CELL = 3
+"""Of YOLOv5 and YOLOv7."""
+_LEAST_COLUMNS, _BOX = 5, 4
+
+_BGR_255 = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=False)
+_RGB_1 = Preparation(mean=(0.0,) * 3, scale=(1 / 255,) * 3)
+_RGB_255 = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """The outputs have the shape of a head."""
+
+    outputs: tuple[int, ...]
+    classes: int | None
+    decoder: Decoder
+    proof: str | None
+    """What leaves no other head; None where the shape alone fits."""
+    possible: bool = True
+    """False where the values speak against it, and only the user can know better."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One head by its name."""
+
+    text: str
+    """Whose it is, and the shape of its outputs."""
+    match: Callable[[Trial], Match | None]
+    anchor: Anchor
+    preparation: Preparation
+    suppresses: bool = True
+
+    def fits(self, trial: Trial) -> Match | None:
+        """Whether the outputs have its shape, judged by the pictures in the range of its pixels."""
+        return self.match(trial.up_to(255 if self.preparation.scale[0] == 1 else 1))
+
+    def head(self, name: str, match: Match, why: str) -> Head:
+        """The head that a match means."""
+        return Head(
+            name,
+            match.classes,
+            match.outputs,
+            self.anchor,
+            self.preparation,
+            self.suppresses,
+            match.decoder,
+            why,
+        )
+
+
+def _tables(trial: Trial, columns: int | None = None) -> list[int]:
+    """Outputs (1, N, K), or (N, K) with so many columns."""
+    return [
+        index
+        for index in range(len(trial.ports))
+        for shape in [trial.shape(index)]
+        if (len(shape) == 3 and shape[0] == 1 and columns in (None, shape[2]))
+        or (len(shape) == 2 and columns is not None and shape[1] == columns)
+    ]
+
+
+def _only(found: list[int]) -> int | None:
+    return found[0] if len(found) == 1 else None
+
+
+def _of_cells(
+    trial: Trial, strides: tuple[tuple[int, ...], ...] = _STRIDES, *, times: int = 1
+) -> list[tuple[int, tuple[int, ...]]]:
+    """Outputs (1, A, K) with a row for each cell, and the strides of the cells."""
+    return [
+        (index, one)
+        for index in _tables(trial)
+        for one in strides
+        if trial.shape(index)[1] == times * anchor_count(trial.size, one)
+        and trial.shape(index)[2] >= _LEAST_COLUMNS
+    ]
+
+
+def _is_listed(trial: Trial, index: int) -> bool:
+    """Whether the rows are objects: neither rows nor columns are cells."""
+    counts = [anchor_count(trial.size, strides) for strides in _STRIDES]
+    cells = {*counts, *(_ANCHORS_A_CELL * count for count in counts)}
+    return cells.isdisjoint(trial.shape(index)[-2:])
+
+
+# --- a row a cell ---------------------------------------------------------------------------------------------------
+
+
+def _yolox(trial: Trial) -> Match | None:
+    for index, strides in _of_cells(trial, _YOLOX_STRIDES):
+        classes = trial.shape(index)[2] - 5
+        if classes < 1 or not are_probabilities(trial.table(index)[:, 4:]):
+            continue
+        raw = _is_raw(trial, index, strides)
+        proof = "a row a cell, x and y counted from it" if raw else None
+        return Match((index,), classes, YoloxCells(strides), proof, possible=raw)
+    return None
+
+
+def _yolox_decoded(trial: Trial) -> Match | None:
+    return _with_objectness(trial, constant=False)
+
+
+def _yolov6(trial: Trial) -> Match | None:
+    return _with_objectness(trial, constant=True)
+
+
+def _with_objectness(trial: Trial, *, constant: bool) -> Match | None:
+    """(1, A, 5+C) in pixels; YOLOv6 has no objectness, and writes 1."""
+    for index, strides in _of_cells(trial, _YOLOX_STRIDES):
+        classes, table = trial.shape(index)[2] - 5, trial.table(index)
+        if classes < 1 or not are_probabilities(table[:, 4:]) or _is_raw(trial, index, strides):
+            continue
+        ones = bool((abs(table[:, 4] - 1) < 1e-3).all())
+        if ones != constant:
+            continue
+        proof = None
+        if ones:
+            proof = "a row a cell in pixels, and column 5 is always 1"
+        elif classes == trial.names:
+            proof = f"a row a cell in pixels, objectness and {classes} scores, as many as there are names"
+        return Match((index,), classes, Dense(objectness=True), proof)
+    return None
+
+
+def _yolov8_rows(trial: Trial) -> Match | None:
+    for index, strides in _of_cells(trial):
+        classes, table = trial.shape(index)[2] - 4, trial.table(index)
+        if not are_probabilities(table[:, 4:]) or _is_raw(trial, index, strides):
+            continue
+        same = classes == trial.names
+        proof = f"a row a cell in pixels and {classes} scores, as many as there are names" if same else None
+        return Match((index,), classes, Dense(), proof)
+    return None
+
+
+def _yolov5(trial: Trial) -> Match | None:
+    for index, _ in _of_cells(trial, times=_ANCHORS_A_CELL):
+        classes, table = trial.shape(index)[2] - 5, trial.table(index)
+        if classes >= 1 and are_probabilities(table[:, 4:]):
+            return Match(
+                (index,), classes, Dense(objectness=True), "three rows a cell: box, objectness and scores"
+            )
+    return None
+
+
+def _yolov8(trial: Trial) -> Match | None:
+    counts = [anchor_count(trial.size, strides) for strides in _STRIDES]
+    found = [
+        index
+        for index in _tables(trial)
+        for shape in [trial.shape(index)]
+        if shape[2] in counts and shape[1] >= _LEAST_COLUMNS and are_probabilities(_scores(trial, index))
+    ]
+    if not found or len({trial.shape(index) for index in found}) > 1:
+        return None
+    # YOLOv9 writes its auxiliary branch too: the main one is the surer of both.
+    best = max(found, key=lambda index: float(_scores(trial, index).max(initial=0)))
+    proof = "a column a cell: box and scores" + ("; of both branches the surer one" if len(found) > 1 else "")
+    return Match((best,), trial.shape(best)[1] - 4, Dense(transposed=True), proof)
+
+
+def _scores(trial: Trial, index: int) -> Array:
+    return np.concatenate([run[index][0, 4:].astype(np.float32) for run in trial.runs], axis=1)
+
+
+def _is_raw(trial: Trial, index: int, strides: tuple[int, ...]) -> bool:
+    """Whether centres lie nearer to zero, counted in cells, than to their cells in pixels."""
+    grid, stride = cell_grid(trial.size, strides)
+    centres = rows_of(trial.runs[0][index].astype(np.float32))[:, :2]
+    if float(np.abs(centres).max(initial=0)) == 0:
+        return True
+    as_shares = np.abs(centres * np.array(trial.size, np.float32) / stride - grid - 0.5).mean()
+    as_pixels = np.abs(centres / stride - grid - 0.5).mean()
+    return bool(np.abs(centres).mean() <= min(as_shares, as_pixels))
+
+
+# --- a row an object ------------------------------------------------------------------------------------------------
+
+
+def _end_to_end(trial: Trial) -> Match | None:
+    index = _only(_tables(trial, 6))
+    if index is None or not _is_score_and_class(trial, index):
+        return None
+    proof = None
+    table = trial.table(index)
+    boxes = _shown(table)
+    if _is_listed(trial, index) or len(boxes) < 0.5 * len(table):  # a row a cell has no padding
+        if not len(boxes):
+            proof = "rows of six; none in the trial, so as x1 y1 x2 y2 score class, which is usual"
+        elif _are_corners(boxes):
+            proof = "rows of six: x1 y1 x2 y2, a score and a class"
+    return Match((index,), None, Listed(0, 4, 5), proof)
+
+
+def _rt_detr_rows(trial: Trial) -> Match | None:
+    """(1, N, 6) or (1, N, 4+C), boxes by their centre; as Ultralytics exports RT-DETR."""
+    index = _only([one for one in _tables(trial) if trial.shape(one)[2] >= _LEAST_COLUMNS])
+    if index is None or not _is_listed(trial, index):
+        return None
+    table, columns = trial.table(index), trial.shape(index)[2]
+    by_centre = _shows_centres(_shown(table))
+    if columns == 6 and _is_score_and_class(trial, index):
+        proof = "rows of six: a box by its centre, a score and a class" if by_centre else None
+        return Match((index,), None, Listed(0, 4, 5, form="centre"), proof)
+    if not are_probabilities(table[:, 4:]):
+        return None
+    proof = f"rows of a box by its centre and {columns - 4} scores" if by_centre else None
+    return Match((index,), columns - 4, Dense(), proof)
+
+
+def _yolov7_rows(trial: Trial) -> Match | None:
+    return _with_image(trial, score=6, kind=5, columns="image, x1 y1 x2 y2, class, score")
+
+
+def _nas_rows(trial: Trial) -> Match | None:
+    return _with_image(trial, score=5, kind=6, columns="image, x1 y1 x2 y2, score, class")
+
+
+def _with_image(trial: Trial, *, score: int, kind: int, columns: str) -> Match | None:
+    index = _only([one for one in _tables(trial, 7) if len(trial.shape(one)) == 2])
+    if index is None:
+        return None
+    table = trial.table(index)
+    proof = None
+    if len(table):
+        if not are_probabilities(table[:, score]) or not are_whole(table[:, kind]):
+            return None
+        told = not are_whole(table[:, score]) or float(table[:, kind].max()) > 1
+        proof = f"rows of seven: {columns}" if told else None
+    return Match((index,), None, Listed(1, score, kind, image=0), proof)
+
+
+def _ssd(trial: Trial) -> Match | None:
+    found = [index for index in range(len(trial.ports)) if trial.shape(index)[:2] == (1, 1)]
+    index = _only([one for one in found if len(trial.shape(one)) == 4 and trial.shape(one)[3] == 7])
+    proof = "(1, 1, N, 7): image, class, score, x1 y1 x2 y2"
+    return None if index is None else Match((index,), None, Listed(3, 2, 1, image=0), proof)
+
+
+def _is_score_and_class(trial: Trial, index: int) -> bool:
+    table = trial.table(index)
+    return are_probabilities(table[:, 4]) and are_whole(table[:, 5])
+
+
+def _shown(table: Array) -> Array:
+    """(N, 4) boxes of the rows that are not padding."""
+    boxes = table[:, :4]
+    return boxes[np.isfinite(boxes).all(axis=1) & (boxes > 0).any(axis=1)]
+
+
+def _are_corners(boxes: Array) -> bool:
+    """Whether x1 y1 x2 y2 can be meant."""
+    return bool((boxes[:, 2:] >= boxes[:, :2]).all() and (boxes[:, 2:] > boxes[:, :2]).any())
+
+
+def _shows_centres(boxes: Array) -> bool:
+    """Whether a centre, width and height are meant: shares of the input that cannot be corners."""
+    inside = float(np.abs(boxes).max(initial=0)) <= MOST_RELATIVE
+    return bool(len(boxes) and inside and not _are_corners(boxes) and (boxes >= 0).all())
+
+
+# --- boxes, scores and classes apart --------------------------------------------------------------------------------
+
+
+def _boxes_and_table(trial: Trial) -> tuple[int, int] | None:
+    """Outputs (1, N, 4) and (1, N, C)."""
+    tables = _tables(trial)
+    pairs = [
+        (boxes, scores)
+        for boxes in tables
+        for scores in tables
+        if boxes != scores
+        and trial.shape(boxes)[2] == _BOX
+        and trial.shape(boxes)[1] == trial.shape(scores)[1]
+    ]
+    if len(pairs) > 1:  # four classes: the box is named so
+        pairs = [pair for pair in pairs if "box" in trial.ports[pair[0]].name.lower()]
+    return pairs[0] if len(pairs) == 1 else None
+
+
+def _yolo_nas(trial: Trial) -> Match | None:
+    pair = _boxes_and_table(trial)
+    if pair is None or not are_probabilities(trial.table(pair[1])):
+        return None
+    boxes = trial.table(pair[0])
+    a_row_a_cell = (
+        not _is_listed(trial, pair[0]) and _are_corners(_shown(boxes)) and not trial.relative(boxes)
+    )
+    proof = "boxes x1 y1 x2 y2 and scores, a row a cell" if a_row_a_cell else None
+    return Match(pair, trial.shape(pair[1])[2], PerQuery("corners"), proof)
+
+
+def _rt_detr(trial: Trial) -> Match | None:
+    pair = _boxes_and_table(trial)
+    if pair is None or not _is_listed(trial, pair[0]):
+        return None
+    boxes, table = trial.table(pair[0]), trial.table(pair[1])
+    if not np.isfinite(table).all():
+        return None
+    logits = not are_probabilities(table)
+    words = " ".join(trial.ports[index].name.lower() for index in pair)
+    # Of a softmax over "no object" the greatest logit is positive everywhere, on grey too.
+    grey = rows_of(trial.runs[0][pair[1]].astype(np.float32))
+    sigmoid = not logits or float((grey.max(axis=1) > 0).mean()) < 0.5
+    told = trial.relative(boxes) and (logits or "logit" in words or _shows_centres(_shown(boxes)))
+    proof = f"boxes by their centre in 0…1 and {'logits' if logits else 'scores'}, a row a query"
+    found = Match(
+        pair, trial.shape(pair[1])[2], PerQuery("centre", logits=logits), proof if told and sigmoid else None
+    )
+    return None if "dets" in words else found  # RF-DETR, which wants other pixels
+
+
+def _rf_detr(trial: Trial) -> Match | None:
+    pair = _boxes_and_table(trial)
+    if pair is None or trial.named("dets", "labels") != pair:
+        return None
+    proof = "outputs dets and labels" if trial.relative(trial.table(pair[0])) else None
+    return Match(pair, trial.shape(pair[1])[2], PerQuery("centre", logits=True), proof)
+
+
+def _nms_lists(trial: Trial) -> Match | None:
+    count = _only([i for i in range(len(trial.ports)) if np.prod(trial.shape(i)) == 1 and trial.whole(i)])
+    lists = _lists(trial, leave=count)
+    if count is None or lists is None or "detection_boxes" in trial.ports[lists[0]].name:
+        return None
+    proof = "a count, boxes, scores and classes"
+    return Match((*lists, count), None, Parallel(), proof if _are_corners_or_none(trial, lists[0]) else None)
+
+
+def _labels_boxes_scores(trial: Trial) -> Match | None:
+    lists = _lists(trial, leave=None) if len(trial.ports) == 3 else None
+    if lists is None:
+        return None
+    proof = "boxes, scores and classes" if _are_corners_or_none(trial, lists[0]) else None
+    return Match(lists, None, Parallel(), proof)
+
+
+def _tf_lists(trial: Trial) -> Match | None:
+    lists = trial.named("detection_boxes", "detection_scores", "detection_classes")
+    count = trial.named("num_detections")
+    if not lists or trial.shape(lists[0])[-1] != _BOX:
+        return None
+    proof = "outputs detection_boxes, detection_scores and detection_classes"
+    return Match((*lists, *count), None, Parallel("corners-yx", first_class=1), proof)
+
+
+def _atss(trial: Trial) -> Match | None:
+    boxes = _only([*_tables(trial, 5)])
+    if boxes is None:
+        return None
+    kinds = _only([i for i in range(len(trial.ports)) if i != boxes and trial.whole(i)])
+    if kinds is None or np.prod(trial.shape(kinds)) != np.prod(trial.shape(boxes)[:-1]):
+        return None
+    table = trial.table(boxes)
+    if not are_probabilities(table[:, 4]) or not _are_corners_or_none(trial, boxes):
+        return None
+    return Match((boxes, kinds), None, Corners(), "boxes with their score, and classes")
+
+
+def _lists(trial: Trial, *, leave: int | None) -> tuple[int, int, int] | None:
+    """Outputs of boxes (…N, 4), scores (…N) and classes (…N); which is which is told by type, then by name."""
+    rest = [index for index in range(len(trial.ports)) if index != leave]
+    boxes = _only([i for i in rest if len(trial.shape(i)) in (2, 3) and trial.shape(i)[-1] == _BOX])
+    if boxes is None:
+        return None
+    long = [i for i in rest if i != boxes and trial.shape(i) == trial.shape(boxes)[:-1]]
+    kinds = _only([i for i in long if trial.whole(i)])
+    if kinds is None:
+        words = ("class", "label")
+        kinds = _only([i for i in long if any(word in trial.ports[i].name.lower() for word in words)])
+    scores = _only([i for i in long if i != kinds])
+    if kinds is None or scores is None:
+        return None
+    fits = are_probabilities(trial.numbers(scores)) and are_whole(trial.numbers(kinds))
+    return (boxes, scores, kinds) if fits else None
+
+
+def _are_corners_or_none(trial: Trial, index: int) -> bool:
+    boxes = _shown(trial.table(index))
+    return not len(boxes) or _are_corners(boxes)
+
+
+KINDS: Mapping[str, Kind] = {
+    "yolox": Kind("YOLOX, raw: (1, A, 5+C)", _yolox, "top-left", _BGR_255),
+    "yolox-decoded": Kind("YOLOX in pixels: (1, A, 5+C)", _yolox_decoded, "top-left", _BGR_255),
+    "yolov5": Kind("YOLOv5 and YOLOv7: (1, 3A, 5+C)", _yolov5, "centre", _RGB_1),
+    "yolov6": Kind("YOLOv6: (1, A, 5+C), objectness 1", _yolov6, "centre", _RGB_1),
+    "yolov8": Kind("YOLOv8 to v13, YOLOv5-u, YOLOv9: (1, 4+C, A)", _yolov8, "centre", _RGB_1),
+    "yolov8-rows": Kind("the same, transposed: (1, A, 4+C)", _yolov8_rows, "centre", _RGB_1),
+    "end-to-end": Kind(
+        "YOLOv10, YOLO26, and NMS inside: (1, N, 6) x1 y1 x2 y2 score class",
+        _end_to_end,
+        "centre",
+        _RGB_1,
+        suppresses=False,
+    ),
+    "yolov7-rows": Kind(
+        "YOLOv7 with NMS: (N, 7) image x1 y1 x2 y2 class score",
+        _yolov7_rows,
+        "centre",
+        _RGB_1,
+        suppresses=False,
+    ),
+    "yolo-nas": Kind("YOLO-NAS: (1, A, 4) x1 y1 x2 y2 and (1, A, C)", _yolo_nas, "centre", _RGB_1),
+    "nas-rows": Kind(
+        "YOLO-NAS with NMS: (N, 7) image x1 y1 x2 y2 score class",
+        _nas_rows,
+        "centre",
+        _RGB_1,
+        suppresses=False,
+    ),
+    "nms-lists": Kind(
+        "NMS of TensorRT, YOLO-NAS, YOLOv6: count (1, 1), boxes (1, N, 4), scores (1, N), classes (1, N)",
+        _nms_lists,
+        "centre",
+        _RGB_1,
+        suppresses=False,
+    ),
+    "rt-detr": Kind(
+        "RT-DETR, D-FINE, DEIM: logits (1, N, C) and boxes (1, N, 4), centre x y w h 0…1",
+        _rt_detr,
+        "stretch",
+        _RGB_1,
+        suppresses=False,
+    ),
+    "rt-detr-rows": Kind(
+        "RT-DETR of Ultralytics: (1, N, 4+C) or (1, N, 6), centre x y w h",
+        _rt_detr_rows,
+        "stretch",
+        _RGB_1,
+        suppresses=False,
+    ),
+    "rf-detr": Kind(
+        "RF-DETR: dets (1, N, 4) and labels (1, N, C)",
+        _rf_detr,
+        "stretch",
+        Preparation.torchvision(),
+        suppresses=False,
+    ),
+    "labels-boxes-scores": Kind(
+        "RT-DETR and D-FINE as deployed, torchvision: labels (N), boxes (N, 4) x1 y1 x2 y2, scores (N)",
+        _labels_boxes_scores,
+        "stretch",
+        _RGB_1,
+        suppresses=False,
+    ),
+    "ssd": Kind(
+        "SSD of the Open Model Zoo: (1, 1, N, 7) image class score x1 y1 x2 y2",
+        _ssd,
+        "stretch",
+        _BGR_255,
+        suppresses=False,
+    ),
+    "atss": Kind(
+        "ATSS of the Open Model Zoo: boxes (N, 5) x1 y1 x2 y2 score, labels (N)",
+        _atss,
+        "stretch",
+        _BGR_255,
+        suppresses=False,
+    ),
+    "tf-lists": Kind(
+        "TensorFlow: detection_boxes (1, N, 4) y1 x1 y2 x2, _scores, _classes from 1",
+        _tf_lists,
+        "stretch",
+        _RGB_255,
+        suppresses=False,
+    ),
+}
+"""By the name of ``--head``."""

@@ -1,0 +1,226 @@
+"""Every head that the field uses: what it is taken for, and that its boxes come out where they are."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from onnx import TensorProto, helper
+
+from hvt_common.errors import UserError
+from hvt_common.inference.detect import OnnxDetector, open_detector
+from hvt_common.inference.heads.choose import HEAD_NAMES
+from hvt_common.inference.runtimes.model import open_model
+from media.head_models import FAMILIES, NEEDS_NAMES, SQUARES, family_model, picture
+from media.onnx_models import constant_model, save
+
+NAMED = {"names": "['red', 'blue']"}
+ULTRALYTICS = {**NAMED, "author": "Ultralytics", "task": "detect", "stride": "32", "imgsz": "[320, 320]"}
+
+
+def check(detector: OnnxDetector, head: str) -> None:
+    """Both squares, nothing else, and nothing on grey."""
+    assert detector.head.name == head
+    assert detector.head.why
+    found = detector.detect(picture())
+    assert found.class_ids.tolist() == [0, 1]
+    np.testing.assert_allclose(found.boxes_xyxy_px, SQUARES, atol=1.0)
+    np.testing.assert_allclose(found.confidences, [0.9, 0.8], atol=0.01)
+    assert len(detector.detect(np.full((192, 320, 3), 100, np.uint8))) == 0
+
+
+def opened(path: Path, **settings: object) -> OnnxDetector:
+    """As the programs open it."""
+    detector = open_detector(str(path), **settings)
+    assert isinstance(detector, OnnxDetector)
+    return detector
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_head_is_told_by_all_its_outputs(tmp_path: Path, family: str) -> None:
+    """A model of the field would find nothing, or boxes elsewhere, without a word."""
+    metadata = NAMED if family in NEEDS_NAMES else {}
+    check(opened(family_model(tmp_path / "m.onnx", family, metadata=metadata)), FAMILIES[family][0])
+
+
+@pytest.mark.parametrize(
+    "family", [family for family in FAMILIES if family not in ("yolox", "yolox-decoded")]
+)
+def test_metadata_of_ultralytics_change_no_head(tmp_path: Path, family: str) -> None:
+    """A file that says more would be read worse."""
+    check(opened(family_model(tmp_path / "m.onnx", family, metadata=ULTRALYTICS)), FAMILIES[family][0])
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_user_or_the_file_may_name_the_head(tmp_path: Path, family: str) -> None:
+    """What no value tells could not be used at all."""
+    head = FAMILIES[family][0]
+    path = family_model(tmp_path / "m.onnx", family)
+    check(opened(path, head=head), head)
+    path = family_model(tmp_path / "m.onnx", family, metadata={"head": head})
+    check(opened(path), head)
+    assert head in HEAD_NAMES
+
+
+@pytest.mark.parametrize("dtype", [TensorProto.FLOAT, TensorProto.FLOAT16])
+@pytest.mark.parametrize("family", ["yolov8", "yolov10", "rt-detr", "ssd", "yolo-nas"])
+def test_channels_may_come_last(tmp_path: Path, family: str, dtype: int) -> None:
+    """Exports of TensorFlow would be refused, or see one colour as another."""
+    path = family_model(tmp_path / "m.onnx", family, channels_last=True, dtype=dtype)
+    detector = opened(path)
+    check(detector, FAMILIES[family][0])
+    assert "channels last" in detector.pixels
+
+
+@pytest.mark.parametrize("channels_last", [False, True])
+def test_a_network_of_bytes_gets_bytes(tmp_path: Path, *, channels_last: bool) -> None:
+    """Pixels would be divided by 255 and all be 0."""
+    path = family_model(
+        tmp_path / "m.onnx", "tensorflow", channels_last=channels_last, dtype=TensorProto.UINT8
+    )
+    check(opened(path), "tf-lists")
+
+
+@pytest.mark.parametrize("family", NEEDS_NAMES)
+def test_what_stays_open_is_refused_with_the_option_that_decides(tmp_path: Path, family: str) -> None:
+    """One of two readings would be taken, and half of all users see nonsense."""
+    path = family_model(tmp_path / "m.onnx", family)
+    with pytest.raises(UserError, match=r"could be yolox-decoded or yolov8-rows, which --head") as caught:
+        open_detector(str(path))
+    assert "output (" in str(caught.value)
+    with pytest.raises(UserError, match="--head 'yolo' is not known: choose one of yolox, "):
+        open_detector(str(path), head="yolo")
+    with pytest.raises(UserError, match="are not those of --head ssd"):
+        open_detector(str(path), head="ssd")
+    with pytest.raises(UserError, match="--head ssd has no say"):
+        open_detector("motion", head="ssd")
+
+
+def test_rt_detr_is_told_by_what_its_file_says(tmp_path: Path) -> None:
+    """Its 300 rows look like those of others where the trial lists nothing but padding."""
+    rows = np.zeros((1, 300, 6))
+    rows[0, 0] = [0.5, 0.25, 0.2, 0.1, 0.9, 1]
+    for said in ({"head": "RTDETRDecoder"}, {"description": "Ultralytics RT-DETR-l model"}):
+        path = constant_model(tmp_path / "m.onnx", rows, metadata={**NAMED, **said}, size=(320, 320))
+        detector = opened(path)
+        assert detector.head.name == "rt-detr-rows"
+        assert detector.head.why.startswith("its metadata say")
+        np.testing.assert_allclose(
+            detector.detect(np.zeros((100, 200, 3), np.uint8)).boxes_xyxy_px, [[80, 20, 120, 30]], atol=1e-3
+        )
+
+
+def test_a_softmax_over_no_object_is_no_sigmoid(tmp_path: Path) -> None:
+    """DETR's own logits would make an object of every query."""
+    logits, boxes = np.full((1, 100, 5), -5.0), np.full((1, 100, 4), 0.3)
+    logits[..., 4] = 8
+    with pytest.raises(UserError, match="--head"):
+        open_detector(str(constant_model(tmp_path / "m.onnx", logits, boxes)))
+
+
+def test_raw_levels_beside_the_rows_are_passed_over(tmp_path: Path) -> None:
+    """YOLOv5 exports the levels before decoding too; the model would be refused as two."""
+    rows = np.zeros((1, 252, 7))
+    rows[0, :, :4] = 20
+    levels = [np.zeros((1, 3, side, side, 7)) for side in (8, 4, 2)]
+    assert opened(constant_model(tmp_path / "m.onnx", rows, *levels)).head.name == "yolov5"
+
+
+def test_classes_without_names_are_numbers_and_said_once(tmp_path: Path, caplog) -> None:
+    """Ten classes of somebody's own would be called pedestrian, people and bicycle."""
+    for classes in (10, 80):
+        caplog.clear()
+        table = np.full((1, 4 + classes, 126), 1e-3)
+        table[:, :4] = 32
+        path = str(constant_model(tmp_path / "m.onnx", table, size=(96, 64)))
+        detector = opened(Path(path))
+        assert detector.class_names == tuple(f"class {index}" for index in range(classes))
+        said = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+        assert len(said) == 1
+        assert f"class 0 to class {classes - 1}" in said[0]
+    assert opened(Path(path), labels=Path("coco")).class_names[:2] == ("person", "bicycle")
+
+
+def test_a_class_beyond_the_names_is_said_once(tmp_path: Path, caplog) -> None:
+    """Its objects would vanish, and nobody know why."""
+    rows = np.zeros((1, 20, 6))
+    rows[0, 0] = [10, 10, 40, 40, 0.9, 7]
+    rows[0, 1] = [10, 10, 40, 40, 0.8, 1]
+    detector = opened(constant_model(tmp_path / "m.onnx", rows, metadata=NAMED))
+    caplog.clear()
+    for _ in range(3):
+        assert detector.detect(np.zeros((64, 64, 3), np.uint8)).class_ids.tolist() == [1]
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 1
+    assert "lists class 7, and has names up to class 1" in said[0]
+
+
+@pytest.mark.parametrize("said", [{}, {"stride": "64"}])
+def test_a_network_of_stride_64_gets_multiples_of_it(tmp_path: Path, said: dict[str, str]) -> None:
+    """P6 networks fail on 1280x736, whose 23 rows of 32 are no whole number of 64."""
+    path = free_network(tmp_path / "m.onnx", stride=64, metadata=said)
+    detector = opened(path)
+    assert detector.input_size((1280, 720)) == (1280, 768)
+    detector.detect(np.zeros((720, 1280, 3), np.uint8))
+    assert opened(free_network(tmp_path / "n.onnx", stride=32)).input_size((1280, 720)) == (1280, 736)
+
+
+def test_a_free_network_gets_the_side_that_it_was_trained_at(tmp_path: Path) -> None:
+    """Objects would be twice as large as in training, and half of them missed."""
+    detector = opened(free_network(tmp_path / "m.onnx", stride=32, metadata={"imgsz": "[640, 640]"}))
+    sizes = [(1280, 720), (640, 360), (320, 180), (100, 100)]
+    assert [detector.input_size(size) for size in sizes] == [(640, 384), (640, 384), (640, 384), (224, 224)]
+
+
+def free_network(path: Path, *, stride: int, metadata: dict[str, str] | None = None) -> Path:
+    """A raw YOLOX head of any size that is a multiple of a stride."""
+    nodes = [
+        helper.make_node("MaxPool", ["images"], ["low"], kernel_shape=[stride] * 2, strides=[stride] * 2),
+        helper.make_node("Resize", ["low", "", "scales"], ["again"], mode="nearest"),
+        helper.make_node("Add", ["images", "again"], ["whole"]),  # fails where the sides are no multiples
+    ]
+    weights = np.zeros((7, 3, 1, 1), np.float32)
+    constants = {"w": weights, "flat": np.array([1, 7, -1], np.int64)}
+    constants["scales"] = np.array([1, 1, stride, stride], np.float32)
+    for s in (8, 16, 32):
+        nodes += [
+            helper.make_node("AveragePool", ["whole"], [f"p{s}"], kernel_shape=[s, s], strides=[s, s]),
+            helper.make_node("Conv", [f"p{s}", "w"], [f"c{s}"]),
+            helper.make_node("Reshape", [f"c{s}", "flat"], [f"r{s}"]),
+        ]
+    nodes.append(helper.make_node("Concat", ["r8", "r16", "r32"], ["columns"], axis=2))
+    nodes.append(helper.make_node("Transpose", ["columns"], ["output"], perm=[0, 2, 1]))
+    return save(
+        path,
+        nodes,
+        inputs={"images": (1, 3, "H", "W")},
+        outputs={"output": (1, "A", 7)},
+        constants=constants,
+        metadata=metadata,
+    )
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "head"), [("pvb-2001", "ssd"), ("pvb-2003", "atss"), ("crossroad-1016-int8", "ssd")]
+)
+def test_models_of_the_open_model_zoo_find_people(data: Path, name: str, head: str) -> None:
+    """Intel's networks for street cameras are what many have; in OpenVINO's own form they could not be opened."""
+    pytest.importorskip("openvino")
+    detector = OnnxDetector(open_model(data / f"models/omz/{name}.xml"), confidence=0.3)
+    assert detector.head.name == head
+    assert detector.model.provider.provider == "openvino"
+    frames = sorted((data / "aerial/sequences_dev/otb_Crossing/img1").iterdir())
+    import cv2
+
+    image = cv2.imread(str(frames[0]))
+    truth = np.loadtxt(data / "aerial/sequences_dev/otb_Crossing/gt/gt.txt", delimiter=",")[0, 2:6]
+    found = detector.detect(image).boxes_xyxy_px
+    x1, y1 = truth[:2] - 1
+    target = np.array([x1, y1, x1 + truth[2], y1 + truth[3]])
+    shared = np.minimum(found[:, 2:], target[2:]) - np.maximum(found[:, :2], target[:2])
+    overlap = np.clip(shared, 0, None).prod(axis=1)
+    area = (found[:, 2:] - found[:, :2]).prod(axis=1) + (target[2:] - target[:2]).prod()
+    assert (overlap / (area - overlap)).max() > 0.4
