@@ -31,7 +31,7 @@ def choose_head(trial: Trial, *, wanted: str | None = None) -> Head:
     check_head_name(wanted)
     said = trial.metadata.get("head", "")
     if wanted is not None or said in KINDS:
-        return _as_told(trial, wanted or said, "--head" if wanted else "its metadata: head")
+        return _named(trial, wanted or said, "--head" if wanted else "its metadata: head")
     kinds: dict[str, Kind] = dict(KINDS)
     why = ""
     if _says_rt_detr(trial):
@@ -51,7 +51,7 @@ def choose_head(trial: Trial, *, wanted: str | None = None) -> Head:
     raise UserError(f"its outputs could be {could}, which --head NAME decides")
 
 
-def _as_told(trial: Trial, name: str, by: str) -> Head:
+def _named(trial: Trial, name: str, by: str) -> Head:
     kind = KINDS[name]
     match = kind.fits(trial)
     if match is None:

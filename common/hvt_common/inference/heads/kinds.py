@@ -262,8 +262,8 @@ def _with_image(trial: Trial, *, score: int, kind: int, columns: str) -> Match |
     if len(table):
         if not are_probabilities(table[:, score]) or not are_whole(table[:, kind]):
             return None
-        told = not are_whole(table[:, score]) or float(table[:, kind].max()) > 1
-        proof = f"rows of seven: {columns}" if told else None
+        decided = not are_whole(table[:, score]) or float(table[:, kind].max()) > 1
+        proof = f"rows of seven: {columns}" if decided else None
     return Match((index,), None, Listed(1, score, kind, image=0), proof)
 
 
@@ -339,10 +339,13 @@ def _rt_detr(trial: Trial) -> Match | None:
     # Of a softmax over "no object" the greatest logit is positive everywhere, on grey too.
     grey = rows_of(trial.runs[0][pair[1]].astype(np.float32))
     sigmoid = not logits or float((grey.max(axis=1) > 0).mean()) < 0.5
-    told = trial.relative(boxes) and (logits or "logit" in words or _shows_centres(_shown(boxes)))
+    decided = trial.relative(boxes) and (logits or "logit" in words or _shows_centres(_shown(boxes)))
     proof = f"boxes by their centre in 0…1 and {'logits' if logits else 'scores'}, a row a query"
     found = Match(
-        pair, trial.shape(pair[1])[2], PerQuery("centre", logits=logits), proof if told and sigmoid else None
+        pair,
+        trial.shape(pair[1])[2],
+        PerQuery("centre", logits=logits),
+        proof if decided and sigmoid else None,
     )
     return None if "dets" in words else found  # RF-DETR, which wants other pixels
 

@@ -38,8 +38,8 @@ class Trial:
 
     def up_to(self, top: int) -> Trial:
         """Without the pictures in the other range: there a network may say anything."""
-        kept = [index for index, one in enumerate(self.tops) if one in (0, top)]
-        return replace(self, runs=[self.runs[i] for i in kept], tops=[self.tops[i] for i in kept])
+        these = [index for index, one in enumerate(self.tops) if one in (0, top)]
+        return replace(self, runs=[self.runs[i] for i in these], tops=[self.tops[i] for i in these])
 
     def shape(self, index: int) -> tuple[int, ...]:
         """Of an output of the first picture."""

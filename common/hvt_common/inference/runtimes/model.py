@@ -195,11 +195,11 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
     cannot load; or for a provider that is unknown, not installed or cannot start.
     """
     settings = settings or ModelSettings()
+    if is_ir(path):
+        return _open_ir(path, settings)
     choice = choose_provider(
         settings.provider, onnxruntime=ort.get_available_providers(), openvino=find_openvino
     )
-    if is_ir(path):
-        return _open_ir(path, settings)
     check_onnx_file(path)
     try:
         model = _open(path, settings, choice)
