@@ -203,7 +203,7 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
     check_onnx_file(path)
     try:
         model = _open(path, settings, choice)
-        if choice.provider == "openvino" and not choice.explicit:
+        if choice.provider == "openvino" and not choice.explicit and len(model.inputs) == 1:
             model = _quicker(model, path, settings)
     except UserError as error:
         if choice.explicit or choice.provider == "cpu":
