@@ -23,6 +23,7 @@ from typing import Any, NoReturn, Protocol, TypeVar, cast
 import tomli_w
 
 from hvt_common.errors import UserError
+from hvt_common.redaction import Redaction
 from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse_share, parse_size
 
 __all__ = [
@@ -377,5 +378,8 @@ def _from_file(config_class: type, file: Path) -> dict[str, Any]:
         if field is None:
             near = difflib.get_close_matches(key, fields, n=1) or sorted(fields)
             raise UserError(f"--config {file} has an unknown key {key!r}: did you mean {', '.join(near)}?")
-        values[field.name] = _value(field, given, name=f"{key} in {file}")
+        try:
+            values[field.name] = _value(field, given, name=f"{key} in {file}")
+        except UserError as error:  # the value may be an address that was meant for another key
+            raise UserError(Redaction([str(given)]).text(str(error))) from None
     return values

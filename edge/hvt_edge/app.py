@@ -106,6 +106,8 @@ class Edge:
             pose_source = world.open_pose(config, source)
             if pose_source is not None:
                 stack.callback(pose_source.close)
+                for note in pose_source.notes:
+                    logging.getLogger(START_LOGGER).info("pose: %s", note)
             check_truth(config.truth, source)
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)

@@ -54,7 +54,7 @@ def start_log(
     logging.basicConfig(level=logging.WARNING, handlers=[held], force=True)
     for name in ("hvt_common.inference.runtimes.model", START_LOGGER, *((STATUS_LOGGER,) if as_json else ())):
         logging.getLogger(name).setLevel(logging.WARNING if quiet else logging.INFO)
-    log = Log(program, held, as_json=as_json)
+    log = Log(program, held, as_json=as_json, redaction=redaction)
     if as_json:
         logging.captureWarnings(capture=True)
     sys.excepthook = log.crashed
@@ -67,9 +67,10 @@ def start_log(
 class Log:
     """What `start_log` began."""
 
-    def __init__(self, program: str, held: _HeldLog, *, as_json: bool) -> None:
+    def __init__(self, program: str, held: _HeldLog, *, as_json: bool, redaction: Redaction) -> None:
         self._logger = logging.getLogger(program)
         self._held = held
+        self._redaction = redaction
         self.as_json = as_json
         """One JSON object a line."""
 
@@ -87,6 +88,7 @@ class Log:
         try:
             yield
         except (UserError, FlightError) as error:
+            error.args = (self._redaction.text(str(error)),)
             if self.as_json:
                 self._write(logging.ERROR, str(error))
                 error.said = True

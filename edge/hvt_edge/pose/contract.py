@@ -24,6 +24,11 @@ class PoseSource(Protocol):
         """Why there is none now; empty where there is one, or nobody would expect one."""
         ...
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was guessed when it was opened, and why: a sentence each."""
+        ...
+
     def close(self) -> None:
         """Let go of what is open."""
         ...

@@ -1,15 +1,16 @@
 """Poses from a file beside a clip: a table with names in its first line, DJI's subtitles, or a GPS track.
 
 A file's time 0 is the clip's first frame: a table says ``time_s``, subtitles have their own times, and of UTC times
-the first one counts as 0.
+the earliest counts as 0. What cannot be read is left out and counted, unless it is half of the file.
 """
 
 from __future__ import annotations
 
 import csv
+import logging
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -20,9 +21,12 @@ from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
 from hvt_edge.pose.angles import compass_deg
+from hvt_edge.pose.subtitles import subtitle_rows
 from hvt_edge.pose.table import PoseTable
 
 __all__ = ["COLUMNS", "read_poses"]
+
+_log = logging.getLogger(__name__)
 
 COLUMNS = (
     *("time_s", "utc", "latitude_deg", "longitude_deg", "height_m", "altitude_m"),
@@ -32,8 +36,6 @@ COLUMNS = (
 """Of a table. One of the first two, latitude and longitude are needed; `Pose` and `Orientation` say what each means:
 ``camera_…`` is where the optical axis points, the plain angles are the platform's."""
 _MOST_BYTES = 64_000_000
-_FULL_FRAME_MM = 36.0
-"""Width of the picture that 35 mm equivalent focal lengths are said for."""
 _BOUNDS: Mapping[str, tuple[float, float]] = {
     "latitude_deg": (-90, 90),
     "longitude_deg": (-180, 180),
@@ -47,26 +49,9 @@ _BOUNDS: Mapping[str, tuple[float, float]] = {
     "pitch_deg": (-90, 90),
 }
 _FAR = 1e6
-_OVERSHOT_DEG = 92.0
-"""So far a gimbal's pitch goes in DJI's subtitles where it means straight down or up."""
+_ANY_TIME = (-1e11, 1e11)
+_DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+\s*", re.ASCII)
 _Values = Mapping[str, float]
-_TIMES = re.compile(r"(?<!\d)(\d{1,4}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
-_NAMED = re.compile(r"\b([A-Za-z_]{1,32})\s{0,4}:\s*([+-]?\d+(?:\.\d+)?)")
-_OLD_GPS = re.compile(r"GPS\s*\(\s*([+-]?[\d.]+)\s*,\s*([+-]?[\d.]+)\s*,")
-"""GPS(longitude, latitude, satellites) of the first models."""
-_DJI = {
-    "latitude": "latitude_deg",
-    "longitude": "longitude_deg",
-    "longtitude": "longitude_deg",
-    "rel_alt": "height_m",
-    "barometer": "height_m",
-    "abs_alt": "altitude_m",
-    "gb_yaw": "camera_yaw_deg",
-    "gb_pitch": "camera_pitch_deg",
-    "gb_roll": "camera_roll_deg",
-    "focal_len": "focal_mm",
-}
-"""Names in DJI's subtitles; ``longtitude`` is how some models spell it."""
 
 
 def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
@@ -74,9 +59,10 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
 
     Raises `UserError` for a file that cannot be read, is none of the three kinds or has an impossible number.
     """
-    readers: Mapping[str, Callable[[str, Path], Iterable[_Values]]] = {
+    notes: list[str] = []
+    readers: Mapping[str, Callable[[str, Path], Iterable[_Values | UserError]]] = {
         ".csv": _table_rows,
-        ".srt": _subtitle_rows,
+        ".srt": lambda text, _: subtitle_rows(text, notes.append),
         ".gpx": _track_rows,
     }
     reader = readers.get(path.suffix.lower())
@@ -89,7 +75,7 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
     except OSError as error:
         raise UserError(f"pose file {path} cannot be read: {error.strerror}") from None
     try:
-        poses = [_pose(row, path, number) for number, row in enumerate(reader(text, path), 1)]
+        poses = _good(reader(text, path), path)
     except csv.Error as error:
         raise UserError(
             f"pose file {path} is no table: {error}; accepted are lines of values between commas"
@@ -97,23 +83,76 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
     if not poses:
         raise UserError(f"pose file {path} has no row with a time, a latitude and a longitude")
     poses = [one if one.hfov_deg is not None else replace(one, hfov_deg=hfov_deg) for one in poses]
-    if any(first.capture_ns >= second.capture_ns for first, second in pairwise(poses)):
+    return PoseTable(_in_order(poses, path), notes=tuple(notes))
+
+
+def _good(rows: Iterable[_Values | UserError], path: Path) -> list[Pose]:
+    """The poses of the rows that hold; the others are counted in the log.
+
+    Raises the first `UserError` where as many are wrong as right: it is another file than it seems.
+    """
+    good: list[tuple[int, _Values]] = []
+    wrong: list[UserError] = []
+    for number, row in enumerate(rows, 1):
+        try:
+            if isinstance(row, UserError):
+                raise row
+            _check(row, path, number)
+        except UserError as error:
+            wrong.append(error)
+        else:
+            good.append((number, row))
+    if wrong and len(wrong) >= len(good):
+        raise wrong[0]
+    if wrong:
+        _log.warning("%d of %d rows are left out: %s", len(wrong), len(wrong) + len(good), wrong[0])
+    begin_s = min((row["utc_s"] for _, row in good if "utc_s" in row), default=0.0)
+    return [_pose(row, begin_s) for _, row in good]
+
+
+def _in_order(poses: list[Pose], path: Path) -> list[Pose]:
+    """By time; of two of one time the first. `UserError` where no time rises."""
+    ordered = sorted(poses, key=lambda one: one.capture_ns)
+    if ordered != poses:
+        _log.warning("pose file %s is not in order of time: sorted", path)
+    rising = [
+        two
+        for one, two in pairwise((None, *ordered))
+        if two and (one is None or one.capture_ns < two.capture_ns)
+    ]
+    if len(rising) == 1 < len(poses):
         raise UserError(f"pose file {path} has times that do not rise")
-    return PoseTable(poses)
+    if len(rising) < len(poses):
+        _log.warning(
+            "pose file %s: %d of %d poses have the time of another, and are left out",
+            path,
+            len(poses) - len(rising),
+            len(poses),
+        )
+    return rising
 
 
-def _pose(row: _Values, path: Path, number: int) -> Pose:
+def _check(row: _Values, path: Path, number: int) -> None:
+    """Raise `UserError` for what no place on earth has."""
     for name, value in row.items():
-        low, high = _BOUNDS.get(name, (-_FAR, _FAR))
+        low, high = _BOUNDS.get(name, _ANY_TIME if name == "utc_s" else (-_FAR, _FAR))
         if not low <= value <= high:
+            swapped = name == "latitude_deg" and abs(row.get("longitude_deg", value)) <= high
+            hint = ": are latitude and longitude exchanged?" if swapped and abs(value) <= 180 else ""
             raise UserError(
-                f"pose file {path}, row {number}: {name} is {value:g}, accepted is {low:g} to {high:g}"
+                f"pose file {path}, row {number}: {name} is {value:g}, accepted is {low:g} to {high:g}{hint}"
             )
+
+
+def _pose(row: _Values, begin_s: float) -> Pose:
+    at_s = row["utc_s"] - begin_s if "utc_s" in row else row["time_s"]
     given = {
-        name: value for name, value in row.items() if not name.endswith(("yaw_deg", "pitch_deg", "roll_deg"))
+        name: value
+        for name, value in row.items()
+        if name not in ("time_s", "utc_s") and not name.endswith(("yaw_deg", "pitch_deg", "roll_deg"))
     }
     return Pose(
-        capture_ns=round(given.pop("time_s") * SECOND_NS),
+        capture_ns=round(at_s * SECOND_NS),
         camera=_orientation(row, "camera_"),
         platform=_orientation(row, ""),
         **given,
@@ -128,8 +167,10 @@ def _orientation(row: _Values, prefix: str) -> Orientation | None:
     return Orientation(compass_deg(yaw), pitch, row.get(f"{prefix}roll_deg", 0.0))
 
 
-def _table_rows(text: str, path: Path) -> Iterable[_Values]:
-    lines = csv.DictReader(text.splitlines())
+def _table_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
+    head = text.lstrip().partition("\n")[0]
+    between = max(",;\t", key=head.count)
+    lines = csv.DictReader(text.splitlines(), delimiter=between)
     names = [(name or "").strip() for name in lines.fieldnames or ()]
     lines.fieldnames = names
     unknown = [name for name in names if name not in COLUMNS]
@@ -139,79 +180,60 @@ def _table_rows(text: str, path: Path) -> Iterable[_Values]:
     missing += [] if {"time_s", "utc"} & set(names) else ["time_s"]
     if missing:
         raise UserError(f"pose file {path} lacks the column {missing[0]}")
-    begin_s: float | None = None
     for number, line in enumerate(lines, 1):
-        where = f"pose file {path}, row {number}"
-        said = {
-            name: value.strip() for name, value in line.items() if name in names and (value or "").strip()
-        }
-        utc = said.pop("utc", None)
-        row = {name: _number(value, f"{where}: {name}") for name, value in said.items()}
-        if utc is not None and "time_s" not in row:
-            at_s = _utc_s(utc, where)
-            begin_s = at_s if begin_s is None else begin_s
-            row["time_s"] = at_s - begin_s
-        if {"time_s", "latitude_deg", "longitude_deg"} <= row.keys():
-            yield row
-
-
-def _subtitle_rows(text: str, path: Path) -> Iterable[_Values]:
-    for block in re.split(r"\r?\n\s*\r?\n", text):
-        time = _TIMES.search(block)
-        if time is None:
+        try:
+            row = _table_row({name: line.get(name) for name in names}, f"pose file {path}, row {number}")
+        except UserError as error:
+            yield error
             continue
-        hours, minutes, seconds, rest = time.groups()
-        row = {"time_s": 3600 * int(hours) + 60 * int(minutes) + int(seconds) + int(rest) / 10 ** len(rest)}
-        old = _OLD_GPS.search(block)
-        if old is not None:
-            row |= {
-                "longitude_deg": _number(old[1], f"pose file {path}: GPS"),
-                "latitude_deg": _number(old[2], f"pose file {path}: GPS"),
-            }
-        for name, value in _NAMED.findall(block[time.end() :]):
-            if name.lower() in _DJI:
-                row[_DJI[name.lower()]] = float(value)
-        focal_mm = row.pop("focal_mm", 0.0)
-        if focal_mm >= 1:
-            focal_mm = focal_mm / 10 if focal_mm > 200 else focal_mm  # some models write tenths: 240 is 24 mm
-            row["hfov_deg"] = math.degrees(2 * math.atan(_FULL_FRAME_MM / 2 / focal_mm))
-        pitch = row.get("camera_pitch_deg", 0.0)
-        if 90 < abs(pitch) <= _OVERSHOT_DEG:
-            row["camera_pitch_deg"] = math.copysign(90.0, pitch)
-        place = row.get("latitude_deg"), row.get("longitude_deg")
-        if None not in place and any(place):  # both are 0 before there is a fix
+        if {"latitude_deg", "longitude_deg"} <= row.keys() and {"time_s", "utc_s"} & row.keys():
             yield row
 
 
-def _track_rows(text: str, path: Path) -> Iterable[_Values]:
+def _table_row(line: Mapping[str, str | None], where: str) -> _Values:
+    said = {name: value.strip() for name, value in line.items() if value is not None and value.strip()}
+    utc = said.pop("utc", None)
+    row = {name: _number(value, f"{where}: {name}") for name, value in said.items()}
+    if utc is not None and "time_s" not in row:
+        row["utc_s"] = _utc_s(utc, where)
+    return row
+
+
+def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise UserError(f"pose file {path} declares a document type, which no GPS track has")
     try:
         root = ET.fromstring(text)  # noqa: S314 - the user's own file, and it declares nothing
     except ET.ParseError as error:
         raise UserError(f"pose file {path} is no GPX: {error}") from None
-    begin_s: float | None = None
+    untimed = 0
     for number, point in enumerate(root.findall(".//{*}trkpt"), 1):
         where = f"pose file {path}, point {number}"
         time = point.findtext("{*}time")
         if time is None:
+            untimed += 1
             continue
-        at_s = _utc_s(time, where)
-        begin_s = at_s if begin_s is None else begin_s
-        row = {
-            "time_s": at_s - begin_s,
-            "latitude_deg": _number(point.get("lat", ""), f"{where}: lat"),
-            "longitude_deg": _number(point.get("lon", ""), f"{where}: lon"),
-        }
-        elevation = point.findtext("{*}ele")
-        if elevation is not None:
-            row["altitude_m"] = _number(elevation, f"{where}: ele")
+        try:
+            row = {
+                "utc_s": _utc_s(time, where),
+                "latitude_deg": _number(point.get("lat", ""), f"{where}: lat"),
+                "longitude_deg": _number(point.get("lon", ""), f"{where}: lon"),
+            }
+            elevation = point.findtext("{*}ele")
+            if elevation is not None:
+                row["altitude_m"] = _number(elevation, f"{where}: ele")
+        except UserError as error:
+            yield error
+            continue
         yield row
+    if untimed:
+        _log.warning("pose file %s: %d points have no time, and are left out", path, untimed)
 
 
 def _number(text: str, where: str) -> float:
     try:
-        value = float(text)
+        # A comma between two numbers is that of half of Europe: columns are apart already.
+        value = float(text.replace(",", ".") if _DECIMAL_COMMA.fullmatch(text) else text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

@@ -27,6 +27,7 @@ class FixedPose:
     """The same pose for every frame."""
 
     trouble = ""
+    notes = ()
 
     def __init__(self, numbers: str, *, hfov_deg: float | None) -> None:
         parts = numbers.split(",")

@@ -1,12 +1,13 @@
 """Poses from an autopilot by MAVLink: listens only, and sends it nothing.
 
 Place and height come from GLOBAL_POSITION_INT, the platform's angles from ATTITUDE, the camera's from
-GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION, its field of view from CAMERA_FOV_STATUS, the accuracy of the fix
-from GPS_RAW_INT. A value that is older than two seconds is not known any more.
+GIMBAL_DEVICE_ATTITUDE_STATUS, MOUNT_ORIENTATION or MOUNT_STATUS, its field of view from CAMERA_FOV_STATUS, the fix
+and its accuracy from GPS_RAW_INT. A value that is older than two seconds, a fix of ten, is not known any more.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections.abc import Callable
@@ -21,15 +22,33 @@ from hvt_edge.pose.mavlink_transport import Address, Connection
 
 __all__ = ["MavlinkPose"]
 
-_OLD_NS = 2 * SECOND_NS
+_log = logging.getLogger(__name__)
+
+_OLD_NS, _OLD_FIX_NS = 2 * SECOND_NS, 10 * SECOND_NS
 _MESSAGES = (
     "GLOBAL_POSITION_INT",
     "ATTITUDE",
     "MOUNT_ORIENTATION",
+    "MOUNT_STATUS",
     "GIMBAL_DEVICE_ATTITUDE_STATUS",
     "CAMERA_FOV_STATUS",
     "GPS_RAW_INT",
+    "GPS2_RAW",
 )
+_OF_AUTOPILOT = frozenset({"GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT", "GPS2_RAW"})
+"""What a gimbal or a companion may say of itself, which is not the aircraft's."""
+_FIXES = ("GPS_RAW_INT", "GPS2_RAW")
+_AUTOPILOT = 1
+"""``MAV_COMP_ID_AUTOPILOT1``."""
+_LEAST_FIX = 2
+"""``GPS_FIX_TYPE_2D_FIX``; with less an autopilot says where its estimate has drifted to from 0, 0."""
+_NOWHERE = 10_000
+"""1e-7 degrees around 0, 0: a hundred metres in the Gulf of Guinea."""
+_MOST_SENDERS = 8
+_MOST_KNOWN = 200
+"""Messages of all that speak here, by name: what strangers send is bounded."""
+_OF_GIMBAL = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS")
+_NO_DIRECTION_NS = 10 * SECOND_NS
 _YAW_LOCK, _YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME = 16, 32, 64
 _JOIN_S = 4.0
 """Longer than an attempt to connect takes."""
@@ -38,20 +57,28 @@ _JOIN_S = 4.0
 class MavlinkPose:
     """Reads in a thread of its own from an address, such as ``udpin:127.0.0.1:14550``.
 
-    Of several vehicles the first that says where it is counts. Raises `UserError` where it cannot be opened.
+    Of several vehicles the first that says where it is counts, until it has said nothing of the kind for two seconds.
+    Place and attitude are those of one component, the autopilot's where it speaks. Raises `UserError` where the
+    address cannot be opened.
     """
+
+    notes = ()
 
     def __init__(self, address: str, *, hfov_deg: float | None, clock: Callable[[], int]) -> None:
         self._hfov_deg = hfov_deg
         self._clock = clock
         self._address = address
-        self._system: int | None = None
-        self._newest: dict[str, tuple[int, Any]] = {}
-        """By name, when it came and the message."""
+        self._vehicle: tuple[int, int] | None = None
+        """System and component whose place counts."""
+        self._newest: dict[tuple[int, int, str], tuple[int, Any]] = {}
+        """By system, component and name, when it came and the message."""
+        self._placed_ns: int | None = None
+        """Since when there is a place and no direction of the camera; 0 once that was told of."""
         self._lock = threading.Lock()
         self._stop = threading.Event()
         where = Address.parse(address)
-        self._parser = FrameParser(is_stream=where.is_stream)
+        self._is_stream = where.is_stream
+        self._parsers: dict[object, FrameParser] = {}
         self._connection = Connection(where, stop=self._stop)
         self._thread = threading.Thread(target=self._read, name="hvt-pose", daemon=True)
         self._thread.start()
@@ -59,23 +86,23 @@ class MavlinkPose:
     @property
     def trouble(self) -> str:
         """Why there is no pose."""
-        with self._lock:
-            come = self._newest.get("GLOBAL_POSITION_INT")
+        known = self._known(fresh=False)
+        come = known.get("GLOBAL_POSITION_INT")
         if come is None:
             return f"no position has come on {self._address}{self._lost()}"
         age_ns = self._clock() - come[0]
-        if age_ns <= _OLD_NS:
-            return ""
-        return f"the autopilot's last position is {age_ns / SECOND_NS:.0f} s old{self._lost()}"
+        if age_ns > _OLD_NS:
+            return f"the autopilot's last position is {age_ns / SECOND_NS:.0f} s old{self._lost()}"
+        if not _has_place({name: one for name, (_, one) in known.items()}):
+            return "the autopilot has no GPS fix"
+        return ""
 
     def at(self, media_ns: int, *, capture_ns: int) -> Pose | None:  # noqa: ARG002 - of now
         """The newest pose."""
-        now_ns = self._clock()
-        with self._lock:
-            known = {name: one for name, (at_ns, one) in self._newest.items() if now_ns - at_ns <= _OLD_NS}
-        place = known.get("GLOBAL_POSITION_INT")
-        if place is None or not (place.lat or place.lon):  # 0, 0: no fix yet
+        known = {name: one for name, (_, one) in self._known(fresh=True).items()}
+        if not _has_place(known):
             return None
+        place = known["GLOBAL_POSITION_INT"]
         platform = _attitude(known.get("ATTITUDE"))
         field = known.get("CAMERA_FOV_STATUS")
         hfov = self._hfov_deg
@@ -90,13 +117,15 @@ class MavlinkPose:
             )
             if 0 < value < 10**6
         }
+        camera = _camera(known, platform)
+        self._watch_direction(camera)
         return Pose(
             capture_ns=capture_ns,
             latitude_deg=place.lat / 1e7,
             longitude_deg=place.lon / 1e7,
             height_m=_clipped(place.relative_alt / 1000),
             altitude_m=_clipped(place.alt / 1000),
-            camera=_camera(known, platform),
+            camera=camera,
             platform=platform,
             hfov_deg=hfov,
             **accuracy,
@@ -111,21 +140,92 @@ class MavlinkPose:
         trouble = self._connection.trouble
         return f" ({trouble})" if trouble else ""
 
+    def _known(self, *, fresh: bool) -> dict[str, tuple[int, Any]]:
+        """By name, when it came and the newest message of the vehicle that is, if ``fresh``, not too old."""
+        now_ns = self._clock()
+        with self._lock:
+            vehicle, newest = self._vehicle, dict(self._newest)
+        known: dict[str, tuple[int, Any]] = {}
+        for (system, component, name), (at_ns, message) in sorted(newest.items(), key=lambda one: one[0]):
+            if fresh and _is_old(name, now_ns - at_ns):
+                continue
+            if vehicle is not None and system != vehicle[0]:
+                continue
+            if vehicle is not None and name in _OF_AUTOPILOT and component != vehicle[1]:
+                continue
+            known.setdefault(name, (at_ns, message))  # of two gimbals always the same
+        return known
+
+    def _watch_direction(self, camera: Orientation | None) -> None:
+        """Tell once of a camera of which nobody says where it points."""
+        now_ns = self._clock()
+        if camera is not None:
+            self._placed_ns = None
+        elif self._placed_ns is None:
+            self._placed_ns = now_ns
+        elif self._placed_ns and now_ns - self._placed_ns > _NO_DIRECTION_NS:
+            self._placed_ns = 0
+            _log.warning(
+                "pose: the autopilot says where it is, and nobody where the camera points (with its ATTITUDE one of "
+                "%s): nothing is placed on the map",
+                ", ".join(_OF_GIMBAL),
+            )
+
     def _read(self) -> None:
         with closing(self._connection) as connection:
             while not self._stop.is_set():
-                for message in self._parser.messages(connection.read()):
+                data = connection.read()
+                sender = connection.sender
+                if sender not in self._parsers and len(self._parsers) >= _MOST_SENDERS:
+                    self._parsers.pop(next(iter(self._parsers)))
+                parser = self._parsers.setdefault(sender, FrameParser(is_stream=self._is_stream))
+                for message in parser.messages(data):
                     self._take(message)
 
     def _take(self, message: Any) -> None:
-        name, system = message.get_type(), message.get_srcSystem()
+        name, whose = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
         if name not in _MESSAGES:
             return
+        now_ns = self._clock()
         with self._lock:
-            if self._system is None and name == "GLOBAL_POSITION_INT":
-                self._system = system
-            if system == self._system:
-                self._newest[name] = (self._clock(), message)
+            if len(self._newest) > _MOST_KNOWN:
+                self._newest = {key: one for key, one in self._newest.items() if now_ns - one[0] <= _OLD_NS}
+            if len(self._newest) <= _MOST_KNOWN:
+                self._newest[(*whose, name)] = (now_ns, message)
+            if name == "GLOBAL_POSITION_INT" and whose != self._vehicle and self._is_better(whose, now_ns):
+                self._vehicle = whose
+
+    def _is_better(self, whose: tuple[int, int], now_ns: int) -> bool:
+        """Whether the place of this one counts from now on."""
+        if self._vehicle is None:
+            return True
+        if not _has_place(self._of(whose, now_ns)):
+            return False
+        if not _has_place(self._of(self._vehicle, now_ns)):
+            return True
+        return whose == (self._vehicle[0], _AUTOPILOT)
+
+    def _of(self, whose: tuple[int, int], now_ns: int) -> dict[str, Any]:
+        """What one component has said lately."""
+        return {
+            name: message
+            for (system, component, name), (at_ns, message) in self._newest.items()
+            if (system, component) == whose and not _is_old(name, now_ns - at_ns)
+        }
+
+
+def _is_old(name: str, age_ns: int) -> bool:
+    """Receivers may report their fix less often than autopilots their place."""
+    return age_ns > (_OLD_FIX_NS if name in _FIXES else _OLD_NS)
+
+
+def _has_place(known: dict[str, Any]) -> bool:
+    """Whether a position is one: not where an autopilot without a fix believes to be."""
+    place = known.get("GLOBAL_POSITION_INT")
+    if place is None or max(abs(place.lat), abs(place.lon)) < _NOWHERE:
+        return False
+    fixes = [known[name].fix_type for name in _FIXES if name in known]
+    return not fixes or max(fixes) >= _LEAST_FIX
 
 
 def _attitude(message: Any) -> Orientation | None:
@@ -143,14 +243,20 @@ def _camera(known: dict[str, Any], platform: Orientation | None) -> Orientation 
             return _orientation(yaw, pitch, roll)
         return None if platform is None else _orientation(yaw + platform.yaw_deg, pitch, roll)
     mount = known.get("MOUNT_ORIENTATION")
-    if mount is None:
+    if mount is not None:
+        yaw = getattr(mount, "yaw_absolute", math.nan)
+        if math.isfinite(yaw) and yaw != 0:  # an autopilot of before 2018 does not say it
+            return _orientation(yaw, mount.pitch, mount.roll)
+        return (
+            None if platform is None else _orientation(mount.yaw + platform.yaw_deg, mount.pitch, mount.roll)
+        )
+    status = known.get(
+        "MOUNT_STATUS"
+    )  # of before ArduPilot 4.3: pitch, roll and yaw to the vehicle, in 0.01 degrees
+    if status is None or platform is None:
         return None
-    yaw = getattr(mount, "yaw_absolute", math.nan)
-    if not math.isfinite(yaw) or yaw == 0:  # an autopilot of before 2018 does not say it
-        if platform is None:
-            return None
-        yaw = mount.yaw + platform.yaw_deg
-    return _orientation(yaw, mount.pitch, mount.roll)
+    pitch, roll, yaw = (value / 100 for value in (status.pointing_a, status.pointing_b, status.pointing_c))
+    return _orientation(yaw + platform.yaw_deg, pitch, roll)
 
 
 def _orientation(yaw: float, pitch: float, roll: float) -> Orientation | None:

@@ -13,33 +13,37 @@ MAX_FRAME_BYTES = 280
 
 
 class FrameParser:
-    """Of a stream, whose frames may begin in one read and end in the next, or of datagrams, whose frames do not."""
+    """Of a stream, whose frames may begin in one read and end in the next, or of datagrams, which may be cut alike.
+
+    Of a datagram what is left of the one before may be noise: it counts where more messages come out with it.
+    """
 
     def __init__(self, *, is_stream: bool) -> None:
         self._is_stream = is_stream
-        self._parser = _new_parser()
+        self._rest = b""
 
     @property
     def buffered_bytes(self) -> int:
         """What waits for the rest of its frame."""
-        return len(self._parser.buf)
+        return len(self._rest)
 
     def messages(self, data: bytes) -> list[Any]:
         """All messages that end in ``data``; what is none is left out."""
-        try:
-            found = self._parser.parse_buffer(data) or []
-        except Exception:  # noqa: BLE001 - whatever a parser of foreign bytes raises ends no flight
-            self._parser = _new_parser()
-            return []
-        if not self._is_stream or self._parser.buf_len() > MAX_FRAME_BYTES:
-            self._parser = _new_parser()
-        else:  # the parser itself forgets what it has read only where a read ends with a frame
-            del self._parser.buf[: self._parser.buf_index]
-            self._parser.buf_index = 0
+        found, rest = _parsed(self._rest + data)
+        if not self._is_stream and self._rest:
+            alone, rest_alone = _parsed(data)
+            if len(alone) > len(found):
+                found, rest = alone, rest_alone
+        self._rest = rest if len(rest) <= MAX_FRAME_BYTES else b""
         return found
 
 
-def _new_parser() -> Any:
+def _parsed(data: bytes) -> tuple[list[Any], bytes]:
+    """The messages in it, and the beginning of one that is not there as a whole."""
     parser = ardupilotmega.MAVLink(None)
     parser.robust_parsing = True
-    return parser
+    try:
+        found = parser.parse_buffer(data) or []
+    except Exception:  # noqa: BLE001 - whatever a parser of foreign bytes raises ends no flight
+        return [], b""
+    return [one for one in found if one.get_type() != "BAD_DATA"], bytes(parser.buf[parser.buf_index :])

@@ -37,6 +37,9 @@ _PAUSES_S = (0.5, 1.0, 2.0, 4.0, 8.0)
 class Link(Protocol):
     """An open port."""
 
+    sender: object
+    """Whose the newest bytes are; of a stream always the same."""
+
     def read(self) -> bytes:
         """What has come, of one datagram at most; nothing after `_POLL_S`. Raises `OSError` once it is gone."""
         ...
@@ -140,6 +143,11 @@ class Connection:
             self._failed, self.trouble = 0, ""
         return data
 
+    @property
+    def sender(self) -> object:
+        """Whose the bytes are that `read` gave last."""
+        return None if self._link is None else self._link.sender
+
     def close(self) -> None:
         """Let go of the port, if it is open."""
         link, self._link = self._link, None
@@ -149,6 +157,8 @@ class Connection:
 
 
 class _UdpPort:
+    sender: object = None
+
     def __init__(self, host: str, port: int) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -160,15 +170,18 @@ class _UdpPort:
 
     def read(self) -> bytes:
         try:
-            return self._socket.recvfrom(_READ_BYTES)[0]
+            data, self.sender = self._socket.recvfrom(_READ_BYTES)
         except TimeoutError:
             return b""
+        return data
 
     def close(self) -> None:
         self._socket.close()
 
 
 class _TcpStream:
+    sender: object = None
+
     def __init__(self, host: str, port: int, *, silent_s: float) -> None:
         self._socket = socket.create_connection((host, port), timeout=_CONNECT_S)
         self._socket.settimeout(_POLL_S)
@@ -193,6 +206,8 @@ class _TcpStream:
 
 
 class _SerialDevice:
+    sender: object = None
+
     def __init__(self, device: str, baud: int) -> None:
         self._port = serial.Serial(device, baud, timeout=_POLL_S)
 

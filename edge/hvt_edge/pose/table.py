@@ -19,7 +19,10 @@ _BEYOND_NS = SECOND_NS
 class PoseTable:
     """``poses`` in order of time, at least one; their ``capture_ns`` counts from the clip's first frame."""
 
-    def __init__(self, poses: Sequence[Pose], *, most_gap_s: float = 10.0) -> None:
+    def __init__(
+        self, poses: Sequence[Pose], *, most_gap_s: float = 10.0, notes: tuple[str, ...] = ()
+    ) -> None:
+        self.notes = notes
         self._poses = poses
         self._times = [one.capture_ns for one in poses]
         self._most_gap_ns = round(most_gap_s * SECOND_NS)

@@ -1,0 +1,135 @@
+"""DJI's subtitles. Models differ in their layout, which words, ranges and units tell apart. Pure."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+__all__ = ["subtitle_rows"]
+
+_FULL_FRAME_MM = 36.0
+"""Width of the picture that 35 mm equivalent focal lengths are said for."""
+_OVERSHOT_DEG = 92.0
+"""So far a gimbal's pitch goes where it means straight down or up."""
+_NUMBER = r"[+-]?\d+(?:[.,]\d+)?"
+"""With a point, or with the comma that half of Europe writes."""
+_TIMES = re.compile(r"(?<!\d)(\d{1,4}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER})")
+_GPS = re.compile(r"\bGPS\s*\(([^()\n]{1,80})\)")
+_HEIGHT = re.compile(rf"(?<![\w.])H\s+({_NUMBER})\s*m\b")
+_ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{1,80})\)")
+"""Pitch, roll and yaw of the aircraft (F) and of the gimbal (G): Phantom 4 and Mavic Mini, all in one line."""
+_DJI = {
+    "latitude": "latitude_deg",
+    "longitude": "longitude_deg",
+    "longtitude": "longitude_deg",
+    "rel_alt": "height_m",
+    "barometer": "height_m",
+    "abs_alt": "altitude_m",
+    "gb_yaw": "camera_yaw_deg",
+    "gb_pitch": "camera_pitch_deg",
+    "gb_roll": "camera_roll_deg",
+    "focal_len": "focal_mm",
+    "altitude": "unclear_m",
+    "dzoom_ratio": "zoom",
+}
+"""Names in the subtitles; ``longtitude`` is how some models spell it."""
+_MOST_LATITUDE = 90.0
+
+
+def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[str, float]]:
+    """Rows of values as `hvt_edge.pose.files.COLUMNS` names them; ``note`` is told what was guessed, and why."""
+    blocks = [
+        (time, block[time.end() :])
+        for block in re.split(r"\r?\n\s*\r?\n", text)
+        if (time := _TIMES.search(block)) is not None
+    ]
+    places = [_numbers(found[1]) for _, body in blocks if (found := _GPS.search(body)) is not None]
+    latitude_first = _latitude_first([one for one in places if len(one) >= 2], note)
+    unplaced = 0
+    said: set[str] = set()
+    for time, body in blocks:
+        row = {"time_s": _seconds(time), **_values(body, latitude_first=latitude_first)}
+        if row.pop("unclear_m", None) is not None and not {"height_m", "altitude_m"} & row.keys():
+            said.add("its 'altitude' is left out: models mean different heights by it")
+        if row.pop("zoom", 1.0) > 1:
+            said.add("its digital zoom is not read: give a table with hfov_deg")
+        place = row.get("latitude_deg"), row.get("longitude_deg")
+        if None in place or not any(place):  # both are 0 before there is a fix
+            unplaced += 1
+            continue
+        yield row
+    for sentence in sorted(said):
+        note(sentence)
+    if unplaced:
+        note(f"{unplaced} of its {len(blocks)} blocks have no place, as before there is a fix")
+
+
+def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
+    row: dict[str, float] = {}
+    if (gps := _GPS.search(body)) is not None and len(place := _numbers(gps[1])) >= 2:
+        names = ("latitude_deg", "longitude_deg") if latitude_first else ("longitude_deg", "latitude_deg")
+        row |= {name: value for name, (value, _) in zip(names, place, strict=False)}
+    if (height := _HEIGHT.search(body)) is not None:
+        row["height_m"] = _value(height[1])
+    for whose, angles in _ANGLES.findall(body):
+        values = _numbers(angles)
+        prefix = "camera_" if whose == "G" else ""
+        if len(values) == 3:
+            angle_names = (f"{prefix}pitch_deg", f"{prefix}roll_deg", f"{prefix}yaw_deg")
+            row |= {name: value for name, (value, _) in zip(angle_names, values, strict=True)}
+    for name, said in _NAMED.findall(body):
+        if name.lower() in _DJI:
+            row[_DJI[name.lower()]] = _value(said)
+    focal_mm = row.pop("focal_mm", 0.0)
+    if focal_mm >= 1:
+        focal_mm = focal_mm / 10 if focal_mm > 200 else focal_mm  # some models write tenths: 240 is 24 mm
+        row["hfov_deg"] = math.degrees(2 * math.atan(_FULL_FRAME_MM / 2 / focal_mm))
+    pitch = row.get("camera_pitch_deg", 0.0)
+    if 90 < abs(pitch) <= _OVERSHOT_DEG:
+        row["camera_pitch_deg"] = math.copysign(90.0, pitch)
+    return row
+
+
+def _latitude_first(places: Sequence[Sequence[tuple[float, str]]], note: Callable[[str], None]) -> bool:
+    """Which of the first two numbers of GPS(…) is the latitude; the third is its height, or a count of satellites.
+
+    | what is there | is first |
+    |---|---|
+    | a first number beyond 90 | the longitude |
+    | a second number beyond 90 | the latitude |
+    | a third with a unit or a fraction, a height | the latitude (enterprise models, goggles) |
+    | else | the longitude (Phantom, Mavic); it is said that this is a guess |
+    """
+    if not places:
+        return False
+    if any(abs(one[0][0]) > _MOST_LATITUDE for one in places):
+        return False
+    if any(abs(one[1][0]) > _MOST_LATITUDE for one in places):
+        return True
+    if any(len(one) > 2 and not one[2][1].isdigit() for one in places):
+        note("its GPS(…) is taken for latitude, longitude, height, because the third number is a height")
+        return True
+    note("its GPS(…) is taken for longitude, latitude, satellites, as most models write: look at the map")
+    return False
+
+
+def _numbers(text: str) -> list[tuple[float, str]]:
+    """(value, how it is written) of numbers between commas, with decimal points or decimal commas."""
+    parts = re.split(r"\s*(?:,\s+|;)\s*", text.strip())
+    if len(parts) < 2:
+        parts = text.strip().split(",")
+        if "." not in text and len(parts) >= 4:
+            parts = [f"{parts[0]}.{parts[1]}", f"{parts[2]}.{parts[3]}", ".".join(parts[4:])]
+    found = [(re.match(_NUMBER, one), one) for one in parts]
+    return [(_value(number[0]), one) for number, one in found if number is not None]
+
+
+def _value(text: str) -> float:
+    return float(text.replace(",", "."))
+
+
+def _seconds(time: re.Match[str]) -> float:
+    hours, minutes, seconds, rest = time.groups()
+    return 3600 * int(hours) + 60 * int(minutes) + int(seconds) + float(f"0.{rest}")

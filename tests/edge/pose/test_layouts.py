@@ -1,0 +1,136 @@
+"""Pose files as models, phones and spreadsheets write them."""
+
+from __future__ import annotations
+
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_edge.pose.files import read_poses
+
+SECOND_NS = 1_000_000_000
+
+
+def read(tmp_path, name, text):
+    """The table, and its pose of the first moment."""
+    file = tmp_path / name
+    file.write_text(text, encoding="utf-8")
+    table = read_poses(file, hfov_deg=60.0)
+    return table, table.at(0, capture_ns=0)
+
+
+def blocks(make, count=4):
+    """Subtitles of a block a second."""
+    return "".join(
+        f"{n + 1}\n00:00:{n:02d},000 --> 00:00:{n + 1:02d},000\n{make(n)}\n\n" for n in range(count)
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "place", "says"),
+    [
+        ("GPS(36.9000,-5.3000,0.0M) BAROMETER:20.3M", (36.9, -5.3, 20.3), "latitude, longitude, height"),
+        ("GPS(40.1,116.2,69.800) BAROMETER(91.2) HOME(40.1,116.2)", (40.1, 116.2, 91.2), ""),
+        ("GPS(116.2,40.1,69.800) BAROMETER(91.2)", (40.1, 116.2, 91.2), ""),
+        ("GPS(8.2,47.4,16) BAROMETER:1.9", (47.4, 8.2, 1.9), "longitude, latitude, satellites"),
+        ("GPS(11,5000,48,1000,16) BAROMETER:50,5", (48.1, 11.5, 50.5), "longitude, latitude, satellites"),
+        ("GPS (11,5000, 48,1000, 16)", (48.1, 11.5, None), "longitude, latitude, satellites"),
+        ("GPS(48,1000,11,5000,20,5M)", (48.1, 11.5, None), "latitude, longitude, height"),
+        ("[latitude: 48,1000] [longitude: 11,5000] [rel_alt: 50,5 abs_alt: 570,2]", (48.1, 11.5, 50.5), ""),
+        (
+            "[latitude : -34.5] [longtitude : -58.5] [altitude: 74.7]",
+            (-34.5, -58.5, None),
+            "'altitude' is left out",
+        ),
+    ],
+)
+def test_each_layout_of_subtitles_is_recognised(tmp_path, line, place, says):
+    """The flight would be over another continent, or two hundred metres from where it was, and nothing be said."""
+    table, pose = read(tmp_path, "a.srt", blocks(lambda _: line))
+    assert (pose.latitude_deg, pose.longitude_deg, pose.height_m) == pytest.approx(place)
+    assert says in " ".join(table.notes)
+    assert bool(says) is bool(table.notes)
+
+
+def test_subtitles_of_one_line_have_height_and_gimbal(tmp_path):
+    """Nothing would be placed, though all is there."""
+    line = (
+        "F/5.6, SS 400, ISO 100, EV 0, GPS (-3.700000, 40.400000, 15), HOME (-3.7001, 40.4001, 650.00m), D 98.70m, "
+        "H 85.80m, H.S 0.00m/s, V.S 0.00m/s, F.PRY (2.7°, -7.0°, 110.1°), G.PRY (-60.0°, 0.0°, 110.4°)"
+    )
+    _, pose = read(tmp_path, "a.srt", blocks(lambda _: line))
+    assert (pose.latitude_deg, pose.longitude_deg, pose.height_m) == pytest.approx((40.4, -3.7, 85.8))
+    assert (pose.camera.yaw_deg, pose.camera.pitch_deg, pose.camera.roll_deg) == pytest.approx(
+        (110.4, -60.0, 0.0)
+    )
+    assert (pose.platform.yaw_deg, pose.platform.pitch_deg, pose.platform.roll_deg) == pytest.approx(
+        (110.1, 2.7, -7.0)
+    )
+
+
+def test_a_bad_block_is_left_out_and_counted(tmp_path, caplog):
+    """One block that a camera has damaged would take the map of the whole flight."""
+    table, _ = read(
+        tmp_path, "a.srt", blocks(lambda n: f"[latitude: {95 if n == 2 else 47.5}] [longitude: 9.7]", count=6)
+    )
+    assert table.at(1 * SECOND_NS, capture_ns=0) is not None
+    assert "1 of 6 rows are left out: " in caplog.text
+    assert "latitude_deg is 95" in caplog.text
+
+
+def test_a_file_that_is_half_wrong_is_refused(tmp_path):
+    """A table of something else would be flown with the few rows that look like a place."""
+    with pytest.raises(
+        UserError, match=r"latitude_deg is 116\.2, .*: are latitude and longitude exchanged\?"
+    ):
+        read(tmp_path, "a.csv", "time_s,latitude_deg,longitude_deg\n0,116.2,40.1\n1,116.2,40.1\n")
+
+
+POINT = '<trkpt lat="47.{:05d}" lon="9.7"><ele>{}</ele>{}</trkpt>'
+
+
+def track(seconds, *, elevation="512.4"):
+    """A GPS track; a second of None has no time."""
+    points = "".join(
+        POINT.format(50_000 + n, elevation, "" if at is None else f"<time>2026-05-01T10:00:{at:02d}Z</time>")
+        for n, at in enumerate(seconds)
+    )
+    return f'<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>'
+
+
+@pytest.mark.parametrize(
+    ("seconds", "says"),
+    [
+        ([n // 2 for n in range(16)], "8 of 16 poses have the time of another"),
+        ([0, 1, 2, 3, 3, 4, 5], "1 of 7 poses have the time of another"),
+        ([0, 1, 2, 3, 4, 3, 4, 5], "not in order of time"),
+        ([7, 6, 5, 4, 3, 2, 1, 0], "not in order of time"),
+        ([0, None, 2, 3, None], "2 points have no time"),
+    ],
+)
+def test_a_track_is_read_as_a_phone_writes_it(tmp_path, caplog, seconds, says):
+    """Two points in one second would refuse the file of the whole flight."""
+    table, pose = read(tmp_path, "a.gpx", track(seconds))
+    assert pose is not None
+    assert table.at(2 * SECOND_NS, capture_ns=0) is not None
+    assert says in caplog.text
+
+
+def test_a_track_has_decimal_commas_in_its_heights(tmp_path):
+    """The height would be a thousand times what it is, or the file be refused."""
+    assert read(tmp_path, "a.gpx", track(range(4), elevation="68,000"))[1].altitude_m == 68.0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufefftime_s;latitude_deg;longitude_deg;height_m\r\n0,0;47,5;9,7;50,5\r\n1,0;47,5;9,7;50,5\r\n",
+        "time_s;latitude_deg;longitude_deg;height_m\n0.0;47.5;9.7;50.5\n1.0;47.5;9.7;50.5\n",
+        "time_s\tlatitude_deg\tlongitude_deg\theight_m\n0\t47.5\t9.7\t50.5\n",
+        'time_s,latitude_deg,longitude_deg,height_m\n"0,0","47,5","9,7","50,5"\n',
+        "\ufeffheight_m, longitude_deg, latitude_deg, time_s\r\n50.5, 9.7, 47.5, 0\r\n",
+    ],
+)
+def test_a_table_is_read_as_a_spreadsheet_writes_it(tmp_path, text):
+    """Half of Europe would have to convert each table by hand."""
+    _, pose = read(tmp_path, "a.csv", text)
+    assert (pose.latitude_deg, pose.longitude_deg, pose.height_m) == pytest.approx((47.5, 9.7, 50.5))

@@ -1,0 +1,57 @@
+"""What the program says of an address that it cannot use, however it was mistyped."""
+
+from __future__ import annotations
+
+import pytest
+
+from hvt_edge.cli import main
+
+SECRET = "S3CRETpw"
+ADDRESSES = [
+    "rtsp://admin:{secret}@127.0.0.1:{port}/cam",
+    "rtsp://admin:{secret}#1@127.0.0.1:{port}/cam",
+    "rtsp://admin:a/{secret}@127.0.0.1:{port}/cam",
+    "rtsp://admin:a?{secret}@127.0.0.1:{port}/cam",
+    "rtsp://admin:a[{secret}@127.0.0.1:{port}/cam",
+    "rtsp://admin:{secret} x@127.0.0.1:{port}/cam",
+    "rtsp://127.0.0.1:{port}/cam?password={secret}",
+    "rtsp://127.0.0.1:{port}/user=admin&password={secret}&channel=1",
+    "http://127.0.0.1:{port}/{secret}/video",
+    "srt://127.0.0.1:{port}?passphrase={secret}",
+    "rstp://admin:{secret}@127.0.0.1/cam",
+    "rtsp:/admin:{secret}@127.0.0.1/cam",
+    "rtsp//admin:{secret}@127.0.0.1/cam",
+    "admin:{secret}@127.0.0.1/cam",
+    "file.mp4?password={secret}",
+]
+FORMS = {
+    "source": lambda address: ["--source", address],
+    "joined": lambda address: [f"--source={address}"],
+    "mistyped option": lambda address: [f"--sorce={address}"],
+    "no option": lambda address: [address],
+    "a number": lambda address: ["--source", "demo", "--fps", address],
+    "passthrough": lambda address: ["--source", address, "--encoder", "passthrough"],
+    "printed": lambda address: ["--source", address, "--print-config"],
+    "pose": lambda address: ["--source", "demo", "--pose", address],
+}
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("address", ADDRESSES)
+@pytest.mark.parametrize("form", FORMS)
+def test_no_sentence_has_the_password(free_port, capsys, address, form):
+    """Who shows an error message to others would give the camera away."""
+    main(FORMS[form](address.format(secret=SECRET, port=free_port)))
+    said = "".join(capsys.readouterr())
+    assert said
+    assert SECRET not in said
+
+
+@pytest.mark.parametrize("address", ADDRESSES)
+def test_nor_where_a_file_has_the_address(tmp_path, capsys, free_port, address):
+    """The settings of a service would be in its log."""
+    file = tmp_path / "edge.toml"
+    for text in ("source = '{}'", "fps = '{}'", "sorce = '{}'", "source = {}"):
+        file.write_text(text.format(address.format(secret=SECRET, port=free_port)))
+        main(["--config", str(file)])
+        assert SECRET not in "".join(capsys.readouterr())
