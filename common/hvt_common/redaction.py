@@ -25,7 +25,7 @@ _SCHEMELESS = re.compile(
     re.IGNORECASE | re.DOTALL,
 )
 """What looks like an address with a typing error, and like no file."""
-_BEGIN = re.compile(r":[/\\]+|\w//")
+_BEGIN = re.compile(r"://+|:\\+|\b(?:rtsps?|rtmps?|https?|srt|udp|tcp|rtp):/|\w//", re.IGNORECASE)
 _WORD = re.compile(
     r"(?:[A-Za-z]{0,12}[0-9]{0,4}|h26[45][A-Za-z]{0,12})(?:[._-](?:[A-Za-z]{0,12}[0-9]{0,4}|mp4))*", re.ASCII
 )
