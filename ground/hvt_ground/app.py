@@ -165,7 +165,13 @@ class Ground:
     def _open_page(self, address: str, settings: LinkSettings) -> WebPage:
         with needs_extra("'hvt[web]'"):  # only now: who serves none starts faster
             from hvt_ground.web import WebPage  # noqa: PLC0415
-        return WebPage(address, clock=self._clock, keys=key_pair(settings), proxy=self._config.web_proxy)
+        return WebPage(
+            address,
+            clock=self._clock,
+            keys=key_pair(settings),
+            proxy=self._config.web_proxy,
+            recorded=self._config.record is not None,
+        )
 
     def _say_where(self, line: StatusLine, *, pages: Sequence[str]) -> None:
         config = self._config

@@ -22,11 +22,10 @@ import platformdirs
 
 from hvt_common.errors import UserError
 
-__all__ = ["COOKIE", "HEADERS", "ROLE_HEADER", "Access", "Role", "is_loopback", "own_tokens"]
+__all__ = ["HEADERS", "ROLE_HEADER", "Access", "Role", "cookie_name", "is_loopback", "own_tokens"]
 
 Role = Literal["viewer", "operator"]
 
-COOKIE = "hvt"
 ROLE_HEADER = "X-HVT-Role"
 """In it a reverse proxy names the role."""
 HEADERS = {
@@ -67,7 +66,7 @@ class Access:
                 return None if any(one in headers for one in _FORWARDED) else "operator"
             said = headers.get(ROLE_HEADER.lower())
             return next((role for role in get_args(Role) if role == said), None)
-        given = (token or _cookie(headers.get("cookie", ""))).encode()
+        given = (token or _cookie(headers)).encode()
         found = [role for role, known in self.tokens.items() if hmac.compare_digest(given, known.encode())]
         return found[0] if found else None
 
@@ -80,16 +79,39 @@ class Access:
             return f"the proxy of {self.proxy} has to say in {ROLE_HEADER} who is viewer or operator", 403
         return "unknown host, or a reverse proxy without --web-proxy", 403
 
-    @staticmethod
-    def same_origin(headers: Mapping[str, str]) -> bool:
-        """Whether a page of ours asks, not one of another site that a browser has open beside it."""
-        origin = headers.get("origin", "")
-        return bool(origin) and urlsplit(origin).netloc == headers.get("host", "")
+    def foreign(self, headers: Mapping[str, str]) -> str:
+        """Empty where a page of ours asks; else why it is taken for one of another site, open beside it."""
+        origin, host = _place(headers.get("origin", "")), _place(f"https://{headers.get('host', '')}")
+        plain = _place(f"http://{headers.get('host', '')}")
+        if origin and origin in (host, plain):
+            return ""
+        if self.proxy is not None and origin and origin[0] == host[0] == self.proxy:
+            return (
+                "the proxy takes the port off the header Host, so that this looks like another site: have it pass "
+                "Host as the browser sent it (nginx: proxy_set_header Host $http_host)"
+            )
+        return "this comes from another site"
 
 
-def _cookie(header: str) -> str:
+def cookie_name(headers: Mapping[str, str]) -> str:
+    """By the port that the browser sees: cookies know no port, and another ground of this host has its own."""
+    port = _place(f"http://{headers.get('host', '')}")[1:]
+    return f"hvt-{port[0]}" if port else "hvt"
+
+
+def _place(url: str) -> tuple[str, ...]:
+    """Host and port of an origin; nothing where it is none."""
     try:
-        found = SimpleCookie(header).get(COOKIE)
+        parts = urlsplit(url)
+        port = parts.port or {"http": 80, "https": 443}.get(parts.scheme)
+    except ValueError:
+        return ()
+    return (parts.hostname, str(port)) if parts.hostname and port else ()
+
+
+def _cookie(headers: Mapping[str, str]) -> str:
+    try:
+        found = SimpleCookie(headers.get("cookie", "")).get(cookie_name(headers))
     except CookieError:
         return ""
     return "" if found is None else found.value

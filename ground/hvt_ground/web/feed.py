@@ -10,11 +10,12 @@ from typing import Any
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Info
-from hvt_common.protocol.still_words import counts_text
+from hvt_common.protocol.still_words import counts_text, still_words
 from hvt_common.runtime.failures import FailedPart
 from hvt_common.runtime.process import lower_priority
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_ground.events import Event, MessageTiming, Notice, Overlay, Refinement, VideoSample
+from hvt_ground.sinks.palette import class_colour
 from hvt_ground.state import EdgeState, GroundState, SessionState
 from hvt_ground.web.pictures import Pictures, jpeg
 from hvt_ground.web.viewers import EdgePage, Hub, text
@@ -123,7 +124,8 @@ class SessionFeed:
             | {word: 1 for word, holds in (("read", read), ("doubted", doubt), ("sure", known)) if holds}
             for track, box, name, sureness, read, doubt, known in rows
         ]
-        return self._text("overlay", item, tracks=tracks)
+        colours = {name: "#{:02x}{:02x}{:02x}".format(*class_colour(name)) for name in set(item.classes)}
+        return self._text("overlay", item, tracks=tracks, colours=colours)
 
     def _still(self, item: Refinement) -> None:
         still = still_name(self._info, item)
@@ -148,6 +150,7 @@ class SessionFeed:
             after=item.class_after,
             sureness=round(item.confidence, 2),
             reason=item.reason,
+            why=still_words(item.reason),
             stored=item.stored,
             unread=item.unread,
             doubted=item.doubted,
@@ -162,8 +165,12 @@ def still_name(info: Info, still: Refinement) -> str:
     return f"{info.session_id & 0xFFFFFF:06x}-{still.still_sequence}"
 
 
-def state_message(state: GroundState) -> str:
-    """How all edges are, for the wall and the plot; the words that an operator reads are made here."""
+def state_message(state: GroundState, *, recorded: bool | None = None) -> str:
+    """How all edges are, for the wall and the plot; the words that an operator reads are made here.
+
+    ``recorded``: this ground writes recordings; None where that is not known.
+    """
+    failing = {part.part for part in state.failed}
     edges = {
         one.edge: {
             "link": one.link,
@@ -172,6 +179,11 @@ def state_message(state: GroundState) -> str:
             "base": None if one.session is None else one.session.base_bps,
             "budget": None if one.session is None else one.session.budget_bps,
             "method": None if one.session is None else one.session.method,
+            "short": "" if one.session is None else _short(one),
+            "recording": None
+            if recorded is None or one.session is None
+            else recorded and not failing & {f"recording of {one.edge}", "recording"},
+            "why": [] if one.session is None else _why(one.session),
             "words": [] if one.session is None else _words(one.session, calibrated=state.calibrated),
             "failed": [*map(_failure, one.failed), *_edge_failures(one)],
         }
@@ -205,9 +217,7 @@ def _words(session: SessionState, *, calibrated: bool) -> list[str]:
         words.append(
             f"capture to boxes {session.delay_p50_ms:.0f} ms, at most {session.delay_p95_ms:.0f} ms for 95 %"
         )
-    not_sent = session.stills_not_sent
-    why = f" (not sent: {counts_text(not_sent, most=3)})" if not_sent else ""
-    words.append(f"{session.stills_received} stills{why}")
+    words.append(f"{session.stills_received} stills")
     trust = "" if calibrated else "; the probability of a class is not calibrated"
     words.append(f"{session.tracks} tracks, {session.tracks_refined} refined by stills{trust}")
     if session.gaps:
@@ -216,9 +226,28 @@ def _words(session: SessionState, *, calibrated: bool) -> list[str]:
         words.append(
             f"from outages {session.backlog_stills} stills, {session.backlog_video_s:.0f} s of video"
         )
-    if session.levers:
-        words.append(session.levers)
     return words
+
+
+def _short(one: EdgeState) -> str:
+    """What of the link stands on the picture."""
+    session = one.session
+    if session is None or session.total_bps is None:
+        return ""
+    thin = "the link does not carry all frames, " if one.link == "thin" else ""
+    return f"{thin}{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}"
+
+
+def _why(session: SessionState) -> list[str]:
+    """What became of frames and stills, and what decides on tracks and stills, in sentences."""
+    why = [] if session.edge_frames is None else [f"At the edge {session.edge_frames}."]
+    if session.stills_not_sent:
+        why.append(f"Not sent as stills: {counts_text(session.stills_not_sent)}.")
+    if session.still_outcomes:
+        why.append(f"Of the objects in stills: {counts_text(session.still_outcomes)}.")
+    if session.levers:
+        why.append(session.levers)
+    return why
 
 
 def _edge_failures(one: EdgeState) -> list[str]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import logging
 import socket
 import ssl
+import struct
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -32,13 +34,16 @@ __all__ = ["WebPage"]
 _MOST_CONNECTIONS = 256
 _FIRST_REQUEST_S = 10.0
 _END_S = 2.0
+_GET_ADDRESS, _MOST_ADDRESSES = 0x8915, 3
+"""SIOCGIFADDR of netdevice(7)."""
 
 
 class WebPage:
     """Serves the page at ``address`` (HOST:PORT) while the context lasts; ``clock`` is the ground's.
 
     ``keys``, a certificate and its key, encrypt it beyond loopback. ``proxy`` is the host for which a reverse proxy
-    on this machine answers. Raises `UserError` where the address, the tokens or the keys cannot be used.
+    on this machine answers, ``recorded`` whether this ground writes recordings. Raises `UserError` where the address,
+    the tokens or the keys cannot be used.
     """
 
     def __init__(
@@ -48,6 +53,7 @@ class WebPage:
         clock: Callable[[], int],
         keys: tuple[Path, Path] | None = None,
         proxy: str | None = None,
+        recorded: bool | None = None,
     ) -> None:
         host, port = _parsed(address)
         if proxy is not None:
@@ -57,6 +63,7 @@ class WebPage:
         if keys is not None:
             _check_keys(*keys)
         self._clock = clock
+        self._recorded = recorded
         self._socket = _bound(host, port)
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
         start = f"{'http' if keys is None else 'https'}://{shown}:{port}/"
@@ -64,7 +71,12 @@ class WebPage:
         """Without a token."""
         self.is_local = proxy is None and not tokens
         """Whether only this machine reaches it."""
-        by_token = tuple(f"{start}?token={token} ({role})" for role, token in tokens.items())
+        scheme = start.partition(":")[0]
+        others = [f"{scheme}://{one}:{port}/" for one in _own_addresses()] if host == "0.0.0.0" else []  # noqa: S104
+        by_token = tuple(
+            " or ".join(f"{where}?token={token}" for where in (start, *others)) + f" ({role})"
+            for role, token in tokens.items()
+        )
         self.links = by_token or (self.address,)
         """What to open, one for each role."""
         self._client: EdgeClient | None = None
@@ -106,7 +118,7 @@ class WebPage:
 
     def show(self, state: GroundState) -> None:
         """Give out how all edges are; for any thread."""
-        message, loads = state_message(state), state_loads(state)
+        message, loads = state_message(state, recorded=self._recorded), state_loads(state)
         self._hub.post(lambda: self._hub.state(message, loads))
 
     def __enter__(self) -> Self:
@@ -149,6 +161,21 @@ class _BoundedProtocol(H11Protocol):
     def _close_silent(self, transport: asyncio.Transport) -> None:
         if self.cycle is None and transport.get_protocol() is self:
             transport.close()
+
+
+def _own_addresses() -> list[str]:
+    """IPv4 addresses of this machine beside loopback, the first few: a network may have no name server."""
+    found: list[str] = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        for _, name in socket.if_nameindex():
+            try:
+                answer = fcntl.ioctl(asking, _GET_ADDRESS, struct.pack("256s", name.encode()[:15]))
+            except OSError:  # it has none, or this is no Linux
+                continue
+            address = socket.inet_ntoa(answer[20:24])
+            if not is_loopback(address):
+                found.append(address)
+    return found[:_MOST_ADDRESSES]
 
 
 def _parsed(address: str) -> tuple[str, int]:

@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from hvt_common.errors import UserError
-from hvt_ground.web.access import COOKIE, HEADERS, Access, Role
+from hvt_ground.web.access import HEADERS, Access, Role, cookie_name
 from hvt_ground.web.pictures import RUNGS
 from hvt_ground.web.requests import BadRequestError, BusyError, EdgeRequests
 from hvt_ground.web.viewers import Hub, Viewer, packed, text
@@ -58,7 +58,9 @@ class Site:
             return _file("index.html")
         response = RedirectResponse("/", 303)
         secure = request.url.scheme == "https"
-        response.set_cookie(COOKIE, token, _COOKIE_S, httponly=True, samesite="lax", secure=secure)
+        response.set_cookie(
+            cookie_name(request.headers), token, _COOKIE_S, httponly=True, samesite="lax", secure=secure
+        )
         return response
 
     async def file(self, request: Request) -> Response:
@@ -242,8 +244,8 @@ class _Guard:
             return PlainTextResponse(*self._access.refusal)
         scope["role"] = role
         acts = scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD")
-        if acts and not self._access.same_origin(headers):
-            return PlainTextResponse("this comes from another site", 403)
+        if acts and (foreign := self._access.foreign(headers)):
+            return PlainTextResponse(foreign, 403)
         if acts and scope["type"] == "http" and role != "operator":
             return PlainTextResponse("only an operator may do this", 403)
         return None

@@ -261,6 +261,7 @@ class Hub:
     def watch(self, viewer: Viewer, edge_name: str, rung: Rung) -> None:
         """Show it this edge from now on, beginning with what it needs for the picture of now."""
         viewer.leave_video()
+        self._put_thumbnails(viewer)
         viewer.watches = (edge_name, rung)
         viewer.put(text("loads", edge=edge_name, rows=list(self._loads.get(edge_name, ()))))
         edge = self.edges.get(edge_name)
@@ -273,19 +274,23 @@ class Hub:
     def leave_edge(self, viewer: Viewer) -> None:
         """It looks at no edge."""
         viewer.leave_video()
+        self._put_thumbnails(viewer)
         viewer.watches = None
         self._want_all()
 
     def show_wall(self, viewer: Viewer, *, shown: bool) -> None:
         """Send it thumbnails of all edges, or no more."""
         viewer.wall = shown
-        if shown:
-            for edge in self.edges.values():
-                if edge.thumbnail is not None:
-                    viewer.put_video(edge.thumbnail, begins=True)
+        self._put_thumbnails(viewer)
         self._want_all()
 
     # Within
+
+    def _put_thumbnails(self, viewer: Viewer) -> None:
+        """Those of all edges: of a silent one no other would come."""
+        for edge in self.edges.values() if viewer.wall else ():
+            if edge.thumbnail is not None:
+                viewer.put_video(edge.thumbnail, begins=True)
 
     def _new_stream(self) -> _Stream:
         self._streams += 1
@@ -294,6 +299,7 @@ class Hub:
     def _begin(self, edge: EdgePage, rung: Rung) -> None:
         for viewer in self._watching(edge, rung):
             viewer.leave_video()
+            self._put_thumbnails(viewer)
             self._join_stream(viewer, edge.streams[rung])
 
     def _join_stream(self, viewer: Viewer, stream: _Stream | None) -> None:

@@ -205,7 +205,7 @@ def test_elsewhere_nothing_is_shown_without_the_token(public, state_folder):
     tokens = json.loads((state_folder / "web-tokens.json").read_text())
     assert (state_folder / "web-tokens.json").stat().st_mode & 0o777 == 0o600
     for path in ("/", "/static/main.js", "/?token=wrong", "/stills/a/b/still"):
-        status, _, text = asked(public, path, Cookie="hvt=wrong")
+        status, _, text = asked(public, path, Cookie=f"hvt-{public}=wrong")
         assert status == 401
         assert tokens["operator"] not in text
     with pytest.raises(InvalidStatus) as refused:
@@ -214,7 +214,7 @@ def test_elsewhere_nothing_is_shown_without_the_token(public, state_folder):
     status, headers, _ = asked(public, f"/?token={tokens['viewer']}")
     assert (status, headers["location"]) == (303, "/")
     assert "HttpOnly" in headers["set-cookie"]
-    cookie = f"hvt={tokens['viewer']}"
+    cookie = f"hvt-{public}={tokens['viewer']}"
     assert asked(public, "/", Cookie=cookie)[0] == 200
     with joined(public, additional_headers={"Cookie": cookie}) as viewer:
         assert json.loads(viewer.recv())["role"] == "viewer"
@@ -245,7 +245,7 @@ def test_a_viewer_commands_nothing(public, state_folder):
     origin = f"http://127.0.0.1:{public}"
     for role, expected in (("viewer", 403), ("operator", 400)):
         status, _, _ = asked(
-            public, "/edges/uav-1/still", "POST", b"{}", Cookie=f"hvt={tokens[role]}", Origin=origin
+            public, "/edges/uav-1/still", "POST", b"{}", Cookie=f"hvt-{public}={tokens[role]}", Origin=origin
         )
         assert status == expected
 

@@ -175,13 +175,68 @@ def test_a_gap_greys_the_last_picture_and_ends_with_the_next(flight, page):
     flight.edge.process.send_signal(signal.SIGSTOP)
     try:
         page.locator("#stage.old").wait_for()
-        assert "old" in page.inner_text("#gap")
+        assert page.inner_text("#standing").startswith(("NO NEW PICTURE", "LINK LOST"))
         last = frame(page)
         time.sleep(1.5)
     finally:
         flight.edge.process.send_signal(signal.SIGCONT)
     page.locator("#stage:not(.old)").wait_for()
     shows(page, after=last + 5)
+
+
+def test_what_an_operator_must_see_stands_on_the_picture(flight, page):
+    """He would scroll for it, or take a paused picture for the one of now."""
+    for viewport in ({"width": 1440, "height": 900}, {"width": 390, "height": 844}):
+        page.set_viewport_size(viewport)
+        shows(page, after=frame(page))
+        eventually(lambda: page.inner_text("#standing").startswith("live, "), within_s=20, what="it is live")
+        eventually(lambda: page.inner_text("#recording") == "recording", within_s=20, what="it is recorded")
+        eventually(
+            lambda: "500 kbps" in page.inner_text("#on-link"), within_s=20, what="what the link carries"
+        )
+        bottom = page.locator("#sign").evaluate("one => one.getBoundingClientRect().bottom")
+        assert bottom < viewport["height"], "without scrolling"
+    page.locator("#pause").click()
+    eventually(lambda: page.inner_text("#standing").startswith("PAUSED "), within_s=5, what="it says so")
+    page.locator("#now").click()
+    eventually(
+        lambda: page.inner_text("#standing").startswith("live, "), within_s=10, what="it is live again"
+    )
+
+
+def test_an_edge_that_is_not_here_is_not_another(flight):
+    """Another edge's picture would be shown to who asked for this one."""
+    page = flight.page("edge=uav-9")
+    page.locator("#absent").wait_for(state="visible")
+    assert page.inner_text("#absent").startswith("uav-9, which the address names, is not here")
+    assert page.locator("#main").is_hidden()
+    page.locator('.edge[data-edge="uav-1"]').click()
+    shows(page)
+    page.context.close()
+
+
+def test_scrolling_commands_nothing(flight):
+    """A wheel over the page would change the budget in flight, or a finger ask for a closer look."""
+    page = flight.page()
+    shows(page)
+    sent: list[str] = []
+    page.on("request", lambda one: sent.append(one.url) if one.method == "POST" else None)
+    for selector in ("#budget", "#method"):
+        before = page.locator(selector).input_value()
+        page.locator(selector).focus()
+        page.locator(selector).hover()
+        page.mouse.wheel(0, 300)
+        page.keyboard.press("ArrowDown")
+        assert selector == "#method" or page.locator(selector).input_value() == before
+    touch = page.context.new_cdp_session(page)
+    box = page.locator("#boxes").bounding_box()
+    x, y = box["x"] + box["width"] / 2, max(box["y"], 0) + 40
+    for kind, at in (("touchStart", y), ("touchMove", y + 60), ("touchEnd", None)):
+        points = [] if at is None else [{"x": x, "y": at}]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    time.sleep(0.5)
+    assert sent == []
+    page.context.close()
 
 
 def test_steps_back_and_to_the_picture_of_now(page):
@@ -202,7 +257,7 @@ def test_an_event_leads_to_its_picture(page):
     """Who reads that something happened would search two minutes for it."""
     shows(page)
     page.locator("#budget").fill("400")
-    page.locator("#settings button").click()
+    page.locator("#budget-form button").click()
     event = page.locator("#events li", has_text="budget 400 kbps").get_by_role("button")
     event.wait_for(timeout=60_000)
     newest = shows(page, after=frame(page) + 20)
@@ -254,11 +309,11 @@ def test_an_operator_sets_the_budget(flight):
         return words in page.locator("#settings-text").text_content()
 
     page.locator("#budget").fill("300")
-    page.locator("#settings button").click()
-    eventually(lambda: said("300 kbps from now on"), within_s=20, what="it is set")
+    page.locator("#budget-form button").click()
+    eventually(lambda: said("300 kbps is in force"), within_s=60, what="the edge flies with it")
     assert "300 kbps" in page.locator("#facts").text_content()
     page.locator("#budget").fill("10")
-    page.locator("#settings button").click()
+    page.locator("#budget-form button").click()
     refused = ("wait two seconds", "takes at least")
     eventually(lambda: any(map(said, refused)), within_s=20, what="the edge's refusal")
     page.context.close()

@@ -1,13 +1,16 @@
 // Boxes and names on the picture, in step with it; a click or a drag is a box too.
 
 /** @typedef {{id: number, box: number[], name: string, sureness: number, read?: 1, doubted?: 1, sure?: 1}} Track */
-/** @typedef {{frame: number, captured: number, tracks: Track[]}} Overlay */
+/** @typedef {{frame: number, captured: number, tracks: Track[], colours: Record<string, string>}} Overlay */
 
 const MOST = 4000;
-const OLD_MS = 500; // a list so old says nothing of this picture
+export const OLD_MS = 500; // a list so old says nothing of this picture
+const LOOK_BACK = 900; // frames
 const FADED_MS = 200;
 const CLICK_SHARE = 0.12; // of the picture's width: what a click beside all boxes asks for
-const COLOURS = ["#4cc9f0", "#ffd166", "#f78c6b", "#83e377", "#c77dff", "#ff8fab", "#72efdd", "#e9c46a"];
+const CROWD = 30; // objects: from so many on only names that matter are written
+const TAP_MS = 500;
+const TAP_PX = 10;
 
 export class Boxes {
   /**
@@ -26,16 +29,23 @@ export class Boxes {
     this.drag = null;
     /** @type {number[] | null} */
     this.marked = null;
+    this.shown = true;
+    /** Classes that are not drawn. @type {Set<string>} */
+    this.left = new Set();
+    /** Of classes, as in the recording. @type {Map<string, string>} */
+    this.colours = new Map();
+    this.downAt = 0;
     new ResizeObserver(() => this.draw()).observe(canvas);
     canvas.addEventListener("pointerdown", (event) => {
-      if (event.button !== 0) return;
-      canvas.setPointerCapture(event.pointerId);
+      if (event.button !== 0 || !event.isPrimary) return;
+      this.downAt = event.timeStamp;
+      if (event.pointerType === "mouse") canvas.setPointerCapture(event.pointerId);
       this.drag = [...this.place(event), ...this.place(event)];
     });
     canvas.addEventListener("pointermove", (event) => {
       if (!this.drag) return;
       this.drag.splice(2, 2, ...this.place(event));
-      this.draw();
+      if (event.pointerType === "mouse") this.draw();
     });
     canvas.addEventListener("pointerup", (event) => this.finish(event));
     canvas.addEventListener("pointercancel", () => {
@@ -47,12 +57,14 @@ export class Boxes {
   reset() {
     this.overlays.clear();
     this.frame = -1;
-    this.marked = null;
+    this.captured = 0;
+    this.marked = this.drag = null;
     this.draw();
   }
 
   /** @param {Overlay} overlay */
   add(overlay) {
+    for (const [name, colour] of Object.entries(overlay.colours)) this.colours.set(name, colour);
     this.overlays.set(overlay.frame, overlay);
     if (this.overlays.size > MOST) this.overlays.delete(this.overlays.keys().next().value);
     if (overlay.frame <= this.frame) this.draw();
@@ -67,11 +79,47 @@ export class Boxes {
 
   /** The list of this picture, or the newest of those shortly before it. */
   current() {
-    for (let frame = this.frame; frame > this.frame - 30 && frame >= 0; frame--) {
+    const found = this.newest();
+    return found && this.captured - found.captured < OLD_MS ? found : null;
+  }
+
+  /** The newest list of this picture or of one before it, however old; null where there is none. */
+  newest() {
+    for (let frame = this.frame; frame > this.frame - LOOK_BACK && frame >= 0; frame--) {
       const found = this.overlays.get(frame);
-      if (found) return this.captured - found.captured < OLD_MS ? found : null;
+      if (found) return found;
     }
     return null;
+  }
+
+  /** How far the boxes are behind the picture, ms; null where there are none at all. */
+  behind() {
+    const found = this.newest();
+    return found ? Math.max(0, this.captured - found.captured) : null;
+  }
+
+  /** @param {boolean} shown whether boxes are drawn at all */
+  toggle(shown) {
+    this.shown = shown;
+    this.draw();
+  }
+
+  /** @param {string} name @param {boolean} drawn */
+  filter(name, drawn) {
+    if (drawn) this.left.delete(name);
+    else this.left.add(name);
+    this.draw();
+  }
+
+  /** Those that are drawn. */
+  drawn() {
+    if (!this.shown) return [];
+    return (this.current()?.tracks ?? []).filter((track) => !this.left.has(track.name));
+  }
+
+  /** @param {string} name */
+  colourOf(name) {
+    return this.colours.get(name) ?? "#aab0b8";
   }
 
   /** @param {number[] | null} box a place that is asked for */
@@ -99,10 +147,14 @@ export class Boxes {
     context.globalAlpha = list && this.captured - list.captured > FADED_MS ? 0.5 : 1;
     /** @type {number[][]} */
     const taken = [];
-    for (const track of list?.tracks ?? []) {
-      this.drawBox(context, track, scale, ratio);
-      if (!track.doubted) this.drawName(context, track, scale, letter, taken);
-    }
+    const tracks = this.drawn();
+    for (const track of tracks) this.drawBox(context, track, scale, ratio);
+    // Those that a still has named go first, then the larger: where it is crowded the others go without.
+    const named = tracks.filter((track) => !track.doubted).sort((one, other) => (other.read ?? 0) - (one.read ?? 0) || area(other.box) - area(one.box));
+    const centres = named.map((track) => [((track.box[0] + track.box[2]) / 2) * scale, ((track.box[1] + track.box[3]) / 2) * scale]);
+    named.forEach((track, index) => {
+      this.drawName(context, track, scale, letter, taken, centres.filter((_, other) => other !== index), named.length > CROWD);
+    });
     context.globalAlpha = 1;
     for (const box of [this.marked, this.drag && sorted(this.drag)]) {
       if (!box) continue;
@@ -117,7 +169,7 @@ export class Boxes {
   /** @param {CanvasRenderingContext2D} context @param {Track} track @param {number} scale @param {number} ratio */
   drawBox(context, track, scale, ratio) {
     const [x, y, right, bottom] = track.box.map((value) => value * scale);
-    context.strokeStyle = colourOf(track);
+    context.strokeStyle = this.colourOf(track.name);
     context.lineWidth = (track.read ? 3 : 1.5) * ratio;
     context.setLineDash(track.doubted ? [4 * ratio, 4 * ratio] : []);
     if (track.doubted) context.lineWidth = ratio;
@@ -126,24 +178,31 @@ export class Boxes {
   }
 
   /**
-   * Names that would cover one another are left out.
+   * Name and score, above or below the box: where it covers another name, or the middle of another object, it is left
+   * out. In a crowd an object smaller than its name has none.
    * @param {CanvasRenderingContext2D} context @param {Track} track @param {number} scale @param {number} letter
-   * @param {number[][]} taken
+   * @param {number[][]} taken @param {number[][]} centres of the others @param {boolean} crowd
    */
-  drawName(context, track, scale, letter, taken) {
-    const words = track.name + (track.sure ? " ✓" : "");
+  drawName(context, track, scale, letter, taken, centres, crowd) {
+    const words = `${track.name} ${track.sure ? "✓" : Math.round(track.sureness * 100)}`;
     const height = letter * 1.35;
     const width = context.measureText(words).width + letter * 0.5;
-    const x = track.box[0] * scale;
-    const top = track.box[1] * scale > height ? track.box[1] * scale - height : track.box[3] * scale;
-    const right = x + width;
-    const bottom = top + height;
-    if (taken.some(([l, t, r, b]) => x < r && right > l && top < b && bottom > t)) return;
-    taken.push([x, top, right, bottom]);
-    context.fillStyle = "#000a";
-    context.fillRect(x, top, width, height);
-    context.fillStyle = colourOf(track);
-    context.fillText(words, x + letter * 0.25, top + letter);
+    const [x, y, end, low] = track.box.map((value) => value * scale);
+    if (crowd && !track.read && end - x < width / 2) return;
+    const left = Math.max(0, Math.min(x, this.canvas.width - width));
+    for (const top of [y - height, low]) {
+      const right = left + width;
+      const bottom = top + height;
+      if (top < 0 || bottom > this.canvas.height) continue;
+      if (taken.some(([l, t, r, b]) => left < r && right > l && top < b && bottom > t)) continue;
+      if (centres.some(([cx, cy]) => cx > left && cx < right && cy > top && cy < bottom)) continue;
+      taken.push([left, top, right, bottom]);
+      context.fillStyle = "#000a";
+      context.fillRect(left, top, width, height);
+      context.fillStyle = this.colourOf(track.name);
+      context.fillText(words, left + letter * 0.25, top + letter);
+      return;
+    }
   }
 
   /** @param {PointerEvent} event */
@@ -159,13 +218,19 @@ export class Boxes {
     if (!this.drag) return;
     const box = sorted(this.drag);
     this.drag = null;
+    const moved = Math.max(box[2] - box[0], box[3] - box[1]) * (this.canvas.clientWidth / this.size[0]);
+    // A finger that moves scrolls, and one that rests does nothing: only a tap asks.
+    if (event.pointerType !== "mouse" && (moved > TAP_PX || event.timeStamp - this.downAt > TAP_MS)) {
+      this.draw();
+      return;
+    }
     const little = this.size[0] / 100;
     if (box[2] - box[0] > little && box[3] - box[1] > little) {
       this.onPick(box, null);
       return;
     }
     const [x, y] = this.place(event);
-    const hit = (this.current()?.tracks ?? [])
+    const hit = this.drawn()
       .filter(({ box: [left, top, right, bottom] }) => x >= left && x <= right && y >= top && y <= bottom)
       .sort((one, other) => area(one.box) - area(other.box))[0];
     if (hit) this.onPick(hit.box, hit);
@@ -181,13 +246,3 @@ const area = (box) => (box[2] - box[0]) * (box[3] - box[1]);
 
 /** @param {number[]} drag */
 const sorted = ([x1, y1, x2, y2]) => [Math.min(x1, x2), Math.min(y1, y2), Math.max(x1, x2), Math.max(y1, y2)];
-
-/** @param {Track} track */
-const colourOf = (track) => COLOURS[hashed(track.name) % COLOURS.length];
-
-/** @param {string} name */
-function hashed(name) {
-  let sum = 7;
-  for (const letter of name) sum = (sum * 31 + letter.charCodeAt(0)) >>> 0;
-  return sum;
-}

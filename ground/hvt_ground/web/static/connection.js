@@ -9,7 +9,7 @@ const NOTHING = new Uint8Array(0);
 export class Connection {
   /**
    * @param {(message: Message, payload: Uint8Array) => void} onMessage empty where there is none
-   * @param {(state: "connected" | "waiting") => void} onState
+   * @param {(state: "connected" | "waiting", why: string) => void} onState why it is refused, where the ground says so
    */
   constructor(onMessage, onState) {
     this.onMessage = onMessage;
@@ -43,7 +43,7 @@ export class Connection {
     socket.onopen = () => {
       this.tries = 0;
       this.roundTrip = Infinity;
-      this.onState("connected");
+      this.onState("connected", "");
       this.askTime();
     };
     socket.onmessage = (event) => {
@@ -54,7 +54,8 @@ export class Connection {
     socket.onclose = () => {
       if (this.socket !== socket) return;
       this.socket = null;
-      this.onState("waiting");
+      this.onState("waiting", "");
+      if (performance.now() - this.heard < 1000) this.askWhy();
       setTimeout(() => this.open(), PAUSES_MS[Math.min(this.tries++, PAUSES_MS.length - 1)]);
     };
   }
@@ -72,6 +73,16 @@ export class Connection {
       this.ahead = message.now - (message.sent + roundTrip / 2);
     }
     this.roundTrip *= 1.1; // an old answer counts less than a new one
+  }
+
+  /** A WebSocket that is refused tells no page why; the same question as a command is answered in words. */
+  async askWhy() {
+    try {
+      const reply = await fetch("/ws", { method: "POST" });
+      if ((reply.status === 401 || reply.status === 403) && !this.socket) this.onState("waiting", (await reply.text()).slice(0, 300));
+    } catch {
+      // there is no ground at all
+    }
   }
 
   askTime() {

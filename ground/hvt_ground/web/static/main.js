@@ -1,41 +1,38 @@
 // The page: which edge is shown, what its messages go to, and what keys and buttons do.
 
-import { Boxes } from "./boxes.js";
+import { Boxes, OLD_MS } from "./boxes.js";
 import { Connection, unpacked } from "./connection.js";
 import { Player } from "./player.js";
 import { Plot } from "./plot.js";
 import { Stills, clock } from "./stills.js";
 import { Wall, kbps, make } from "./wall.js";
+import { LINK_WORDS, RUNG_WORDS, boxesWords, connectionWords, recordingWords, seconds, standing, tracksTitle } from "./words.js";
 
 /** @typedef {import("./connection.js").Message} Message */
 
-const GAP_MS = 1000; // without a new picture
-/** @type {Record<string, string>} */
-const LINK_WORDS = {
-  waiting: "waiting for a keyframe",
-  up: "link up",
-  thin: "link too thin for all frames",
-  lost: "link lost",
-  ended: "ended",
-};
-const WAIT_FOR_NAMED_MS = 1500;
+const STATE_OLD_MS = 4000; // one comes each second
+const PERIODS = 8; // between pictures, of which the longest counts
+const KEYFRAME_MS = 8000;
 const MOST_EVENTS = 200;
 const SET_MS = 30000;
 const METHODS = ["M0", "M1", "M2", "M3", "M4", "M5", "M6"];
-/** @type {Record<string, string>} */
-const RUNG_WORDS = {
-  hevc: "HEVC, as received",
-  h264: "H.264, coded again",
-  jpeg: "single pictures, 2 a second",
-};
 
 /** @param {string} id @returns {any} */
 const by = (id) => document.getElementById(id);
 
 /** @type {Map<string, Message>} */
 const sessions = new Map();
-/** @type {Map<string, string>} */
-const links = new Map();
+/** How each edge is, by the newest state. @type {Map<string, Message>} */
+const states = new Map();
+/** When a keyframe of the chosen edge was asked for; 0: none is waited for. */
+let keyframeAt = 0;
+/** A budget or method that is asked for and not confirmed, by edge. @type {Map<string, {budget?: number, method?: string}>} */
+const asked = new Map();
+/** Between the pictures that were shown last, ms. @type {number[]} */
+let periods = [];
+let connected = false;
+let connectedAt = performance.now();
+let stateAt = -Infinity;
 /** When this page last set something, by edge. @type {Map<string, number>} */
 const setAt = new Map();
 /** Empty before there is one. */
@@ -56,9 +53,12 @@ const wanted = new URLSearchParams(location.hash.slice(1)).get("rung");
 if (wanted && rungs.includes(wanted)) rungs = rungs.slice(rungs.indexOf(wanted));
 wall.mark("");
 
-/** @param {"connected" | "waiting"} state */
-function onState(state) {
-  by("connection").textContent = state === "connected" ? "connected" : "no connection to the ground: trying again";
+/** @param {"connected" | "waiting"} state @param {string} why */
+function onState(state, why) {
+  connected = state === "connected";
+  if (connected) connectedAt = performance.now();
+  showAge();
+  by("connection").textContent = connectionWords(connected, why);
   if (state !== "connected") return;
   connection.send({ type: "wall", shown: true });
   if (chosen) watch();
@@ -76,6 +76,7 @@ function onMessage(message, payload) {
       by("events").replaceChildren();
       break;
     case "session":
+      if (mine && sessions.get(chosen)?.session !== message.session) forget(); // it begins anew, with other frames
       sessions.set(message.edge, message);
       wall.card(message.edge);
       if (mine) describe();
@@ -88,7 +89,7 @@ function onMessage(message, payload) {
       plot.fill(message.edge, message.rows);
       break;
     case "thumbnail":
-      wall.thumbnail(message.edge, payload);
+      wall.thumbnail(message.edge, payload, message.captured);
       break;
     case "notice":
       wall.event(message.edge, message.text);
@@ -111,6 +112,10 @@ function onMessage(message, payload) {
       break;
     case "fragment":
       player.fragment(/** @type {any} */ (message), payload);
+      if (mine && message.key && keyframeAt) {
+        confirm(`a keyframe came ${seconds(performance.now() - keyframeAt)} after it was asked for`);
+        keyframeAt = 0;
+      }
       break;
     case "jpeg":
       if (mine) player.jpeg(/** @type {any} */ (message), payload);
@@ -120,13 +125,14 @@ function onMessage(message, payload) {
 
 // Which edge
 
-/** The one that the address names, or after a moment another. */
+/** The one that the address names; where it names none, the first. */
 function chooseFirst() {
   const named = new URLSearchParams(location.hash.slice(1)).get("edge");
   const [first] = [...sessions.keys()].sort();
-  if (named && sessions.has(named)) choose(named);
-  else if (!named && sessions.size) choose(first);
-  else setTimeout(() => chosen || choose(first), WAIT_FOR_NAMED_MS);
+  if (named && !sessions.has(named)) {
+    by("absent").textContent = `${named}, which the address names, is not here: it is shown when it comes; or choose another`;
+    by("absent").hidden = false;
+  } else if (sessions.size) choose(named || first);
 }
 
 /** @param {string} edge */
@@ -135,13 +141,32 @@ function choose(edge) {
   chosen = edge;
   history.replaceState(null, "", `#${new URLSearchParams({ edge, ...(wanted ? { rung: wanted } : {}) })}`);
   by("main").hidden = false;
+  by("absent").hidden = true;
   wall.mark(edge);
   plot.show(edge);
-  shown = { frame: -1, captured: 0, at: 0 };
   by("answer").hidden = true;
   by("settings-text").textContent = "";
+  keyframeAt = 0;
+  forget();
+  by("link-text").textContent = by("failed").textContent = "";
+  by("why-list").replaceChildren();
   describe();
   watch();
+  const state = states.get(edge);
+  if (state) showState(state);
+}
+
+/** No pixel, box or number of what was shown before may stand under this name. */
+function forget() {
+  player.clear();
+  boxes.reset();
+  shown = { frame: -1, captured: 0, at: 0 };
+  periods = [];
+  by("tracks").replaceChildren();
+  by("classes").replaceChildren();
+  boxes.left.clear();
+  showAge();
+  listTracks();
 }
 
 function watch() {
@@ -175,54 +200,100 @@ function stepDown() {
 
 /** @param {{frame: number, captured: number}} picture */
 function onShown(picture) {
+  if (picture.frame > shown.frame && shown.frame >= 0) periods = [...periods.slice(1 - PERIODS), picture.captured - shown.captured];
   shown = { ...picture, at: performance.now() };
   boxes.show(picture);
   const age = by("age");
   const ms = Math.round(connection.now() - picture.captured);
   age.dataset.ms = String(ms);
   age.dataset.frame = String(picture.frame);
-  if (!by("gap").hidden) showAge();
+  if (by("stage").classList.contains("old")) showAge();
   if (performance.now() - tracksAt > 1000) listTracks();
 }
 
 function showAge() {
-  const lockstep = sessions.get(chosen)?.pace === "lockstep";
+  const now = performance.now();
   const ms = connection.now() - shown.captured;
-  const old = player.live && shown.frame >= 0 && performance.now() - shown.at > GAP_MS;
-  by("stage").classList.toggle("old", old);
-  by("gap").hidden = !old && shown.frame >= 0;
-  by("gap").textContent = shown.frame < 0 ? waitingWords() : `last picture, ${seconds(ms)} old`;
-  if (shown.frame < 0) by("age").textContent = "";
-  else if (!player.live) by("age").textContent = `of ${clock(shown.captured)}, ${seconds(ms)} ago`;
-  else by("age").textContent = lockstep ? "flown in lockstep: no age" : `picture ${seconds(ms)} old`;
+  const state = states.get(chosen);
+  const jpeg = rungs[0] === "jpeg";
+  const { state: name, words, live } = standing({
+    connected: connected && (now - stateAt < STATE_OLD_MS || now - connectedAt < STATE_OLD_MS),
+    goneMs: now - Math.max(stateAt, 0),
+    link: state?.link ?? "",
+    silentMs: state ? connection.now() - state.since : null,
+    chosen: Boolean(chosen),
+    shown: shown.frame >= 0,
+    follows: player.live,
+    plays: !by("video").paused && !jpeg,
+    ageMs: ms,
+    sinceMs: now - shown.at,
+    periodMs: Math.max(jpeg ? 500 : 0, ...periods),
+    lockstep: sessions.get(chosen)?.pace === "lockstep",
+  });
+  const stage = by("stage");
+  stage.dataset.state = name;
+  stage.classList.toggle("old", !live && shown.frame >= 0 && name !== "paused");
+  by("standing").textContent = words;
+  const gone = name === "gone";
+  by("behind").textContent = shown.frame < 0 || gone ? "" : boxesWords(boxes.behind(), OLD_MS);
+  by("on-link").textContent = state && !gone && name !== "lost" ? state.short : "";
+  by("recording").textContent = gone ? "" : recordingWords(state?.recording ?? null);
+  by("recording").classList.toggle("bad", state?.recording === false);
+  by("gap").hidden = shown.frame >= 0;
+  by("gap").textContent = state?.link === "ended" ? "the flight has ended" : "waiting for a picture";
+  by("age").textContent = shown.frame < 0 || player.live ? "" : `of ${clock(shown.captured)}, ${seconds(ms)} ago`;
   by("now").disabled = player.live;
   by("pause").textContent = by("video").paused && !player.live ? "Play" : "Pause";
 }
 setInterval(showAge, 200);
-
-const waitingWords = () => (links.get(chosen) === "ended" ? "the flight has ended" : "waiting for a picture");
-
-/** @param {number} ms */
-const seconds = (ms) => (Math.abs(ms) < 10000 ? `${(ms / 1000).toFixed(1)} s` : `${Math.round(ms / 1000)} s`);
+setInterval(() => wall.tick(connection.now(), connected && performance.now() - stateAt < STATE_OLD_MS), 500);
 
 function listTracks() {
   tracksAt = performance.now();
   const list = by("tracks");
   if (list.contains(document.activeElement)) return; // not under somebody's fingers
-  const tracks = boxes.current()?.tracks ?? [];
-  by("objects-title").textContent = `Tracks: ${tracks.length}`;
+  const newest = boxes.newest();
+  const tracks = newest?.tracks ?? [];
+  by("objects-title").textContent = tracksTitle(newest ? tracks.length : null, newest ? boxesWords(boxes.behind(), OLD_MS) : "");
+  listClasses(tracks);
   if (!by("objects").open) return;
   list.replaceChildren();
   for (const track of tracks.slice(0, 40)) {
     const button = make("button", `${track.doubted ? "doubted" : ""} ${track.read ? "read" : ""}`, make("li", "", list));
-    button.textContent = `${track.name} ${track.id}`;
+    button.textContent = `${track.name} ${track.id}, ${Math.round(track.sureness * 100)} %`;
     button.setAttribute("aria-label", `${track.name}, track ${track.id}${track.doubted ? ", doubted" : ""}: closer look`);
     button.disabled = role !== "operator";
     button.addEventListener("click", () => pick(track.box, track));
   }
 }
 
+/** A button for each class that was there, in its colour. @param {{name: string}[]} tracks */
+function listClasses(tracks) {
+  const known = new Set([...by("classes").children].map((one) => one.dataset.name));
+  for (const { name } of tracks) {
+    if (known.has(name) || known.size >= 24) continue;
+    known.add(name);
+    const button = make("button", "", by("classes"));
+    button.dataset.name = button.textContent = name;
+    button.style.borderColor = boxes.colourOf(name);
+    button.setAttribute("aria-pressed", "true");
+    button.addEventListener("click", () => boxes.filter(name, pressed(button)));
+  }
+}
+
+/** Press a button that stays pressed, or let it go. @param {Element} button @returns {boolean} whether it is pressed now */
+function pressed(button) {
+  const now = button.getAttribute("aria-pressed") !== "true";
+  button.setAttribute("aria-pressed", String(now));
+  return now;
+}
+
 // What is asked of the edge
+
+/** What came of a command. @param {string} words */
+function confirm(words) {
+  by("settings-text").textContent = words;
+}
 
 /** @param {number[]} box @param {{name: string, id: number} | null} track */
 async function pick(box, track) {
@@ -269,63 +340,96 @@ async function post(address, content) {
 
 async function keyframe() {
   if (role !== "operator" || !chosen) return;
-  const reply = await post(`/edges/${encodeURIComponent(chosen)}/keyframe`, {});
-  if (typeof reply === "string") tell(reply, null);
+  const edge = chosen;
+  const at = performance.now();
+  keyframeAt = rungs[0] === "jpeg" ? 0 : at;
+  confirm("asked for a keyframe");
+  const reply = await post(`/edges/${encodeURIComponent(edge)}/keyframe`, {});
+  if (edge !== chosen) return;
+  if (typeof reply === "string") {
+    keyframeAt = 0;
+    confirm(reply);
+  } else if (rungs[0] === "jpeg") confirm("the edge has taken the request for a keyframe");
+  setTimeout(() => {
+    if (keyframeAt !== at) return;
+    keyframeAt = 0;
+    confirm(`no keyframe has come within ${seconds(KEYFRAME_MS)}`);
+  }, KEYFRAME_MS);
 }
 
-/** @param {object} content @param {object} now of the session, once it is set @param {string} words */
+/** @param {object} content @param {{budget?: number, method?: string}} now of the session, once it is set @param {string} words */
 async function set(content, now, words) {
   if (role !== "operator" || !chosen) return;
   const edge = chosen;
-  by("settings-text").textContent = "asking the edge";
+  confirm(`asking ${edge} for ${words}`);
   const reply = await post(`/edges/${encodeURIComponent(edge)}/settings`, content);
   if (typeof reply !== "string") {
     Object.assign(sessions.get(edge) ?? {}, now);
     setAt.set(edge, performance.now());
+    asked.set(edge, now);
   }
   if (edge !== chosen) return;
-  by("settings-text").textContent = typeof reply === "string" ? reply : words;
+  confirm(typeof reply === "string" ? reply : `${edge} has agreed to ${words}; it is not in force yet`);
   describe();
+}
+
+/** The edge says what it flies with: what was asked for is in force. @param {string} edge @param {Message} state */
+function confirmSet(edge, state) {
+  const now = asked.get(edge);
+  if (!now || (now.budget ?? state.budget) !== state.budget || (now.method ?? state.method) !== state.method) return;
+  asked.delete(edge);
+  setAt.delete(edge);
+  if (edge === chosen) confirm(now.budget ? `${kbps(now.budget)} is in force` : `stills by ${now.method} is in force`);
 }
 
 /** What the edge flies with now; not under somebody's fingers. */
 function showSettings() {
   const session = sessions.get(chosen);
-  if (!session || by("settings").contains(document.activeElement)) return;
+  if (!session || by("commands").contains(document.activeElement)) return;
   by("budget").value = String(Math.round(session.budget / 1000));
   by("method").value = session.method;
 }
 
 for (const name of METHODS) make("option", "", by("method")).textContent = name;
-by("settings").addEventListener("submit", (/** @type {Event} */ event) => {
+by("budget-form").addEventListener("submit", (/** @type {Event} */ event) => {
   event.preventDefault();
   const kbps = Number(by("budget").value);
-  set({ kbps }, { budget: 1000 * kbps }, `${kbps} kbps from now on`);
+  set({ kbps }, { budget: 1000 * kbps }, `${kbps} kbps`);
 });
-by("method").addEventListener("change", () => {
+// A wheel or a key that moves a list commands nothing: only Set does.
+by("method-form").addEventListener("submit", (/** @type {Event} */ event) => {
+  event.preventDefault();
   const method = by("method").value;
-  set({ method }, { method }, `stills by ${method} from now on`);
+  set({ method }, { method }, `stills by ${method}`);
 });
+by("show-boxes").addEventListener("click", () => boxes.toggle(pressed(by("show-boxes"))));
 
 // Link and events
 
 /** @param {Message} message */
 function onGroundState(message) {
+  stateAt = performance.now();
   wall.elsewhere(message.elsewhere);
   for (const [edge, state] of Object.entries(message.edges)) {
     wall.state(edge, state, message.at);
-    links.set(edge, state.link);
+    states.set(edge, { ...state, failed: [...state.failed, ...message.failed] });
     if (state.total !== null) plot.add(edge, { at: message.at, total: state.total, base: state.base, budget: state.budget });
     const session = sessions.get(edge);
     const fresh = performance.now() - (setAt.get(edge) ?? -Infinity) < SET_MS; // the ground learns of it later
+    confirmSet(edge, state);
     if (session && state.budget !== null && !fresh) Object.assign(session, { budget: state.budget, method: state.method });
     if (edge !== chosen) continue;
     describe();
-    const words = [`${LINK_WORDS[state.link]} since ${clock(state.since)}`, ...state.words];
-    by("link-text").textContent = words.join(" · ");
-    const failed = [...state.failed, ...message.failed];
-    by("failed").textContent = failed.join(" · ");
+    showState(/** @type {Message} */ (states.get(edge)));
   }
+}
+
+/** How the chosen edge is. @param {Message} state */
+function showState(state) {
+  by("link-text").textContent = [`${LINK_WORDS[state.link]} since ${clock(state.since)}`, ...state.words].join(" · ");
+  by("failed").textContent = state.failed.join(" · ");
+  by("why-list").replaceChildren();
+  for (const one of state.why) make("li", "", by("why-list")).textContent = one;
 }
 
 /** @param {Message} message */

@@ -56,7 +56,19 @@ export class Player {
     return [...(can("hvc1.1.6.L93.B0") ? ["hevc"] : []), ...(can("avc1.42c01f") ? ["h264"] : []), "jpeg"];
   }
 
-  /** Forget the picture: another edge, or a new connection. The last one stays on the screen. */
+  /** Forget the picture and take it off the screen: another edge's may not stand there, nor that of another session. */
+  clear() {
+    this.reset();
+    const { video, image } = this;
+    for (const old of [video.src, image.src]) if (old) URL.revokeObjectURL(old);
+    image.onload = null;
+    image.removeAttribute("src");
+    video.removeAttribute("src");
+    video.load(); // else its last picture stays
+    image.hidden = video.hidden = true;
+  }
+
+  /** Begin anew with the same edge: the last picture stays on the screen until there is another. */
   reset() {
     this.stream = -1;
     this.waiting = [];
@@ -110,7 +122,7 @@ export class Player {
     const url = URL.createObjectURL(new Blob([data], { type: "image/jpeg" }));
     const old = this.image.src;
     this.image.onload = () => {
-      if (old) URL.revokeObjectURL(old);
+      if (old.startsWith("blob:")) URL.revokeObjectURL(old);
       this.onShown({ media: 0, frame: head.frame, captured: head.captured });
     };
     this.video.hidden = true;

@@ -5,7 +5,7 @@ import { make } from "./wall.js";
 const MOST = 60;
 
 /** @typedef {{id: string, edge: string, frame: number, captured: number, shows: string[], track: number | null,
- *    before: string, after: string, sureness: number, reason: string, stored: boolean, unread: boolean,
+ *    before: string, after: string, sureness: number, reason: string, why: string, stored: boolean, unread: boolean,
  *    doubted: boolean, note: string}} Still */
 
 export class Stills {
@@ -64,7 +64,7 @@ export class Stills {
     }
     const words = make("span", "words", button);
     words.textContent = sentence(still);
-    make("small", "", words).textContent = `${clock(still.captured)} · ${reasonOf(still)}${still.stored ? " · came afterwards" : ""}`;
+    make("small", "", words).textContent = `${clock(still.captured)} · ${still.why}${still.stored ? " · came afterwards" : ""}`;
     button.addEventListener("click", () => this.open(still));
     this.list.prepend(item);
     while (this.list.children.length > MOST) this.list.lastElementChild?.remove();
@@ -77,7 +77,7 @@ export class Stills {
       picture.parentElement.hidden = !still.shows.includes(which);
       if (still.shows.includes(which)) picture.src = address(still, which);
     }
-    this.part("#large-text").textContent = `${sentence(still)} · ${clock(still.captured)} · ${reasonOf(still)}`;
+    this.part("#large-text").textContent = `${sentence(still)} · ${clock(still.captured)} · ${still.why}`;
     this.large.showModal();
   }
 
@@ -89,9 +89,6 @@ export class Stills {
 
 /** @param {Still} still @param {string} which */
 const address = (still, which) => `/stills/${encodeURIComponent(still.edge)}/${still.id}/${which}`;
-
-/** @param {Still} still */
-const reasonOf = (still) => (still.reason === "asked" ? "on demand" : still.reason);
 
 /** @param {Still} still */
 function sentence(still) {

@@ -1,5 +1,7 @@
 // The wall: each edge with a small picture, its link, its budget and what happened last.
 
+const OLD_MS = 10000; // a thumbnail comes once a second, or with each frame
+
 /** @typedef {{link: string, since: number, total: number | null, budget: number | null}} EdgeState */
 
 export class Wall {
@@ -25,6 +27,7 @@ export class Wall {
     picture.width = 320;
     picture.height = 180;
     const about = make("span", "about", button);
+    const age = make("span", "card-age", button);
     const top = make("span", "top", about);
     const light = make("span", "light", top);
     make("b", "", top).textContent = edge;
@@ -33,7 +36,7 @@ export class Wall {
     bar.setAttribute("aria-label", "Share of the budget in use");
     const last = make("span", "last", about);
     button.addEventListener("click", () => this.onChoose(edge));
-    const card = { button, picture, light, state, bar, last };
+    const card = { button, picture, light, state, bar, last, age, captured: 0, link: "" };
     this.cards.set(edge, card);
     this.nobody.hidden = true;
     const after = [...this.cards.keys()].sort();
@@ -41,9 +44,11 @@ export class Wall {
     return card;
   }
 
-  /** @param {string} edge @param {Uint8Array} data */
-  thumbnail(edge, data) {
-    const { picture } = this.card(edge);
+  /** @param {string} edge @param {Uint8Array} data @param {number} captured */
+  thumbnail(edge, data, captured) {
+    const card = this.card(edge);
+    const { picture } = card;
+    card.captured = captured;
     const old = picture.src;
     picture.onload = () => {
       if (old) URL.revokeObjectURL(old);
@@ -59,12 +64,31 @@ export class Wall {
   /** @param {string} edge @param {EdgeState} state @param {number} now */
   state(edge, state, now) {
     const card = this.card(edge);
+    card.link = state.link;
     card.light.dataset.state = state.link;
     card.state.textContent = `${state.link} ${lasting(now - state.since)}`;
     const { total, budget } = state;
     const known = total !== null && budget !== null;
+    card.bar.hidden = !known;
     card.bar.value = known ? Math.min(1, total / budget) : 0;
     card.bar.title = known ? `${kbps(total)} of ${kbps(budget)}` : "";
+  }
+
+  /**
+   * About once a second: what is not live looks so, and says how old it is.
+   * @param {number} now @param {boolean} connected whether the ground tells how the edges are
+   */
+  tick(now, connected) {
+    for (const card of this.cards.values()) {
+      const age = now - card.captured;
+      const old = !connected || card.link === "lost" || card.link === "ended" || age > OLD_MS;
+      card.button.classList.toggle("old", old);
+      card.age.textContent = card.captured && old ? `${lasting(age)} old` : "";
+      if (connected) continue;
+      card.light.dataset.state = "unknown";
+      card.state.textContent = "not known";
+      card.bar.hidden = true;
+    }
   }
 
   /**
