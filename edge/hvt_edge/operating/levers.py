@@ -178,16 +178,18 @@ class LeverControl:
         """One line for people."""
         if self._too_slow:
             return "video alone: this machine is too slow for the detector"
-        who = "ground does not see" if self._measured.reported else "base does not show"
-        hidden = f"{self._measured.hidden:.0f} objects the {who}"
-        for count, what in ((self._measured.denied, "false"), (self._measured.misnamed, "misnamed")):
+        measured = self._measured
+        who = "the ground overlooks" if measured.reported else "the video hides"
+        hidden = f"{who} {_objects(measured.hidden)}"
+        for count, what in ((measured.denied, "shows {} false"), (measured.misnamed, "misnames {}")):
             if round(count):
-                hidden += f", {count:.0f} {what}"
-        of_tracks = (
-            f"{'tracks' if tracks else 'no tracks'}: {hidden}"
-            if self._measured.comparisons
-            else "no tracks: not measured"
-        )
-        changed = f"changed {sum(self._changed)} of {len(self._changed)}"
-        of_stills = f"stills show details, {changed}" if self._settings.finer else f"stills {changed}"
-        return f"{of_tracks}; {of_stills if stills else f'stills paused: {changed}'}"
+                hidden += f", {what.format(f'{count:.0f}')}"
+        why = hidden if measured.comparisons else "not measured yet"
+        of_tracks = f"{'tracks' if tracks else 'no tracks'}: {why}"
+        renamed = f"{sum(self._changed)} of {len(self._changed)} renamed something"
+        details = "stills show details, " if self._settings.finer else "stills: "
+        return f"{of_tracks}; {details if stills else 'stills paused: '}{renamed}"
+
+
+def _objects(count: float) -> str:
+    return f"{count:.0f} object" + "s" * (round(count) != 1)

@@ -67,11 +67,11 @@ def test_tracks_follow_their_gain_and_do_not_flicker():
 def test_it_says_who_does_not_see_them():
     """An operator would look for the fault in the video where the ground's model is the wrong one."""
     rig = Rig()
-    for reported, who in ((True, "ground does not see"), (False, "base does not show")):
+    for reported, who in ((True, "the ground overlooks"), (False, "the video hides")):
         rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, reported=reported))
-        assert rig.second().says.startswith(f"tracks: 16 objects the {who}; ")
+        assert rig.second().says.startswith(f"tracks: {who} 16 objects; ")
     rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, denied=4.2, misnamed=2.6))
-    says = "tracks: 16 objects the base does not show, 4 false, 3 misnamed; "
+    says = "tracks: the video hides 16 objects, shows 4 false, misnames 3; "
     assert rig.second().says.startswith(says)
 
 
@@ -113,7 +113,7 @@ def test_stills_of_a_source_much_finer_than_the_base_never_pause():
     """Details are what they are for there: no class changes, and an operator could read nothing."""
     rig = Rig(finer=True)
     assert rig.answers(60)
-    assert rig.operating.now.levers.says.endswith("stills show details, changed 0 of 40")
+    assert rig.operating.now.levers.says.endswith("stills show details, 0 of 40 renamed something")
     rig.control.take_load(0, 0, now_ns=0)
     for second in range(1, 10):
         rig.control.take_load(15 * second, 15 * second, now_ns=second * SECOND_NS)
@@ -124,7 +124,7 @@ def test_stills_that_change_something_go_on():
     """The next one may be the one that matters."""
     rig = Rig()
     assert rig.answers(SETTINGS.most_answers, changed=5)
-    assert "stills changed 5 of 40" in rig.operating.now.levers.says
+    assert "stills: 5 of 40 renamed something" in rig.operating.now.levers.says
 
 
 def test_stills_go_on_where_the_base_misnames_and_no_tracks_tell():
@@ -143,7 +143,7 @@ def test_another_scene_begins_anew():
     rig.control.forget()
     levers = rig.second()
     assert levers.stills
-    assert levers.says.startswith("no tracks: not measured")
+    assert levers.says.startswith("no tracks: not measured yet")
 
 
 def test_a_machine_that_is_too_slow_sends_video_alone_and_says_so():

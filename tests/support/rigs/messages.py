@@ -112,7 +112,7 @@ STATUS = Status(
             working=False,
         ),
     ),
-    levers="tracks: 31 objects the base does not show",
+    levers="tracks: the video hides 31 objects",
 )
 INFO = Info(
     session_id=7,
