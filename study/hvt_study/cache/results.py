@@ -79,6 +79,10 @@ class ResultCache:
         found: dict[str, Any] = json.loads(text)
         return found
 
+    def count(self) -> int:
+        """How many there are."""
+        return sum(1 for _ in self._folder.glob("*/*.json"))
+
     def put(self, key: str, result: Mapping[str, Any]) -> None:
         """Keep a result; whole or not at all, whenever the process dies."""
         path = self._path(key)

@@ -101,8 +101,8 @@ def run(arguments: argparse.Namespace) -> int:
     folder: Path = arguments.out
     file = make_out(folder, name="compare.json")
     pool, _ = open_pool(arguments)
-    with RunProgress("runs") as progress, pool as workers:
-        result = compare(plan, pool=workers, on_run=progress.update)
+    with RunProgress("flights") as progress, pool as workers:
+        result = compare(plan, pool=workers, on_flights=progress.update)
     if not result.rows:
         raise UserError(f"nothing could be flown: {result.missing[0].reason}")
     try:

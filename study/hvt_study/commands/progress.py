@@ -1,4 +1,4 @@
-"""How far a study is: a bar on a terminal, elsewhere a line a minute, so that logs stay short."""
+"""How far a study is: a bar on a terminal; elsewhere a line at once, one with the first estimate, one a minute."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 __all__ = ["RunProgress", "time_left_s"]
 
 _LINE_EVERY_S = 60
+_FIRST_LINE_S = 2
+"""What cannot be done at all says so sooner."""
 _REMEMBERED = 64
+_LEAST = 4
 
 
 class RunProgress:
@@ -24,7 +27,9 @@ class RunProgress:
         self._what = what
         self._console = Console(stderr=True, highlight=False)
         self._began_s = self._said_s = time.monotonic()
+        self._said = self._estimated = False
         self._steps: deque[tuple[float, int]] = deque([(self._began_s, 0)], maxlen=_REMEMBERED)
+        """(time, done); the first is that of the first one done: what begins a study is done once."""
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -39,11 +44,16 @@ class RunProgress:
     def update(self, done: int, of: int, *, failed: int = 0) -> None:
         """So many are done, of so many."""
         now_s = time.monotonic()
-        self._steps.append((now_s, done))
+        if not self._steps[0][1] and done:
+            self._steps.clear()
+        if not self._steps or done != self._steps[-1][1]:
+            self._steps.append((now_s, done))
         more = self._more(of, failed)
         self._bar.update(self._task, completed=done, total=of, more=more)
-        if not self._console.is_terminal and (now_s - self._said_s >= _LINE_EVERY_S or done == of):
-            self._said_s = now_s
+        first = not self._said and now_s - self._began_s >= _FIRST_LINE_S
+        news = first or (bool(more) and not self._estimated) or done == of
+        if not self._console.is_terminal and (news or now_s - self._said_s >= _LINE_EVERY_S):
+            self._said, self._estimated, self._said_s = True, self._estimated or bool(more), now_s
             gone = timedelta(seconds=round(now_s - self._began_s))
             self.note(f"{self._what}: {done} of {of} in {gone}" + f", {more}" * bool(more))
 
@@ -71,6 +81,9 @@ class RunProgress:
 
 
 def time_left_s(steps: deque[tuple[float, int]], of: int) -> float:
-    """From (time, done) of the last steps, oldest first, to the end; 0 where nothing is to be done."""
+    """From (time, done) of the last steps, oldest first, to the end; 0 where it is not known yet, or nothing is left.
+
+    Processes that begin together end together: of fewer than `_LEAST` steps nothing is concluded.
+    """
     (first_s, first), (last_s, last) = steps[0], steps[-1]
-    return (last_s - first_s) / (last - first) * (of - last) if last > first else 0.0
+    return (last_s - first_s) / (last - first) * (of - last) if last - first >= _LEAST else 0.0

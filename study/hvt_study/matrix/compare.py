@@ -8,7 +8,7 @@ are exact where the source knows what it shows (the demo, an annotated picture u
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import as_completed
+from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,11 +16,12 @@ from typing import Any, Literal, TypeAlias
 
 from hvt_common.errors import UserError
 from hvt_edge.wiring import default_size
+from hvt_study.cache.results import ResultCache
 from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.sequence import Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, open_camera
 from hvt_study.matrix.schedule import Pool
-from hvt_study.runs.execute import run_spec
+from hvt_study.runs.execute import FLIGHTS, run_spec
 from hvt_study.runs.methods import METHODS
 from hvt_study.runs.spec import ModelChoice, RunSpec
 
@@ -39,6 +40,9 @@ COMPARED: Mapping[str, tuple[str, str]] = {
 }
 """(method, still codec) by the name in tables, in their order."""
 Labels = Literal["auto", "exact", "reference"]
+_OTHER_SIZES = 4
+"""So many flights at other sizes are usual."""
+_TICK_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,9 +123,9 @@ class CompareResult:
 
 
 def compare(
-    plan: ComparePlan, *, pool: Pool, on_run: Callable[[int, int], None] = lambda *_: None
+    plan: ComparePlan, *, pool: Pool, on_flights: Callable[[int, int], None] = lambda *_: None
 ) -> CompareResult:
-    """Fly everything; ``on_run(done, of)`` is called after each run.
+    """Fly everything; ``on_flights(done, of)`` is called at once and then each second, with how many may be needed.
 
     Raises:
         UserError: the clip, a detector or a rate cannot be used.
@@ -149,16 +153,36 @@ def compare(
     run = partial(run_spec, cache=plan.cache, folder=Path.cwd())
     # Those of several flights first, so that no process is left with one at the end.
     order = sorted(specs, key=lambda one: _flights(specs[one]), reverse=True)
+    left = {one: _distinct_flights(specs[one], beside=plan.methods) for one in order}
+    flights = ResultCache(plan.cache / FLIGHTS)
+    before = at_last = flights.count()
     running = {pool.submit(run, specs[one]): one for one in order}
     done: dict[tuple[int, str], dict[str, Any]] = {}
     try:
-        for future in as_completed(running):
-            done[running[future]] = future.result()
-            on_run(len(done), len(specs))
+        while left:
+            flown = flights.count() - before
+            on_flights(flown, max(flown, at_last - before + sum(left.values())))
+            waiting = [future for future, one in running.items() if one in left]
+            for future in wait(waiting, timeout=_TICK_S, return_when=FIRST_COMPLETED).done:
+                done[running[future]] = future.result()
+                del left[running[future]]  # which may have taken fewer flights than expected
+                at_last = flights.count()
+        on_flights(flights.count() - before, flights.count() - before)
     finally:
         for future in running:
             future.cancel()
     return _result(sequence.name, labels, [(one, done[one]) for one in specs])
+
+
+def _distinct_flights(spec: RunSpec, *, beside: tuple[str, ...]) -> int:
+    """About how many flights a run takes that no other run of its rate takes too."""
+    method = METHODS[spec.method]
+    if method.any_size:
+        return len(method.fps_choices) + _OTHER_SIZES
+    best = (METHODS[COMPARED[one][0]] for one in beside)
+    if any(one.any_size and one.flags == method.flags for one in best):
+        return 0  # it is among those of the best one
+    return max(1, len(method.fps_choices))
 
 
 def _flights(spec: RunSpec) -> tuple[bool, int]:

@@ -24,11 +24,13 @@ from hvt_study.runs.scoring import figures
 from hvt_study.runs.spec import RunSpec
 from hvt_study.runs.video_shape import VideoShape, competing_sizes, search_shape
 
-__all__ = ["run_spec"]
+__all__ = ["FLIGHTS", "run_spec"]
 
 RunRow = dict[str, Any]
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
+FLIGHTS = "flights"
+"""Of the cache: results of flights."""
 _in_flight = threading.Lock()
 """Flights of one process take turns with its detectors; a Dask worker may have several threads."""
 
@@ -72,7 +74,7 @@ class _Flights:
 
     def __init__(self, spec: RunSpec, cache: Path, found: Materials, here: RunSpec) -> None:
         self._spec, self._folder, self._found, self._here = spec, cache, found, here
-        self._cache = ResultCache(cache / "flights")
+        self._cache = ResultCache(cache / FLIGHTS)
         self.wall_s = 0.0
         """What all of them took, whenever that was."""
 
