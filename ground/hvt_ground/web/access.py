@@ -111,7 +111,9 @@ def _place(url: str) -> tuple[str, ...]:
 
 def _cookie(headers: Mapping[str, str]) -> str:
     try:
-        found = SimpleCookie(headers.get("cookie", "")).get(cookie_name(headers))
+        cookies = SimpleCookie(headers.get("cookie", ""))
+        # The name without a port is what a proxy sends, and what a browser was given by an earlier HVT.
+        found = cookies.get(cookie_name(headers)) or cookies.get("hvt")
     except CookieError:
         return ""
     return "" if found is None else found.value
