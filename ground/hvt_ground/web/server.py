@@ -9,6 +9,7 @@ import socket
 import ssl
 import struct
 import threading
+from array import array
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -34,8 +35,9 @@ __all__ = ["WebPage"]
 _MOST_CONNECTIONS = 256
 _FIRST_REQUEST_S = 10.0
 _END_S = 2.0
-_GET_ADDRESS, _MOST_ADDRESSES = 0x8915, 3
-"""SIOCGIFADDR of netdevice(7)."""
+_LIST_ADDRESSES, _ROW_BYTES = 0x8912, 40 if struct.calcsize("P") == 8 else 32
+"""SIOCGIFCONF and struct ifreq of netdevice(7)."""
+_MOST_ADDRESSES = 3
 
 
 class WebPage:
@@ -165,17 +167,16 @@ class _BoundedProtocol(H11Protocol):
 
 def _own_addresses() -> list[str]:
     """IPv4 addresses of this machine beside loopback, the first few: a network may have no name server."""
-    found: list[str] = []
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        for _, name in socket.if_nameindex():
-            try:
-                answer = fcntl.ioctl(asking, _GET_ADDRESS, struct.pack("256s", name.encode()[:15]))
-            except OSError:  # it has none, or this is no Linux
-                continue
-            address = socket.inet_ntoa(answer[20:24])
-            if not is_loopback(address):
-                found.append(address)
-    return found[:_MOST_ADDRESSES]
+    rows = array("B", bytes(_ROW_BYTES * 64))
+    where, size_bytes = rows.buffer_info()
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            answer = fcntl.ioctl(probe, _LIST_ADDRESSES, struct.pack("iP", size_bytes, where))
+    except OSError:  # this is no Linux
+        return []
+    used_bytes = struct.unpack("iP", answer)[0]
+    known = (socket.inet_ntoa(rows[at + 20 : at + 24].tobytes()) for at in range(0, used_bytes, _ROW_BYTES))
+    return [one for one in dict.fromkeys(known) if not is_loopback(one)][:_MOST_ADDRESSES]
 
 
 def _parsed(address: str) -> tuple[str, int]:

@@ -42,7 +42,7 @@ COMPARED: Mapping[str, tuple[str, str]] = {
 Labels = Literal["auto", "exact", "reference"]
 _OTHER_SIZES = 4
 """So many flights at other sizes are usual."""
-_TICK_S = 1.0
+_REPORT_EVERY_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,8 +162,8 @@ def compare(
         while left:
             flown = flights.count() - before
             on_flights(flown, max(flown, at_last - before + sum(left.values())))
-            waiting = [future for future, one in running.items() if one in left]
-            for future in wait(waiting, timeout=_TICK_S, return_when=FIRST_COMPLETED).done:
+            unfinished = [future for future, one in running.items() if one in left]
+            for future in wait(unfinished, timeout=_REPORT_EVERY_S, return_when=FIRST_COMPLETED).done:
                 done[running[future]] = future.result()
                 del left[running[future]]  # which may have taken fewer flights than expected
                 at_last = flights.count()

@@ -30,9 +30,15 @@ export class Boxes {
     /** @type {number[] | null} */
     this.marked = null;
     this.shown = true;
-    /** Classes that are not drawn. @type {Set<string>} */
+    /**
+     * Classes that are not drawn.
+     * @type {Set<string>}
+     */
     this.left = new Set();
-    /** Of classes, as in the recording. @type {Map<string, string>} */
+    /**
+     * Of classes, as in the recording.
+     * @type {Map<string, string>}
+     */
     this.colours = new Map();
     this.downAt = 0;
     new ResizeObserver(() => this.draw()).observe(canvas);

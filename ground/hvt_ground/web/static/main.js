@@ -22,18 +22,30 @@ const by = (id) => document.getElementById(id);
 
 /** @type {Map<string, Message>} */
 const sessions = new Map();
-/** How each edge is, by the newest state. @type {Map<string, Message>} */
+/**
+ * How each edge is, by the newest state.
+ * @type {Map<string, Message>}
+ */
 const states = new Map();
 /** When a keyframe of the chosen edge was asked for; 0: none is waited for. */
 let keyframeAt = 0;
-/** A budget or method that is asked for and not confirmed, by edge. @type {Map<string, {budget?: number, method?: string}>} */
+/**
+ * A budget or method that is asked for and not confirmed, by edge.
+ * @type {Map<string, {budget?: number, method?: string}>}
+ */
 const asked = new Map();
-/** Between the pictures that were shown last, ms. @type {number[]} */
+/**
+ * Between the pictures that were shown last, ms.
+ * @type {number[]}
+ */
 let periods = [];
 let connected = false;
 let connectedAt = performance.now();
 let stateAt = -Infinity;
-/** When this page last set something, by edge. @type {Map<string, number>} */
+/**
+ * When this page last set something, by edge.
+ * @type {Map<string, number>}
+ */
 const setAt = new Map();
 /** Empty before there is one. */
 let chosen = "";
@@ -267,7 +279,10 @@ function listTracks() {
   }
 }
 
-/** A button for each class that was there, in its colour. @param {{name: string}[]} tracks */
+/**
+ * A button for each class that was there, in its colour.
+ * @param {{name: string}[]} tracks
+ */
 function listClasses(tracks) {
   const known = new Set([...by("classes").children].map((one) => one.dataset.name));
   for (const { name } of tracks) {
@@ -281,7 +296,11 @@ function listClasses(tracks) {
   }
 }
 
-/** Press a button that stays pressed, or let it go. @param {Element} button @returns {boolean} whether it is pressed now */
+/**
+ * Press a button that stays pressed, or let it go.
+ * @param {Element} button
+ * @returns {boolean} whether it is pressed now
+ */
 function pressed(button) {
   const now = button.getAttribute("aria-pressed") !== "true";
   button.setAttribute("aria-pressed", String(now));
@@ -290,7 +309,10 @@ function pressed(button) {
 
 // What is asked of the edge
 
-/** What came of a command. @param {string} words */
+/**
+ * What came of a command.
+ * @param {string} words
+ */
 function confirm(words) {
   by("settings-text").textContent = words;
 }
@@ -373,7 +395,11 @@ async function set(content, now, words) {
   describe();
 }
 
-/** The edge says what it flies with: what was asked for is in force. @param {string} edge @param {Message} state */
+/**
+ * The edge says what it flies with: what was asked for is in force.
+ * @param {string} edge
+ * @param {Message} state
+ */
 function confirmSet(edge, state) {
   const now = asked.get(edge);
   if (!now || (now.budget ?? state.budget) !== state.budget || (now.method ?? state.method) !== state.method) return;
@@ -424,7 +450,10 @@ function onGroundState(message) {
   }
 }
 
-/** How the chosen edge is. @param {Message} state */
+/**
+ * How the chosen edge is.
+ * @param {Message} state
+ */
 function showState(state) {
   by("link-text").textContent = [`${LINK_WORDS[state.link]} since ${clock(state.since)}`, ...state.words].join(" · ");
   by("failed").textContent = state.failed.join(" · ");
