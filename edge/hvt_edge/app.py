@@ -44,6 +44,7 @@ from hvt_edge.wiring import (
     check_store,
     open_for_flight,
     qualify_encoder,
+    say_size,
     track_confidence,
     try_scene,
 )
@@ -111,6 +112,7 @@ class Edge:
             check_truth(config.truth, source)
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
+            say_size(config, source.view)
             headroom = qualify_encoder(config, source, clock=world.clock, stop=self._stop)
             background = (lambda call: call()) if self._lockstep else with_lower_priority
             opened = background(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +38,7 @@ from hvt_edge.operating.point import base_rate_bps
 from hvt_edge.profiles import PROFILES, REGIMES
 from hvt_edge.source.contract import check_shape
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
-from hvt_edge.video.encoder_settings import PRESETS, least_base_bps
+from hvt_edge.video.encoder_settings import PRESETS, keyframe_total_bps, least_base_bps
 from hvt_edge.video.encoders.registry import PASSTHROUGH, X265, check_encoder
 from hvt_edge.video.share import FIRST_SHARE
 
@@ -47,6 +48,8 @@ __all__ = [
     "EdgeConfig",
     "check",
     "check_rate",
+    "least_budget_bps",
+    "stream_text",
     "with_profile",
 ]
 
@@ -98,7 +101,7 @@ class EdgeConfig:
         or_auto(SIZE),
         None,
         "size of the base stream in pixels; auto: as large as the rate carries",
-        shown_default="1280x720, or what the source fills of it",
+        shown_default="1280x720, or what the source fills of it and --budget carries",
     )
     fps: float | str = _SOURCE.option(
         or_auto(number(0.1, 240, unit=" frames a second")),
@@ -451,20 +454,41 @@ def check(config: EdgeConfig) -> EdgeConfig:
 
 
 def check_rate(config: EdgeConfig, size: tuple[int, int]) -> None:
-    """Raise `UserError` where x265 cannot follow what the budget leaves to the base stream at this size.
+    """Raise `UserError` where the budget cannot carry a base stream of this size; what a camera takes is measured.
 
-    What a camera takes is measured (`hvt_edge.video.encoders.passthrough`).
+    See `least_budget_bps`, and for a camera `hvt_edge.video.encoders.passthrough`.
     """
     if config.passes_through:
         return
-    fps = LEAST_FPS if config.auto_fps else config.nominal_fps
-    least_bps = least_base_bps(size, fps, edge_id=config.edge_id)
-    if config.base_bps < least_bps:
+    least_bps = least_budget_bps(config, size, share=config.share)
+    if config.budget_bps < least_bps:
+        by_share = least_bps > least_budget_bps(config, size, share=1.0)
         raise UserError(
-            f"--budget {bitrate_text(config.budget_bps)} leaves {bitrate_text(config.base_bps)} for video, but "
-            f"{size[0]}x{size[1]} at {fps:g} fps takes at least {bitrate_text(least_bps)}: "
-            "raise --budget, or lower --size or --fps"
+            f"--budget {bitrate_text(config.budget_bps)} is too little for {stream_text(config, size)}: give at "
+            f"least {bitrate_text(least_bps)}, lower --size or --fps"
+            f"{f', or raise --video-share {config.share:g}' if by_share else ''}"
         )
+
+
+def least_budget_bps(config: EdgeConfig, size: tuple[int, int], *, share: float) -> int:
+    """The least total, whole kilobits a second, with which a base stream of this size and share works.
+
+    x265 can follow what is left to it, and each window holds the smallest keyframe of a picture with texture beside
+    what goes with it. Below that the stream would be left out for seconds, or made ever coarser.
+    """
+    fps = LEAST_FPS if config.auto_fps else config.nominal_fps
+    base_bps = least_base_bps(size, fps, edge_id=config.edge_id)
+    keyframe_bps = keyframe_total_bps(
+        size, window_s=config.window, metadata_bps=config.metadata_bps, edge_id=config.edge_id
+    )
+    return 1000 * math.ceil(max(base_bps / share, base_bps + config.metadata_bps, keyframe_bps) / 1000)
+
+
+def stream_text(config: EdgeConfig, size: tuple[int, int]) -> str:
+    """Such as ``1280x720 at 15 fps``: what the least budget is for."""
+    fps = LEAST_FPS if config.auto_fps else config.nominal_fps
+    what = f"{size[0]}x{size[1]} at {fps:g} fps"
+    return what if config.window == 1 else f"{what} with --window {config.window:g}s"
 
 
 def _with_rates(config: EdgeConfig) -> EdgeConfig:

@@ -15,6 +15,7 @@ from hvt_common.errors import UserError
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.policy.registry import METHODS
+from hvt_edge.video.encoder_settings import keyframe_floor_bytes
 
 
 def read(*argv: str) -> EdgeConfig:
@@ -82,14 +83,33 @@ def test_the_regimes_are_the_papers():
     assert rates == {"low": (800_000, 650_000), "moderate": (1_400_000, 1_200_000)}
 
 
+@pytest.mark.parametrize("size", ["160x120", "320x180", "640x360", "1280x720", "1920x1080"])
+@pytest.mark.parametrize("fps", ["2", "5", "15", "30", "auto"])
+@pytest.mark.parametrize(
+    "flags", [["--method", "M0"], ["--method", "M5"], ["--profile", "auto"], ["--window", "2s"]]
+)
+def test_a_budget_whose_window_holds_no_keyframe_is_refused_with_the_least_that_does(size, fps, flags):
+    """The first second would be twice what the link carries, without a word."""
+    argv = ["--size", size, "--fps", fps, *flags]
+    with pytest.raises(UserError, match="give at least") as refused:
+        settled(*argv, "--budget", "9kbps")
+    words = str(refused.value).split("give at least ")[1].split()
+    least_bps = round(float(words[0]) * (1e6 if words[1].startswith("M") else 1e3))
+    config = settled(*argv, "--budget", f"{least_bps / 1000:.0f}kbps")
+    wide, high = map(int, size.split("x"))
+    assert config.budget_bps * config.window / 8 > keyframe_floor_bytes((wide, high))
+    with pytest.raises(UserError, match="give at least"):
+        settled(*argv, "--budget", f"{least_bps / 1000 - 2:.0f}kbps")
+
+
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
         (["--regime", "low", "--budget", "1Mbps"], "--regime low already sets"),
         (["--regime", "low", "--video-share", "0.5"], "--regime low already sets"),
         (["--video-share", "0"], "--video-share 0 leaves no base stream"),
-        (["--budget", "60kbps", "--size", "1280x720"], "raise --budget, or lower --size or --fps"),
-        (["--budget", "500kbps", "--video-share", "0.1", "--size", "1280x720"], "leaves 50 kbps for video"),
+        (["--budget", "60kbps", "--size", "1280x720"], "give at least 118 kbps, lower --size or --fps"),
+        (["--budget", "500kbps", "--video-share", "0.1", "--size", "1280x720"], "or raise --video-share 0.1"),
         (["--window", "10ms"], "--window 0.01s is not accepted"),
         (["--window", "61s"], "--window 61s is not accepted"),
         (["--size", "1281x720"], "size 1281x720 is impossible"),

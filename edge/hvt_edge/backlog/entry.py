@@ -10,7 +10,7 @@ from hvt_common.protocol.messages import MAX_BACKLOG_BYTES, BacklogKind, ObjectK
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 
-__all__ = ["FIRST_STORED", "SEGMENT_NS", "Entry", "OpenSegment", "moved_rank", "worth"]
+__all__ = ["FIRST_STORED", "MOST_UNIT_BYTES", "SEGMENT_NS", "Entry", "OpenSegment", "moved_rank", "worth"]
 
 FIRST_STORED = 2**31
 """Stills that are stored for later have numbers of their own: those that are sent have no holes then."""
@@ -18,7 +18,8 @@ SEGMENT_NS = 10 * SECOND_NS
 """A keyframe is wanted when a segment is so long: eviction and sending go by segments."""
 _HALF_LIFE_NS = 600 * SECOND_NS
 _LEAST_STRENGTH = -60.0
-_MOST_SEGMENT_BYTES = MAX_BACKLOG_BYTES - 512 * 1024
+MOST_UNIT_BYTES = _MOST_SEGMENT_BYTES = MAX_BACKLOG_BYTES - 512 * 1024
+"""A larger access unit would be more than any ground takes in one object."""
 _MOST_SEGMENT_UNITS = 2400
 
 

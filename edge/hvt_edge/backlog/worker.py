@@ -21,7 +21,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Backfill, Chunk
 from hvt_edge.backlog.disk import Store
-from hvt_edge.backlog.entry import Entry
+from hvt_edge.backlog.entry import MOST_UNIT_BYTES, Entry
 from hvt_edge.backlog.intake import EndSegment, Intake, IntakeStill, News
 
 __all__ = ["ChunkAllowance", "ChunkThread", "StoreNumbers", "StoreWorker"]
@@ -109,6 +109,7 @@ class StoreWorker:
         self._sending = ChunkThread(send, on_done=self.intake.signal)
         self._sent_stills = self._sent_ns = self._trickle_ns = 0
         self._slow = False
+        self._too_large = 0
         self._retry, self._sending_retry = RetryPause(), RetryPause()
         self.failed = False
         """The disk refuses: nothing is stored until it takes something again."""
@@ -125,9 +126,15 @@ class StoreWorker:
             raise error
 
     def offer(self, item: AccessUnit | IntakeStill) -> bool:
-        """Hand over something to be stored; False where it is not, because the disk is too slow or refuses."""
+        """Hand over something to be stored; False where the disk is too slow or refuses, or it is too large."""
         self.check()
         if self.failed:
+            return False
+        if isinstance(item, AccessUnit) and len(item.data) > MOST_UNIT_BYTES:
+            self._too_large += 1
+            if self._too_large.bit_count() == 1:  # 1, 2, 4, 8 …
+                size = f"{len(item.data) / 1e6:.1f} MB"
+                _log.warning("a frame of %s is too large to be stored (%d so far)", size, self._too_large)
             return False
         if not self.intake.offer(item):
             if not self._slow:

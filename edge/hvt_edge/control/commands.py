@@ -17,16 +17,15 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, TrackNow, fitted_text
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_edge.backlog.stage import BacklogStage
-from hvt_edge.config import LEAST_FPS, EdgeConfig
+from hvt_edge.config import EdgeConfig, least_budget_bps, stream_text
 from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.point import Operating, base_rate_bps
+from hvt_edge.operating.point import Operating
 from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.on_demand_crop import OnDemandRequest, RefusedError
 from hvt_edge.stills.policy.base import Method
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser
-from hvt_edge.video.encoder_settings import least_base_bps
 from hvt_edge.video.share import FIRST_SHARE
 
 __all__ = ["Commands"]
@@ -209,18 +208,13 @@ class Commands:
         """As `hvt_edge.config.check_rate`, in words for whoever commands from afar."""
         config, size = self.config, self.base_size
         share = FIRST_SHARE if video_share is None else video_share
-        base_bps = base_rate_bps(budget_bps, share, metadata_bps=config.metadata_bps)
-        fps = LEAST_FPS if config.auto_fps else config.nominal_fps
-        least_bps, what = (
-            least_base_bps(size, fps, edge_id=config.edge_id),
-            f"{size[0]}x{size[1]} at {fps:g} fps",
-        )
+        least_bps, what = least_budget_bps(config, size, share=share), stream_text(config, size)
         if config.passes_through:  # what of a camera has no room is left out
-            least_bps, what = _LEAST_CAMERA_BPS, "a camera that is passed through"
-        if base_bps < least_bps:
+            least_bps = max(round(_LEAST_CAMERA_BPS / share), _LEAST_CAMERA_BPS + config.metadata_bps)
+            what = "a camera that is passed through"
+        if budget_bps < least_bps:
             raise RefusedError(
-                f"{bitrate_text(budget_bps)} would leave {bitrate_text(base_bps)} for video, and {what} takes at "
-                f"least {bitrate_text(least_bps)}"
+                f"{bitrate_text(budget_bps)} is too little for {what}: it takes at least {bitrate_text(least_bps)}"
             )
 
 

@@ -188,6 +188,10 @@ class RollingBudget:
         self._tokens -= line_bytes - borrowed
         self._record(line_bytes, now_ns)
 
+    def holds(self, line_bytes: int) -> bool:
+        """Tell whether an empty window has room for a message of so many line bytes."""
+        return line_bytes <= self._total
+
     def fits(self, line_bytes: int, *, now_ns: int) -> bool:
         """Tell whether a message of so many line bytes, sent now, leaves every window within the total.
 
@@ -215,15 +219,17 @@ class RollingBudget:
         """Return when a message of so many line bytes may go: now, or as soon as its window has room.
 
         A ``base`` message also keeps every window of the base stream within `BASE_PEAK` times B_v. Messages keep
-        their order: never before the base message or metadata recorded last. The wait beyond that is one window at
-        the most, also for a message that no window can hold.
+        their order: never before the base message or metadata recorded last. The wait beyond that is about one window
+        at the most, also for a message that no window can hold (`holds`), which must not go.
         """
         self._note_query(now_ns)
         at_ns = max(now_ns, self._last_ns)
         latest_ns = at_ns + self._settings.window_ns
         if base:
             at_ns = self._first_fit_ns(self._base_events, self._peak_at(at_ns), line_bytes, at_ns)
-        return min(latest_ns, self._first_fit_ns(self._events, self._total, line_bytes, at_ns))
+            at_ns = min(latest_ns, at_ns)
+        at_ns = self._first_fit_ns(self._events, self._total, line_bytes, at_ns)
+        return at_ns if self.holds(line_bytes) else min(latest_ns, at_ns)
 
     def _first_fit_ns(
         self, events: Sequence[tuple[int, int]], limit: float, line_bytes: int, at_ns: int

@@ -24,7 +24,14 @@ from typing import Protocol
 
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
-from hvt_common.protocol.messages import BacklogHeader, BacklogStill, BaseHeader, Flags, Status
+from hvt_common.protocol.messages import (
+    MAX_PAYLOAD_BYTES,
+    BacklogHeader,
+    BacklogStill,
+    BaseHeader,
+    Flags,
+    Status,
+)
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.backlog.backfill import Chunk
@@ -92,12 +99,15 @@ class Transmitter:
     def base(self, unit: AccessUnit, *, now_ns: int, after_hole: bool = False, announced: bool = True) -> int:
         """Send one access unit as soon as the budget's window has room for it; return its line bytes.
 
+        0 where it is not sent, because no window has room for it, or no message (`holds`): a keyframe has to follow.
         ``after_hole``: frames that it builds on were not sent. A number is left out, so that nobody shows it.
         ``announced``: stills yield to a keyframe beforehand; else the budget keeps room for another that comes by
         itself.
         """
         line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
+            if not self._holds(unit, line_bytes):
+                return 0
             at_ns = self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
             self.base_sequence += 2 if after_hole else 1
             header = BaseHeader(
@@ -306,11 +316,20 @@ class Transmitter:
             return max(0, self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True) - now_ns)
 
     def base_unit_wait_ns(self, unit: AccessUnit, *, now_ns: int) -> int | None:
-        """How long this unit would wait for the budget's window; None where no window would have room for it."""
+        """How long this unit would wait for the budget's window; None where nothing would have room for it."""
         line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
             at_ns = self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
-            return at_ns - now_ns if self.budget.fits(line_bytes, now_ns=at_ns) else None
+            return at_ns - now_ns if self._holds(unit, line_bytes) else None
+
+    def holds(self, unit: AccessUnit) -> bool:
+        """Tell whether an empty window of the budget, and a message, have room for this unit."""
+        line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
+        with self._lock:
+            return self._holds(unit, line_bytes)
+
+    def _holds(self, unit: AccessUnit, line_bytes: int) -> bool:
+        return len(unit.data) <= MAX_PAYLOAD_BYTES and self.budget.holds(line_bytes)
 
     def end_base(self) -> None:
         """The source has given its last frame; see `RollingBudget.end_base`."""

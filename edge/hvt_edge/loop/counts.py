@@ -118,7 +118,8 @@ def _group(decision: FrameDecision, *, coded: bool, taken: bool, has_viewer: boo
     | skip | | | | frame_rate |
     | hold | | | | who held it: budget, link, closer_look … |
     | code | no | | | encoder |
-    | code | yes | no | | link |
+    | code, to the store | yes | no | | link |
+    | code, to the link | yes | no | | budget |
     | code, to the store | yes | yes | | stored |
     | code, to the link | yes | yes | yes | sent |
     | code, to the link | yes | yes | no | nobody_listened |
@@ -130,7 +131,7 @@ def _group(decision: FrameDecision, *, coded: bool, taken: bool, has_viewer: boo
     if not coded:
         return "encoder"
     if not taken:
-        return "link"
+        return "link" if decision.to_store else "budget"
     if decision.to_store:
         return "stored"
     return "sent" if has_viewer else "nobody_listened"

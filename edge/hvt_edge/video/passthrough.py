@@ -175,7 +175,7 @@ class PassthroughStage:
             line_bytes = self.transmitter.base(unit, now_ns=now_ns, announced=False)
             if self.least_link is not None:
                 self.least_link.sent(line_bytes, now_ns=now_ns)
-            return True
+            return bool(line_bytes)
         taken = self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
         if decision.to_link:
             self.transmitter.base(unit, now_ns=now_ns, after_hole=not unit.keyframe, announced=False)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from hvt_common.errors import UserError
 
 __all__ = [
+    "LEAST_SIDE_PX",
     "PROMPT",
     "SIZES",
     "SPARING",
@@ -33,7 +34,7 @@ _STEPS = (1, 2, 3, 5, 8, 15)
 _LEAST_FPS = 2.0
 """A budget's window of a second holds two frames at least (see config)."""
 
-_LEAST_SIDE_PX = 64
+LEAST_SIDE_PX = 64
 # Bits for each pixel of a coded frame: from where a size is worth its pixels, and a frame its place.
 _SIZE_BITS_PER_PX = 0.020
 _RATE_BITS_PER_PX = 0.040
@@ -114,9 +115,9 @@ def _size_for(bits_per_frame: float, source_size: tuple[int, int]) -> tuple[int,
 def sizes_of(source_size: tuple[int, int]) -> list[tuple[int, int]]:
     """The ladder for a source of this (width, height), largest first: its aspect ratio, even sides, none larger."""
     width, height = source_size
-    if min(width, height) < _LEAST_SIDE_PX:
+    if min(width, height) < LEAST_SIDE_PX:
         raise UserError(
-            f"the source has {width}x{height} pixels, and a base stream has {_LEAST_SIDE_PX} on each side at least: "
+            f"the source has {width}x{height} pixels, and a base stream has {LEAST_SIDE_PX} on each side at least: "
             "give --size"
         )
     whole = (width // 2 * 2, height // 2 * 2)
@@ -124,7 +125,7 @@ def sizes_of(source_size: tuple[int, int]) -> list[tuple[int, int]]:
     for area in (wide * high for wide, high in SIZES):
         scale = math.sqrt(area / (width * height))
         size = (round(width * scale / 2) * 2, round(height * scale / 2) * 2)
-        if min(size) >= _LEAST_SIDE_PX and size[0] * size[1] < 0.9 * sizes[-1][0] * sizes[-1][1]:
+        if min(size) >= LEAST_SIDE_PX and size[0] * size[1] < 0.9 * sizes[-1][0] * sizes[-1][1]:
             sizes.append(size)
     largest = SIZES[0][0] * SIZES[0][1]
     return [size for size in sizes if size[0] * size[1] <= 1.05 * largest] or [whole]

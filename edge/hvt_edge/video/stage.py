@@ -6,10 +6,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 
+import cv2
+import numpy as np
+
 from hvt_common.errors import FlightError
 from hvt_common.protocol.frame_account import FrameGroup
 from hvt_common.runtime.failures import Failures
-from hvt_common.units import SECOND_NS
+from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage, State
 from hvt_edge.link.transmitter import Transmitter
@@ -23,8 +26,11 @@ from hvt_edge.video.regions import TrackRegions
 
 __all__ = ["BaseStage"]
 
-_PART = "encoder"
+_PART, _SIZE_PART = "encoder", "video"
 _MOST_FAILURES, _FAILURES_NS = 3, 10 * SECOND_NS
+_COARSER = (2, 4, 8)
+"""By how much a picture is made coarser whose unit is too large. x265 cannot code more coarsely than at quantiser 51;
+what it has to code can have less detail."""
 
 
 @dataclass(eq=False)
@@ -62,7 +68,7 @@ class BaseStage:
         self._frame_skip = self.frame_skip or FrameSkip()
         self._failed_ns: deque[int] = deque(maxlen=_MOST_FAILURES)
         self._begins_anew = False
-        """The encoder was opened again: its next frame is a keyframe."""
+        """The encoder was opened again, or a frame that others build on was left out: the next is a keyframe."""
 
     def decide(self, frame: Frame, *, now_ns: int) -> FrameDecision:
         """Decide on this source frame; once for each, in order."""
@@ -88,7 +94,8 @@ class BaseStage:
     ) -> AccessUnit | None:
         """Encode the frame as decided (None where it is not coded); ``tracks`` are the newest known.
 
-        A frame on which the encoder fails is left out. `FlightError` where it fails again and again.
+        A frame on which the encoder fails is left out. `FlightError` where it fails again and again. One that no
+        window of the budget has room for is coded again, as a keyframe of less and less detail.
         """
         if not decision.codes:
             return None
@@ -97,6 +104,8 @@ class BaseStage:
                 self._at_keyframe(frame.index, now_ns=now_ns)
             regions = [] if self.regions is None else self.regions.regions(tracks)
             unit = self.encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
+            if decision.to_link:
+                unit = self._within_a_window(unit, frame)
         except Exception as error:
             if self.open_again is None:
                 raise
@@ -123,7 +132,7 @@ class BaseStage:
     def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> bool:
         """Store the unit, or send it, or both; blocks while the link is full: frames are dropped before encoding.
 
-        False where it was for the store, and the store did not take it.
+        False where the store did not take it, or nothing has room for it on the link.
         """
         if self.backlog is not None and decision.to_store:
             taken = self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
@@ -134,6 +143,11 @@ class BaseStage:
             # On the way back none of it is on the line: the budget has to get room for the keyframe to go on with.
             return taken or decision.to_link
         line_bytes = self.transmitter.base(unit, now_ns=now_ns)
+        if not line_bytes:
+            self._leave_out(unit)
+            return False
+        if self.failures is not None:
+            self.failures.works(_SIZE_PART)
         if unit.keyframe:
             self._keyframe_bytes = line_bytes
             self.keyframes.note_cost(self.transmitter.takes_ns(line_bytes))
@@ -142,6 +156,30 @@ class BaseStage:
     def wants_keyframe(self, index: int) -> bool:
         """Whether more frames are worth a keyframe of their own after this one; about once a second."""
         return self._frame_skip.wants_keyframe(index)
+
+    def _within_a_window(self, unit: AccessUnit, frame: Frame) -> AccessUnit:
+        """The unit, or a keyframe of the same picture with so little detail that a window has room for it."""
+        for factor in _COARSER:
+            if self.transmitter.holds(unit):
+                break
+            height, width = frame.base_bgr.shape[:2]
+            small = (max(1, width // factor), max(1, height // factor))
+            coarse = cv2.resize(frame.base_bgr, small, interpolation=cv2.INTER_AREA)
+            coarse = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+            coded = replace(frame, base_bgr=coarse.astype(np.uint8, copy=False))
+            unit = self.encoder.encode(coded, keyframe=True, regions=[])
+        return unit
+
+    def _leave_out(self, unit: AccessUnit) -> None:
+        """Nothing has room for it: what follows cannot be shown before another keyframe."""
+        self._begins_anew = True
+        if self.failures is not None:
+            what = f"{'a keyframe' if unit.keyframe else 'a frame'} of {len(unit.data) / 1000:.1f} kB"
+            self.failures.failed(
+                _SIZE_PART,
+                f"{what} is more than a window of {bitrate_text(self.transmitter.total_bps)} or one message holds, "
+                "and is left out: raise --budget, or lower --size",
+            )
 
     def _recover(self, error: Exception, *, now_ns: int) -> None:
         assert self.open_again is not None, "checked"

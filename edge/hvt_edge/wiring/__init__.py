@@ -13,6 +13,7 @@ from hvt_edge.wiring.video import (
     first_decimation,
     make_encoder,
     qualify_encoder,
+    say_size,
 )
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "make_link_settings",
     "open_for_flight",
     "qualify_encoder",
+    "say_size",
     "store_folder",
     "track_confidence",
     "try_scene",

@@ -11,9 +11,9 @@ from typing import cast
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.log import START_LOGGER
-from hvt_common.units import SECOND_NS
-from hvt_common.values import Fit, Frame
-from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig
+from hvt_common.units import SECOND_NS, bitrate_text
+from hvt_common.values import Fit, Frame, View
+from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, least_budget_bps
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
 from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, shown
@@ -29,7 +29,7 @@ from hvt_edge.video.encoders.qualification import allowed, headroom_of, run_fram
 from hvt_edge.video.encoders.registry import X265, open_encoder
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.keyframes import keyframe_interval_s
-from hvt_edge.video.rate_model import PROMPT, SPARING, choose_base, most_decimation
+from hvt_edge.video.rate_model import LEAST_SIDE_PX, PROMPT, SPARING, choose_base, most_decimation, sizes_of
 from hvt_edge.video.reconfigure import ReconfigurationSettings
 from hvt_edge.video.regions import TrackRegions
 
@@ -56,8 +56,35 @@ def base_size(config: EdgeConfig) -> BaseSize:
     if config.passes_through:
         return lambda source_size: source_size
     if config.size is None:
-        return lambda source_size: default_size(source_size, fit=cast("Fit", config.fit))
-    return lambda source_size: _chosen(config, source_size, size=None)[0]
+        fit = cast("Fit", config.fit)
+        return lambda source_size: _carried(config, default_size(source_size, fit=fit))
+    return lambda source_size: _carried(config, _chosen(config, source_size, size=None)[0])
+
+
+def say_size(config: EdgeConfig, view: View) -> None:
+    """Say it where the budget has made the picture smaller than it is by default."""
+    if config.size is not None or config.passes_through:
+        return
+    usual = default_size(view.source_size, fit=cast("Fit", config.fit))
+    if view.base_size != usual:
+        least_bps = least_budget_bps(config, usual, share=config.share)
+        logging.getLogger(START_LOGGER).info(
+            "video is %dx%d: %dx%d takes a --budget of at least %s",
+            *view.base_size,
+            *usual,
+            bitrate_text(least_bps),
+        )
+
+
+def _carried(config: EdgeConfig, size: tuple[int, int]) -> tuple[int, int]:
+    """This size, or the largest below it that the budget carries; where none is, the smallest."""
+    if config.budget_bps >= least_budget_bps(config, size, share=config.share) or min(size) < LEAST_SIDE_PX:
+        return size
+    smaller = [one for one in sizes_of(size) if one[0] * one[1] < size[0] * size[1]] or [size]
+    carried = (
+        one for one in smaller if config.budget_bps >= least_budget_bps(config, one, share=config.share)
+    )
+    return next(carried, smaller[-1])
 
 
 def default_size(source_size: tuple[int, int], *, fit: Fit) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import threading
 from dataclasses import replace
 
@@ -520,3 +521,34 @@ def test_a_stored_still_has_the_bytes_that_it_would_have_had():
     assert (stored.payload, stored.encoding) == (data, encoding)
     sent = RoiHeader.parse(attachment, data)
     assert RoiHeader.parse(stored.attachment, data) == replace(sent, flags=Flags.STORED)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    total_bps=st.sampled_from([12_000, 25_000, 100_000, 800_000]),
+    fps=st.sampled_from([1, 2, 5, 15, 30]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_no_unit_breaks_a_window_however_large_it_is(total_bps, fps, seed):
+    """A keyframe of twice the budget would be one second's worth, without a word."""
+    rng, rig, left_out = random.Random(seed), Rig(total_bps=total_bps), 0
+    for index in range(8 * fps):
+        now_ns = NOW_NS + index * SECOND_NS // fps
+        one = unit(index, round(total_bps / 8 * rng.choice([0.02, 0.1, 0.9, 1.0, 1.6])))
+        sent = rig.sender.base(one, now_ns=now_ns)
+        assert bool(sent) == rig.sender.holds(one)
+        left_out += not sent
+        rig.sender.status(status, now_ns=now_ns, before_frames=rng.random() < 0.5)
+        if (most_bytes := rig.sender.still_allowance_bytes(now_ns)) > 300:
+            rig.sender.still(rig.sender.envelope(still(most_bytes, sequence=index)), now_ns=now_ns)
+    assert rig.ledger.worst_window_bps.total <= total_bps
+    assert len([row for row, *_ in rig.out.puts if row is Channel.BASE]) + left_out == 8 * fps
+
+
+def test_a_unit_that_no_message_carries_is_left_out():
+    """One keyframe of a large picture would end the flight."""
+    rig = Rig(total_bps=100_000_000)
+    assert not rig.sender.base(unit(0, 4 * 2**20 + 1, keyframe=True), now_ns=NOW_NS)
+    assert rig.sender.base_unit_wait_ns(unit(0, 4 * 2**20 + 1), now_ns=NOW_NS) is None
+    assert rig.sender.base(unit(1, 4 * 2**20, keyframe=True), now_ns=NOW_NS)
+    assert rig.sender.base_sequence == 0, "no number is missing"

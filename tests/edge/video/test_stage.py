@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -57,9 +58,11 @@ class Rig:
         interval_s=10.0,
         reconfigures=True,
         reopens=True,
+        total_bps=800_000,
     ) -> None:
         self.kept, self.failures, self.reopened = Kept(), Failures(time.time_ns), 0
         self.opened: list[int] = []
+        self.ledger = Ledger()
         self.frame_skip = frame_skip or FrameSkip()
         self.keyframes = KeyframeRequests(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
         self.stage = BaseStage(
@@ -67,8 +70,8 @@ class Rig:
             keyframes=self.keyframes,
             transmitter=Transmitter(
                 self.kept,
-                ledger=Ledger(),
-                budget=RollingBudget(BudgetSettings(800_000, 400_000, fps=15)),
+                ledger=self.ledger,
+                budget=RollingBudget(BudgetSettings(total_bps, total_bps // 2, fps=15)),
                 edge_id="uav-1",
                 session_id=1,
                 lockstep=True,
@@ -234,3 +237,32 @@ def test_no_encoder_at_all_is_one_sentence():
     """A build of PyAV without x265 would end in a traceback."""
     with pytest.raises(UserError, match=r"PyAV .* has no encoder libx265-lost"):
         encoder_context("libx265-lost")
+
+
+def test_a_keyframe_that_no_window_holds_is_coded_again_with_less_detail():
+    """It would break the budget, or there would be no picture of a scene with much texture."""
+    small = np.random.default_rng(1).integers(0, 256, (SIZE[1] // 3, SIZE[0] // 3, 3), np.uint8)
+    pictures = [cv2.resize(small, SIZE, interpolation=cv2.INTER_CUBIC)] * 30
+    plain = Rig()
+    plain.play(pictures[:1])
+    tight = Rig(total_bps=round(0.85 * 8 * len(plain.kept.units[0])))
+    tight.play(pictures)
+    assert tight.kept.units
+    assert BaseDecoder().decode(tight.kept.units[0]) is not None
+    assert tight.ledger.worst_window_bps.total <= tight.stage.transmitter.total_bps
+    assert tight.failures.parts == ()
+
+
+def test_what_has_room_nowhere_is_left_out_said_and_followed_by_a_keyframe():
+    """The edge would end, or a ground show what builds on a picture that it never got."""
+    rig = Rig(total_bps=4_000)
+    pictures = smooth_pictures(6, size=SIZE)
+    rig.play(pictures[:3])
+    assert rig.kept.units == []
+    (part,) = rig.failures.parts
+    assert (part.part, part.working, part.count) == ("video", False, 3)
+    assert "raise --budget, or lower --size" in part.reason
+    rig.stage.transmitter.set_rates(800_000, 400_000, 15, now_ns=START_NS)
+    rig.play(pictures)
+    assert BaseDecoder().decode(rig.kept.units[0]) is not None, "it begins with a keyframe"
+    assert rig.failures.parts[0].working
