@@ -16,10 +16,12 @@ from hvt_common.values import Image, View
 from hvt_common.video.exact_crop import exact_base_crop
 from hvt_common.video.hevc import YuvPicture
 
-__all__ = ["MAX_SIDE_PX", "base_crop", "coded_size", "resampled"]
+__all__ = ["MAX_REQUESTED_SIDE_PX", "MAX_SIDE_PX", "base_crop", "coded_size", "resampled"]
 
 MAX_SIDE_PX = 512
 """A longer crop is coded smaller: an object that fills 512 pixels needs no more to be classified."""
+MAX_REQUESTED_SIDE_PX = 2048
+"""The same of a still that a ground requested: who looks closer wants the source's own pixels."""
 
 
 def coded_size(

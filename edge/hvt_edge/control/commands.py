@@ -53,6 +53,7 @@ class _Result:
     still_request: int = -1
     frame_index: int = -1
     tracks: tuple[TrackNow, ...] = ()
+    note: str = ""
 
 
 @dataclass(eq=False)
@@ -108,6 +109,7 @@ class Commands:
             still_request=result.still_request,
             frame_index=result.frame_index,
             tracks=result.tracks,
+            note=fitted_text(result.note, _REASON_BYTES),
         )
 
     def _obey(self, request: ControlRequest) -> _Result:
@@ -142,8 +144,7 @@ class Commands:
         reader = _Reader("still-outcome", arguments)
         number = reader.needed("ask", 0, _U32)
         reader.end()
-        self.on_demand.outcome(number)
-        return _Result()
+        return _Result(note=self.on_demand.outcome(number))
 
     def _tracks(self, arguments: Arguments) -> _Result:
         _Reader("tracks", arguments).end()

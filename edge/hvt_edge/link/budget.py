@@ -17,7 +17,8 @@ Two limits hold for stills at once, both in line bytes (payload, attachment and 
 
 So stills yield where the base overshoots. What no forecast sees, a base frame that is suddenly large after stills
 have taken their share, waits the few milliseconds until the window has room (`earliest_ns`): nothing is dropped, and
-the total holds all the same.
+the total holds all the same. Only a still that a ground requested borrows from the base itself
+(`hvt_edge.link.loan`): frames are left out for it before they are coded.
 
 Whatever is no frame goes only where the frames to come keep their room: pieces of the backlog by the same forecast
 as stills, also while the camera gives no frame, since the next may come at any moment (`backlog_allowance`); tracks,
@@ -36,6 +37,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.units import SECOND_NS
+from hvt_edge.link.loan import MOST_SHARE, VideoLoan
 
 __all__ = ["BASE_PEAK", "BudgetSettings", "RollingBudget"]
 
@@ -46,6 +48,8 @@ _FORECASTS = 30
 _ROUNDING = 0.01
 """Of a frame: rates and times are rounded to whole nanoseconds."""
 
+_SPARE_SHARE = 0.05
+"""Of a window: what a requested still leaves for ``status``."""
 BASE_PEAK = 1.15
 """The fullest window of the base stream over B_v: what the VBV allows, kept also where frames bunch up."""
 
@@ -65,6 +69,9 @@ class BudgetSettings:
     """Kept free of stills for messages beside base and stills, such as ``tracks``."""
     borrow_unused: bool = False
     """Whether stills may also take what the base leaves of B_v."""
+    yields: bool = True
+    """Whether base frames are left out for a still that a ground requested. A camera's own cannot be: all up to its
+    next keyframe would be lost."""
 
     @property
     def still_bps(self) -> int:
@@ -95,6 +102,9 @@ class RollingBudget:
         self._adopt(settings)
         self._tokens = self._cap
         self._tokens_ns: int | None = None
+        self._loan_ns = min(settings.window_ns, SECOND_NS)
+        """The stretch over which the base yields."""
+        self._loan = VideoLoan(self._loan_ns)
 
     def _adopt(self, settings: BudgetSettings) -> None:
         """Take over settings with the same total and window; what the base did at another rate is forgotten."""
@@ -249,6 +259,59 @@ class RollingBudget:
         """Return how many line bytes a still may take now; 0 where it has to wait."""
         self._refill(now_ns)
         return max(0, int(min(self._tokens + self._borrowable(now_ns), self._window_allowance(now_ns))))
+
+    # What a ground requests
+
+    @property
+    def most_requested_bytes(self) -> int:
+        """The most line bytes that `requested_allowance` gives at the present rates."""
+        if self._settings.yields:
+            return int(MOST_SHARE * self._loan_bytes)
+        return max(0, int(min(MOST_SHARE * self._loan_bytes, self._total - self._burst[-1] - self._spare)))
+
+    def requested_allowance(self, now_ns: int) -> int:
+        """Return how many line bytes a requested still may take now: all that is free in the window that ends now.
+
+        The base frames to come wait for their room, or are left out (`leaves_out`).
+        """
+        self._note_query(now_ns)
+        spent = sum(size for at_ns, size in self._events if at_ns > now_ns - self._settings.window_ns)
+        free = self._total - spent - self._spare
+        if not self._settings.yields:
+            free = min(free, self._window_allowance(now_ns))
+        return max(0, int(min(free, self._loan.left_bytes(self._loan_bytes, now_ns=now_ns))))
+
+    def record_requested(self, line_bytes: int, *, now_ns: int) -> None:
+        """Count a requested still, admitted by `requested_allowance`: what stills have not saved the base yields."""
+        self._refill(now_ns)
+        saved = min(float(line_bytes), max(0.0, self._tokens))
+        self._tokens -= saved
+        self._lent.append((now_ns, line_bytes - saved))
+        self._loan.take(line_bytes, now_ns=now_ns)
+        self._record(line_bytes, now_ns)
+
+    def want_requested(self, line_bytes: int | None, *, now_ns: int) -> None:
+        """A requested still of about so many line bytes waits for its room; None: none waits any more."""
+        if line_bytes is None:
+            self._loan.withdraw()
+        else:
+            self._loan.want(line_bytes, now_ns=now_ns)
+
+    def yielding(self, now_ns: int) -> bool:
+        """Whether a requested still waits for which frames are left out: what gets free is its own."""
+        return self._settings.yields and self._loan.waits(self._loan_bytes, now_ns=now_ns)
+
+    def leaves_out(self, now_ns: int) -> bool:
+        """Whether the base frame that is due now is left out for a requested still; ask once for each."""
+        return self._settings.yields and self._loan.leaves_out(self._loan_bytes, now_ns=now_ns)
+
+    @property
+    def _loan_bytes(self) -> float:
+        return self._total * self._loan_ns / self._settings.window_ns
+
+    @property
+    def _spare(self) -> float:
+        return _SPARE_SHARE * self._loan_bytes + self._settings.metadata_bps * self._loan_ns / 8 / SECOND_NS
 
     def backlog_allowance(self, now_ns: int, *, reserve: float) -> int:
         """Return how many line bytes of what was kept may go now: what neither base nor stills will want.

@@ -156,14 +156,59 @@ class Transmitter:
         header_bytes = envelope.header_at(now_ns, flags=self._flags).size_bytes
         return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
 
+    def requested_allowance_bytes(self, now_ns: int, *, still: Still) -> int:
+        """As `still_allowance_bytes`, not paced, of one that a ground requested: the video yields to it."""
+        with self._lock:
+            line_bytes = self.budget.requested_allowance(now_ns)
+        envelope = self.envelope(still)
+        header_bytes = envelope.header_at(now_ns, flags=self._flags).size_bytes
+        return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
+
+    def link_is_free(self, now_ns: int) -> bool:
+        """Whether a still may go as far as the link is concerned."""
+        return self.pacer is None or self.pacer.admits_still(now_ns)
+
+    def want_requested(self, size_bytes: int | None, *, now_ns: int) -> None:
+        """A requested still of so many payload bytes waits for its room; None: none waits any more."""
+        with self._lock:
+            if size_bytes is None:
+                self.budget.want_requested(None, now_ns=now_ns)
+                return
+            overhead = overhead_bytes(
+                size_bytes,
+                STILL_ATTACHMENT_BYTES,
+                key=self._keys.key(Channel.ROI),
+                encoding=DELIVERIES[Channel.ROI].encoding,
+            )
+            line_bytes = size_bytes + STILL_ATTACHMENT_BYTES + overhead
+            self.budget.want_requested(min(line_bytes, self.budget.most_requested_bytes), now_ns=now_ns)
+
+    def yielding(self, now_ns: int) -> bool:
+        """Whether frames are being left out for a requested still that waits."""
+        with self._lock:
+            return self.budget.yielding(now_ns)
+
+    def leaves_out(self, now_ns: int) -> bool:
+        """Whether the frame that is due now is left out for a requested still; ask once for each."""
+        with self._lock:
+            return self.budget.leaves_out(now_ns)
+
+    def most_requested_bytes(self) -> int:
+        """About the payload of the largest still that a ground may have at the present rates."""
+        with self._lock:
+            line_bytes = self.budget.most_requested_bytes
+        return self._payload_bytes(line_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding)
+
     def most_still_bytes(self) -> int:
         """About the payload of the largest still that the budget ever admits."""
         return self._payload_bytes(
             self.budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding
         )
 
-    def still(self, envelope: StillEnvelope, *, now_ns: int, copy: str = "") -> None:
+    def still(self, envelope: StillEnvelope, *, now_ns: int, copy: str = "", requested: bool = False) -> None:
         """Send one still that `still_allowance_bytes` admitted at this very time; ``copy``: why it is sent again.
+
+        ``requested`` by a ground: `requested_allowance_bytes` admitted it.
 
         Where another thread has taken the allowance since, it waits until there is one again, as everything does.
         Its outcome is noted with its bytes: ``sent``, or ``dropped`` once the run has ended.
@@ -180,7 +225,8 @@ class Transmitter:
             line_bytes = self._count(
                 Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=encoding
             )
-            self.budget.record_still(line_bytes, now_ns=at_ns)
+            record = self.budget.record_requested if requested else self.budget.record_still
+            record(line_bytes, now_ns=at_ns)
             if self.pacer is not None and copy:  # its number stands for the first copy, or for later stills
                 self.pacer.sent_other(line_bytes, now_ns=at_ns)
             elif self.pacer is not None:
@@ -217,6 +263,8 @@ class Transmitter:
     def backlog_allowance_bytes(self, now_ns: int, *, reserve: float) -> int:
         """Payload that a chunk of the backlog may have now; ``reserve``: see `RollingBudget.backlog_allowance`."""
         with self._lock:
+            if self.budget.yielding(now_ns):
+                return 0
             line_bytes = self.budget.backlog_allowance(now_ns, reserve=reserve)
         if self.pacer is not None and not self.pacer.admits_still(now_ns):
             return 0

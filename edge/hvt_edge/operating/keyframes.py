@@ -50,6 +50,8 @@ class KeyframeState:
     due_ns: int | None = None
     """Since when one is due; None where none is."""
     sent: int = 0
+    requested: bool = False
+    """Whether the one that is due was requested, and is no mere one of the schedule."""
 
     def due(self, now_ns: int) -> bool:
         """Whether a keyframe is to come: the first, one that was requested, or one of the schedule."""
@@ -88,6 +90,12 @@ class KeyframeRequests:
     def due(self, now_ns: int) -> bool:
         """Whether a keyframe is to come: stills are held from now on until it has gone."""
         return self._requested_ns is not None or self._state.due(now_ns)
+
+    @property
+    def requested(self) -> bool:
+        """Whether a keyframe is to come that somebody or something needs: not even a requested still goes before."""
+        state = self._state
+        return self._requested_ns is not None or state.requested or state.last_ns is None
 
     def request(self, now_ns: int) -> str | None:
         """A ground wants a keyframe; return why it gets none now, in a sentence, or None where it is served.

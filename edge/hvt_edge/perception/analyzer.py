@@ -13,7 +13,6 @@ from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
-from hvt_edge.perception.skipped_units import SkippedUnits
 
 __all__ = ["AnalyzedFrame", "Analyzer", "AnalyzerSettings", "FailingDetector"]
 
@@ -87,7 +86,6 @@ class Analyzer:
         """Capture time of the newest picture that was searched for objects; None before the first."""
         self._coded_index: int | None = None
         self._coded_gap = 1
-        self._passed_over = SkippedUnits()
         self._track_ids = DistinctIds()
         self.spent_ns = 0
         """Time to decode, detect and track so far."""
@@ -128,9 +126,6 @@ class Analyzer:
         """
         began_ns = time.perf_counter_ns()
         for one in skipped:
-            self._passed_over.add(one)
-        unit, before = self._passed_over.take(unit)
-        for one in before:
             self._decode(one.frame_index, one)
         analyzed = self._analyze(frame, unit, hurry=hurry)
         self.spent_ns += time.perf_counter_ns() - began_ns
@@ -141,13 +136,14 @@ class Analyzer:
     def pass_over(
         self, frame: Frame, unit: AccessUnit | None, *, skipped: Sequence[AccessUnit] = ()
     ) -> AnalyzedFrame:
-        """Take in the next source frame for nobody: nothing is decoded, searched or tracked.
+        """Take in the next source frame for nobody: nothing is searched or tracked.
 
-        What is coded is kept, as far as it is not too much, so that `analyze` can go on from any frame.
+        What is coded is decoded all the same (3 ms at 1280x720), so that `analyze` can go on from any frame, and a
+        requested still has the base to beat.
         """
         for one in skipped:
-            self._passed_over.add(one)
-        self._passed_over.add(unit)
+            self._decode(one.frame_index, one)
+        picture = None if unit is None else self._decode(frame.index, unit)
         self.detected_ns = None
         none = np.empty(0, np.int64)
         tracks = Tracks(
@@ -160,7 +156,7 @@ class Analyzer:
             seen_frames=none,
             started=np.empty(0, np.bool_),
         )
-        return AnalyzedFrame(frame, None, tracks, detected=False, followed=False)
+        return AnalyzedFrame(frame, None, tracks, detected=False, picture=picture, followed=False)
 
     def _analyze(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool) -> AnalyzedFrame:
         picture = None if unit is None else self._decode(frame.index, unit)

@@ -1,23 +1,32 @@
-"""The last seconds of untouched source frames, each with its tracks, for stills on demand.
+"""The last seconds of untouched source frames, each with its tracks and its base picture, for stills on demand.
 
 The newest is there as the source gave it; those before it as 4:2:0, half the memory, which is what still codecs and
 cameras have anyway. Their bound is in bytes and in seconds. Where the bytes do not hold every frame of those seconds,
-frames are kept further apart, evenly, so that the ring reaches as far back as asked for: 24 MB hold one each 0.3 s at
-1280x720, one each 0.8 s at 1920x1080 and one of 5 s ago at 3840x2160.
+frames are kept further apart, evenly, so that the ring reaches as far back as asked for: 24 MB hold one each 0.6 s at
+1280x720, one each second at 1920x1080 and one of 5 s ago at 3840x2160.
+
+Frames that were coded are preferred: with them stands what the base shows, which a still has to beat. Of the others
+only the newest is kept, and one in so long where the video stands still.
 """
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, Image, Tracks
+from hvt_common.video.hevc import YuvPicture
 
 __all__ = ["FrameRing", "RingFrame", "RingSettings"]
+
+_UNCODED_NS = 6 * SECOND_NS // 10
+"""A frame that was coded stands for one that was not, so near: at two a second there is one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +49,13 @@ class RingFrame:
     """The source's own, not copied: nobody may write into it. Or, where it has two dimensions, I420."""
     tracks: Tracks
     """At this very frame, base pixels."""
+    base: YuvPicture | Image | None = None
+    """What the base shows of this very frame; None where it was not coded."""
+
+    @property
+    def base_bytes(self) -> int:
+        """Memory of the base picture."""
+        return 0 if self.base is None else self.base.nbytes
 
     @property
     def source_bgr(self) -> Image:
@@ -70,7 +86,8 @@ class FrameRing:
     def __init__(self, settings: RingSettings = RingSettings()) -> None:
         self._settings = settings
         self._frames: list[RingFrame] = []
-        """Oldest first; all but the newest are packed and lie on the grid that `_spacing_ns` makes."""
+        """Oldest first; all but the newest, and the newest that was coded, are packed and lie on the grid that
+        `_spacing_ns` makes."""
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -78,8 +95,8 @@ class FrameRing:
 
     @property
     def size_bytes(self) -> int:
-        """Memory of the pixels, without the newest's."""
-        return sum(one.pixels.nbytes for one in self._frames[:-1])
+        """Memory of the pixels, source and base, without the newest's."""
+        return sum(one.pixels.nbytes + one.base_bytes for one in self._frames[:-1])
 
     @property
     def newest(self) -> RingFrame | None:
@@ -87,18 +104,31 @@ class FrameRing:
         with self._lock:
             return self._frames[-1] if self._frames else None
 
-    def add(self, frame: Frame, tracks: Tracks) -> None:
+    @property
+    def newest_coded(self) -> RingFrame | None:
+        """The newest frame that was coded; the newest of all where that is much newer, or none was."""
+        with self._lock:
+            if not self._frames:
+                return None
+            return self._nearest(lambda one: self._frames[-1].capture_ns - one.capture_ns)
+
+    def add(self, frame: Frame, tracks: Tracks, *, base: YuvPicture | Image | None = None) -> None:
         """Keep a frame, newer than all before; let go of what there is no more room or time for."""
         height, width = frame.source_bgr.shape[:2]
-        newest = RingFrame(frame.index, frame.capture_ns, (width, height), frame.source_bgr, tracks)
+        newest = RingFrame(frame.index, frame.capture_ns, (width, height), frame.source_bgr, tracks, base)
         with self._lock:
             if not self._settings.max_bytes:
                 return
-            # The newest was kept for being the newest; unless it lies on the grid, it makes way for this one.
-            last = self._frames.pop() if self._frames else None
-            if last is not None and (not self._frames or self._gap_ns(last) >= self._spacing_ns(last)):
-                self._frames.append(last.packed())
-            self._frames.append(newest)
+            frames = self._frames
+            if frames and frames[-1].base is None and self._stands_for(frames[-1]):
+                frames.pop()
+            # The last was kept for being the newest; unless it lies on the grid, it makes way for this one.
+            last = frames[-1] if frames else None
+            if last is not None and (base is not None or last.base is None):
+                frames.pop()
+                if not frames or self._gap_ns(last) >= self._spacing_ns(last):
+                    frames.append(last.packed())
+            frames.append(newest)
             self._let_go(frame.capture_ns - self._settings.max_age_ns)
 
     def near_time(self, capture_ns: int) -> RingFrame | None:
@@ -106,15 +136,31 @@ class FrameRing:
         with self._lock:
             if not self._frames or capture_ns < self._reach_ns():
                 return None
-            return min(self._frames, key=lambda one: abs(one.capture_ns - capture_ns))
+            return self._nearest(lambda one: abs(one.capture_ns - capture_ns))
 
     def near_index(self, frame_index: int) -> RingFrame | None:
         """The frame kept whose index is nearest; None where that is further back than the ring goes, or to come."""
         with self._lock:
-            if not self._frames or frame_index > self._frames[-1].frame_index:
+            if not self._frames or not self._frames[0].frame_index <= frame_index <= self.last_index:
                 return None
             near = min(self._frames, key=lambda one: abs(one.frame_index - frame_index))
-            return None if frame_index < self._frames[0].frame_index else near
+            return self._nearest(lambda one: abs(one.capture_ns - near.capture_ns))
+
+    @property
+    def last_index(self) -> int:
+        """Of the newest frame; -1 before the first."""
+        return self._frames[-1].frame_index if self._frames else -1
+
+    def _nearest(self, distance_ns: Callable[[RingFrame], int]) -> RingFrame:
+        """The nearest of the frames that were coded, or of all where none of these is near."""
+        coded = [one for one in self._frames if one.base is not None and distance_ns(one) <= _UNCODED_NS]
+        return min(coded or self._frames, key=distance_ns)
+
+    def _stands_for(self, uncoded: RingFrame) -> bool:
+        """Whether the frame before it is near, and was coded."""
+        before = self._frames[-2] if len(self._frames) > 1 else None
+        near = before is not None and uncoded.capture_ns - before.capture_ns <= _UNCODED_NS
+        return before is not None and before.base is not None and near
 
     def reach_s(self) -> float:
         """How far it goes back from the newest frame."""
@@ -125,7 +171,7 @@ class FrameRing:
 
     def _spacing_ns(self, frame: RingFrame) -> int:
         """The least time between two frames on the grid, for them to reach back all the seconds."""
-        count = self._settings.max_bytes // frame.packed_bytes
+        count = self._settings.max_bytes // (frame.packed_bytes + frame.base_bytes)
         return self._settings.max_age_ns // max(1, count - 1)  # one more is about to grow too old
 
     def _gap_ns(self, newer: RingFrame) -> int:

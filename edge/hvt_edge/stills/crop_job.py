@@ -5,6 +5,7 @@ A 4K frame takes 25 MB, its crops a few kilobytes each.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -64,6 +65,14 @@ class Alternative:
             limits=limits,
             psnr_y_db=psnr_y_db(base_crop, crop),
             error_share=error / max(1.0, float(spread[0, 0]) ** 2),
+        )
+
+    def gain_db(self, still: Image, *, crop: Image) -> float:
+        """How much closer the still is: the least of colour and luma, over the crop and over each box."""
+        errors = _errors(still, crop, self.places)
+        return min(
+            10 * math.log10(limit / mine) if mine and limit else math.inf if limit else -math.inf
+            for mine, limit in zip(errors, self.limits, strict=True)
         )
 
     def loses_to(self, still: Image, *, crop: Image) -> bool:

@@ -1,61 +1,74 @@
 """Stills that a ground requests: cropped at once from the frames of the last seconds, sent before all others.
 
-A request only crops (`OnDemand.request`, in the link's callback); coding and sending are the stills' thread's, under
-the same budget as every other still. What the base shows of the place does not matter: whoever requests has a reason.
-It is coded at the requested quality as soon as the budget allows it; where the budget never does, or not within
-`_PATIENCE_NS`, at the largest size, then the best quality, that it allows. While one is pending, no
-other still is sent.
+A request only crops (`OnDemand.request`, in the link's callback); coding and sending are the stills' thread's, within
+the budget as every other still. `code_requested` says how: at the source's pixels, and better than the base. For its
+bytes frames of the video are left out (`hvt_edge.link.loan`), whatever share of the budget stills have. While one is
+pending, no other still is sent.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from hvt_common.protocol.messages import MAX_TRACKS_NOW, TrackNow
-from hvt_common.values import Still, View
+from hvt_common.units import SECOND_NS
+from hvt_common.values import Image, Still, View
+from hvt_common.video.base_crop import base_crop
+from hvt_common.video.hevc import YuvPicture
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.frame_ring import FrameRing
-from hvt_edge.stills.maker import Allowance, NoStill, StillMaker
+from hvt_edge.stills.crop_job import Alternative, inner_box
+from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand_crop import (
     OnDemandRequest,
     RefusedError,
     box_of,
     crop_job_for,
     frame_for,
-    shrunk,
 )
 from hvt_edge.stills.outbox import Outbox, OutboxStill
+from hvt_edge.stills.policy.cost import CostModel
+from hvt_edge.stills.requested_coding import Capacity, NothingCloser, code_requested
 
-__all__ = ["REQUEST_PARAMETER", "OnDemand", "OnDemandStill"]
+__all__ = ["REQUEST_PARAMETER", "OnDemand", "OnDemandStill", "RequestedLine"]
 
 REQUEST_PARAMETER = "ask"
 """The parameter that carries its number."""
 
-_FULL_SHARE = 0.9
-"""With so much of the most a still can ever be given, it is no use to wait for more."""
-_LEAST_BYTES = 400
-"""A budget that never allows a still more than this has none to give."""
-_SHRINKS = (1.0, 0.7, 0.5, 0.35, 0.25)
-_FLOOR_PCT = 20
-"""Below it a smaller picture of better quality shows more."""
-_NO_LIMIT_BYTES = 2**31
-_OUTCOMES = 64
+_PROMPT_SHARE = 0.6
+"""Of the most that the video yields: what comes within a second or so where the link is as thin as the budget."""
+_MARGIN_BYTES = 64
+"""By which a header may be longer than is estimated."""
 _MAX_PENDING = 4
-_PATIENCE_NS = 2_000_000_000
-"""For so long the first waits for its full size."""
-_RETRY_NS = 250_000_000
-"""Between two tries to fit one that is too large: each codes it several times."""
 _TRACKED_NS = 30_000_000_000
 """For so long after a request for tracks they are followed, where nothing else needs them."""
-_REFUSALS = {
-    "stale": "in 10 s the budget had no room for it",
-    "ended": "the session ended before there was room for it",
-}
+_OUTCOMES = 64
+_ENDED = "the edge has ended"
+
+
+class RequestedLine(Protocol):
+    """What requested stills need of the budget and the link; times are of the budget's windows."""
+
+    @property
+    def total_bps(self) -> int:
+        """The budget as it is now."""
+
+    def most_requested_bytes(self) -> int:
+        """About the largest payload."""
+
+    def requested_allowance_bytes(self, now_ns: int, *, still: Still) -> int:
+        """What this one may take now, whether or not the link is free."""
+
+    def link_is_free(self, now_ns: int) -> bool:
+        """Whether a still may go as far as the link is concerned."""
+
+    def want_requested(self, size_bytes: int | None, *, now_ns: int) -> None:
+        """One of so many bytes waits: frames are left out for it; None: none waits."""
 
 
 @dataclass(slots=True, eq=False)
@@ -63,19 +76,20 @@ class OnDemandStill(OutboxStill):
     """One that a ground requested."""
 
     number: int = -1
-    maker: StillMaker | None = None
-    first_ns: int | None = None
-    """When it became the first in the queue."""
-    full: Still | None = None
-    """Coded as requested, once."""
-    tried_ns: int | None = None
+    quality_pct: int = 0
+    base: YuvPicture | Image | None = None
+    """What the base shows of its frame; gone once it is coded."""
+    ready: Still | None = None
+    """Coded, and not gone yet."""
+    link_busy: bool = False
+    """The budget had room for it, and the link had not, when that was last tried."""
 
 
 @dataclass(eq=False)
 class OnDemand:
     """The edge's end of ``control: still``. `request`, `outcome` and `tracks` may be called from any thread.
 
-    ``most_bytes()`` is the largest payload that the budget admits now. These stills never build on the base.
+    These stills never build on the base.
     """
 
     ring: FrameRing
@@ -84,15 +98,15 @@ class OnDemand:
     maker: StillMaker
     view: View
     class_names: tuple[str, ...]
-    most_bytes: Callable[[], int]
+    line: RequestedLine
 
     def __post_init__(self) -> None:
         self._maker = replace(
             self.maker, fidelity_db=0.0
         )  # of crops without a base: never one that builds on it
         self._lock = threading.Lock()
-        self._refusals: OrderedDict[int, str] = OrderedDict()
-        """Number → why it was given up, or nothing where it is pending or was sent; of the last ones."""
+        self._outcomes: OrderedDict[int, tuple[str, str]] = OrderedDict()
+        """Number → (why it was given up, what else is to be said of it), both empty at first; of the last ones."""
         self._next_number = 0
         self._tracks_requested_ns: int | None = None
         """Capture time of the newest frame then."""
@@ -103,46 +117,45 @@ class OnDemand:
     def add(self, analyzed: AnalyzedFrame) -> None:
         """Hold a frame with its tracks."""
         self._followed = analyzed.followed
-        self.ring.add(analyzed.frame, analyzed.tracks)
+        self.ring.add(analyzed.frame, analyzed.tracks, base=analyzed.picture or analyzed.base_bgr)
 
     # From any thread
 
     def request(self, request: OnDemandRequest) -> tuple[int, int]:
         """Crop a still; return its number and frame index. Raises `RefusedError` with the reason."""
         if self._ended:
-            raise RefusedError("the session is ending")
+            raise RefusedError(_ENDED)
         self._check_queue()
-        if self.most_bytes() < _LEAST_BYTES:
-            raise RefusedError("the budget leaves nothing for stills: raise it, or lower --video-share")
         frame = frame_for(request, self.ring)
         if request.track_id is not None:
             self._follow(frame.capture_ns)
         job = crop_job_for(request, frame, maker=self._maker, view=self.view, class_names=self.class_names)
         quality_pct = self._maker.quality_pct if request.quality_pct is None else request.quality_pct
-        maker = replace(self._maker, quality_pct=quality_pct, floor_pct=min(_FLOOR_PCT, quality_pct))
         with self._lock:
             self._check_queue()
             number = self._next_number
             parameters = {**job.header.parameters, REQUEST_PARAMETER: number}
-            header = replace(job.header, quality_pct=quality_pct, parameters=parameters)
+            job = replace(job, header=replace(job.header, parameters=parameters))
             pending = OnDemandStill(
-                replace(job, header=header), None, float("inf"), None, number=number, maker=maker
+                job, None, float("inf"), None, number=number, quality_pct=quality_pct, base=frame.base
             )
             self.outbox.offer_on_demand(pending)
             self._next_number += 1
-            self._note(number, "")
+            self._note(number)
         return number, frame.frame_index
 
-    def outcome(self, number: int) -> None:
-        """Return where that still is pending or was sent.
+    def outcome(self, number: int) -> str:
+        """Return what is to be said of that still before it comes; nothing where it comes as requested, or came.
 
         Raises `RefusedError` where it was given up, or is not known (any more).
         """
         with self._lock:
-            if number not in self._refusals:
+            if number not in self._outcomes:
                 raise RefusedError(f"nothing is known of a still of the number {number}")
-            if self._refusals[number]:
-                raise RefusedError(self._refusals[number])
+            refusal, note = self._outcomes[number]
+            if refusal:
+                raise RefusedError(refusal)
+            return note
 
     def tracks(self) -> tuple[int, tuple[TrackNow, ...]]:
         """The newest frame's index, and its tracks by id; of too many, those of most confidence."""
@@ -172,36 +185,68 @@ class OnDemand:
         requested_ns = self._tracks_requested_ns
         return requested_ns is not None and capture_ns - requested_ns < _TRACKED_NS
 
-    def code(
-        self, pending: OnDemandStill, *, now_ns: int, allowance: Allowance, sequence: int
-    ) -> Still | None:
-        """As requested; or, when waiting longer is of no use, what the budget allows. None: it waits."""
-        assert pending.maker is not None, "`request` has given it one"
-        pending.first_ns = now_ns if pending.first_ns is None else pending.first_ns
-        if pending.full is None:
-            made = pending.maker.code(pending.crop, sequence=sequence, allowance=lambda _: _NO_LIMIT_BYTES)
-            assert isinstance(made, Still), "without a limit, and without a base to beat, there is a still"
-            pending.full = made
-        full = replace(pending.full, sequence=sequence)
-        limit_bytes = allowance(full)
-        if len(full.data) <= limit_bytes:
-            return full
-        patient = now_ns - pending.first_ns < _PATIENCE_NS
-        if patient and limit_bytes < _FULL_SHARE * self.most_bytes():
+    def code(self, pending: OnDemandStill, *, now_ns: int, sequence: int, paced: bool) -> Still | None:
+        """The coded still, where it may go now. None: it waits, or was given up, and is no longer in the outbox.
+
+        ``paced``: it goes to the link, which has to be free.
+        """
+        most_bytes = self.line.most_requested_bytes()
+        due = (
+            pending.ready is None or len(pending.ready.data) > most_bytes
+        )  # the rate may have fallen meanwhile
+        if due and not self._code_anew(pending, most_bytes, now_ns=now_ns):
             return None
-        if pending.tried_ns is not None and now_ns - pending.tried_ns < _RETRY_NS:
-            return None
-        pending.tried_ns = now_ns
-        for shrink in _SHRINKS:  # the largest picture of which some quality fits
-            fitted = pending.maker.code(shrunk(pending.crop, shrink), sequence=sequence, allowance=allowance)
-            if not isinstance(fitted, NoStill):
-                return fitted
+        assert pending.ready is not None, "it was coded just now"
+        still = pending.ready = replace(pending.ready, sequence=sequence)
+        fits = len(still.data) <= self.line.requested_allowance_bytes(now_ns, still=still)
+        pending.link_busy = fits and paced and not self.line.link_is_free(now_ns)
+        if fits and not pending.link_busy:
+            return still
+        self.line.want_requested(len(still.data), now_ns=now_ns)
         return None
 
-    def expired(self, pending: OnDemandStill, reason: str) -> None:
-        """It was given up: ``stale`` or ``ended``."""
+    def _code_anew(self, pending: OnDemandStill, most_bytes: int, *, now_ns: int) -> bool:
+        """Code it for what may be carried; False where there is none, and its requester is told why."""
+        codec, job = self._maker.without_base, pending.crop
+        height, width = job.crop_bgr.shape[:2]
+        expected = CostModel.of_codec(codec.name).estimate().of_px(width * height)
+        # Coding takes a moment, in which the window gets free.
+        self.line.want_requested(min(round(expected), most_bytes), now_ns=now_ns)
+        if pending.base is not None:
+            size, crop_px = (width, height), job.header.crop_source_px
+            shown = base_crop(pending.base, view=self.view, crop_source_px=crop_px, size=size)
+            place = inner_box(job.header.box_source_px, crop_px, size)
+            found = Alternative.of(shown, crop=job.crop_bgr, places=(place,), min_gain_db=0.0)
+            job = pending.job = replace(job, alternative=found)
+            pending.base = None
+        job = replace(job, header=replace(job.header, codec=codec.name, media_type=codec.media_type))
+        capacity = Capacity(
+            prompt_bytes=max(0, round(_PROMPT_SHARE * most_bytes) - _MARGIN_BYTES),
+            most_bytes=max(0, most_bytes - _MARGIN_BYTES),
+            total_bps=self.line.total_bps,
+        )
+        coded = code_requested(job, codec=codec, quality_pct=pending.quality_pct, capacity=capacity)
+        if isinstance(coded, NothingCloser):
+            self._give_up(pending, coded.reason, now_ns=now_ns)
+            return False
+        pending.ready = coded.still
         with self._lock:
-            self._note(pending.number, _REFUSALS[reason])
+            self._note(pending.number, note=coded.note)
+        return True
+
+    def _give_up(self, pending: OnDemandStill, reason: str, *, now_ns: int) -> None:
+        self.line.want_requested(None, now_ns=now_ns)
+        self.outbox.give_up(pending)
+        with self._lock:
+            self._note(pending.number, refusal=reason)
+
+    def expired(self, pending: OnDemandStill, reason: str, *, now_ns: int) -> None:
+        """It was given up: ``stale`` or ``ended``."""
+        self.line.want_requested(None, now_ns=now_ns)
+        waited_s = self.outbox.settings.max_on_demand_ns / SECOND_NS
+        busy = "the link was never free for it" if pending.link_busy else "the budget had no room for it"
+        with self._lock:
+            self._note(pending.number, refusal=_ENDED if reason == "ended" else f"in {waited_s:g} s {busy}")
 
     def close(self) -> None:
         """No more is accepted."""
@@ -220,7 +265,7 @@ class OnDemand:
         if pending >= _MAX_PENDING:
             raise RefusedError(f"{pending} stills that were asked for wait already: ask again later")
 
-    def _note(self, number: int, refusal: str) -> None:
-        self._refusals[number] = refusal
-        while len(self._refusals) > _OUTCOMES:
-            self._refusals.popitem(last=False)
+    def _note(self, number: int, *, refusal: str = "", note: str = "") -> None:
+        self._outcomes[number] = refusal, note
+        while len(self._outcomes) > _OUTCOMES:
+            self._outcomes.popitem(last=False)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from hvt_common.values import Boxes, Still, View
-from hvt_common.video.base_crop import coded_size
+from hvt_common.video.base_crop import MAX_REQUESTED_SIDE_PX, coded_size
 from hvt_edge.perception.crop import MIN_SIDE_PX, crop_box
 from hvt_edge.perception.frame_ring import FrameRing, RingFrame
 from hvt_edge.stills.crop_job import CropJob, crop_of, size_parameters
 from hvt_edge.stills.maker import StillMaker
 
-__all__ = ["ON_DEMAND", "OnDemandRequest", "RefusedError", "box_of", "crop_job_for", "frame_for", "shrunk"]
+__all__ = ["ON_DEMAND", "OnDemandRequest", "RefusedError", "box_of", "crop_job_for", "frame_for"]
 
 ON_DEMAND = "asked"
 """The reason that such a still carries on the wire and in the ledger."""
@@ -39,11 +38,14 @@ class OnDemandRequest:
     ago_ms: int | None = None
     """Before the newest frame."""
     quality_pct: int | None = None
-    """At most so good; None for the quality of all stills."""
+    """None for the quality of all stills."""
 
 
 def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
-    """The frame that is requested, or the nearest in the ring; raises `RefusedError` where it is gone or to come."""
+    """The frame that is requested, or the nearest in the ring; raises `RefusedError` where it is gone or to come.
+
+    The newest means the newest that was coded, unless the track is not in it.
+    """
     newest = ring.newest
     if newest is None:
         raise RefusedError("there is no frame yet, or none is kept (--ring)")
@@ -53,8 +55,12 @@ def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
                 f"frame {request.frame_index} is yet to come: the newest is {newest.frame_index}"
             )
         frame, wanted = ring.near_index(request.frame_index), f"frame {request.frame_index}"
+    elif not request.ago_ms:
+        coded = ring.newest_coded
+        lacks = coded is None or (request.track_id is not None and request.track_id not in coded.tracks.ids)
+        return newest if lacks or coded is None else coded
     else:
-        ago_ms = request.ago_ms or 0
+        ago_ms = request.ago_ms
         frame = ring.near_time(newest.capture_ns - ago_ms * 1_000_000)
         wanted = f"the frame of {ago_ms / 1000:g} s ago"
     if frame is None:
@@ -83,7 +89,7 @@ def crop_job_for(
     else:
         crop = _inside(request.box_xywh_px or (0, 0, width, height), (width, height))
         box, name, confidence = (*map(float, crop),), "", 0.0  # type: ignore[assignment]
-    size = coded_size(crop, max_side_px=maker.max_side_px)
+    size = coded_size(crop, max_side_px=MAX_REQUESTED_SIDE_PX)
     codec = maker.without_base
     header = Still(
         sequence=0,
@@ -115,17 +121,6 @@ def _row(frame: RingFrame, track_id: int) -> int:
         f"there is no track {track_id} at frame {frame.frame_index}: the edge's own tracks there are "
         f"{listed or 'none'}"
     )
-
-
-def shrunk(job: CropJob, shrink: float) -> CropJob:
-    """The same crop, coded with its sides so much shorter."""
-    height, width = job.crop_bgr.shape[:2]
-    size = max(1, round(width * shrink)), max(1, round(height * shrink))
-    if size == (width, height):
-        return job
-    pixels = np.asarray(cv2.resize(job.crop_bgr, size, interpolation=cv2.INTER_AREA), np.uint8)
-    parameters = {**job.header.parameters, **size_parameters(job.header.crop_source_px, size)}
-    return replace(job, header=replace(job.header, parameters=parameters), crop_bgr=pixels)
 
 
 def _inside(box_xywh_px: tuple[int, int, int, int], size: tuple[int, int]) -> Crop:

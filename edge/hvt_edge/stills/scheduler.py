@@ -162,18 +162,29 @@ class Chooser:
             return
         # A pending still must not hold frames: what is measured on them is measured now.
         pending = OutboxStill(job, request.without_frame(), request.score, now_ns)
-        self._count_left(self.outbox.offer(pending))
+        self._count_left(self.outbox.offer(pending), now_ns=now_ns)
 
     # Which stills go now
+
+    def requested(self, *, now_ns: int, store: bool = False) -> Iterator[OutboxStill]:
+        """Yield coded stills that grounds requested, as `stills` does."""
+        self._count_left(self.outbox.expire(now_ns), now_ns=now_ns)
+        while isinstance(pending := self.outbox.on_demand, OnDemandStill) and self.on_demand is not None:
+            sequence = self.outbox.sequence(store=store)
+            still = self.on_demand.code(pending, now_ns=now_ns, sequence=sequence, paced=not store)
+            if still is not None:
+                self._coded(pending, still, now_ns=now_ns, store=store)
+                yield pending
+            elif self.outbox.on_demand is pending:
+                return  # it waits
 
     def stills(self, *, now_ns: int, allowance: Allowance, store: bool = False) -> Iterator[OutboxStill]:
         """Yield coded stills that fit ``allowance``; the caller sends each before it takes the next.
 
         ``store``: they go to the backlog. Then none builds on the base, which may come later still, or never.
         """
-        self._count_left(self.outbox.offer_undecodable(now_ns))
-        self._count_left(self.outbox.expire(now_ns))
-        yield from self._requested(now_ns=now_ns, allowance=allowance, store=store)
+        self._count_left(self.outbox.offer_undecodable(now_ns), now_ns=now_ns)
+        yield from self.requested(now_ns=now_ns, store=store)
         if self.outbox.on_demand is not None:
             return  # it waits for its allowance; none of the others takes that away
         while (pending := self.outbox.best()) is not None:
@@ -190,16 +201,6 @@ class Chooser:
             yield from self._overdue(over=-math.inf, now_ns=now_ns, allowance=allowance)
         held = {pending.track_id for pending in self.outbox.pending}
         self._held_up = {track_id: ns for track_id, ns in self._held_up.items() if track_id in held}
-
-    def _requested(self, *, now_ns: int, allowance: Allowance, store: bool) -> Iterator[OutboxStill]:
-        """Those that grounds requested."""
-        while isinstance(pending := self.outbox.on_demand, OnDemandStill) and self.on_demand is not None:
-            sequence = self.outbox.sequence(store=store)
-            still = self.on_demand.code(pending, now_ns=now_ns, allowance=allowance, sequence=sequence)
-            if still is None:
-                return
-            self._coded(pending, still, now_ns=now_ns, store=store)
-            yield pending
 
     def _overdue(self, *, over: float, now_ns: int, allowance: Allowance) -> Iterator[OutboxStill]:
         """Those to be sent again that are more useful than ``over``, and fit."""
@@ -299,13 +300,13 @@ class Chooser:
         """What is pending will not be sent any more."""
         if self.on_demand is not None:
             self.on_demand.close()
-        self._count_left(self.outbox.clear())
+        self._count_left(self.outbox.clear(), now_ns=0)
 
-    def _count_left(self, left: Iterable[tuple[OutboxStill, str]]) -> None:
+    def _count_left(self, left: Iterable[tuple[OutboxStill, str]], *, now_ns: int) -> None:
         for one, reason in left:
             if isinstance(one, OnDemandStill):
                 if self.on_demand is not None:
-                    self.on_demand.expired(one, reason)
+                    self.on_demand.expired(one, reason, now_ns=now_ns)
             else:
                 self.on_outcome("deferred" if reason == "replaced" else "dropped", reason)
 

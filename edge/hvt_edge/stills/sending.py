@@ -43,7 +43,9 @@ class StillSender:
             self._store(coded, now_ns=now_ns, counted=True)
             return
         coded.envelope = coded.envelope or self.transmitter.envelope(coded.still)
-        self.transmitter.still(coded.envelope, now_ns=now_ns, copy=AGAIN if coded.copies > 1 else "")
+        # A second copy waits for its allowance like any other: nobody waits for it.
+        copy, requested = AGAIN if coded.copies > 1 else "", coded.request is None and coded.copies == 1
+        self.transmitter.still(coded.envelope, now_ns=now_ns, copy=copy, requested=requested)
 
     def store_lost(self, now_ns: int) -> None:
         """Store what was sent before the link went away, or came back, and no report has named."""

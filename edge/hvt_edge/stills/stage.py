@@ -71,6 +71,11 @@ class StillStage:
         """Whether a still is pending, one that a ground requested included."""
         return self.outbox.any_pending
 
+    @property
+    def any_requested(self) -> bool:
+        """Whether one that a ground requested is pending."""
+        return self.outbox.on_demand is not None
+
     def analyze(
         self,
         frame: Frame,
@@ -109,7 +114,7 @@ class StillStage:
             self.reporter.report(analyzed, now_ns=now_ns)
         if most_bytes := self.transmitter.most_still_bytes():
             self.chooser.set_most_bytes(most_bytes)
-        # What is requested waits until the link is free, which right behind a base frame it never is.
+        # What a method requests waits until the link is free, which right behind a base frame it never is.
         allowance_bytes = self.transmitter.still_allowance_bytes(now_ns, paced=False)
         self.chooser.consider(
             analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not levers.stills
@@ -120,11 +125,15 @@ class StillStage:
         """Send those that are pending and may go now, without another frame; the rest as of `send`."""
         self.sender.store_lost(now_ns)
         store = self.sender.offline
-        if not store and (self.keyframes.due(now_ns) if held is None else held):
-            return set()
         sent: set[int] = set()
-        allowance = self.sender.allowance(now_ns, paced=not store)
-        for coded in self.chooser.stills(now_ns=now_ns, allowance=allowance, store=store):
+        if not store and (self.keyframes.due(now_ns) if held is None else held):
+            if self.keyframes.requested:
+                return sent
+            stills = self.chooser.requested(now_ns=now_ns)  # a keyframe of the schedule can wait for them
+        else:
+            allowance = self.sender.allowance(now_ns, paced=not store)
+            stills = self.chooser.stills(now_ns=now_ns, allowance=allowance, store=store)
+        for coded in stills:
             self.sender.put(coded, now_ns=now_ns, store=store)
             if not store:
                 sent.add(coded.still.sequence)

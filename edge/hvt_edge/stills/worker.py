@@ -107,7 +107,10 @@ class StillWorker:
             try:
                 if (item := self._next()) is None:
                     return
-                behind = self._frames.qsize() >= _BEHIND_FRAMES
+                # Whoever looks closer waits: a detection takes longer than what he asked for.
+                behind = self._frames.qsize() >= _BEHIND_FRAMES or self.stage.any_requested
+                if self.stage.any_requested:
+                    self.stage.send_pending(now_ns=self.clock())
                 self.stage.on_results(self.results(), detected=self.detected())
                 analyzed = self.stage.analyze(*item, hurry=behind)
                 self.stage.send(analyzed, now_ns=self.clock())

@@ -29,6 +29,8 @@ class FrameInputs:
     """The plan wants its keyframe now: one is due, and it fits the budget's window or has waited long enough."""
     admitted: bool
     """Pacer and budget have room for a frame now."""
+    yielded: bool = False
+    """Its bytes go to a still that a ground requested."""
     link: State = State.LIVE
     """Always LIVE where there is no store."""
     segment_due: bool = False
@@ -64,6 +66,7 @@ class FrameDecision:
 
 
 _SKIP, _HOLD = FrameDecision(Action.SKIP), FrameDecision(Action.HOLD)
+_YIELD = FrameDecision(Action.HOLD, held_by="closer_look")
 
 
 def decide(inputs: FrameInputs) -> FrameDecision:
@@ -86,13 +89,14 @@ def decide(inputs: FrameInputs) -> FrameDecision:
     | RETURNING | no | yes | | no | code, to the store |
     | RETURNING | no | | | yes | keyframe to the store; the plan still waits for its own |
 
-    OFFLINE, a coded frame also goes to the link as a probe, where one is due and admitted.
+    OFFLINE, a coded frame also goes to the link as a probe, where one is due and admitted. LIVE, a frame that is no
+    keyframe is held too where a requested still needs its bytes.
     """
     if inputs.link is State.LIVE:
         if not inputs.keyframe_due and not inputs.due:
             return _SKIP
-        if not inputs.admitted:
-            return _HOLD
+        if not inputs.admitted or (inputs.yielded and not inputs.keyframe_due):
+            return _YIELD if inputs.admitted else _HOLD
         keyframe = inputs.keyframe_due
         return FrameDecision(Action.CODE, keyframe, to_link=True, meets_plan=keyframe)
     if inputs.link is State.RETURNING and inputs.keyframe_due and inputs.admitted:

@@ -56,7 +56,13 @@ class KeyframePlan:
 
     def _publish(self) -> None:
         self._requests.publish(
-            KeyframeState(self._settings.interval_ns, self._last_ns, self._due_ns, self._sent)
+            KeyframeState(
+                self._settings.interval_ns,
+                self._last_ns,
+                self._due_ns,
+                self._sent,
+                requested=self._requested_ns is not None,
+            )
         )
 
 

@@ -74,20 +74,28 @@ class BaseStage:
         """Decide on this source frame; once for each, in order."""
         keyframe_bytes = self.keyframe_bytes(self._keyframe_bytes)
         fits = self.transmitter.keyframe_fits(keyframe_bytes, now_ns=now_ns)
+        if not self.keyframes.requested:  # one of the schedule: a requested still goes before it
+            fits = fits and not self.transmitter.yielding(now_ns)
         keyframe_due = self._plan.now(now_ns, fits=fits) or self._begins_anew
         line_bytes = keyframe_bytes if keyframe_due else self.transmitter.frame_bytes
         backlog = self.backlog
+        due, admitted = self._frame_skip.codes(frame.index), self.admits(now_ns, line_bytes)
+        link = State.LIVE if backlog is None else backlog.state
+        coded = due and admitted and not keyframe_due and link is State.LIVE
         decision = decide(
             FrameInputs(
-                due=self._frame_skip.codes(frame.index),
+                due=due,
                 keyframe_due=keyframe_due,
-                admitted=self.admits(now_ns, line_bytes),
-                link=State.LIVE if backlog is None else backlog.state,
+                admitted=admitted,
+                yielded=coded and self.transmitter.leaves_out(now_ns),
+                link=link,
                 segment_due=backlog is not None and backlog.segment_due(now_ns),
                 probe_due=backlog is not None and backlog.probe_due(now_ns),
             )
         )
-        return replace(decision, held_by=self.holder(now_ns)) if decision.action is Action.HOLD else decision
+        if decision.action is Action.HOLD and not admitted:
+            return replace(decision, held_by=self.holder(now_ns))
+        return decision
 
     def encode(
         self, frame: Frame, decision: FrameDecision, *, now_ns: int, tracks: Tracks | None = None

@@ -67,6 +67,7 @@ def make_budget(config: EdgeConfig, *, base_bps: int, decimation: int) -> Rollin
             window_ns=round(config.window * SECOND_NS),
             metadata_bps=config.metadata_bps,
             borrow_unused=config.borrow_unused,
+            yields=not config.passes_through,
         )
     )
 

@@ -238,7 +238,7 @@ def build_stages(
         maker=maker,
         view=view,
         class_names=class_names,
-        most_bytes=transmitter.most_still_bytes,
+        line=transmitter,
     )
     chooser = make_chooser(
         config,

@@ -14,7 +14,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.perception.candidates import Candidate, TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.on_demand import OnDemand
+from hvt_edge.stills.on_demand import OnDemand, RequestedLine
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.base import Method, Step
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
@@ -116,7 +116,7 @@ def make_on_demand(
     maker: StillMaker,
     view: View,
     class_names: tuple[str, ...],
-    most_bytes: Callable[[], int],
+    line: RequestedLine,
 ) -> OnDemand:
     """The ring of source frames, and who serves stills from it."""
     ring = FrameRing(RingSettings(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS)))
@@ -126,7 +126,7 @@ def make_on_demand(
         maker=maker,
         view=view,
         class_names=class_names,
-        most_bytes=most_bytes,
+        line=line,
     )
 
 

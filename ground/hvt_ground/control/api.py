@@ -32,6 +32,7 @@ from hvt_common.protocol.messages import (
     ControlRequest,
     Info,
     RoiHeader,
+    Status,
     UnknownVersionError,
     WireError,
 )
@@ -48,8 +49,8 @@ __all__ = ["EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge", "RequestedSt
 
 _ANSWER_S = 2.0
 _POLL_S = 0.3
-_OUTCOME_S = 2.0
-"""So often the edge is asked what became of a still that does not come."""
+_FIRST_OUTCOME_S, _OUTCOME_S = 0.5, 2.0
+"""When the edge is first asked what became of a still that does not come, and how often then."""
 _INBOX_MESSAGES = 64
 _JPEG_QUALITY_PCT = 95
 _SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -83,7 +84,7 @@ class RequestedStill:
     data: bytes
     """As it came over the link."""
     image_bgr: Image
-    """(height, width, 3) uint8; smaller than the crop where that is longer than 512 pixels or the budget is thin."""
+    """(height, width, 3) uint8; smaller than the crop where the budget is thin, or it is longer than 2048 pixels."""
 
     def save(self, path: Path | str) -> None:
         """Write it as JPEG or PNG, by the suffix; a JPEG that came as one is written as it came.
@@ -204,14 +205,16 @@ class RemoteEdge:
         frame: int | None = None,
         quality_pct: int | None = None,
         timeout_s: float = 15.0,
+        on_note: Callable[[str], None] = lambda _note: None,
     ) -> RequestedStill:
         """Ask for a still of the untouched source frame, and wait for it.
 
         Of a ``track`` (the edge's id, see `tracks`), of a ``box`` (x, y, width and height in source pixels), or
         else the whole frame; ``at_s`` seconds before the edge's newest frame (as ``-3``), at ``frame``, or else the
         newest. ``quality_pct`` is 5 to 95, None for the edge's ``--jpeg-quality``; less where the budget has no
-        room. Raises `RefusedError` where the edge refused it or gave it up, `UserError` where it did not come in
-        time.
+        room, more where the video is as good. ``on_note`` is called with a sentence where it comes otherwise than
+        requested, before it comes. Raises `RefusedError` where the edge refused it or gave it up, `UserError` where
+        the edge ended, or it did not come in time.
         """
         given = {"track": track, "frame": frame, "quality": quality_pct}
         given["at_ms"] = None if at_s is None else round(at_s * 1000)
@@ -221,12 +224,16 @@ class RemoteEdge:
         self._check_may_command()
         info = self.info()
         inbox = Inbox(capacity=_INBOX_MESSAGES)
-        subscriber = subscribe(self._session, self._keys.key(Channel.ROI), inbox=inbox)
+        subscribers = [
+            subscribe(self._session, self._keys.key(channel), inbox=inbox)
+            for channel in (Channel.ROI, Channel.STATUS)
+        ]
         try:
             answer = self.command(Command.STILL, arguments)
-            header, item = self._wait(inbox, answer, until_s=until_s, timeout_s=timeout_s)
+            header, item = self._wait(inbox, answer, until_s=until_s, timeout_s=timeout_s, on_note=on_note)
         finally:
-            subscriber.undeclare()  # type: ignore[no-untyped-call]
+            for subscriber in subscribers:
+                subscriber.undeclare()  # type: ignore[no-untyped-call]
         received = ReceivedStill(header, item.payload)
         try:
             image = decode_still(received, base=None, view=info.view)
@@ -246,27 +253,48 @@ class RemoteEdge:
         return answer
 
     def _wait(
-        self, inbox: Inbox, answer: ControlAnswer, *, until_s: float, timeout_s: float
+        self,
+        inbox: Inbox,
+        answer: ControlAnswer,
+        *,
+        until_s: float,
+        timeout_s: float,
+        on_note: Callable[[str], None],
     ) -> tuple[RoiHeader, Received]:
         """The still of that number; in between the edge is asked whether it is still to come."""
-        query_s = time.monotonic() + _OUTCOME_S
+        query_s, noted = time.monotonic() + _FIRST_OUTCOME_S, ""
         while (now_s := time.monotonic()) < until_s:
             item = inbox.get(timeout_s=min(_POLL_S, until_s - now_s))
+            if item is not None and _has_ended(item, answer):
+                raise UserError(f"{self.name} has ended: the still does not come")
             header = None if item is None else _header(item)
             if item is not None and header is not None and _is_answer(header, answer):
                 return header, item
             if now_s >= query_s:
-                try:
-                    self._commanded(Command.STILL_OUTCOME, {"ask": answer.still_request})
-                except RefusedError:
-                    raise
-                except UserError:
-                    pass  # an answer that cannot be used, as no answer: the still itself may come all the same
+                note = self._note_of(answer.still_request)
+                if note and note != noted:
+                    on_note(note)
+                    noted = note
                 query_s = now_s + _OUTCOME_S
         raise UserError(
-            f"{self.name} accepted the still, but it did not come within {timeout_s:g} s: "
-            "the budget or the link is full"
+            f"{self.name} accepted the still, but it did not come within {timeout_s:g} s: {self._why_late()}"
         )
+
+    def _note_of(self, number: int) -> str:
+        """What the edge says of a pending still. Raises `RefusedError` where none comes."""
+        try:
+            outcome = self._commanded(Command.STILL_OUTCOME, {"ask": number})
+        except RefusedError:
+            raise
+        except UserError:
+            return ""  # an answer that cannot be used, as no answer: the still itself may come all the same
+        return "" if outcome is None else outcome.note
+
+    def _why_late(self) -> str:
+        alive = self._session.liveliness().get(self._keys.key(Channel.ALIVE), timeout=_ANSWER_S)
+        if any(reply.ok is not None for reply in alive):
+            return "the budget or the link is full"
+        return "the edge is not there any more: it has ended, or its link is down"
 
     def _commanded(self, command: str, arguments: Mapping[str, int | float | str]) -> ControlAnswer | None:
         """The answer where the edge accepts; None where there is none in time."""
@@ -363,6 +391,17 @@ def _header(item: Received) -> RoiHeader | None:
         return RoiHeader.parse(item.attachment, item.payload)
     except WireError:
         return None
+
+
+def _has_ended(item: Received, answer: ControlAnswer) -> bool:
+    """Whether this is the last status of the session that accepted the still."""
+    if not item.key.endswith(f"/{Channel.STATUS}"):
+        return False
+    try:
+        status = Status.parse(item.payload)
+    except WireError:
+        return False
+    return status.session_id == answer.session_id and status.state == "ended"
 
 
 def _is_answer(header: RoiHeader, answer: ControlAnswer) -> bool:

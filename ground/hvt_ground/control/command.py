@@ -70,6 +70,7 @@ def _still(arguments: argparse.Namespace) -> Callable[[RemoteEdge], None]:
             frame=arguments.frame,
             quality_pct=arguments.quality,
             timeout_s=timeout_s,
+            on_note=lambda note: say(f"{edge.name}: {note}"),
         )
         still.save(out)
         say(f"{out}: {_described(still)}")
@@ -171,7 +172,12 @@ def _still_flags(parser: argparse.ArgumentParser) -> None:
     when.add_argument(
         "--frame", type=int, metavar="N", help="or at this frame index, as the recording shows it"
     )
-    parser.add_argument("--quality", type=int, metavar="PCT", help="5 to 95, at most [the edge's]")
+    parser.add_argument(
+        "--quality",
+        type=int,
+        metavar="PCT",
+        help="5 to 95; less where the budget is thin, more where the video is as good [the edge's]",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="crop.jpg or crop.png")
     parser.add_argument(
         "--timeout",

@@ -75,6 +75,11 @@ def test_no_window_exceeds_the_budget_for_it(codec):
     rig = Rig("200kbps", share=0.8, codec=codec)
     sent: list[tuple[int, int]] = []
     record_still, record_base = rig.budget.record_still, rig.budget.record_base
+    record_requested = rig.budget.record_requested
+    rig.budget.record_requested = lambda size, now_ns: (
+        sent.append((now_ns, size)),
+        record_requested(size, now_ns=now_ns),
+    )
     rig.budget.record_still = lambda size, now_ns: (
         sent.append((now_ns, size)),
         record_still(size, now_ns=now_ns),
@@ -100,7 +105,7 @@ def test_one_that_never_fits_comes_smaller_within_some_seconds():
     rig.run(75)
     ((header, data),) = rig.asked()
     assert header.parameters["ask"] == answer.still_request
-    assert len(data) <= 15_000 / 8
+    assert len(data) <= 0.8 * 150_000 / 8
     assert shown(header, data).shape[1] == header.parameters["w"] < 512
 
 
@@ -133,16 +138,13 @@ def test_what_cannot_be_served_is_refused_with_the_reason(arguments, reason):
     assert rig.asked() == []
 
 
-def test_too_many_and_too_poor_are_refused():
-    """A loop at a ground would fill the drone's memory, or wait for what no budget will ever send."""
+def test_too_many_are_refused():
+    """A loop at a ground would fill the drone's memory."""
     rig = Rig("150kbps", share=0.9)
     rig.run(30)
     answers = [rig.ask("still", quality=95) for _ in range(6)]
     assert [one.accepted for one in answers] == [True] * 4 + [False] * 2
     assert "4 stills that were asked for wait already" in answers[-1].reason
-    poor = Rig(name="M0", share=None)
-    poor.run(3)
-    assert "the budget leaves nothing for stills" in poor.ask("still").reason
 
 
 def test_whoever_waits_can_ask_what_became_of_it():
@@ -155,9 +157,9 @@ def test_whoever_waits_can_ask_what_became_of_it():
     rig.chooser.close()
     assert len(rig.asked()) in (1, 2)
     if len(rig.asked()) == 1:
-        assert "session ended" in rig.ask("still-outcome", ask=second.still_request).reason
+        assert "the edge has ended" in rig.ask("still-outcome", ask=second.still_request).reason
     assert "nothing is known" in rig.ask("still-outcome", ask=99).reason
-    assert "session is ending" in rig.ask("still").reason
+    assert "the edge has ended" in rig.ask("still").reason
 
 
 def test_the_tracks_are_those_of_the_newest_frame_in_source_pixels():

@@ -60,7 +60,9 @@ class ScriptedEdge:
         self.answer, self.outcome = YES, YES
         self.puts: list[tuple[bytes, bytes]] = [(DATA, HEADER.pack(DATA))]
         self.asked: list[ControlRequest] = []
+        self.ends = False
         self._publisher: zenoh.Publisher | None = None
+        self._status: zenoh.Publisher | None = None
 
     def control(self, question: bytes) -> bytes:
         """Note the request; the stills come a little later, as they do."""
@@ -73,11 +75,14 @@ class ScriptedEdge:
     def _put(self) -> None:
         for payload, attachment in self.puts:
             self._publisher.put(payload, attachment=attachment, encoding="image/jpeg")
+        if self.ends:
+            self._status.put(replace(messages.STATUS, session_id=7, state="ended").pack())
 
     def fly(self, up: threading.Event, stop: threading.Event) -> None:
         """Listen, as an edge with --listen does."""
         with open_session(LinkSettings("edge", listen=(self.endpoint,))) as session:
             self._publisher = declare_publisher(session, Channel.ROI, keys=KEYS)
+            self._status = declare_publisher(session, Channel.STATUS, keys=KEYS)
             serve(session, Channel.INFO, keys=KEYS, answer=lambda _question: INFO.pack())
             serve(session, Channel.CONTROL, keys=KEYS, answer=self.control)
             token = session.liveliness().declare_token(KEYS.key(Channel.ALIVE))
@@ -153,6 +158,21 @@ def test_a_still_that_was_given_up_is_not_waited_for(edge):
         edges["uav-1"].still(timeout_s=30)
     assert [one.command for one in edge.asked] == ["still", "still-outcome"]
     assert edge.asked[1].arguments == {"ask": 3}
+
+
+def test_an_edge_that_ends_meanwhile_says_so(edge):
+    """The operator would blame the budget or the link, and wait for an edge that has landed."""
+    edge.puts, edge.ends = [], True
+    with EdgeClient.connect(edge.endpoint) as edges, pytest.raises(UserError, match="uav-1 has ended"):
+        edges["uav-1"].still(timeout_s=30)
+
+
+def test_how_it_comes_is_said_before_it_comes(edge, tmp_path, capsys):
+    """A picture that takes seconds, or shows less than was asked for, would be a riddle."""
+    edge.puts, edge.outcome = [], replace(YES, note="96x64 pixels at quality 40 come within about 3 s")
+    words = ["still", "--connect", edge.endpoint, "--timeout", "1.5s", "--out", str(tmp_path / "crop.png")]
+    assert main(words) == 2
+    assert "uav-1: 96x64 pixels at quality 40 come within about 3 s\n" in capsys.readouterr().out
 
 
 def test_one_that_never_comes_ends_with_the_timeout(edge):

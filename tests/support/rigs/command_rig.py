@@ -89,7 +89,7 @@ class Rig:
             maker=maker,
             view=VIEW,
             class_names=("car",),
-            most_bytes=self.sender.most_still_bytes,
+            line=self.sender,
         )
         self.chooser = Chooser(
             method(name),
@@ -150,8 +150,13 @@ class Rig:
             pixels = picture(self.index)
             base = cv2.blur(cv2.resize(pixels, BASE, interpolation=cv2.INTER_AREA), (31, 31))
             tracks = tracks_at(self.index, {5: self.box(self.index)})
-            seen = AnalyzedFrame(Frame(self.index, self.now_ns, pixels, base), base, tracks, detected=others)
-            self.budget.record_base(int(self.budget.base_step_bytes), now_ns=self.now_ns)
+            coded = not self.sender.leaves_out(self.now_ns)
+            seen = AnalyzedFrame(
+                Frame(self.index, self.now_ns, pixels, base), base if coded else None, tracks, detected=others
+            )
+            if coded:
+                size, now_ns = int(self.budget.base_step_bytes), self.now_ns
+                self.budget.record_base(size, now_ns=self.budget.earliest_ns(size, now_ns=now_ns, base=True))
             self.chooser.consider(seen, now_ns=self.now_ns, allowance_bytes=1000)
             sender = StillSender(self.outbox, maker=self.maker, transmitter=self.sender)
             for coded in self.chooser.stills(

@@ -114,6 +114,8 @@ class ControlAnswer(Message):
     """The frame that the still shows, or whose tracks these are; -1 where neither."""
     tracks: tuple[TrackNow, ...] = wire_field(ListOf(Nested(TrackNow), MAX_TRACKS_NOW))
     """For the command ``tracks``; else empty."""
+    note: str = wire_field(Text(200), default="")
+    """What else is to be said where accepted, in a sentence; of a pending still, how it comes and when."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,233 @@
+"""A closer look is closer than the video: how a requested crop is coded, and what it takes of the video."""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvt_common.values import Image, Still
+from hvt_common.video.still_codecs import JpegCodec, psnr_y_db
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.stills.crop_job import Alternative, CropJob
+from hvt_edge.stills.requested_coding import Capacity, CodedRequest, NothingCloser, code_requested
+from media.clips import START_NS, hard_pictures
+from media.pictures import write_scene
+from rigs.closer_looks import LookFlight, RequestedLook
+
+SIZE = (240, 160)
+CROP = hard_pictures(1, size=SIZE)[0]
+JPEG = JpegCodec()
+PLENTY = Capacity(prompt_bytes=100_000, most_bytes=150_000, total_bps=1_500_000)
+
+
+def job(base: Image | None) -> CropJob:
+    """The crop, with what the base shows of it."""
+    whole = (slice(0, SIZE[1]), slice(0, SIZE[0]))
+    alternative = None
+    if base is not None:
+        alternative = Alternative.of(base, crop=CROP, places=(whole,), min_gain_db=0.0)
+    header = Still(
+        sequence=0,
+        frame_index=3,
+        capture_ns=START_NS,
+        track_id=-1,
+        box_source_px=(0.0, 0.0, *map(float, SIZE)),
+        crop_source_px=(0, 0, *SIZE),
+        class_name="",
+        confidence=0.0,
+        reason="asked",
+        codec="jpeg",
+        quality_pct=65,
+        data=b"",
+    )
+    return CropJob(header=header, crop_bgr=CROP, base_crop_bgr=None, alternative=alternative)
+
+
+def as_base(quality_pct: int) -> Image:
+    """A base that is as good as a still of this quality."""
+    coded = JPEG.encode(CROP, quality_pct=quality_pct)
+    return JPEG.decode(coded.data, size=SIZE, parameters=coded.parameters)
+
+
+def shown(still: Still) -> Image:
+    """What its requester sees, at the size of the crop."""
+    size = still.parameters.get("w", SIZE[0]), still.parameters.get("h", SIZE[1])
+    image = JPEG.decode(still.data, size=size, parameters=still.parameters)
+    return np.asarray(cv2.resize(image, SIZE, interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    base_pct=st.integers(1, 99),
+    wanted_pct=st.integers(5, 95),
+    most_bytes=st.integers(200, 60_000),
+)
+def test_what_comes_is_closer_to_the_source_than_the_video_and_fits(base_pct, wanted_pct, most_bytes):
+    """An operator who looks closer would see less than before, or wait for what never fits."""
+    base = as_base(base_pct)
+    capacity = Capacity(round(0.6 * most_bytes), most_bytes, total_bps=10 * most_bytes)
+    look = code_requested(job(base), codec=JPEG, quality_pct=wanted_pct, capacity=capacity)
+    if isinstance(look, NothingCloser):
+        assert "the video" in look.reason
+        return
+    assert len(look.still.data) <= most_bytes
+    assert psnr_y_db(shown(look.still), CROP) > psnr_y_db(base, CROP)
+    full = "w" not in look.still.parameters
+    assert full or look.note, "fewer pixels are said before they come"
+
+
+def test_quality_goes_up_until_it_plainly_shows_more_and_down_before_pixels():
+    """At the stills' usual quality it would be as good as the video, or small where it could be whole."""
+    base = as_base(65)
+    better = code_requested(job(base), codec=JPEG, quality_pct=65, capacity=PLENTY)
+    assert isinstance(better, CodedRequest)
+    assert better.still.quality_pct > 65
+    assert psnr_y_db(shown(better.still), CROP) > psnr_y_db(base, CROP) + 1.5
+    whole = len(JPEG.encode(CROP, quality_pct=65).data)
+    thin = Capacity(round(0.5 * whole), round(0.7 * whole), total_bps=8 * whole)
+    lower = code_requested(job(as_base(10)), codec=JPEG, quality_pct=65, capacity=thin)
+    assert isinstance(lower, CodedRequest)
+    assert lower.still.quality_pct < 65
+    assert "w" not in lower.still.parameters
+    assert f"{SIZE[0]}x{SIZE[1]} pixels at quality {lower.still.quality_pct} come within about" in lower.note
+
+
+def test_what_the_video_shows_as_well_is_refused_and_what_is_too_large_says_what_would_do():
+    """The request would be answered by a copy of the picture, or by nothing for ten seconds."""
+    same = code_requested(job(CROP), codec=JPEG, quality_pct=65, capacity=PLENTY)
+    assert same == NothingCloser("the video already shows it as well as the source does")
+    large = code_requested(job(as_base(70)), codec=JPEG, quality_pct=65, capacity=Capacity(900, 1500, 15_000))
+    assert isinstance(large, NothingCloser)
+    assert "240x160 pixels take" in large.reason
+    assert "15 kbps carry 1.5 kB at once: ask for a smaller region" in large.reason
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    total_bps=st.sampled_from([100_000, 300_000, 800_000, 2_000_000]),
+    share=st.sampled_from([0.5, 0.8, 0.95, 1.0]),
+    fps=st.sampled_from([2.0, 5.0, 7.5, 15.0, 30.0]),
+    parts=st.lists(st.floats(0.02, 0.78), min_size=1, max_size=5),
+)
+def test_the_video_lends_what_is_requested_within_every_window_and_goes_on(
+    seed, total_bps, share, fps, parts
+):
+    """The hard budget would break for a picture, the picture come late, or the video stop for it."""
+    rng = np.random.default_rng(seed)
+    budget = RollingBudget(BudgetSettings(total_bps, round(share * total_bps), fps=fps))
+    step_ns, tick_ns = round(1e9 / fps), 25_000_000
+    wanted = [round(part * total_bps / 8) for part in parts]
+    sent: list[tuple[int, int]] = []
+    base_ns: list[int] = []
+    asked_ns = delays = 0
+    waits: list[float] = []
+    next_frame_ns = now_ns = START_NS
+    end_ns = START_NS + 14 * 10**9
+    while now_ns < end_ns:
+        if now_ns >= next_frame_ns:
+            next_frame_ns += step_ns
+            size = int(share * total_bps / 8 / fps * rng.uniform(0.6, 1.1))
+            if budget.earliest_ns(size, now_ns=now_ns, base=True) - now_ns <= 100_000_000 and not (
+                budget.leaves_out(now_ns)
+            ):
+                at_ns = budget.earliest_ns(size, now_ns=now_ns, base=True)
+                budget.record_base(size, now_ns=at_ns)
+                sent.append((at_ns, size))
+                base_ns.append(at_ns)
+        if now_ns - START_NS > (delays + 1) * 2_500_000_000 and delays < len(wanted):
+            size = wanted[delays]
+            asked_ns = asked_ns or now_ns
+            if size <= budget.requested_allowance(now_ns):
+                budget.record_requested(size, now_ns=now_ns)
+                sent.append((now_ns, size))
+                waits.append((now_ns - asked_ns) / 1e9)
+                asked_ns, delays = 0, delays + 1
+            else:
+                budget.want_requested(size, now_ns=now_ns)
+        now_ns += tick_ns
+    assert len(waits) == len(wanted)
+    assert max(waits) <= 1.1, "a window, and the moment at which it is seen"
+    for at_ns, _ in sent:
+        assert sum(size for other, size in sent if at_ns - 10**9 < other <= at_ns) <= total_bps / 8
+    longest_ns = max(later - one for one, later in itertools.pairwise(base_ns))
+    assert longest_ns <= 1.2e9 + 2 * step_ns
+
+
+FLIGHTS = [
+    ({"method": "M0", "fps": "auto"}, 100_000),
+    ({"profile": "auto"}, 100_000),
+    ({"method": "M0"}, 300_000),
+    ({"profile": "paper"}, 300_000),
+    ({"profile": "thin"}, 300_000),
+    ({"profile": "auto", "video_share": 1.0}, 300_000),
+    ({"profile": "tracks"}, 2_000_000),
+]
+BOXES = [(400, 200, 64, 48), (300, 100, 230, 70), (100, 60, 480, 320)]
+
+
+@pytest.mark.parametrize(("profile", "budget_bps"), FLIGHTS)
+def test_in_flight_it_is_full_prompt_and_better_than_the_video_with_every_method(
+    tmp_path, profile, budget_bps
+):
+    """With the defaults on a thin link it would come after seconds, small and blurred, or be refused."""
+    write_scene(tmp_path, frames=90)
+    looks = [
+        RequestedLook(30 + 20 * number, dict(zip("xywh", box, strict=True)))
+        for number, box in enumerate(BOXES)
+    ]
+    flight = LookFlight(
+        {
+            "source": str(tmp_path),
+            "source_fps": 15.0,
+            "budget": budget_bps,
+            "size": (480, 270),
+            "preset": "ultrafast",
+            "detector": "motion",
+            "tiles": "off",
+            **profile,
+        },
+        looks,
+    )
+    summary = flight.run()
+    assert summary["worst_window_bps"]["total"] <= budget_bps
+    bound_s = 1.5 if budget_bps >= 300_000 else 5.0
+    for look, (_, _, width, height) in zip(looks, BOXES, strict=True):
+        if look.header is None:
+            assert "pixels take" in look.refusal
+            assert width * height > 50_000, "only what is large is too large"
+            continue
+        assert look.delay_s <= bound_s
+        assert look.image.shape[:2] == (height, width) or look.note
+        image = cv2.resize(look.image, (width, height), interpolation=cv2.INTER_CUBIC)
+        assert psnr_y_db(image, look.source) > psnr_y_db(look.base, look.source)
+    assert all(one.header is not None and "w" not in one.header.parameters for one in looks[:2])
+    assert summary["frame_account"]["closer_look"] > 0 or budget_bps >= 2_000_000
+
+
+def test_an_edge_that_ends_says_so_to_whoever_waits(tmp_path):
+    """Whoever asked at the end would be told of a full budget, and ask for more of it."""
+    write_scene(tmp_path, frames=20)
+    looks = [RequestedLook(19, {"x": 100, "y": 60, "w": 480, "h": 320})]
+    flight = LookFlight(
+        {
+            "source": str(tmp_path),
+            "source_fps": 15.0,
+            "budget": 100_000,
+            "size": (480, 270),
+            "preset": "ultrafast",
+            "detector": "motion",
+            "method": "M0",
+            "fps": "auto",
+        },
+        looks,
+    )
+    flight.run()
+    number = looks[0].answer.still_request
+    assert flight.command("still-outcome", ask=number).reason == "the edge has ended"
+    assert flight.command("still").reason == "the edge has ended"
