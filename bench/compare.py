@@ -76,7 +76,7 @@ def _fly(name: str) -> CompareResult:
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(name, total=None)
 
-        def on_run(done: int, of: int) -> None:
+        def on_flights(done: int, of: int) -> None:
             progress.update(task, completed=done, total=of)
 
         plan = ComparePlan(
@@ -89,7 +89,7 @@ def _fly(name: str) -> CompareResult:
             cache=(_OUT / "cache").absolute(),
         )
         with local_pool(os.cpu_count() or 1) as pool:
-            result = compare(plan, pool=pool, on_run=on_run)
+            result = compare(plan, pool=pool, on_flights=on_flights)
     print(f"{name}: {time.monotonic() - began_s:.0f} s", file=sys.stderr)
     write_json(_OUT / f"{name}.json", list(result.rows))
     plot(result, _OUT / f"{name}.png")

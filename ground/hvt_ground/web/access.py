@@ -85,7 +85,7 @@ class Access:
         plain = _place(f"http://{headers.get('host', '')}")
         if origin and origin in (host, plain):
             return ""
-        if self.proxy is not None and origin and origin[0] == host[0] == self.proxy:
+        if self.proxy is not None and origin[:1] == host[:1] == (self.proxy,):
             return (
                 "the proxy takes the port off the header Host, so that this looks like another site: have it pass "
                 "Host as the browser sent it (nginx: proxy_set_header Host $http_host)"

@@ -5,7 +5,9 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
-from hvt_ground.web.access import own_tokens
+import pytest
+
+from hvt_ground.web.access import Access, cookie_name, own_tokens
 
 GROUNDS = 8
 
@@ -25,3 +27,41 @@ def test_grounds_that_start_at_once_agree_on_their_tokens(tmp_path):
             assert all(one == found[0] for one in found)
             assert [one.name for one in folder.iterdir()] == ["web-tokens.json"]
             assert (folder / "web-tokens.json").stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize(
+    ("host", "name"),
+    [("10.8.0.1:8080", "hvt-8080"), ("10.8.0.1", "hvt-80"), ("[::1]:81", "hvt-81"), ("", "hvt")],
+)
+def test_a_cookie_is_of_the_port_that_the_browser_sees(host, name):
+    """Two grounds of one host would throw each other's viewers out: cookies know no port."""
+    assert cookie_name({"host": host}) == name
+
+
+def test_each_ground_takes_its_own_cookie_of_two():
+    """The token of the other ground would be tried, and refused."""
+    access = Access({"operator": "o" * 20, "viewer": "v" * 20})
+    cookie = f"hvt-8080={'o' * 20}; hvt-8081=other"
+    assert access.role({"host": "10.8.0.1:8080", "cookie": cookie}) == "operator"
+    assert access.role({"host": "10.8.0.1:8081", "cookie": cookie}) is None
+    assert access.role({"host": "10.8.0.1:8080", "cookie": f"hvt={'v' * 20}"}) == "viewer", "of a proxy"
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "said"),
+    [
+        ("hvt.example.org", "https://hvt.example.org", ""),
+        ("HVT.example.org", "https://hvt.example.org", ""),
+        ("hvt.example.org:8443", "https://hvt.example.org:8443", ""),
+        ("hvt.example.org:443", "https://hvt.example.org", ""),
+        ("hvt.example.org", "https://hvt.example.org:8443", "proxy_set_header Host $http_host"),
+        ("hvt.example.org", "https://evil.example.org", "another site"),
+        ("hvt.example.org", "null", "another site"),
+        ("hvt.example.org", "", "another site"),
+        ("hvt.example.org:99999", "https://hvt.example.org", "another site"),
+    ],
+)
+def test_a_proxy_that_drops_the_port_is_told_which_header_is_wrong(host, origin, said):
+    """The page would say "no connection" for ever, and nobody look at the proxy."""
+    found = Access({}, proxy="hvt.example.org").foreign({"host": host, "origin": origin})
+    assert found.count(said) if said else found == ""

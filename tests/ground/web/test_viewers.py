@@ -10,7 +10,7 @@ import pytest
 
 from hvt_ground.web.fmp4 import Fragment, Start
 from hvt_ground.web.pictures import Made
-from hvt_ground.web.viewers import EdgePage, Hub, StillPictures, Viewer
+from hvt_ground.web.viewers import EdgePage, Hub, StillPictures, Viewer, packed
 
 
 def fragment(number: int, *, keyframe: bool = False, size: int = 10) -> Made:
@@ -116,3 +116,16 @@ def test_who_takes_nothing_at_all_is_given_up():
     for _ in range(3000):
         viewer.put("words")
     assert viewer.hopeless
+
+
+def test_a_reload_shows_the_last_picture_of_an_edge_that_is_silent(hub):
+    """The wall would have a black tile for the very edge that was lost."""
+    flown(hub, frames=3, keyframe_every=10)
+    lost = EdgePage("lost")
+    hub.begin(lost, {"edge": "lost"})
+    lost.thumbnail = packed("thumbnail", b"x", edge="lost")
+    viewer = Viewer()
+    hub.join(viewer)
+    hub.show_wall(viewer, shown=True)
+    hub.watch(viewer, "uav-1", "h264")
+    assert "thumbnail" in kinds(viewer)

@@ -159,6 +159,9 @@ class Running:
     def summary(self) -> Any:
         """The JSON that it left. Of an edge: every source frame is in one group, and the table says the same."""
         content = json.loads(self._summary.read_text())
+        for session in content if isinstance(content, list) else ():
+            if told := session.get("edge_frames"):
+                assert sum(told[name] for name in FRAME_GROUPS) == told["came"], told
         if isinstance(content, dict) and (frames := content.get("frame_account")):
             groups = {name: count for name, count in frames.items() if name in FRAME_GROUPS}
             assert sum(groups.values()) == frames["came"] == content["frames_captured"], frames

@@ -1,0 +1,84 @@
+"""Two edges on one page in a real browser: nothing of one is ever shown as the other's."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+
+from hvt_ground.events import VideoSample
+from hvt_ground.web import WebPage
+from media.moving_square import FPS, SIZE, moving_square
+from programs.processes import eventually, free_ports
+from rigs.messages import INFO
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.timeout(180),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt install chromium)"),
+]
+
+_SHOWN = """() => {
+  const video = document.getElementById("video");
+  const image = document.getElementById("still-picture");
+  const drawn = (!video.hidden && video.readyState > 1) || (!image.hidden && image.naturalWidth > 0);
+  return { drawn, name: document.getElementById("name").textContent };
+}"""
+
+
+@pytest.fixture
+def address() -> Iterator[str]:
+    """A page with an edge that flies, and one of which no picture comes any more."""
+    (port,) = free_ports(1)
+    units = list(moving_square("libx265", 60))
+    ended = threading.Event()
+    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns, recorded=False) as page:
+
+        def fly(edge: str, number: int, *, stops: bool) -> None:
+            info = replace(
+                INFO, edge=edge, session_id=number, base_size=SIZE, source_size=SIZE, fps=FPS, pace="realtime"
+            )
+            sink = page.feed(info)()
+            index = 0
+            while not ended.wait(1 / FPS):
+                data, keyframe = units[index % len(units)]
+                if not stops:
+                    sink.log(VideoSample(index, time.time_ns(), data, keyframe))
+                index += 1
+
+        threads = [
+            threading.Thread(target=fly, args=("flies", 1), kwargs={"stops": False}),
+            threading.Thread(target=fly, args=("silent", 2), kwargs={"stops": True}),
+        ]
+        for one in threads:
+            one.start()
+        yield f"http://127.0.0.1:{port}/"
+        ended.set()
+        for one in threads:
+            one.join()
+
+
+@pytest.mark.parametrize("rung", ["h264", "jpeg"])
+def test_no_pixel_of_one_edge_stands_under_the_name_of_another(address, rung):
+    """An operator would take the first edge's street for the second one's, in colour."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.goto(f"{address}#edge=flies&rung={rung}")
+        eventually(lambda: page.evaluate(_SHOWN)["drawn"], within_s=60, what="the first edge's picture")
+        page.locator('.edge[data-edge="silent"]').click()
+        for _ in range(10):
+            assert page.evaluate(_SHOWN) == {"drawn": False, "name": "silent"}
+            time.sleep(0.1)
+        assert page.inner_text("#objects-title") == "Tracks: not known yet"
+        page.locator('.edge[data-edge="flies"]').click()
+        eventually(lambda: page.evaluate(_SHOWN)["drawn"], within_s=60, what="the first edge's picture again")
+        browser.close()
