@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import zenoh
 
@@ -14,6 +15,7 @@ from hvt_common.config import load
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import Detector, detect_every
 from hvt_common.protocol.channels import Channel, EdgeKeys
+from hvt_common.redaction import Redaction
 from hvt_common.runtime.checkup import (
     Finding,
     check_clock,
@@ -63,7 +65,11 @@ def run(argv: Sequence[str]) -> int:
     config = check(with_profile(config, given=given.values))
     logging.getLogger("hvt_common.inference.runtimes.model").setLevel(logging.INFO)  # what a network runs on
     checks = _Checks(config)
-    findings = run_checks(checks.by_name)
+    redaction = Redaction([*words, *(str(one) for one in given.values.values())])
+    findings = {
+        name: replace(one, found=redaction.text(one.found), todo=redaction.text(one.todo))
+        for name, one in run_checks(checks.by_name).items()
+    }
     checks.close()
     return print_findings(f"hvt-edge doctor: {config.edge_id}", findings, as_json=len(words) < len(argv))
 

@@ -36,6 +36,7 @@ _DJI = {
 }
 """Names in the subtitles; ``longtitude`` is how some models spell it."""
 _MOST_LATITUDE = 90.0
+_MOST_SATELLITES = 60
 
 
 def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[str, float]]:
@@ -99,7 +100,7 @@ def _latitude_first(places: Sequence[Sequence[tuple[float, str]]], note: Callabl
     |---|---|
     | a first number beyond 90 | the longitude |
     | a second number beyond 90 | the latitude |
-    | a third with a unit or a fraction, a height | the latitude (enterprise models, goggles) |
+    | a third with a unit, a fraction, or beyond 60: a height | the latitude (enterprise models, goggles) |
     | else | the longitude (Phantom, Mavic); it is said that this is a guess |
     """
     if not places:
@@ -108,7 +109,7 @@ def _latitude_first(places: Sequence[Sequence[tuple[float, str]]], note: Callabl
         return False
     if any(abs(one[1][0]) > _MOST_LATITUDE for one in places):
         return True
-    if any(len(one) > 2 and not one[2][1].isdigit() for one in places):
+    if any(len(one) > 2 and not (one[2][1].isdigit() and one[2][0] <= _MOST_SATELLITES) for one in places):
         note("its GPS(…) is taken for latitude, longitude, height, because the third number is a height")
         return True
     note("its GPS(…) is taken for longitude, latitude, satellites, as most models write: look at the map")

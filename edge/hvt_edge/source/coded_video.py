@@ -53,11 +53,12 @@ class CodedVideoSource(Source):
         fit: Fit,
         max_frames: int | None = None,
         source_fps: float | None = None,
+        growing: bool = False,
     ) -> None:
         self._spec, self._name = spec, name_of(spec)
-        self._limit = max_frames
+        self._limit, self._growing = max_frames, growing
         notes = Notes(self._name)
-        container, stream = open_video(spec, note=notes)
+        container, stream = open_video(spec, growing=growing, note=notes)
         with container:
             check_stream(self._name, stream)
             self._stamps, first = survey(container, stream)
@@ -69,7 +70,7 @@ class CodedVideoSource(Source):
         self._size = (first.width, first.height)
         self._resizer = Resizer(self._size, size, fit=fit)
         self.view = self._resizer.view
-        container, stream = open_video(spec)
+        container, stream = open_video(spec, growing=growing)
         with container:
             said = float(1 / self._stamps.period_s)
             seen = _seen(self._timed(container, stream), open_units(self._name, stream))
@@ -99,7 +100,7 @@ class CodedVideoSource(Source):
             self._running = None
 
     def _play(self, start_ns: int) -> Generator[Frame, None, None]:
-        container, stream = open_video(self._spec)
+        container, stream = open_video(self._spec, growing=self._growing)
         left_out, before, count, zero_s, begun, last_ns = 0, 0, 0, 0.0, False, -1
         decoder = CameraDecoder(open_units(self._name, stream), size=self._size)
         packets = self._timed(container, stream, say=True)

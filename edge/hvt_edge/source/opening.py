@@ -78,7 +78,9 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     else:
         _check_there(spec, scheme)
     if coded:
-        return CodedVideoSource(spec, size=size, fit=fit, max_frames=max_frames, source_fps=source_fps)
+        return CodedVideoSource(
+            spec, size=size, fit=fit, max_frames=max_frames, source_fps=source_fps, growing=growing
+        )
     if not scheme and Path(spec).is_dir():
         return FolderSource(spec, size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps)
     return VideoSource(

@@ -31,6 +31,7 @@ def blocks(make, count=4):
         ("GPS(36.9000,-5.3000,0.0M) BAROMETER:20.3M", (36.9, -5.3, 20.3), "latitude, longitude, height"),
         ("GPS(40.1,116.2,69.800) BAROMETER(91.2) HOME(40.1,116.2)", (40.1, 116.2, 91.2), ""),
         ("GPS(116.2,40.1,69.800) BAROMETER(91.2)", (40.1, 116.2, 91.2), ""),
+        ("GPS(36.9,-5.3,120)", (36.9, -5.3, None), "latitude, longitude, height"),
         ("GPS(8.2,47.4,16) BAROMETER:1.9", (47.4, 8.2, 1.9), "longitude, latitude, satellites"),
         ("GPS(11,5000,48,1000,16) BAROMETER:50,5", (48.1, 11.5, 50.5), "longitude, latitude, satellites"),
         ("GPS (11,5000, 48,1000, 16)", (48.1, 11.5, None), "longitude, latitude, satellites"),

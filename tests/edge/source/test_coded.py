@@ -155,6 +155,10 @@ def test_time_stamps_that_jump_change_neither_rate_nor_window(tmp_path, ahead):
     assert len(both.units) == 2 * len(once.units), "all of it is looked at"
     assert both.fps == once.fps
     assert both.keyframe_s == pytest.approx(once.keyframe_s, abs=0.01)
+    with coded(jumping(clip, ahead=ahead)) as source:
+        times = [frame.capture_ns for frame in source.frames(start_ns=0)]
+    assert len(times) == len(both.units)
+    assert max(later - earlier for earlier, later in pairwise(times)) < SECOND_NS / 10, "in flight too"
     fullest = [measure_camera(one, window_s=1.0, edge_id="edge-1").window_bytes for one in (once, both)]
     assert fullest[1] == pytest.approx(fullest[0], rel=0.2)
 
