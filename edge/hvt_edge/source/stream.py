@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from fractions import Fraction
@@ -24,6 +25,7 @@ LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "http", "https", "udp", "rtp", "tcp",
 
 _OPEN_S = 10.0
 _RESTART_S = 2.5
+_UNDECODED_S = 10.0
 _MOST_TIMES = 64
 _READ_S = 2.0  # also how long closing may take
 
@@ -108,13 +110,26 @@ class StreamGrabber:
 
 
 def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
-    """Frames, each with its time by the camera's clock."""
+    """Frames, each with its time by the camera's clock.
+
+    What does not decode is left out: a stream that is joined between two keyframes, or has lost packets. Raises
+    FFmpeg's error where nothing else has come for ten seconds.
+    """
     times: dict[Fraction, int] = {}
+    whole_s = time.monotonic()
     for packet in container.demux(stream):
         camera_ns = camera_time_ns(packet)
         if packet.pts is not None and camera_ns is not None:
             times[packet.pts * packet.time_base] = camera_ns
-        for coded in packet.decode():
+        try:
+            decoded = packet.decode()
+        except av.error.FFmpegError:
+            if time.monotonic() - whole_s > _UNDECODED_S:
+                raise
+            continue
+        if decoded:
+            whole_s = time.monotonic()
+        for coded in decoded:
             for frame in pictures.frames(coded):
                 base = frame.time_base
                 at_s = None if frame.pts is None or base is None else frame.pts * base

@@ -472,6 +472,33 @@ def test_a_udp_stream_plays(tmp_path):
     assert frames[-1].capture_ns - frames[0].capture_ns >= (4 - 1 / 4) / 15 * 1e9
 
 
+def test_a_stream_that_is_joined_between_two_keyframes_plays_from_the_next(tmp_path, free_port):
+    """A drone whose picture is whole once in four seconds would be refused until the start hits that moment."""
+    clip = tmp_path / "whole.ts"
+    write_clip(clip, count=240, g=60, bf=0)
+    packets = [clip.read_bytes()[at : at + 188] for at in range(0, clip.stat().st_size, 188)]
+    video = [
+        place for place, one in enumerate(packets) if one[1] & 0x40 and (one[1] & 31) << 8 | one[2] == 256
+    ]
+    stop = threading.Event()
+
+    def send():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            for place in range(video[7], len(packets)):
+                out.sendto(packets[place], ("127.0.0.1", free_port))
+                if stop.wait(0.01):
+                    return
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        with open_source(f"udp://127.0.0.1:{free_port}", size=(320, 180), fps=30, max_frames=2) as source:
+            assert len(list(source.frames(start_ns=0))) == 2
+    finally:
+        stop.set()
+        sender.join()
+
+
 def test_closing_ends_a_reader_that_waits(http_stream):
     """Ctrl-C would hang while the camera is silent."""
     source = LiveSource(StreamGrabber(http_stream), size=(320, 180), fps=15, fit="letterbox")

@@ -45,7 +45,8 @@ _SURVEYED = 256
 _QUIET_S, _POLL_S = 10.0, 0.1
 """A file that has not grown for so long has ended."""
 _MOST_BOXES = 64
-_PACKET_BYTES = {"mpegts": 188}
+_TS_BYTES = (188, 192, 204)
+"""Of a packet: plain, with a time before it as in Blu-ray's, with a checksum behind it as in DVB's."""
 
 
 def is_local(spec: str) -> bool:
@@ -233,13 +234,13 @@ class _Reading:
         # An edit list may hide a few on purpose.
         if self._count < stream.frames and (self._lacks_bytes() or self._count < 0.98 * stream.frames - 2):
             return f"{self._count} of its {stream.frames} frames are there"
-        unit = _PACKET_BYTES.get(container.format.name)
-        if unit and self._size and self._size % unit:
-            return "its last packet is cut"
+        if container.format.name == "mpegts":
+            return "its last packet is cut" if all((self._size or 0) % one for one in _TS_BYTES) else ""
         begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)
         said_s = _seconds(stream.duration, stream.time_base)
-        said_s = said_s or _seconds(container.duration, Fraction(1, 1_000_000))
-        if said_s is not None and self._end_s is not None and unit is None:
+        if said_s is None and len(container.streams) == 1:  # else it may be that of the sound
+            said_s = _seconds(container.duration, Fraction(1, 1_000_000))
+        if said_s is not None and self._end_s is not None:
             missing_s = said_s - (self._end_s - begin_s)
             if missing_s > 1 and missing_s > said_s / 50:
                 return f"it ends {float(missing_s):.1f} s before the end that its header says"
