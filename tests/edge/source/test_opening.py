@@ -475,7 +475,7 @@ def test_a_udp_stream_plays(tmp_path):
 def test_a_stream_that_is_joined_between_two_keyframes_plays_from_the_next(tmp_path, free_port):
     """A drone whose picture is whole once in four seconds would be refused until the start hits that moment."""
     clip = tmp_path / "whole.ts"
-    write_clip(clip, count=240, g=60, bf=0)
+    write_clip(clip, count=520, g=260, bf=0)
     packets = [clip.read_bytes()[at : at + 188] for at in range(0, clip.stat().st_size, 188)]
     video = [
         place for place, one in enumerate(packets) if one[1] & 0x40 and (one[1] & 31) << 8 | one[2] == 256
