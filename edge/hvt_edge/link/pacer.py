@@ -232,8 +232,13 @@ class Pacer:
             if report.first:
                 self._forget_path()
                 self._progress_ns = now_ns
+            silent = self._reported_ns is not None and now_ns - self._reported_ns > _SILENCE_NS
             self._reported_ns = now_ns
             sent = self._flight.acknowledge(feedback.base_sequence, feedback.still_sequence)
+            if (
+                silent
+            ):  # at the least rate, what else was sent would be waited for longer than for what is lost
+                self._flight.clear()
             if sent is None:
                 return
             self._note_times(sent, 1000 * feedback.base_held_us, now_ns)
@@ -260,7 +265,10 @@ class Pacer:
             self._reported_ns = self._progress_ns = now_ns
 
     def link(self, there: bool, *, now_ns: int, reports: bool = True) -> bool:  # noqa: FBT001 - the news itself
-        """Whether anybody can be reached at all; True where that has just come back. ``reports``: a ground."""
+        """Whether anybody can be reached at all. ``reports``: a ground.
+
+        True where that has just come back, or what was on its way is given up: who shows the video needs a keyframe.
+        """
         with self._lock:
             before, self._linked, self._reports = self._linked, there, reports
             if there and not before:
@@ -270,7 +278,8 @@ class Pacer:
                 if self._reported_ns is not None:
                     self._controller.on_silence(now_ns)
                 self._leave()
-            return before is False and there and self.backoffs > 0
+            gave_up = there and self._reported_ns is not None and self._give_up(now_ns, self._reported_ns)
+            return gave_up or (before is False and there and self.backoffs > 0)
 
     # What may go
 
@@ -283,12 +292,9 @@ class Pacer:
                 self._leave()
                 self._controller.forget_silence()
                 return True
+            self._give_up(now_ns, self._reported_ns)
             if now_ns - self._reported_ns > _SILENCE_NS:
-                self._controller.on_silence(now_ns)
                 return now_ns - self._last_sent_ns >= _PROBE_NS
-            if min(self._overdue_ns(now_ns), now_ns - self._progress_ns) > _GIVEN_UP_NS:
-                self._controller.on_silence(now_ns)
-                self._flight.clear()
             return self._is_open(now_ns, _MOST_BACKLOG_NS)
 
     def holds(self, now_ns: int) -> bool:
@@ -305,6 +311,17 @@ class Pacer:
             if self._reported_ns is None:
                 return self._may_start(now_ns)
             return now_ns - self._reported_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)
+
+    def _give_up(self, now_ns: int, reported_ns: int) -> bool:
+        """Down to the least rate, where no report comes or none names anything; True where that is taken for lost."""
+        if now_ns - reported_ns > _SILENCE_NS:
+            self._controller.on_silence(now_ns)
+            return False
+        if min(self._overdue_ns(now_ns), now_ns - self._progress_ns) <= _GIVEN_UP_NS:
+            return False
+        self._controller.on_silence(now_ns)
+        self._flight.clear()
+        return True
 
     def _may_start(self, now_ns: int) -> bool:
         if not self._linked or not self._reports or self._started_ns is None:

@@ -1,0 +1,152 @@
+"""Live video comes back: budgets, frame rates, silences and falls of the link, with all that shares the window."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_edge.config import EdgeConfig, check, check_rate
+from hvt_edge.video.encoder_settings import keyframe_total_bps
+from rigs.live_flight import LiveFlight, SteppedLink
+
+SIZES = ((1920, 1080), (1280, 720), (640, 360), (320, 180), (96, 64))
+BACK_S = 3.0
+
+
+def needed_bps(config: EdgeConfig, window_s: float) -> int:
+    """What holds a keyframe in so long, with status and tracks beside it."""
+    size = config.fixed_size
+    assert size is not None
+    return keyframe_total_bps(
+        size, window_s=window_s, metadata_bps=config.metadata_bps, edge_id=config.edge_id
+    )
+
+
+def largest(budget: int, fps: float, **settings) -> dict:
+    """Settings with the largest size that this budget carries; `UserError` where there is none."""
+    for size in SIZES:
+        given = {"budget": budget, "fps": fps, "size": size, "window": max(1.0, 2 / fps), **settings}
+        try:
+            config = check(EdgeConfig(source="demo", **given))
+            check_rate(config, size)
+        except UserError:
+            continue
+        if needed_bps(config, config.window) <= budget:
+            return given
+    raise UserError("no size")
+
+
+def flown(flight: LiveFlight, seconds: float) -> LiveFlight:
+    """The flight, with its budget kept in each window."""
+    flight.fly(seconds)
+    assert flight.ledger.worst_window_bps.total <= flight.operating.now.highest_budget_bps
+    return flight
+
+
+@pytest.mark.parametrize("store", [False, True])
+@pytest.mark.parametrize("silent_s", [2.5, 4, 12])
+@pytest.mark.parametrize(
+    ("budget", "fps"), [(300_000, 2), (600_000, 5), (1_800_000, 15), (8_000_000, 30), (400_000, 1)]
+)
+def test_live_video_is_back_after_a_silence(tmp_path, budget, fps, silent_s, store):
+    """After a hiccup of some seconds no frame would ever be sent again, however good the link is."""
+    link = SteppedLink(((0, 1.3 * budget), (12, 0), (12 + silent_s, 1.3 * budget)), loses=store)
+    given = largest(budget, fps, video_share=0.85, method="M6")
+    flight = flown(LiveFlight(link, store=tmp_path / "store" if store else None, **given), 40 + silent_s)
+    assert flight.back_after(12 + silent_s) <= BACK_S
+    assert flight.longest_hole(15 + silent_s, 40 + silent_s) <= BACK_S
+    assert flight.pacer is not None
+    assert flight.pacer.rate_bps == budget
+
+
+@pytest.mark.parametrize(
+    ("budget", "fps", "falls_to"),
+    [(800_000, 3, 200_000), (2_000_000, 15, 150_000), (2_000_000, 7.5, 150_000), (8_000_000, 30, 300_000)],
+)
+def test_live_video_is_back_after_a_fall_of_the_link(budget, fps, falls_to):
+    """Behind a hill nothing more would be sent, although the link carries a coarser picture well."""
+    given = largest(budget, fps, video_share=0.85, method="M6")
+    flight = flown(LiveFlight(SteppedLink(((0, 1.3 * budget), (12, falls_to))), **given), 60)
+    known = flight.drained(14)  # what was on its way, and what went before anybody could know
+    assert flight.longest_hole(known, 60) <= BACK_S
+    assert flight.longest_hole(known + 10, 60) <= 1.5
+
+
+def any_flight(seed: int) -> tuple[dict, dict, list[tuple[float, float]], list[float], float]:
+    """Settings, what goes along, the link's steps, when it is back, and the end."""
+    chance = random.Random(seed)
+    while True:
+        budget = round(12_000 * (8_000_000 / 12_000) ** chance.random())
+        share = chance.choice([{"video_share": 0.85}, {"video_share": 0.6}, {"method": "M0"}, {}])
+        more = {"send_tracks": chance.random() < 0.7, **share}
+        if chance.random() < 0.5:
+            more["min_budget"] = min(budget, chance.choice([1_000, 50_000, 400_000]))
+        try:
+            given = largest(budget, chance.choice([1, 2, 3, 5, 7.5, 10, 15, 30]), **more)
+        except UserError:
+            continue
+        break
+    carried = max(1.3 * budget, 1.1 * needed_bps(check(EdgeConfig(source="demo", **given)), 1.0))
+    second, steps, back = 11.0 + chance.random(), [(0.0, carried)], []
+    for _ in range(chance.randint(1, 4)):
+        steps.append((second, 0.0))
+        second += chance.choice([0.5, 1.5, 2, 2.5, 3, 4, 6, 12])
+        steps.append((second, carried))
+        back.append(second)
+        second += chance.choice([6, 8, 15])
+    beside = {
+        "track_bytes": 250 if given["send_tracks"] else 0,
+        "texture": chance.choice([0.4, 1.0]),
+        "joins_s": chance.choice([0.0, 5.0]),
+        "seed": seed,
+    }
+    if chance.random() < 0.5:
+        beside["commands"] = [(chance.uniform(8, second), round(0.9 * budget))]
+    return given, beside, steps, back, second
+
+
+@pytest.mark.parametrize("loses", [False, True])
+@pytest.mark.parametrize("seeds", [range(first, first + 15) for first in range(0, 60, 15)])
+def test_from_every_state_live_video_is_back_within_three_seconds(seeds, loses):
+    """Some budget, frame rate and silence would end the video, as some did."""
+    for seed in seeds:
+        given, beside, steps, back, end = any_flight(seed)
+        flight = flown(LiveFlight(SteppedLink(steps, loses=loses), **beside, **given), end)
+        # A budget may take longer than a second for a keyframe; then all takes so much longer.
+        slow = max(1.0, needed_bps(flight.config, 1.0) / flight.config.budget_bps)
+        for second in back:
+            held = max(second, flight.drained(second))  # what waited in the link comes first
+            assert flight.back_after(second) <= held - second + slow * BACK_S, (
+                f"seed {seed}, away until {second}"
+            )
+
+
+@pytest.mark.parametrize(("late_s", "heard"), [(0.6, 1.0), (1.5, 1.0), (0.0, 0.4)])
+def test_reports_that_come_late_or_in_part_do_not_end_the_video(late_s, heard):
+    """A ground that is badly heard would see the video stop for good."""
+    chance = random.Random(3)
+    flight = LiveFlight(
+        SteppedLink(((0, 500_000), (12, 0), (15, 500_000))),
+        late_s=lambda _second: late_s if chance.random() < heard else None,
+        **largest(400_000, 3),
+    )
+    assert flown(flight, 60).longest_hole(20 + late_s, 60) <= BACK_S
+
+
+def test_an_hour_at_two_frames_a_second_over_a_link_that_comes_and_goes():
+    """Of a long flight at a thin rate nobody would see the part behind the first hill."""
+    chance, steps, away = random.Random(5), [(0.0, 400_000.0)], []
+    for turn in range(20):
+        begin = 60.0 + 170 * turn + chance.uniform(0, 60)
+        end = begin + chance.choice([1, 2, 3, 5, 10, 30, 60])
+        steps += [(begin, 0.0 if turn % 4 else 70_000.0), (end, 400_000.0)]
+        away.append((begin, end))
+    flight = flown(LiveFlight(SteppedLink(steps), **largest(300_000, 2)), 3600)
+    begin = 5.0
+    for gone, back in away:
+        assert flight.longest_hole(begin, gone) <= BACK_S
+        assert flight.back_after(back) <= max(back, flight.drained(back)) - back + BACK_S
+        begin = max(back, flight.drained(back)) + BACK_S
+    assert flight.longest_hole(begin, 3600) <= BACK_S

@@ -1,0 +1,437 @@
+"""Live video in simulated time: an edge's own parts from its settings, a link with a queue, a ground that reports.
+
+The parts are the real ones, built as `hvt_edge.wiring` builds them: budget, pacer, transmitter, reconfiguration,
+frame decimation, base stage and link control. Simulated are x265 (its sizes), the link and the ground.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import BaseHeader
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
+from hvt_common.values import AccessUnit, Frame
+from hvt_edge.backlog.disk import Store
+from hvt_edge.backlog.outage import BaseInFlight
+from hvt_edge.backlog.stage import BacklogLink, BacklogStage
+from hvt_edge.config import EdgeConfig, check, check_rate
+from hvt_edge.control.link_control import LinkControl
+from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
+from hvt_edge.operating.point import Operating
+from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.outbox import Outbox
+from hvt_edge.stills.sending import StillSender
+from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_bytes, minimum_bps
+from hvt_edge.video.frame_skip import LimitedFrameSkip
+from hvt_edge.video.reconfigure import EncoderReconfiguration
+from hvt_edge.video.stage import BaseStage
+from hvt_edge.wiring.link import make_budget, make_pacer
+from hvt_edge.wiring.video import first_decimation, make_frame_skip, reconfiguration_settings
+from rigs.kept import INFO
+from rigs.messages import feedback
+
+__all__ = ["LiveFlight", "SteppedLink"]
+
+_WAY_NS = SECOND_NS // 50
+_REPORT_NS, _IDLE_REPORT_NS = SECOND_NS // 8, SECOND_NS // 2
+_PIXELS = np.zeros((8, 8, 3), np.uint8)
+_START_NS = 1_790_000_000 * SECOND_NS
+
+
+@dataclass
+class SteppedLink:
+    """A link of pieces, (from second, bits a second), with a queue before it.
+
+    With ``loses`` it loses what is sent while it carries nothing; else that waits.
+    """
+
+    steps: Sequence[tuple[float, float]]
+    loses: bool = False
+    _free_ns: int = 0
+
+    def bps(self, second: float) -> float:
+        """What it carries at this second."""
+        at_ns = round(second * SECOND_NS)
+        return next(rate for begin, rate in reversed(self.steps) if at_ns >= round(begin * SECOND_NS))
+
+    def carry(self, size_bytes: int, *, at_ns: int) -> int | None:
+        """When the last bit of it has left; None where it is lost. Nanoseconds since the start."""
+        if self.loses and not self.bps(at_ns / SECOND_NS):
+            return None
+        now_ns, bits = max(self._free_ns, at_ns), 8.0 * size_bytes
+        ends_ns = [at_ns for begin, _ in self.steps if (at_ns := round(begin * SECOND_NS)) > now_ns]
+        for end_ns in [*ends_ns, None]:
+            rate = self.bps(now_ns / SECOND_NS)
+            if end_ns is None or (rate and bits * SECOND_NS / rate <= end_ns - now_ns):
+                assert rate, "a link that ends away carries nothing any more"
+                self._free_ns = now_ns + round(bits * SECOND_NS / rate)
+                return self._free_ns
+            bits, now_ns = bits - rate * (end_ns - now_ns) / SECOND_NS, end_ns
+        raise AssertionError
+
+
+@dataclass
+class _Encoder:
+    """Sizes as x265 gives them: what rate and VBV allow, and ``texture`` of a textured picture's least."""
+
+    size: tuple[int, int]
+    fps: float
+    bitrate_bps: float
+    vbv_s: float
+    texture: float
+    chance: random.Random
+    mean_qp: float = 35.0
+
+    def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Any] = ()) -> AccessUnit:
+        """A unit without content."""
+        del regions
+        mean = self.bitrate_bps / 8 / self.fps
+        if keyframe:
+            least = self.texture * keyframe_floor_bytes(self.size)
+            wanted = min(8 * mean, 0.9 * self.vbv_s * self.bitrate_bps / 8)
+        else:
+            least = self.texture * minimum_bps(self.size, self.fps) / 8 / self.fps
+            wanted = 0.95 * mean * self.chance.uniform(0.75, 1.25)
+        return AccessUnit(frame.index, frame.capture_ns, bytes(max(20, round(max(least, wanted)))), keyframe)
+
+
+@dataclass
+class _Ground:
+    """What has arrived, and what can be shown of it."""
+
+    last: int = -1
+    held_since_ns: int = 0
+    messages: int = 0
+    lost: int = 0
+    whole: bool = False
+    shown: list[tuple[float, float]] = field(default_factory=list)
+    """(second of arrival, second of capture) of each frame that builds on what was shown before."""
+    news: bool = False
+    number: int = 0
+    asked_ns: int = -(10**18)
+
+    def take(self, header: BaseHeader, *, now_ns: int) -> None:
+        """An access unit arrives."""
+        if header.sequence <= self.last:
+            return
+        gap = header.sequence - self.last - 1
+        self.lost += gap if self.messages else 0
+        self.messages += 1
+        self.last, self.held_since_ns, self.news = header.sequence, now_ns, True
+        self.whole = header.keyframe or (self.whole and not gap)
+        if self.whole:
+            self.shown.append((now_ns / SECOND_NS, (header.capture_ns - _START_NS) / SECOND_NS))
+
+
+class LiveFlight:
+    """One flight. Seconds count from its first frame.
+
+    ``late_s(second)`` is how much later a report comes that is made then, None: not at all. ``joins_s`` is when the
+    ground comes. ``commands`` are ``(second, budget)``. ``store`` is a folder for what is stored while the link is
+    away.
+    """
+
+    def __init__(
+        self,
+        link: SteppedLink,
+        *,
+        late_s: Callable[[float], float | None] = lambda _second: 0.0,
+        joins_s: float = 0.0,
+        commands: Sequence[tuple[float, int]] = (),
+        store: Path | None = None,
+        texture: float = 1.0,
+        track_bytes: int = 250,
+        pose_bytes: int = 60,
+        loss: float = 0.0,
+        seed: int = 0,
+        **settings: Any,
+    ) -> None:
+        self.config = config = check(EdgeConfig(source="demo", **settings))
+        size = config.fixed_size
+        assert size is not None, "given"
+        check_rate(config, size)
+        self.link, self.loss, self.late_s, self.joins_s = link, loss, late_s, joins_s
+        self.commands = list(commands)
+        self.track_bytes, self.pose_bytes = track_bytes, pose_bytes
+        self.chance, self.texture = random.Random(seed), texture
+        self.now_ns = _START_NS
+        self.ground, self.ledger = _Ground(), Ledger(window_ns=config.window_ns)
+        self.sent: list[float] = []
+        """Seconds at which an access unit went out."""
+        self.rates: list[tuple[float, int]] = []
+        self._left: list[tuple[float, float]] = []
+        """(second at which a message was sent, second at which it had left)."""
+        self.keyframes = KeyframeRequests(KeyframeSettings(interval_ns=60 * SECOND_NS))
+        self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._count = itertools.count()
+        self._in_loop = False
+        self._build(size, store)
+
+    def _build(self, size: tuple[int, int], store: Path | None) -> None:
+        config = self.config
+        decimation = first_decimation(config, size)
+        self.operating = Operating(
+            budget_bps=config.budget_bps,
+            video_share=config.fixed_share,
+            base_bps=config.base_bps,
+            method=config.method,
+            decimation=decimation,
+        )
+        self.pacer = make_pacer(config, None, size)
+        in_flight, outbox = BaseInFlight(), Outbox()
+        self.failures = Failures(self._clock)
+        self.transmitter = Transmitter(
+            self,
+            ledger=self.ledger,
+            budget=make_budget(config, base_bps=config.base_bps, decimation=decimation),
+            edge_id=config.edge_id,
+            session_id=1,
+            lockstep=False,
+            wait_until=self._wait_until,
+            pacer=self.pacer,
+            in_flight=in_flight,
+        )
+        reconfiguration = EncoderReconfiguration(
+            self.operating,
+            reconfiguration_settings(config, size),
+            open_encoder=lambda **rates: self._opened(size, **rates),
+            transmitter=self.transmitter,
+            split=None,
+            pacer=self.pacer,
+        )
+        self.backlog = None
+        if store is not None:
+            self.backlog = BacklogStage(
+                Store(store, max_bytes=50_000_000, session_id=1, info=INFO.pack),
+                session_id=1,
+                live=True,
+                link=BacklogLink(
+                    has_subscriber=lambda: False,  # so that no thread sends chunks at times of its own
+                    allowance_bytes=lambda _now_ns, _reserve: 0,
+                    send=lambda _chunk, _now_ns: 0,
+                    round_trip_ns=lambda: SECOND_NS // 2,
+                    total_bps=lambda: config.budget_bps,
+                    stills_pending=lambda: False,
+                    stills_in_flight=lambda: 0,
+                ),
+                in_flight=in_flight,
+                keyframes=self.keyframes,
+                clock=self._clock,
+                on_outcome=lambda _outcome, _reason: None,
+                failures=self.failures,
+            )
+        self.link_control = LinkControl(
+            has_ground=lambda: self.second >= self.joins_s,
+            has_subscriber=lambda: False,
+            session_id=1,
+            transmitter=self.transmitter,
+            keyframes=self.keyframes,
+            inbox=FeedbackInbox(),
+            reconfiguration=reconfiguration,
+            clock=self._clock,
+            pacer=self.pacer,
+            in_flight=in_flight,
+            outbox=outbox,
+            stills=StillSender(
+                outbox, maker=StillMaker(), transmitter=self.transmitter, backlog=self.backlog
+            ),
+            backlog=self.backlog,
+            failures=self.failures,
+        )
+        self.stage = BaseStage(
+            self._opened(size, total_bps=config.budget_bps, base_bps=config.base_bps, decimation=decimation),
+            keyframes=self.keyframes,
+            transmitter=self.transmitter,
+            local_copy=None,
+            first_keyframe_bytes=config.base_bps // 40,
+            frame_skip=LimitedFrameSkip(
+                make_frame_skip(config, decimation, size=size), reconfiguration.least_decimation
+            ),
+            reconfigure=reconfiguration,
+            keyframe_bytes=reconfiguration.keyframe_bytes,
+            admits=self.link_control.admits,
+            holder=self.link_control.holder,
+            backlog=self.backlog,
+            failures=self.failures,
+        )
+
+    @property
+    def second(self) -> float:
+        """Since the first frame."""
+        return (self.now_ns - _START_NS) / SECOND_NS
+
+    def _clock(self) -> int:
+        return self.now_ns
+
+    def _opened(self, size: tuple[int, int], *, total_bps: int, base_bps: int, decimation: int) -> _Encoder:
+        config = self.config
+        asked = encoder_settings(
+            size=size,
+            fps=config.nominal_fps / decimation,
+            preset=config.preset,
+            total_bps=max(total_bps - config.metadata_bps, base_bps),
+            base_bps=base_bps,
+            edge_id=config.edge_id,
+        )
+        return _Encoder(size, asked.fps, asked.bitrate_bps, asked.vbv_s, self.texture, self.chance)
+
+    # What goes out
+
+    def put(
+        self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+    ) -> None:
+        """The link takes a message."""
+        del encoding
+        if self.second < self.joins_s:
+            return
+        size_bytes = len(payload) + len(attachment or b"") + 60
+        left_ns = self.link.carry(size_bytes, at_ns=self.now_ns - _START_NS)
+        if left_ns is not None:
+            self._left.append((self.second, left_ns / SECOND_NS))
+        if channel is not Channel.BASE:
+            return
+        self.sent.append(self.second)
+        if left_ns is None or self.chance.random() < self.loss:
+            return
+        header = BaseHeader.parse(attachment or b"", payload)
+        at_ns = _START_NS + left_ns + _WAY_NS
+        self._at(at_ns, lambda: self.ground.take(header, now_ns=at_ns - _START_NS))
+
+    def _wait_until(self, at_ns: int) -> None:
+        if self._in_loop and at_ns > self.now_ns:
+            self._pass(at_ns)
+
+    # Time
+
+    def _at(self, at_ns: int, call: Callable[[], None]) -> None:
+        heapq.heappush(self._events, (at_ns, next(self._count), call))
+
+    def _pass(self, until_ns: int) -> None:
+        """Let time pass, and all happen that is due."""
+        while self._events and self._events[0][0] <= until_ns:
+            at_ns, _, call = heapq.heappop(self._events)
+            self.now_ns = max(self.now_ns, at_ns)
+            call()
+        self.now_ns = max(self.now_ns, until_ns)
+
+    def _each(self, period_ns: int, call: Callable[[], object], *, first_ns: int = 0) -> None:
+        def turn(at_ns: int) -> None:
+            call()
+            self._at(at_ns + period_ns, lambda: turn(at_ns + period_ns))
+
+        self._at(_START_NS + first_ns, lambda: turn(_START_NS + first_ns))
+
+    def fly(self, seconds: float) -> LiveFlight:
+        """So many seconds of it; once."""
+        sender = self.transmitter
+        if self.track_bytes:
+            self._each(
+                SECOND_NS // 3, lambda: sender.tracks(lambda _: bytes(self.track_bytes), now_ns=self.now_ns)
+            )
+        if self.pose_bytes:
+            self._each(SECOND_NS, lambda: sender.pose(lambda _: bytes(self.pose_bytes), now_ns=self.now_ns))
+        self._each(_REPORT_NS, self._report)
+        status_ns = _START_NS
+        for bps, second in ((bps, second) for second, bps in self.commands):
+            self._at(_START_NS + round(second * SECOND_NS), lambda bps=bps: self._command(bps))  # type: ignore[misc]
+        try:
+            for index in range(round(seconds * self.config.nominal_fps)):
+                taken_ns = _START_NS + round(index * SECOND_NS / self.config.nominal_fps)
+                if taken_ns < self.now_ns - SECOND_NS / self.config.nominal_fps:
+                    continue  # the loop was held up: a camera's frames are gone
+                self._pass(taken_ns)
+                self._frame(Frame(index, taken_ns, _PIXELS, _PIXELS))
+                if self.now_ns >= status_ns:
+                    status_ns = self.now_ns + SECOND_NS
+                    self._status()
+        finally:
+            if self.backlog is not None:
+                self.backlog.close()
+        return self
+
+    def _frame(self, frame: Frame) -> None:
+        self._in_loop = True
+        self.link_control.before_frame(self.now_ns)
+        decision = self.stage.decide(frame, now_ns=self.now_ns)
+        unit = self.stage.encode(frame, decision, now_ns=self.now_ns)
+        if unit is not None:
+            self.stage.send(unit, decision, now_ns=self.now_ns)
+        self._in_loop = False
+        if self.pacer is not None:
+            self.rates.append((self.second, self.pacer.rate_bps))
+
+    def _status(self) -> None:
+        class Report:
+            @staticmethod
+            def pack() -> bytes:
+                return bytes(330)
+
+        self.transmitter.status(lambda _: Report(), now_ns=self.now_ns)  # type: ignore[arg-type,return-value]
+
+    def _command(self, budget_bps: int) -> None:
+        now = self.operating.now
+        self.operating.command(budget_bps=budget_bps, video_share=now.video_share, method=now.method)
+        self.keyframes.require(self.now_ns)
+
+    # What comes back
+
+    def _report(self) -> None:
+        ground, second = self.ground, self.second
+        if second < self.joins_s or not self.link.bps(second):
+            return
+        if not ground.news and self.now_ns - ground.asked_ns < _IDLE_REPORT_NS:
+            return
+        ground.news, ground.asked_ns = False, self.now_ns
+        ground.number += 1
+        said = feedback(
+            session_id=1,
+            receiver_id=1,
+            sequence=ground.number,
+            send_ns=self.now_ns,
+            base_messages=ground.messages,
+            lost=ground.lost,
+            base_sequence=ground.last,
+            base_held_us=max(0, self.now_ns - _START_NS - ground.held_since_ns) // 1000,
+            still_sequence=-1,
+            missing_stills=(),
+            backlog=(),
+        )
+        late_s = self.late_s(second)
+        if late_s is None:
+            return
+        at_ns = self.now_ns + _WAY_NS + round(late_s * SECOND_NS)
+        wants = ground.messages > 0 and not ground.whole
+        self._at(at_ns, lambda: self._hear(said, wants=wants))
+
+    def _hear(self, said: Any, *, wants: bool) -> None:
+        self.link_control.on_feedback(said)
+        if wants:
+            self.keyframes.request(self.now_ns)
+
+    # What came of it
+
+    def drained(self, second: float) -> float:
+        """The second at which the link had carried what was sent before this one."""
+        return max((left for sent, left in self._left if sent < second), default=second)
+
+    def longest_hole(self, begin: float, end: float) -> float:
+        """The longest time without a frame that was shown, within these seconds."""
+        times = [begin, *(at for at, _ in self.ground.shown if begin < at < end), end]
+        return max(after - before for before, after in itertools.pairwise(times))
+
+    def back_after(self, second: float) -> float:
+        """How long after this second the ground shows a frame that was taken after it."""
+        return min((at - second for at, taken in self.ground.shown if taken >= second), default=float("inf"))
