@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import codecs
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,7 @@ __all__ = [
     "MAX_LABELS",
     "MAX_LABEL_CHARS",
     "class_labels",
+    "decoded",
     "first_synonym",
     "metadata_labels",
     "read_labels",
@@ -79,6 +81,12 @@ def first_synonym(label: str) -> str:
     return label.partition(",")[0].strip() or label
 
 
+def decoded(content: bytes) -> str:
+    """Text in UTF-8, or in what its byte order mark says. Raises `UnicodeDecodeError` for anything else."""
+    wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    return content.decode("utf-16" if wide else "utf-8-sig")
+
+
 def _read_text(path: Path) -> str:
     if not path.is_file():
         state = "is not a file" if path.exists() else "does not exist"
@@ -90,7 +98,7 @@ def _read_text(path: Path) -> str:
             raise UserError(
                 f"labels file {path} is larger than {_MAX_FILE_BYTES} bytes, which is what is accepted"
             )
-        return content.decode("utf-8-sig")
+        return decoded(content)
     except OSError as error:
         raise UserError(f"labels file {path} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:

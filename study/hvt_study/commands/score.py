@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -66,5 +67,9 @@ def _print(columns: Sequence[tuple[str, Score]]) -> None:
         table.add_column(name, justify="right")
     table.add_row("objects on all frames", *(f"{one.objects}" for _, one in columns))
     for label, field in _ROWS:
-        table.add_row(label, *(f"{getattr(one, field):.3f}" for _, one in columns))
+        table.add_row(label, *(_shown(getattr(one, field)) for _, one in columns))
     Console(highlight=False).print(table)
+
+
+def _shown(share: float) -> str:
+    return "-" if math.isnan(share) else f"{share:.3f}"

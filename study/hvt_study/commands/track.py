@@ -12,7 +12,7 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_study.datasets.annotation_rows import LAST_FRAME
-from hvt_study.datasets.mot_files import detections_by_frame, read_mot, rows_of_tracks, write_mot
+from hvt_study.datasets.mot_files import detections_by_frame, read_detections, rows_of_tracks, write_mot
 
 __all__ = ["add_arguments", "run"]
 
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     source, out = arguments.detections, arguments.out
     if source.exists() and out.exists() and source.samefile(out):
         raise UserError(f"--out is {out}, the file of detections itself; name another file")
-    rows = read_mot(source)
+    rows = read_detections(source)
     tracker = ByteTracker(settings, fps=arguments.fps)
     tracks = [tracker.update(seen, frame_index=frame) for frame, seen in detections_by_frame(rows)]
     found = rows_of_tracks(tracks)

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
+from hvt_common.inference.labels import decoded
 
 __all__ = ["LAST_FRAME", "Rows", "read_rows"]
 
@@ -93,7 +94,7 @@ def read_rows(path: Path, *, columns: str, least: int, frames: bool = True) -> R
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return decoded(path.read_bytes())
     except UnicodeDecodeError:
         raise UserError(f"{path} is not a text file; accepted are lines of numbers") from None
     except OSError as error:

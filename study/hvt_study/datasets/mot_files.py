@@ -11,9 +11,11 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.values import Detections, Tracks
-from hvt_study.datasets.annotation_rows import read_rows
+from hvt_study.datasets.annotation_rows import Rows, read_rows
 
-__all__ = ["MotRows", "detections_by_frame", "read_mot", "rows_of_tracks", "write_mot"]
+__all__ = ["MotRows", "detections_by_frame", "read_detections", "read_mot", "rows_of_tracks", "write_mot"]
+
+_COLUMNS = "frame,id,x,y,w,h,score"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +40,24 @@ def read_mot(path: Path) -> MotRows:
 
     A `UserError` names the file that cannot be read, or the first line that is malformed.
     """
-    rows = read_rows(path, columns="frame,id,x,y,w,h,score", least=7)
+    return _meant(read_rows(path, columns=_COLUMNS, least=7))
+
+
+def read_detections(path: Path) -> MotRows:
+    """The same of a file of detections, whose scores are probabilities, and of which all or none have ids."""
+    rows = read_rows(path, columns=_COLUMNS, least=7)
+    score, ids = rows["score"], rows["id"]
+    rows.check((score >= 0) & (score <= 1), accepted="a score from 0 to 1 in column 7")
+    if len(rows):
+        with_id = ids[0] >= 0
+        rows.check(
+            (ids >= 0) == with_id,
+            accepted=f"{'an id' if with_id else '-1'} in column 2, as in the first line",
+        )
+    return _meant(rows)
+
+
+def _meant(rows: Rows) -> MotRows:
     return MotRows(
         frames=rows["frame"].astype(np.int64),
         ids=rows["id"].astype(np.int64),

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import csv
+import io
+import logging
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
+from hvt_common.inference.labels import decoded
+from hvt_study.datasets.layouts.mot import read_truth_rows
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.frames import NO_ID, FrameLabels, FrameView, LabelledFrame
 
 __all__ = ["Labelled", "Score", "read_tracks", "read_truth", "score"]
 
+_log = logging.getLogger(__name__)
 _MOST_HELD, _LEAST_GAPS = 15, 10
 """Frames; and so many distances have to be known before any counts as usual."""
 SMALL_SHARE = 0.0012
 """Objects of less than this share of the frame count as small: about 33x33 pixels of 1280x720."""
-_LEAST_VISIBLE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +42,10 @@ class Labelled:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Over all objects on all frames; an object without a track is neither right nor wrong but missed."""
+    """Over all objects on all frames; an object without a track is neither right nor wrong but missed.
+
+    A share of nothing is NaN.
+    """
 
     objects: int
     recall: float
@@ -64,7 +71,7 @@ def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
     """
     rows: dict[int, list[tuple[list[float], str]]] = defaultdict(list)
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with io.StringIO(decoded(path.read_bytes()), newline="") as file:
             for line in csv.DictReader(file):
                 x, y, w, h = (float(line[name]) for name in ("x", "y", "w", "h"))
                 rows[int(line["frame"])].append(([x, y, x + w, y + h], line[column]))
@@ -76,23 +83,25 @@ def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
 
 
 def read_truth(path: Path, *, class_names: Sequence[str]) -> dict[int, Labelled]:
-    """Read MOTChallenge ground truth (``frame,id,x,y,w,h,1,class,visibility``) by frame; hidden ones stand beside."""
-    rows: dict[int, list[tuple[list[float], str]]] = defaultdict(list)
-    beside: dict[int, list[tuple[list[float], str]]] = defaultdict(list)
-    try:
-        with path.open(encoding="utf-8") as file:
-            for fields in csv.reader(file):
-                x, y, w, h = (float(value) for value in fields[2:6])
-                judged = rows if float(fields[8]) >= _LEAST_VISIBLE else beside
-                judged[int(fields[0])].append(([x, y, x + w, y + h], class_names[int(fields[7]) - 1]))
-    except (OSError, IndexError, ValueError) as error:
-        raise UserError(
-            f"{path} is not MOTChallenge ground truth of {len(class_names)} classes ({error})"
-        ) from None
-    return {
-        frame: replace(_labelled(rows[frame]), beside_xyxy_px=_labelled(beside[frame]).boxes_xyxy_px)
-        for frame in sorted(rows.keys() | beside.keys())
-    }
+    """Read MOTChallenge ground truth (``frame,id,x,y,w,h,1,class,visibility``) by frame; hidden ones stand beside.
+
+    Raises `UserError` where a line is wrong, or no object counts.
+    """
+    rows = read_truth_rows(path, class_names)
+    if not rows.judged.any():
+        raise UserError(f"{path} has no object that counts: there is nothing to score against")
+    if rows.classless:
+        _log.warning("%s has ten columns, which name no class: all are %s", path, rows.class_names[0])
+    found: dict[int, Labelled] = {}
+    for frame in np.unique(rows.frames).tolist():
+        here = rows.frames == frame
+        counts = np.flatnonzero(here & rows.judged)
+        found[frame] = Labelled(
+            rows.boxes[counts].astype(np.float64),
+            tuple(rows.class_names[row] for row in counts.tolist()),
+            beside_xyxy_px=rows.boxes[here & ~rows.judged].astype(np.float64),
+        )
+    return found
 
 
 def score(
@@ -107,13 +116,13 @@ def score(
     one = class_score(labelled, limits_px2=(SMALL_SHARE * frame_area_px, math.inf))
     return Score(
         objects=one.counts.labels,
-        recall=_or_zero(one.recall),
-        top1=_or_zero(one.counts.top1_found),
-        macro_f1=_or_zero(one.macro_f1_all),
-        small_top1=_or_zero(one.by_size["small"].top1_found),
-        seen_right=_or_zero(one.counts.top1_all),
-        named_f1=one.named_f1,
-        false_per_frame=_or_zero(one.false_per_frame),
+        recall=one.recall,
+        top1=one.counts.top1_found,
+        macro_f1=one.macro_f1_all,
+        small_top1=one.by_size["small"].top1_found,
+        seen_right=one.counts.top1_all,
+        named_f1=one.named_f1 if one.counts.labels else math.nan,
+        false_per_frame=one.false_per_frame,
     )
 
 
@@ -140,10 +149,6 @@ def _frame(wanted: Labelled, found: Labelled) -> LabelledFrame:
     )
     boxes, sure = found.boxes_xyxy_px.astype(np.float32), np.ones(len(ids), np.float32)
     return labels, FrameView(boxes, ids, found.classes, sure, found.classes)
-
-
-def _or_zero(value: float) -> float:
-    return 0.0 if math.isnan(value) else value
 
 
 def _labelled(rows: Sequence[tuple[list[float], str]]) -> Labelled:

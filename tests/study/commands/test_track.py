@@ -186,3 +186,19 @@ def test_reading_raises_what_the_command_prints(tmp_path: Path) -> None:
     """Other subcommands that read such files would end in a traceback."""
     with pytest.raises(UserError, match="line 1 is 'x'"):
         read_mot(write(tmp_path / "bad.txt", ["x\n"]))
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("2,-1,10,10,20,20,87.5\n", "line 2 is '2,-1,10,10,20,20,87.5'; accepted is a score from 0 to 1"),
+        ("2,-1,10,10,20,20,-0.5\n", "accepted is a score from 0 to 1 in column 7"),
+        ("2,7,10,10,20,20,0.5\n", "line 2 is '2,7,10,10,20,20,0.5'; accepted is -1 in column 2"),
+    ],
+)
+def test_what_is_no_detection_is_refused_with_its_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, words: str
+) -> None:
+    """Scores of 0 to 100 would all be certain, and a file of tracks be tracked again."""
+    source = write(tmp_path / "det.txt", ["1,-1,10,10,20,20,0.9\n", line])
+    assert words in sentence(capsys, "track", source, "--out", tmp_path / "out.txt")

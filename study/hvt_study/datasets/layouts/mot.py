@@ -22,7 +22,8 @@ from __future__ import annotations
 import configparser
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Sequence as Names
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -30,18 +31,21 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.inference.labels import read_labels
+from hvt_common.inference.labels import decoded, read_labels
+from hvt_common.values import Boxes
 from hvt_study.datasets.annotation_rows import Rows, read_rows
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["mot_table", "open_mot"]
+__all__ = ["TruthRows", "mot_table", "open_mot", "read_truth_rows"]
 
 _INFO = "seqinfo.ini"
 _TRUTH = "gt/gt.txt"
 _PICTURES = "img1"
+_COLUMNS = "frame,id,x,y,w,h,counts,class,visibility"
+_LEAST_VISIBLE = 0.5
 _LAYOUT = "NAME/seqinfo.ini, NAME/img1/000001.jpg and NAME/gt/gt.txt"
 _NAMES = ("pedestrian", "person on vehicle", "car", "bicycle", "motor", "non-motorised vehicle")
 """MOT17's classes from 1 on that may be objects."""
@@ -77,7 +81,7 @@ def mot_table(
     truth: Path, names: Path, size: tuple[int, int], beside: tuple[int, ...] = _BESIDE
 ) -> LabelTable:
     """All labels of a sequence; ``names`` may be missing, and ``beside`` are then classes that are not asked for."""
-    rows = read_rows(truth, columns="frame,id,x,y,w,h,counts,class,visibility", least=7)
+    rows = read_rows(truth, columns=_COLUMNS, least=7)
     own = names.is_file()
     class_names = read_labels(names) if own else _NAMES
     kinds = _kinds(rows, len(class_names) if own else _HIGHEST, own=own)
@@ -101,12 +105,49 @@ def mot_table(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class TruthRows:
+    """Rows of a gt.txt whose classes are given apart, in its order."""
+
+    frames: npt.NDArray[np.int64]
+    """(N,) as in the file."""
+    boxes: Boxes
+    """(N, 4) x1 y1 x2 y2 pixels that count from 0."""
+    class_names: tuple[str, ...]
+    """N names."""
+    judged: npt.NDArray[np.bool_]
+    """(N,) False for what does not count, and for what is hidden by half."""
+    classless: bool
+    """MOT15's ten columns, which name no class: all are of the only name that was given, else pedestrians."""
+
+
+def read_truth_rows(truth: Path, names: Names[str]) -> TruthRows:
+    """Of a file whose classes from 1 on have these names; `UserError` names the line that is wrong."""
+    rows = read_rows(truth, columns=_COLUMNS, least=7)
+    classless = _in_the_world(rows)
+    if classless:
+        known = names[0] if len(names) == 1 else _NAMES[0]
+        words = (known,) * len(rows)
+    else:
+        rows.check(np.isin(rows["class"], np.arange(1, len(names) + 1)), accepted=_class_text(len(names)))
+        words = tuple(names[int(kind) - 1] for kind in rows["class"].tolist())
+    judged = rows["counts"] != 0
+    if not classless:
+        share = rows["visibility"]
+        judged &= (share >= _LEAST_VISIBLE) | (share < 0)  # -1 where the file does not say
+    return TruthRows(rows["frame"].astype(np.int64), rows.boxes(), words, judged, classless)
+
+
+def _class_text(highest: int) -> str:
+    return f"a class from 1 to {highest} in column 8"
+
+
 def _kinds(rows: Rows, highest: int, *, own: bool) -> npt.NDArray[np.int64]:
     """Class from 1 on."""
     if not own and _in_the_world(rows):
         return np.full(len(rows), _PEDESTRIAN, np.int64)
     kinds = np.where(rows["class"] == -1, _PEDESTRIAN, rows["class"])
-    rows.check(np.isin(kinds, np.arange(1, highest + 1)), accepted=f"a class from 1 to {highest} in column 8")
+    rows.check(np.isin(kinds, np.arange(1, highest + 1)), accepted=_class_text(highest))
     return kinds.astype(np.int64)
 
 
@@ -169,7 +210,7 @@ def _info(path: Path) -> Mapping[str, str]:
     parser = configparser.ConfigParser(interpolation=None)
     parser.optionxform = str  # type: ignore[assignment, method-assign] # the documented way to keep case
     try:
-        parser.read_string(path.read_text(encoding="utf-8-sig"))
+        parser.read_string(decoded(path.read_bytes()))
         return dict(parser["Sequence"])
     except (configparser.Error, KeyError, OSError, UnicodeDecodeError):
         raise UserError(f"{path} is not a sequence's description: expected is a section [Sequence]") from None
