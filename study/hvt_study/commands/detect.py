@@ -25,7 +25,7 @@ from hvt_common.units import parse_size
 from hvt_common.values import Detections, Image, View
 from hvt_edge.source.resample import Resizer
 from hvt_study.commands.progress import RunProgress
-from hvt_study.datasets.labelled_pictures import LabelledPicture, find_pictures, read_image
+from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
 from hvt_study.datasets.labels import NO_ID, inside_frame
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.frames import FrameView
@@ -50,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="PICTURES",
-        help="pictures, folders of them, a folder with images/ and labels/ (YOLO) or annotations/ (VisDrone), "
-        "COCO's JSON, or a MOTChallenge sequence (img1/, gt/gt.txt)",
+        help="pictures, folders of them, labelled sets (YOLO, Pascal VOC, VisDrone, COCO's JSON), "
+        "or a MOTChallenge sequence (img1/, gt/gt.txt)",
     )
     parser.add_argument("--out", type=Path, required=True, default=argparse.SUPPRESS, metavar="DIR")
     parser.add_argument("--detector", default=EMBEDDED_DETECTOR, metavar="FILE", help="as of hvt-edge")
@@ -118,13 +118,15 @@ def run(arguments: argparse.Namespace) -> int:
         for picture, image, view in _progress(pictures, detector, size):
             if image is None:
                 skipped += 1
-                print(f"{picture.path} cannot be read as a picture; skipped", file=sys.stderr)
+                print(f"{picture.unreadable}; skipped", file=sys.stderr)
                 continue
             table.writerows(_rows(picture.path, view, confidence))
             labels = picture.read((image.shape[1], image.shape[0]))
             if labels is not None:
                 paths.append(picture.path)
                 frames.append((labels, view))
+    for sentence in doubts_of(pictures):
+        print(sentence, file=sys.stderr)
     if skipped:
         print(f"{skipped} of {len(pictures)} pictures skipped", file=sys.stderr)
     if frames:
@@ -151,7 +153,7 @@ def _progress(
 ) -> Iterator[tuple[LabelledPicture, Image | None, FrameView]]:
     with RunProgress("pictures") as progress:
         for number, picture in enumerate(pictures, start=1):
-            image = read_image(picture.path)
+            image = read_image(picture.path, picture.labelled_size)
             yield picture, image, FrameView() if image is None else detected(detector, image, size)
             progress.update(number, len(pictures))
 

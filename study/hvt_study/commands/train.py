@@ -28,7 +28,8 @@ from hvt_common.values import Boxes, Image, View
 from hvt_edge.source.resample import Resizer
 from hvt_study.commands.detect import detected
 from hvt_study.commands.progress import RunProgress
-from hvt_study.datasets.labelled_pictures import LabelledPicture, find_pictures, read_image
+from hvt_study.datasets.label_files import LOOKED_IN
+from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
 from hvt_study.datasets.labels import FrameLabels, inside_frame
 from hvt_study.datasets.yolo_labels import IGNORED
 from hvt_study.metrics.detection import detection_score
@@ -53,10 +54,12 @@ class _Own:
 
     path: Path
     labels: FrameLabels
+    labelled_size: tuple[int, int] | None = None
+    """As of `LabelledPicture`."""
 
     def base(self, size: _Size) -> tuple[Image, FrameLabels]:
         """As the edge fits it into the base stream, with the labels there."""
-        image = read_image(self.path)
+        image = read_image(self.path, self.labelled_size)
         assert image is not None, "it was read before"
         source = (image.shape[1], image.shape[0])
         view = View.fitted(source, size, fit="letterbox")
@@ -197,15 +200,17 @@ def _labelled(uri: str, names: Sequence[str]) -> list[LabelledPicture]:
     place = Path(text).expanduser()
     if not colon or scheme not in _SCHEMES:
         raise UserError(f"--data {uri} is not accepted: yolo:FOLDER or coco:FILE.json is")
-    if scheme == "yolo" and not (place / "labels").is_dir():
-        raise UserError(f"--data {uri} has no folder {place / 'labels'}: images/NAME.jpg and labels/NAME.txt")
     if scheme == "coco" and not place.is_file():
         raise UserError(f"--data {uri} is not a file: COCO's JSON is expected")
     found = find_pictures(place, classes=names or None)
     labelled = [picture for picture in found if picture.labels is not None]
+    if not labelled:
+        raise UserError(
+            f"--data {uri} has {len(found)} pictures and no folder labels/, nor labels in {LOOKED_IN}"
+        )
     if len(labelled) < len(found):
         left = len(found) - len(labelled)
-        print(f"{left} pictures of {place} have no file in labels/; left out", file=sys.stderr)
+        print(f"{left} pictures of {place} have no labels; left out", file=sys.stderr)
     return labelled
 
 
@@ -214,7 +219,7 @@ def _classes(pictures: Sequence[LabelledPicture]) -> list[str]:
     found: dict[str, None] = {}
     for picture in pictures:
         used = None
-        if not isinstance(picture.labels, Path | FrameLabels | None):
+        if isinstance(picture.labels, tuple):
             used = {str(row["name"]) for row in picture.labels}
         found |= dict.fromkeys(name for name in picture.class_names if used is None or name in used)
     names = [name for name in found if name.casefold() not in IGNORED]
@@ -228,15 +233,17 @@ def _read(pictures: Sequence[LabelledPicture]) -> list[_Own]:
     read, skipped = [], 0
     with RunProgress("pictures read") as progress:
         for number, picture in enumerate(pictures, start=1):
-            image = read_image(picture.path)
+            image = read_image(picture.path, picture.labelled_size)
             progress.update(number, len(pictures))
             if image is None:
                 skipped += 1
-                print(f"{picture.path} cannot be read as a picture; skipped", file=sys.stderr)
+                print(f"{picture.unreadable}; skipped", file=sys.stderr)
                 continue
             labels = picture.read((image.shape[1], image.shape[0]))
             assert labels is not None, "only labelled ones are here"
-            read.append(_Own(picture.path, labels))
+            read.append(_Own(picture.path, labels, picture.labelled_size))
+    for sentence in doubts_of(pictures):
+        print(sentence, file=sys.stderr)
     if skipped:
         print(f"{skipped} of {len(pictures)} pictures skipped", file=sys.stderr)
     return read
@@ -281,7 +288,7 @@ def _frames(path: Path, held_out: Sequence[_Own], size: _Size) -> list[LabelledF
     detector = open_detector(str(path), confidence=_CURVE, provider="cpu")
     frames = []
     for own in held_out:
-        image = read_image(own.path)
+        image = read_image(own.path, own.labelled_size)
         assert image is not None, "it was read before"
         frames.append((own.labels, detected(detector, image, size)))
     return frames

@@ -1,11 +1,8 @@
-"""Pictures beside labels: a YOLO folder, COCO JSON, VisDrone's image layout, a MOTChallenge sequence, or none.
+"""Pictures and their labels, in the layouts of `label_files`, COCO's JSON, a MOTChallenge sequence, or none.
 
-::
-
-    ROOT/images/NAME.jpg, ROOT/labels/NAME.txt, [ROOT/classes.txt]     YOLO: class cx cy w h, 0…1 of the picture
-    ROOT/images/NAME.jpg, ROOT/annotations/NAME.txt                    VisDrone-DET
-    FILE.json                                                          COCO; pictures lie beside it or in images/
-    ROOT/img1/000001.jpg, ROOT/gt/gt.txt, [ROOT/gt/labels.txt]         MOTChallenge
+The size that a file of labels says its picture has (COCO, Pascal VOC) is held against the picture as it is read: one
+that was turned by its EXIF tag is read as it was labelled, of one that was resized the boxes are scaled, and anything
+else is refused.
 """
 
 from __future__ import annotations
@@ -13,28 +10,45 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Image
 from hvt_edge.source.folder import sequence_files
 from hvt_study.datasets.clip import NOMINAL_FPS
-from hvt_study.datasets.labels import FrameLabels
+from hvt_study.datasets.label_files import (
+    LOOKED_IN,
+    VocFile,
+    coco_files,
+    label_file,
+    pictures_below,
+    read_text,
+    read_voc,
+)
+from hvt_study.datasets.labels import FrameLabels, LabelDoubts
 from hvt_study.datasets.layouts.mot import open_mot
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.layouts.visdrone import table_of
 from hvt_study.datasets.visdrone_rows import read_image_rows
-from hvt_study.datasets.yolo_labels import labels_of, read_text, read_yolo, yolo_names
+from hvt_study.datasets.yolo_labels import labels_of, read_yolo, yolo_names
 
-__all__ = ["LabelledPicture", "find_pictures", "read_image"]
+__all__ = ["LabelledPicture", "doubts_of", "find_pictures", "read_image"]
 
 _TRUTH = "gt/gt.txt"
+_YAML = (".yaml", ".yml")
+_SAME_SHAPE = 0.01
+"""So much may the ratio of the sides differ where a picture was resized to whole pixels."""
+
+
+_Annotation = tuple[str, tuple[float, ...] | None, str]
+"""Class, x1 y1 x2 y2 as labelled, and the place in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,98 +56,213 @@ class LabelledPicture:
     """A picture and where its labels are."""
 
     path: Path
-    labels: Path | Sequence[Mapping[str, Any]] | FrameLabels | None
+    labels: Path | tuple[Mapping[str, Any], ...] | VocFile | FrameLabels | None
     """A YOLO or VisDrone file, COCO's annotations of the picture, the labels themselves; None: nobody labelled it."""
     class_names: Sequence[str]
     visdrone: bool = False
     one_target: bool = False
     """Of a sequence that labels one object and nothing else that is in view: it can be found or missed, no more."""
+    labelled_size: tuple[int, int] | None = None
+    """(width, height) that the labels say the picture has."""
+    doubts: LabelDoubts = field(default_factory=LabelDoubts)
+    """Of the whole set."""
+
+    @property
+    def unreadable(self) -> str:
+        """Why there is no picture, in words."""
+        return f"{self.path} {'cannot be read as a picture' if self.path.exists() else 'does not exist'}"
 
     def read(self, size: tuple[int, int]) -> FrameLabels | None:
         """The labels in the pixels of the picture, which is (width, height) large.
 
         Raises:
-            UserError: names the file and the line that cannot be.
+            UserError: names a file that cannot be read, or a picture of another shape than its labels say.
         """
         if self.labels is None:
             return None
         if isinstance(self.labels, FrameLabels):
             return self.labels
-        if not isinstance(self.labels, Path):
-            return _from_coco(self.path, self.labels, size)
-        if self.visdrone:
-            return _from_visdrone(self.labels, size)
-        return read_yolo(self.labels, self.class_names, size)
+        if isinstance(self.labels, Path):
+            if self.visdrone:
+                return _from_visdrone(self.labels, size)
+            return read_yolo(self.labels, self.class_names, size, self.doubts)
+        scale = self._scale(size)
+        rows: list[_Annotation]
+        if isinstance(self.labels, VocFile):
+            rows = [(name, box, f"{self.path}, object {name}") for name, box in self.labels.objects]
+        else:
+            rows = [_coco_row(row) for row in self.labels]
+        return self._labels(rows, size, scale)
+
+    def _labels(
+        self, rows: Sequence[_Annotation], size: tuple[int, int], scale: tuple[float, float]
+    ) -> FrameLabels:
+        """Of (class, x1 y1 x2 y2 as labelled, place); rows without four numbers are left out."""
+        names, boxes, wheres = [], [], []
+        for name, box, where in rows:
+            if box is None or not all(map(math.isfinite, box)):
+                self.doubts.leave_out(
+                    f"{where} has no box of four numbers; x, y, w, h in the picture of {size[0]}x{size[1]} do"
+                )
+                continue
+            names.append(name)
+            boxes.append(box)
+            wheres.append(where)
+        corners: npt.NDArray[np.float64] = np.array(boxes, np.float64).reshape(-1, 4) * (scale * 2)
+        inside, rows_inside = self.doubts.inside(corners, wheres, size)
+        return labels_of(inside, [names[row] for row in rows_inside.tolist()])
+
+    def _scale(self, size: tuple[int, int]) -> tuple[float, float]:
+        said = self.labelled_size
+        if said in (None, size):
+            return 1.0, 1.0
+        assert said is not None
+        x, y = size[0] / said[0], size[1] / said[1]
+        sizes = f"{self.path} is {size[0]}x{size[1]}, and its labels say {said[0]}x{said[1]}"
+        if abs(x / y - 1) > _SAME_SHAPE:
+            raise UserError(
+                f"{sizes}: label the picture that is there, or put the one back that was labelled"
+            )
+        self.doubts.resized(sizes)
+        return x, y
 
 
 def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[LabelledPicture]:
     """All pictures of one argument, in natural order.
 
     Args:
-        place: a picture, a folder, or COCO's JSON.
-        classes: names of a YOLO folder's classes; None: those of its ``classes.txt``.
+        place: a picture, a folder, COCO's JSON, or the YAML of a YOLO set.
+        classes: names of a YOLO folder's classes; None: those of its ``classes.txt``, ``obj.names`` or ``data.yaml``.
 
     Raises:
         UserError: nothing is there, or YOLO labels have no names.
     """
+    doubts = LabelDoubts()
     if place.suffix == ".json" and place.is_file():
-        return _coco_pictures(place)
+        return _coco_pictures(place, doubts)
+    if place.suffix in _YAML and place.is_file():
+        return find_pictures(place.parent, classes=classes)
     if place.is_file():
         return [LabelledPicture(place, None, ())]
     if not place.is_dir():
         raise UserError(f"{place} does not exist; a picture, a folder of pictures or a COCO file is expected")
     if (place / _TRUTH).is_file():
         return _mot_pictures(place)
-    images = place / "images" if (place / "images").is_dir() else place
-    files = sequence_files(images)
+    files = pictures_below(place)
     if not files:
-        raise UserError(f"{images} holds no pictures")
-    for folder in ("labels", "annotations"):
-        if (place / folder).is_dir():
-            visdrone = folder == "annotations"
-            names = VISDRONE_NAMES if visdrone else yolo_names(place, classes)
-            found = {file.stem: file for file in (place / folder).glob("*.txt")}
-            return [LabelledPicture(file, found.get(file.stem), names, visdrone) for file in files]
-    return [LabelledPicture(file, None, ()) for file in files]
+        raise UserError(f"{place} holds no pictures, nor do its folders")
+    found = {file: labels for file in files if (labels := label_file(file, place)) is not None}
+    if not found:
+        return _coco_beside(place, files, doubts)
+    voc = {file: read_voc(path) for file, path in found.items() if path.suffix == ".xml"}
+    texts = [path for path in found.values() if path.suffix == ".txt"]
+    visdrone = bool(texts) and _has_commas(texts)
+    names: Sequence[str] = VISDRONE_NAMES if visdrone else ()
+    if voc:
+        names = tuple(sorted({name for one in voc.values() for name, _ in one.objects}))
+    elif texts and not visdrone:
+        names = yolo_names(place, classes, files)
+    return [
+        LabelledPicture(
+            file,
+            voc.get(file, found.get(file)),
+            names,
+            visdrone,
+            labelled_size=voc[file].size if file in voc else None,
+            doubts=doubts,
+        )
+        for file in files
+    ]
 
 
-def read_image(path: Path) -> Image | None:
-    """(height, width, 3) uint8 BGR; None where it is no picture that can be read."""
+def doubts_of(pictures: Sequence[LabelledPicture]) -> list[str]:
+    """What was wrong with the labels that were read, in sentences; `UserError` where no label of a set was good."""
+    sets = {id(picture.doubts): picture.doubts for picture in pictures}.values()
+    for doubts in sets:
+        doubts.check()
+    return [sentence for doubts in sets for sentence in doubts.sentences()]
+
+
+def read_image(path: Path, labelled_size: tuple[int, int] | None = None) -> Image | None:
+    """(height, width, 3) uint8 BGR; None where it is no picture that can be read.
+
+    It is turned as its EXIF tag says, but where it was labelled as it lies (``labelled_size``).
+    """
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is not None and labelled_size == (image.shape[0], image.shape[1]) != (
+        image.shape[1],
+        image.shape[0],
+    ):
+        lying = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = lying if lying is not None and lying.shape[:2] == labelled_size[::-1] else image
     return None if image is None else np.asarray(image, np.uint8)
+
+
+def _has_commas(texts: Sequence[Path]) -> bool:
+    """Whether lines are VisDrone's; of the first file that has any."""
+    first = next((line for path in texts for line in read_text(path).splitlines() if line.strip()), None)
+    return "," in first if first is not None else texts[0].parent.name == "annotations"
+
+
+def _coco_beside(place: Path, files: Sequence[Path], doubts: LabelDoubts) -> list[LabelledPicture]:
+    found = [one for path in coco_files(place) for one in _coco_pictures(path, doubts)]
+    if found:
+        return found
+    if any((place / folder).is_dir() for folder in ("labels", "annotations", "Annotations")):
+        some = f"any of its {len(files)} pictures, such as {files[0].name}"
+        raise UserError(f"{place} has no label of {some}: looked in {LOOKED_IN}")
+    return [LabelledPicture(file, None, ()) for file in files]
 
 
 def _from_visdrone(path: Path, size: tuple[int, int]) -> FrameLabels:
     return table_of(read_image_rows(path), size=size).at(0)
 
 
-def _coco_pictures(path: Path) -> list[LabelledPicture]:
+def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
     """COCO's ``images``, ``annotations`` (also ``annotation``) and ``categories``."""
     try:
         about = json.loads(read_text(path))
         names = {row["id"]: str(row["name"]) for row in about["categories"]}
         rows = about["annotations"] if "annotations" in about else about["annotation"]
         of: dict[Any, list[dict[str, Any]]] = {image["id"]: [] for image in about["images"]}
-        for row in rows:
-            of[row["image_id"]].append({"name": names[row["category_id"]], **row})
-        files = {
-            image["id"]: str(image["file_name"] if "file_name" in image else image["filename"])
+        for number, row in enumerate(rows, start=1):
+            where = f"COCO annotation {row.get('id', number)} of {path.name}"
+            if row.get("image_id") not in of or row.get("category_id") not in names:
+                doubts.leave_out(f"{where} has an image_id or a category_id that the file does not have")
+                continue
+            of[row["image_id"]].append({**row, "name": names[row["category_id"]], "where": where})
+        images = [
+            (
+                image["id"],
+                str(image["file_name"] if "file_name" in image else image["filename"]),
+                _said_size(image),
+            )
             for image in about["images"]
-        }
-    except (ValueError, KeyError, TypeError) as error:
+        ]
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is not COCO's JSON: {type(error).__name__} {error}") from None
     return [
-        LabelledPicture(_beside(path, name), tuple(of[key]), tuple(names.values()))
-        for key, name in files.items()
+        LabelledPicture(
+            _beside(path, name), tuple(of[key]), tuple(names.values()), labelled_size=size, doubts=doubts
+        )
+        for key, name, size in images
     ]
 
 
-def _in_picture(box: Sequence[Any], size: tuple[int, int]) -> bool:
-    """Whether x, y, w, h are numbers that begin in the picture."""
-    if len(box) != len((*size, *size)) or not all(isinstance(side, int | float) for side in box):
-        return False
+def _said_size(image: Mapping[str, Any]) -> tuple[int, int] | None:
+    wide, high = image.get("width"), image.get("height")
+    known = isinstance(wide, int) and isinstance(high, int) and wide > 0 and high > 0
+    return (int(wide), int(high)) if known else None  # type: ignore[arg-type]
+
+
+def _coco_row(row: Mapping[str, Any]) -> _Annotation:
+    box = row.get("bbox")
+    name = "ignore" if row.get("iscrowd") else str(row["name"])
+    numbers = isinstance(box, list) and len(box) == 4 and all(isinstance(side, int | float) for side in box)
+    if box is None or not numbers:
+        return name, None, f"{row['where']} has the box {box}: it"
     x, y, wide, high = box
-    return bool(0 <= x <= size[0] and 0 <= y <= size[1] and 0 <= wide < math.inf and 0 <= high < math.inf)
+    return name, (x, y, x + wide, y + high), str(row["where"])
 
 
 def _mot_pictures(place: Path) -> list[LabelledPicture]:
@@ -150,18 +279,12 @@ def _mot_pictures(place: Path) -> list[LabelledPicture]:
 
 
 def _beside(path: Path, name: str) -> Path:
-    places = [path.parent / name, path.parent / "images" / name, path.parent.parent / "images" / name]
+    """Where a picture of COCO's file lies: beside it, in images/ or data/ there or a level up."""
+    name = name.replace("\\", "/")
+    folders = [
+        folder
+        for root in (path.parent, path.parent.parent)
+        for folder in (root, root / "images", root / "data")
+    ]
+    places = [folder / one for one in (name, Path(name).name) for folder in folders]
     return next((place for place in places if place.is_file()), places[0])
-
-
-def _from_coco(path: Path, rows: Sequence[Mapping[str, Any]], size: tuple[int, int]) -> FrameLabels:
-    for row in rows:
-        box = row.get("bbox")
-        if not (isinstance(box, list) and _in_picture(box, size)):
-            raise UserError(
-                f"COCO annotation {row.get('id', '')} of {path.name} has the box {box}; x, y, w, h in the picture of "
-                f"{size[0]}x{size[1]} is accepted"
-            )
-    boxes = np.array([row["bbox"] for row in rows], np.float64).reshape(-1, 4)
-    kinds = ["ignore" if row.get("iscrowd") else str(row["name"]) for row in rows]
-    return labels_of(np.hstack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]]), kinds)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.errors import UserError
 from hvt_common.values import Boxes
 
-__all__ = ["NO_ID", "FrameLabels", "covered_share", "inside_frame", "no_boxes"]
+__all__ = ["NO_ID", "FrameLabels", "LabelDoubts", "covered_share", "inside_frame", "no_boxes"]
 
+_NOTICED_PX = 0.01
+"""Rows that end nearer to the edge are as exact as their digits."""
 NO_ID = -1
 """Of an object whose dataset knows no identities."""
 
@@ -38,6 +42,73 @@ class FrameLabels:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+
+@dataclass(slots=True)
+class LabelDoubts:
+    """What was wrong with the labels of a set, counted; the worst, or the first, is named."""
+
+    good: int = 0
+    """Rows that count."""
+    _clipped: int = 0
+    _worst: tuple[float, str] = (0.0, "")
+    _left_out: int = 0
+    _first: str = ""
+    _resized: int = 0
+    _first_resized: str = ""
+
+    def leave_out(self, sentence: str) -> None:
+        """A row that cannot be, named in a sentence."""
+        self._first = self._first or sentence
+        self._left_out += 1
+
+    def resized(self, sentence: str) -> None:
+        """A picture of another size than its labels say, whose boxes were scaled."""
+        self._first_resized = self._first_resized or sentence
+        self._resized += 1
+
+    def inside(
+        self, corners: npt.NDArray[np.float64], wheres: Sequence[str], size: tuple[int, int]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.intp]]:
+        """(M, 4) boxes cut at a picture of this (width, height), and (M,) which of the (N, 4) corners they were.
+
+        ``wheres`` has the place of each, for words. What has no area inside is left out.
+        """
+        limits = np.array([*size, *size], np.float64)
+        inside = np.clip(corners, 0, limits)
+        beyond = np.abs(corners - inside).max(axis=1, initial=0)
+        solid = (inside[:, 2:] > inside[:, :2]).all(axis=1)
+        for row in np.flatnonzero(solid & (beyond > _NOTICED_PX)).tolist():
+            self._clipped += 1
+            self._worst = max(self._worst, (float(beyond[row]), wheres[row]))
+        for row in np.flatnonzero(~solid).tolist():
+            self.leave_out(
+                f"{wheres[row]} has a box outside the picture of {size[0]}x{size[1]}, or without area"
+            )
+        rows = np.flatnonzero(solid)
+        self.good += len(rows)
+        return inside[rows], rows
+
+    def sentences(self) -> list[str]:
+        """What there is to say."""
+        said = []
+        if self._clipped:
+            px, where = self._worst
+            said.append(
+                f"{self._clipped} labels end outside their picture and were cut; the worst is {where}, by {px:.2g} px"
+            )
+        if self._left_out:
+            said.append(f"{self._left_out} labels were left out; the first: {self._first}")
+        if self._resized:
+            said.append(
+                f"{self._resized} pictures were resized since they were labelled; the first: {self._first_resized}"
+            )
+        return said
+
+    def check(self) -> None:
+        """`UserError` where rows were left out and none was good: nothing can be said of such a set."""
+        if self._left_out and not self.good:
+            raise UserError(self._first)
 
 
 def covered_share(boxes: Boxes, regions: Boxes) -> npt.NDArray[np.float64]:

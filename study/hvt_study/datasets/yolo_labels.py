@@ -10,39 +10,62 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.inference.labels import read_labels
-from hvt_study.datasets.labels import NO_ID, FrameLabels
+from hvt_study.datasets.label_files import class_file, read_class_file, read_text
+from hvt_study.datasets.labels import NO_ID, FrameLabels, LabelDoubts
 
-__all__ = ["IGNORED", "labels_of", "read_text", "read_yolo", "yolo_names"]
+__all__ = ["IGNORED", "labels_of", "read_yolo", "yolo_names"]
 
 IGNORED = frozenset({"dontcare", "ignore", "ignored"})
 """Classes (any case) whose boxes count neither for nor against."""
 _COLUMNS = 5
 _MOST_COLUMNS = 6
 """With a confidence, as trackers and annotators add it; more is a polygon."""
+_LEAST_POLYGON = 7
+_MOST_SHARE = 2.0
+"""A number beyond is no share of a picture: the file counts in pixels."""
 
 
-def yolo_names(root: Path, classes: Sequence[str] | None) -> Sequence[str]:
-    """The given names, else those of ``root/classes.txt``; `UserError` where there is neither."""
+def yolo_names(root: Path, classes: Sequence[str] | None, pictures: Sequence[Path] = ()) -> Sequence[str]:
+    """The given names, else those of ``classes.txt``, ``obj.names`` or ``data.yaml``; `UserError` where none is."""
     if classes is not None:
         return classes
-    if not (root / "classes.txt").is_file():
-        raise UserError(f"{root} has labels, but no classes.txt: add one, one name a line, or give --classes")
-    return read_labels(root / "classes.txt")
+    path = class_file(root, list(pictures))
+    if path is None:
+        raise UserError(
+            f"{root} has labels, but no classes.txt, obj.names or data.yaml, there or in labels/: add one, one name a"
+            " line, or give --classes"
+        )
+    return read_class_file(path)
 
 
-def read_yolo(path: Path, names: Sequence[str], size: tuple[int, int]) -> FrameLabels:
-    """The labels of a picture of this (width, height), in its pixels; `UserError` names the line that is wrong."""
-    boxes, kinds = [], []
+def read_yolo(
+    path: Path, names: Sequence[str], size: tuple[int, int], doubts: LabelDoubts | None = None
+) -> FrameLabels:
+    """The labels of a picture of this (width, height), in its pixels: rows of boxes, or of polygons.
+
+    What ends outside the picture is cut, and a row that cannot be is left out; ``doubts`` counts both. Without it
+    such a row is a `UserError` that names the line.
+    """
+    own = LabelDoubts() if doubts is None else doubts
+    boxes, kinds, wheres = [], [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
-        if line.strip():
-            kind, *sides = _yolo_row(path, number, line, len(names))
-            boxes.append(sides)
-            kinds.append(names[int(kind)])
-    middle_sides = np.array(boxes, np.float64).reshape(-1, 4)
-    half = middle_sides[:, 2:] / 2
-    corners = np.hstack([middle_sides[:, :2] - half, middle_sides[:, :2] + half]) * [*size, *size]
-    return labels_of(corners, kinds)
+        if not line.strip():
+            continue
+        try:
+            kind, *corners = _yolo_row(path, number, line, len(names))
+        except UserError as error:
+            if doubts is None:
+                raise
+            own.leave_out(str(error))
+            continue
+        boxes.append(corners)
+        kinds.append(names[int(kind)])
+        wheres.append(f"{path}, line {number}")
+    corners_px = np.array(boxes, np.float64).reshape(-1, 4) * [*size, *size]
+    inside, rows = own.inside(corners_px, wheres, size)
+    if doubts is None:
+        own.check()
+    return labels_of(inside, [kinds[row] for row in rows.tolist()])
 
 
 def labels_of(corners: npt.NDArray[np.float64], names: Sequence[str]) -> FrameLabels:
@@ -58,24 +81,23 @@ def labels_of(corners: npt.NDArray[np.float64], names: Sequence[str]) -> FrameLa
 
 
 def _yolo_row(path: Path, number: int, line: str, classes: int) -> list[float]:
+    """Class and x1 y1 x2 y2 as shares of the picture."""
     try:
         row = [float(word) for word in line.split()]
     except ValueError:
         row = []
-    if not _COLUMNS <= len(row) <= _MOST_COLUMNS or not all(map(math.isfinite, row)):
+    polygon = len(row) >= _LEAST_POLYGON and len(row) % 2 == 1
+    if not (_COLUMNS <= len(row) <= _MOST_COLUMNS or polygon) or not all(map(math.isfinite, row)):
         raise UserError(f"{path}, line {number} is {line[:60]!r}; accepted is class cx cy w h, all numbers")
     if row[0] not in range(classes):
         raise UserError(f"{path}, line {number} has class {row[0]:g}; there are {classes}, from 0")
-    if not all(0 <= value <= 1 for value in row[1:_COLUMNS]):
+    if polygon:
+        box = [min(row[1::2]), min(row[2::2]), max(row[1::2]), max(row[2::2])]
+    else:
+        cx, cy, wide, high = row[1:_COLUMNS]
+        box = [cx - wide / 2, cy - high / 2, cx + wide / 2, cy + high / 2]
+    if not all(abs(value) <= _MOST_SHARE for value in row[1 : None if polygon else _COLUMNS]):
         raise UserError(
             f"{path}, line {number} has a box outside the picture: {line[:60]!r}; 0 to 1 is accepted"
         )
-    return row[:_COLUMNS]
-
-
-def read_text(path: Path) -> str:
-    """A text file; `UserError` where it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read as text: {error}") from None
+    return [row[0], *box]

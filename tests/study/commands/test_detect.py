@@ -110,10 +110,6 @@ def test_coco_and_yolo_say_the_same(tmp_path: Path) -> None:
         ("9 0.5 0.5 0.1 0.1", "line 1 has class 9; there are 7, from 0"),
         ("0 1.5 0.5 0.1 0.1", "line 1 has a box outside the picture"),
         ("0 nan 0.5 0.1 0.1", "line 1 is '0 nan 0.5 0.1 0.1'; accepted is class cx cy w h, all numbers"),
-        (
-            "0 0.1 0.1 0.9 0.1 0.9 0.9 0.1 0.9",
-            "line 1 is '0 0.1 0.1 0.9 0.1 0.9 0.9 0.1 0.9'; accepted is class cx",
-        ),
         ("car", "line 1 is 'car'; accepted is class cx cy w h, all numbers"),
     ],
 )
@@ -141,7 +137,7 @@ def test_wrong_boxes_of_coco_are_named(
     }
     (folder / "coco.json").write_text(json.dumps(coco))
     heard = sentence(capsys, folder / "coco.json", "--out", tmp_path / "out")
-    assert "COCO annotation 31 of 0.png has the box" in heard
+    assert "COCO annotation 31 of coco.json has" in heard
 
 
 def write_sequence(folder: Path, *, frames: int, targets: int) -> Path:
@@ -203,9 +199,7 @@ def test_what_cannot_be_is_said_before_anything_is_written(
     assert "holds no pictures" in sentence(capsys, tmp_path / "empty", "--out", out)
     folder = draw(tmp_path / "set", moments=1)
     (folder / "classes.txt").unlink()
-    assert "no classes.txt: add one, one name a line, or give --classes" in sentence(
-        capsys, folder, "--out", out
-    )
+    assert "no classes.txt, obj.names or data.yaml" in sentence(capsys, folder, "--out", out)
     assert "--confidence is 2.0, must be from 0.01 to 1" in sentence(
         capsys, folder, "--confidence", 2, "--out", out
     )

@@ -1,0 +1,288 @@
+"""Labelled pictures as tools write them: where labels lie, and rows and sizes that do not fit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from hvt_common.errors import UserError
+from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
+from hvt_study.datasets.labels import FrameLabels
+
+SIZE = (200, 100)
+BOX = [20.0, 10.0, 80.0, 60.0]
+ROW = "1 0.25 0.35 0.3 0.5\n"
+NAMES = ("car", "bus")
+
+
+def picture(path: Path, size: tuple[int, int] = SIZE, *, exif: int | None = None) -> Path:
+    """A grey picture of this (width, height)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tags = Image.Exif()
+    if exif is not None:
+        tags[0x0112] = exif
+    Image.fromarray(np.full((size[1], size[0], 3), 90, np.uint8)).save(path, exif=tags)
+    return path
+
+
+def text(path: Path, content: str, encoding: str = "utf-8") -> Path:
+    """A file of text."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content.encode(encoding))
+    return path
+
+
+def voc(name: str = "bus", size: tuple[int, int] = SIZE) -> str:
+    """As labelImg writes it."""
+    x1, y1, x2, y2 = (int(side) for side in BOX)
+    return (
+        f"<annotation><size><width>{size[0]}</width><height>{size[1]}</height></size><object><name>{name}</name>"
+        f"<bndbox><xmin>{x1}</xmin><ymin>{y1}</ymin><xmax>{x2}</xmax><ymax>{y2}</ymax></bndbox></object></annotation>"
+    )
+
+
+def coco(name: str = "a.jpg", box: object = None, **image: object) -> str:
+    """One picture with one bus, and a second row where a box is given."""
+    x1, y1, x2, y2 = BOX
+    boxes = [[x1, y1, x2 - x1, y2 - y1], *([box] if box is not None else [])]
+    return json.dumps(
+        {
+            "images": [{"id": 1, "file_name": name, **image}],
+            "categories": [{"id": 5, "name": "bus"}],
+            "annotations": [
+                {"id": number, "image_id": 1, "category_id": 5, "bbox": one}
+                for number, one in enumerate(boxes)
+            ],
+        }
+    )
+
+
+def read(place: Path) -> list[tuple[LabelledPicture, FrameLabels]]:
+    """Every picture that can be read, with its labels."""
+    found = []
+    for one in find_pictures(place, classes=None):
+        image = read_image(one.path, one.labelled_size)
+        assert image is not None, one.unreadable
+        labels = one.read((image.shape[1], image.shape[0]))
+        assert labels is not None
+        found.append((one, labels))
+    return found
+
+
+def ultralytics(root: Path) -> None:
+    """With a list over several lines, and one of the splits empty of labels."""
+    picture(root / "images/train/a.jpg")
+    text(root / "labels/train/a.txt", ROW)
+    text(
+        root / "data.yaml",
+        "path: .\ntrain: images/train\nnames:\n  0: car\n  1: 'bus'  # large\nnc: 2\n",
+        "utf-8-sig",
+    )
+
+
+def roboflow(root: Path) -> None:
+    """A folder a split."""
+    picture(root / "train/images/a_jpg.rf.1.jpg")
+    text(root / "train/labels/a_jpg.rf.1.txt", ROW)
+    text(root / "data.yaml", "train: ../train/images\nnc: 2\nnames: ['car', 'bus']\n")
+
+
+def roboflow_coco(root: Path) -> None:
+    """JSON among the pictures."""
+    picture(root / "valid/a.jpg")
+    text(root / "valid/_annotations.coco.json", coco())
+
+
+def fiftyone(root: Path) -> None:
+    """YOLOv5Dataset."""
+    picture(root / "images/val/a.jpg")
+    text(root / "labels/val/a.txt", ROW)
+    text(root / "dataset.yaml", "names:\n- car\n- bus\nnc: 2\n")
+
+
+def fiftyone_coco(root: Path) -> None:
+    """COCODetectionDataset."""
+    picture(root / "data/a.jpg")
+    text(root / "labels.json", coco())
+
+
+def label_img(root: Path) -> None:
+    """Beside the pictures."""
+    picture(root / "a.jpg")
+    text(root / "a.txt", ROW)
+    text(root / "classes.txt", "car\nbus\n")
+
+
+def label_img_voc(root: Path) -> None:
+    """The same as XML."""
+    picture(root / "a.jpg")
+    text(root / "a.xml", voc(), "utf-8-sig")
+
+
+def cvat(root: Path) -> None:
+    """YOLO 1.1."""
+    picture(root / "obj_train_data/a.jpg")
+    text(root / "obj_train_data/a.txt", ROW)
+    text(root / "obj.names", "car\nbus\n")
+
+
+def cvat_coco(root: Path) -> None:
+    """COCO 1.0."""
+    picture(root / "images/a.jpg")
+    text(root / "annotations/instances_default.json", coco())
+
+
+def cvat_voc(root: Path) -> None:
+    """PASCAL VOC 1.1."""
+    picture(root / "JPEGImages/a.jpg")
+    text(root / "Annotations/a.xml", voc())
+
+
+def label_studio(root: Path) -> None:
+    """YOLO."""
+    picture(root / "images/a.jpg")
+    text(root / "labels/a.txt", ROW)
+    text(root / "classes.txt", "car\nbus\n", "utf-16")
+
+
+def label_studio_coco(root: Path) -> None:
+    """From Windows, with a byte order mark."""
+    picture(root / "images/a.jpg")
+    text(root / "result.json", coco("images\\a.jpg"), "utf-8-sig")
+
+
+LAYOUTS = (
+    ultralytics,
+    roboflow,
+    roboflow_coco,
+    fiftyone,
+    fiftyone_coco,
+    label_img,
+    label_img_voc,
+    cvat,
+    cvat_coco,
+    cvat_voc,
+    label_studio,
+    label_studio_coco,
+)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_layouts_of_tools_are_found(tmp_path: Path, layout: Callable[[Path], None]) -> None:
+    """Whoever labels with another tool would have to move a thousand files first."""
+    layout(tmp_path)
+    ((one, labels),) = read(tmp_path)
+    assert labels.class_names == ("bus",)
+    np.testing.assert_allclose(labels.boxes_xyxy_px, [BOX], atol=0.01)
+    assert doubts_of([one]) == []
+
+
+def test_labels_that_nothing_finds_are_said_with_the_places(tmp_path: Path) -> None:
+    """A set would be taken for one without labels, and no figure come out."""
+    picture(tmp_path / "images/a.jpg")
+    text(tmp_path / "labels/b.txt", ROW)
+    with pytest.raises(
+        UserError, match=r"has no label of any of its 1 pictures, such as a\.jpg: looked in labels/"
+    ):
+        find_pictures(tmp_path, classes=None)
+    text(tmp_path / "labels/a.txt", ROW)
+    with pytest.raises(UserError, match=r"no classes\.txt, obj\.names or data\.yaml"):
+        find_pictures(tmp_path, classes=None)
+
+
+def test_one_bad_row_costs_itself_alone(tmp_path: Path) -> None:
+    """A side of 1.0005, which exporters write, ended the whole set."""
+    label_img(tmp_path)
+    rows = ["0 0.25 0.50025 0.5 1.0005", "0 0.9 0.5 0.4 0.2", "9 0.5 0.5 0.1 0.1", "car", "0 3 0.5 0.1 0.1"]
+    text(tmp_path / "a.txt", "\n".join([*rows, ROW, "1 0.1 0.1 0.4 0.1 0.4 0.6 0.1 0.6"]))
+    ((one, labels),) = read(tmp_path)
+    assert labels.class_names == ("car", "car", "bus", "bus")
+    np.testing.assert_allclose(
+        labels.boxes_xyxy_px, [[0, 0, 100, 100], [140, 40, 200, 60], BOX, [20, 10, 80, 60]], atol=0.01
+    )
+    said = doubts_of([one])
+    assert len(said) == 2
+    assert "2 labels end outside their picture and were cut; the worst is" in said[0]
+    assert "a.txt, line 2, by 20 px" in said[0]
+    assert "3 labels were left out; the first: " in said[1]
+    assert "a.txt, line 3 has class 9; there are 2, from 0" in said[1]
+
+
+@pytest.mark.parametrize(
+    ("box", "boxes", "words"),
+    [
+        ([-0.5, 10, 20, 20], [BOX, [0, 10, 19.5, 30]], "COCO annotation 1 of labels.json, by 0.5 px"),
+        ([190, 90, 20, 20], [BOX, [190, 90, 200, 100]], "by 10 px"),
+        ([500, 90, 20, 20], [BOX], "1 labels were left out; the first: COCO annotation 1"),
+        ([1, 2, 3], [BOX], "has the box [1, 2, 3]"),
+    ],
+)
+def test_boxes_of_coco_are_cut_at_the_picture(
+    tmp_path: Path, box: list[float], boxes: list[list[float]], words: str
+) -> None:
+    """An x of -0.5, which annotators write, ended the whole set."""
+    picture(tmp_path / "data/a.jpg")
+    text(tmp_path / "labels.json", coco(box=box))
+    ((one, labels),) = read(tmp_path / "labels.json")
+    np.testing.assert_allclose(labels.boxes_xyxy_px, boxes, atol=1e-4)
+    (said,) = doubts_of([one])
+    assert words in said
+
+
+def test_a_set_without_a_good_row_is_refused(tmp_path: Path) -> None:
+    """Of labels in pixels nothing is right, and a recall of nothing would be said."""
+    label_img(tmp_path)
+    text(tmp_path / "a.txt", "1 50 35 60 50\n")
+    ((one, _),) = read(tmp_path)
+    with pytest.raises(UserError, match=r"a\.txt, line 1 has a box outside the picture"):
+        doubts_of([one])
+
+
+def test_a_picture_that_was_labelled_as_it_lies_is_read_so(tmp_path: Path) -> None:
+    """A phone's picture is turned by its EXIF tag, its labels are not: recall 0.0 without a word."""
+    picture(tmp_path / "data/a.jpg", exif=6)
+    text(tmp_path / "labels.json", coco(width=200, height=100))
+    ((one, labels),) = read(tmp_path)
+    image = read_image(one.path, one.labelled_size)
+    assert image is not None
+    assert image.shape == (100, 200, 3)
+    np.testing.assert_allclose(labels.boxes_xyxy_px, [BOX])
+    text(tmp_path / "labels.json", coco(width=100, height=200))  # labelled as it is shown
+    ((one, _),) = read(tmp_path)
+    image = read_image(one.path, one.labelled_size)
+    assert image is not None
+    assert image.shape == (200, 100, 3)
+
+
+@pytest.mark.parametrize("form", ["coco", "voc"])
+def test_a_picture_that_was_resized_has_its_boxes_scaled(tmp_path: Path, form: str) -> None:
+    """Boxes of the large picture on the small one: recall 0.0 without a word."""
+    picture(tmp_path / "data/a.jpg", (100, 50))
+    if form == "coco":
+        text(tmp_path / "labels.json", coco(width=200, height=100))
+    else:
+        text(tmp_path / "data/a.xml", voc())
+    ((one, labels),) = read(tmp_path)
+    np.testing.assert_allclose(labels.boxes_xyxy_px, [np.array(BOX) / 2])
+    (said,) = doubts_of([one])
+    assert "1 pictures were resized since they were labelled" in said
+    assert "is 100x50, and its labels say 200x100" in said
+    picture(tmp_path / "data/a.jpg", (120, 120))
+    with pytest.raises(UserError, match=r"a\.jpg is 120x120, and its labels say 200x100"):
+        read(tmp_path)
+
+
+def test_a_picture_that_is_not_there_is_called_so(tmp_path: Path) -> None:
+    """A path that is wrong would be looked for among damaged files."""
+    text(tmp_path / "labels.json", coco())
+    (one,) = find_pictures(tmp_path / "labels.json", classes=None)
+    assert one.unreadable.endswith("a.jpg does not exist")
+    text(one.path, "no picture")
+    assert one.unreadable.endswith("a.jpg cannot be read as a picture")
+    assert cv2.imread(str(one.path)) is None
