@@ -82,6 +82,8 @@ class StillMaker:
     """The most that is spent on being better than the base."""
     min_gain_db: float = 0.1
     """By how much the still must be closer than the base; covers how others round when they count."""
+    least_bytes: int = 0
+    """A smaller still is mostly header and changes nothing at the ground: it gets more bytes, or waits for them."""
     readable: Callable[[str], bool] = lambda _codec: True
     """Whether every ground that listens reads stills of this codec; ``jpeg`` takes the place of any other."""
     padding: float = PADDING
@@ -188,18 +190,25 @@ class StillMaker:
         smaller = _reaching(codec, job, psnr_y_db(fitted.shown_bgr, job.crop_bgr))
         if smaller is None or len(smaller.data) >= len(built.data) or not _beats_base(smaller, job):
             return None
+        if len(smaller.data) < self.least_bytes:
+            return None
         return _filled(_of_codec(header, codec), smaller)
 
     def _best(self, codec: StillCodec, job: CropJob, limit_bytes: int) -> _Fitted | NoStill:
         """The requested fidelity or quality, or the best below that fits; then upwards until the base is beaten."""
+        if limit_bytes < self.least_bytes:
+            return NoStill("too_large")
         fitted = _reaching(codec, job, self.fidelity_db) if self.fidelity_db else None
         if fitted is None:
             fitted = _at(codec, job, _MOST_PCT if self.fidelity_db else self.quality_pct)
         if len(fitted.data) > limit_bytes:
             lower = self._best_fitting(codec, job, limit_bytes, below_pct=fitted.quality_pct)
-            return lower if lower is not None and _beats_base(lower, job) else NoStill("too_large")
+            helps = lower is not None and len(lower.data) >= self.least_bytes and _beats_base(lower, job)
+            return lower if lower is not None and helps else NoStill("too_large")
         quality_pct, ceiling_pct = fitted.quality_pct, max(self.ceiling_pct, fitted.quality_pct)
-        while not _beats_base(fitted, job):
+        if self.least_bytes:
+            ceiling_pct = _MOST_PCT
+        while not _beats_base(fitted, job) or len(fitted.data) < self.least_bytes:
             quality_pct += _QUALITY_STEP_PCT
             if quality_pct > ceiling_pct:
                 return NoStill("base_good")

@@ -215,6 +215,8 @@ class Chooser:
     def _may_go(self, pending: OutboxStill, job: CropJob, limit_bytes: int, *, now_ns: int) -> bool:
         """Whether it is allowed as much as it will need, or has waited for that long enough."""
         assert pending.request is not None, "it is of the method"
+        if limit_bytes < self.maker.least_bytes:
+            return False
         expected = expected_bytes(
             pending.request,
             cost=self._cost_of(job.header.codec).estimate(),

@@ -22,6 +22,7 @@ from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Gate, Suppression
 
 _TRIAL_PX = 48
+_LEAST_STILL_BYTES = 400
 _DETAIL = "detail_weight"
 _FINER = 0.5
 """Of `_hidden_pixels`."""
@@ -139,5 +140,7 @@ def make_still_maker(config: EdgeConfig, *, readable: Callable[[str], bool]) -> 
         quality_pct=config.jpeg_quality,
         fidelity_db=config.fidelity,
         padding=config.padding,
+        # Others have a lowest quality; what builds on the base would be made to fit whatever there is.
+        least_bytes=_LEAST_STILL_BYTES if codec.needs_base else 0,
         readable=readable,
     )

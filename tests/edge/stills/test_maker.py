@@ -476,3 +476,27 @@ def test_one_still_of_several_beats_the_base_at_each_of_them():
     for x1, x2 in ((300, 420), (440, 560)):
         truth = source[200:280, x1:x2]
         assert mse(shown[12:92, x1 - 282 : x2 - 282], truth) < mse(base[200:280, x1:x2], truth)
+
+
+@pytest.mark.parametrize("fidelity_db", [0.0, 33.0, 36.0])
+@pytest.mark.parametrize("limit", [50, 300, 399, 400, 1000, 100_000])
+def test_a_still_too_small_to_change_anything_gets_more_bytes_or_waits_for_them(fidelity_db, limit):
+    """Stills of 26 bytes would be sent, each with a header of a hundred, and show what the base shows."""
+    source = scene(640, 360, seed=4)
+    frame, box = frame_of(source), (100.0, 80.0, 190.0, 150.0)
+    maker = StillMaker(
+        codec=still_codec("residual"),
+        fallback=still_codec("h264-intra"),
+        fidelity_db=fidelity_db,
+        least_bytes=400,
+    )
+    view = View.fitted((640, 360), (640, 360), fit="letterbox")
+    base = cv2.blur(source, (15, 15))
+    job = maker.crop(frame, request_for(box), view=view, base=base)
+    assert not isinstance(job, NoStill)
+    made = maker.code(job, sequence=0, allowance=lambda _still: limit)
+    if limit < 400:
+        assert made == NoStill("too_large")
+    elif not isinstance(made, NoStill):
+        assert 400 <= len(made.data) <= limit
+    assert limit < 100_000 or isinstance(made, Still)

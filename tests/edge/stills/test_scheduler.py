@@ -418,3 +418,12 @@ def test_a_lost_still_keeps_to_the_budget(allowance):
     rig.consider({})
     assert rig.sent_tracks(allowance) == []
     assert rig.sent_tracks(400) == [(50, 9.0)]
+
+
+def test_what_is_allowed_next_to_nothing_waits_for_an_allowance_that_helps():
+    """Each scrap of the budget would go at once to a still that shows nothing, and none be left for one that does."""
+    rig = Rig(maker=StillMaker(least_bytes=400), most_bytes=300)
+    rig.consider({1: box_at(1)})
+    assert rig.stills(399) == []
+    assert len(rig.outbox) == 1
+    assert rig.stills(20_000) == [1]
