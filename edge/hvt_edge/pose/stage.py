@@ -8,7 +8,7 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Final, Protocol
 
 from hvt_common.protocol.messages import PoseEncoder
-from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.units import SECOND_NS
 from hvt_edge.pose.contract import PoseSource
 
@@ -48,12 +48,12 @@ class PoseStage:
         if self._due_ns is not None and capture_ns < self._due_ns:
             return
         self._due_ns = capture_ns + round(_EARLY * SECOND_NS)
-        pose = self.source.at(media_ns, capture_ns=capture_ns)
         encoder = copy(self._encoder)  # the next report builds on the last one that was sent
         try:
+            pose = self.source.at(media_ns, capture_ns=capture_ns)
             make = None if pose is None else encoder.encode(pose)
-        except ValueError as error:  # a number from outside that no place on earth has
-            self.failures.failed(_PART, str(error))
+        except Exception as error:  # noqa: BLE001 - what an autopilot says ends no flight, whatever it is
+            self.failures.failed(_PART, reason_of(error))
             return
         if make is None:
             self.failures.failed(_PART, self.source.trouble)

@@ -13,6 +13,7 @@ Settings and why (measured on drone_carpark, intel_car-detection and a panning a
   network runs beside it. They are given back that of the frame loop, where the process may do that.
 * ``open-gop=0`` makes a forced I frame an IDR, but within ``min-keyint`` of the last one (a second, by default) it
   stays a plain I frame that nobody can start at; ``repeat-headers=1`` puts the parameter sets before an IDR.
+* ``info=0``: else each keyframe carries x265's settings as text, 2.4 kB.
 * BT.709 limited range, signalled: viewers assume it for HD.
 * ``side_data`` attaches regions of interest (see regions). Without any region the bytes are the same as without
   it, the two fastest presets apart.
@@ -139,6 +140,7 @@ def _open(settings: EncoderSettings) -> VideoCodecContext:
         "colormatrix": "bt709",
         "range": "limited",
         "log-level": "none",
+        "info": 0,
     }
     if settings.side_data and settings.preset in _WITHOUT_AQ:
         parameters |= {"aq-mode": 1, "aq-strength": 0.01}

@@ -57,8 +57,8 @@ def base_size(config: EdgeConfig) -> BaseSize:
         return lambda source_size: source_size
     if config.size is None:
         fit = cast("Fit", config.fit)
-        return lambda source_size: _carried(config, default_size(source_size, fit=fit))
-    return lambda source_size: _carried(config, _chosen(config, source_size, size=None)[0])
+        return lambda source_size: _affordable(config, default_size(source_size, fit=fit))
+    return lambda source_size: _affordable(config, _chosen(config, source_size, size=None)[0])
 
 
 def say_size(config: EdgeConfig, view: View) -> None:
@@ -76,15 +76,15 @@ def say_size(config: EdgeConfig, view: View) -> None:
         )
 
 
-def _carried(config: EdgeConfig, size: tuple[int, int]) -> tuple[int, int]:
+def _affordable(config: EdgeConfig, size: tuple[int, int]) -> tuple[int, int]:
     """This size, or the largest below it that the budget carries; where none is, the smallest."""
     if config.budget_bps >= least_budget_bps(config, size, share=config.share) or min(size) < LEAST_SIDE_PX:
         return size
     smaller = [one for one in sizes_of(size) if one[0] * one[1] < size[0] * size[1]] or [size]
-    carried = (
+    affordable = (
         one for one in smaller if config.budget_bps >= least_budget_bps(config, one, share=config.share)
     )
-    return next(carried, smaller[-1])
+    return next(affordable, smaller[-1])
 
 
 def default_size(source_size: tuple[int, int], *, fit: Fit) -> tuple[int, int]:

@@ -72,6 +72,23 @@ def test_where_there_is_none_it_says_so_and_goes_on():
     assert "has nothing at" in part.reason
 
 
+def test_an_error_in_the_source_of_poses_ends_no_flight():
+    """Video would end over a message of the autopilot that nobody had thought of."""
+
+    class Broken:
+        trouble = ""
+
+        def at(self, media_ns, *, capture_ns):
+            raise ZeroDivisionError(f"at {media_ns} of {capture_ns}")
+
+        def close(self):
+            pass
+
+    sent, failures = fly(Broken(), seconds=3)
+    assert sent.messages == []
+    assert "ZeroDivisionError" in failures.parts[0].reason
+
+
 def test_a_number_that_cannot_be_said_is_named():
     """A broken sensor would end the flight."""
     high = [Pose(0, 52.0, 13.0, height_m=1e9), Pose(9 * SECOND_NS, 52.0, 13.0, height_m=1e9)]

@@ -14,11 +14,13 @@ from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failures
+from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.config import EdgeConfig, least_budget_bps
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.regions import TrackRegions
@@ -266,3 +268,43 @@ def test_what_has_room_nowhere_is_left_out_said_and_followed_by_a_keyframe():
     rig.play(pictures)
     assert BaseDecoder().decode(rig.kept.units[0]) is not None, "it begins with a keyframe"
     assert rig.failures.parts[0].working
+
+
+@pytest.mark.parametrize("size", [(160, 128), (320, 192), (640, 360)])
+@pytest.mark.parametrize("fps", [2, 5, 15])
+@pytest.mark.parametrize("above", [1.0, 1.5])
+def test_the_least_budget_that_is_accepted_holds_in_every_second_to_the_byte(size, fps, above):
+    """A thin link would get twice what it carries with each keyframe."""
+    config = EdgeConfig(source="demo", method="M0", fps=fps, size=size, video_share=1.0)
+    total_bps = round(above * least_budget_bps(config, size, share=1.0))
+    kept, ledger, failures = Kept(), Ledger(), Failures(time.time_ns)
+    settings = encoder_settings(
+        size=size, fps=fps, preset="ultrafast", total_bps=total_bps, base_bps=total_bps, edge_id="edge-1"
+    )
+    stage = BaseStage(
+        BaseEncoder(settings),
+        keyframes=KeyframeRequests(),
+        transmitter=Transmitter(
+            kept,
+            ledger=ledger,
+            budget=RollingBudget(BudgetSettings(total_bps, total_bps, fps=fps)),
+            edge_id="edge-1",
+            session_id=1,
+            lockstep=True,
+            wait_until=lambda _at_ns: None,
+        ),
+        local_copy=None,
+        first_keyframe_bytes=total_bps // 40,
+        failures=failures,
+    )
+    pictures = hard_pictures(12 * fps, size=size)
+    for index, picture in enumerate(pictures):
+        frame = Frame(index, START_NS + index * SECOND_NS // fps, picture, picture)
+        if index % (4 * fps) == fps:
+            stage.keyframes.request(frame.capture_ns)
+        decision = stage.decide(frame, now_ns=frame.capture_ns)
+        unit = stage.encode(frame, decision, now_ns=frame.capture_ns)
+        if unit is not None:
+            stage.send(unit, decision, now_ns=frame.capture_ns)
+    assert ledger.worst_window_bps.total <= total_bps
+    assert len(kept.units) > 0.9 * len(pictures), "and there is a picture"
