@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import select
+import socket
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +16,23 @@ from typing import NoReturn
 
 from hvt_common.redaction import Redaction
 
-__all__ = ["FlightError", "Parser", "UserError", "exit_with_sentence", "needs_extra"]
+__all__ = [
+    "FlightError",
+    "NotYetError",
+    "Parser",
+    "UserError",
+    "exit_with_sentence",
+    "may_come",
+    "needs_extra",
+]
+
+_MAY_COME = frozenset(
+    {
+        *(errno.EADDRNOTAVAIL, errno.EADDRINUSE, errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH),
+        *(errno.EHOSTDOWN, errno.ECONNREFUSED, errno.ECONNRESET, errno.ECONNABORTED, errno.ETIMEDOUT),
+        *(errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EBUSY, errno.EAGAIN),
+    }
+)
 
 
 class UserError(Exception):
@@ -27,6 +45,19 @@ class UserError(Exception):
 
     said = False
     """Whether the log has the sentence already."""
+
+
+class NotYetError(UserError):
+    """What is named is not there and may come: a camera that boots, the address of a VPN, another program's port.
+
+    A program that serves waits for it (`hvt_common.runtime.failures.Awaited`); any other ends with exit code 1, so
+    that a supervisor starts it again.
+    """
+
+
+def may_come(error: OSError) -> bool:
+    """Whether time may mend it: something is not there or not free yet, or a name that no server knows yet."""
+    return isinstance(error, socket.gaierror | TimeoutError) or error.errno in _MAY_COME
 
 
 class FlightError(Exception):
@@ -50,7 +81,7 @@ class Parser(argparse.ArgumentParser):
 def exit_with_sentence(
     run: Callable[[Sequence[str] | None], int], *, program: str, argv: Sequence[str] | None
 ) -> int:
-    """Return the exit code of ``run(argv)``: 2 after a `UserError`, 1 after a `FlightError`, said on stderr.
+    """Return the exit code of ``run(argv)``: 2 after a `UserError`, 1 after a `FlightError` or a `NotYetError`, said.
 
     Neither that nor a traceback has the secrets of an address in ``argv``.
 
@@ -64,7 +95,7 @@ def exit_with_sentence(
     except (UserError, FlightError) as error:
         if not error.said:
             print(f"{program}: {redaction.text(str(error))}", file=sys.stderr)
-        return 2 if isinstance(error, UserError) else 1
+        return 2 if isinstance(error, UserError) and not isinstance(error, NotYetError) else 1
     except BrokenPipeError:
         if sys.stdout is None or not _reader_left():
             raise

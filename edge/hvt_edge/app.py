@@ -13,6 +13,7 @@ from hvt_common.errors import FlightError, UserError, needs_extra
 from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
+from hvt_common.runtime.failures import Awaited
 from hvt_common.runtime.health_server import HealthServer, state_answers
 from hvt_common.runtime.log import START_LOGGER
 from hvt_common.runtime.process import notify_systemd, with_lower_priority
@@ -32,7 +33,7 @@ from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.perception.guarded_detector import GuardedDetector
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
-from hvt_edge.source.live import closing_on
+from hvt_edge.source.live import SOURCE_PART, closing_on
 from hvt_edge.status import StatusReporter, status_text
 from hvt_edge.summary import summary
 from hvt_edge.wiring import (
@@ -100,7 +101,7 @@ class Edge:
         with ExitStack() as stack:
             if config.metrics is not None:
                 stack.enter_context(self._health_server(config.metrics))
-            source = stack.enter_context(world.open_source(config))
+            source = stack.enter_context(self._source_when_there())
             for note in source.notes:
                 logging.getLogger(START_LOGGER).info("source: %s", note)
             config = self._config = as_the_camera_is(config, source)
@@ -305,6 +306,14 @@ class Edge:
             loop_clock=self._loop_clock,
         )
 
+    def _source_when_there(self) -> Source:
+        """Wait for a camera that starts after us; `FlightError` where we are stopped before."""
+        awaited = Awaited(partial(self._world.open_source, self._config), SOURCE_PART, self._failures)
+        source = awaited.wait(self._stop)
+        if source is None:
+            raise FlightError(f"stopped before the source was there: {awaited.error}")
+        return source
+
     def _health_server(self, address: str) -> HealthServer:
         with needs_extra("'hvt[metrics]'"):
             from hvt_edge.health.metrics import metrics_text  # noqa: PLC0415 - who is not watched needs no Prometheus
@@ -317,7 +326,7 @@ class Edge:
             metrics_text=metrics_text,
             lacks=lambda state: lacks(state, patience_s=_SILENT_S + 2 * frame_s),
         )
-        return HealthServer(address, answers, name="--metrics")
+        return HealthServer(address, answers, name="--metrics", failures=self._failures)
 
     def _say_goodbye(self, stages: Stages, link: EdgeLink, status: StatusReporter) -> None:
         """Say that this was all, and let the ground finish."""

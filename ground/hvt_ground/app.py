@@ -104,17 +104,21 @@ class Ground:
         with ExitStack() as stack:
             view: LiveView | None = None
             if config.view or config.serve:
-                view = stack.enter_context(LiveView("spawn" if config.view else "serve"))
+                view = stack.enter_context(LiveView("spawn" if config.view else "serve", later=True))
             if config.metrics is not None:
-                stack.enter_context(self._health_server(config.metrics))
+                stack.enter_context(self._health_server(config.metrics, models.failures))
             retention = Retention(config.keep, config.keep_video)
             index = RecordingsFolder(config.record_folder, retention, failures=models.failures)
             stack.enter_context(index)
             settings = make_link_settings(config)
-            page = None if config.web is None else stack.enter_context(self._open_page(config.web, settings))
+            page = (
+                None
+                if config.web is None
+                else stack.enter_context(self._open_page(config.web, settings, models.failures))
+            )
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)
-            session = stack.enter_context(open_session(settings))
+            session = stack.enter_context(open_session(settings, failures=models.failures))
             if page is not None:
                 page.use(EdgeClient.of_session(session, settings))
             make_record_folder(config)
@@ -162,12 +166,13 @@ class Ground:
 
     # Before anything is received
 
-    def _open_page(self, address: str, settings: LinkSettings) -> WebPage:
+    def _open_page(self, address: str, settings: LinkSettings, failures: Failures) -> WebPage:
         with needs_extra("'hvt[web]'"):  # only now: who serves none starts faster
             from hvt_ground.web import WebPage  # noqa: PLC0415
         return WebPage(
             address,
             clock=self._clock,
+            failures=failures,
             keys=key_pair(settings),
             proxy=self._config.web_proxy,
             recorded=self._config.record is not None,
@@ -184,14 +189,14 @@ class Ground:
 
     # Who watches
 
-    def _health_server(self, address: str) -> HealthServer:
+    def _health_server(self, address: str, failures: Failures) -> HealthServer:
         with needs_extra("'hvt[metrics]'"):
             from hvt_ground.metrics import metrics_text  # noqa: PLC0415 - who is not watched needs no Prometheus
 
         answers = state_answers(
             lambda: self._state, clock=self._clock, stuck_s=_STUCK_S, metrics_text=metrics_text
         )
-        return HealthServer(address, answers, name="--metrics")
+        return HealthServer(address, answers, name="--metrics", failures=failures)
 
     # Serving
 

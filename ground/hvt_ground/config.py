@@ -9,7 +9,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from hvt_common.config import BYTES, DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
@@ -277,7 +277,8 @@ def _check_retention(config: GroundConfig) -> None:
 def _check_files(config: GroundConfig) -> None:
     """Two files must not be one. What is written into a folder has names of its own, and a device takes anything."""
     if config.stills is not None and not config.stills.is_dir():
-        raise UserError(f"--stills {config.stills} is no folder: create it, or name one that is there")
+        kind = UserError if config.stills.exists() else NotYetError
+        raise kind(f"--stills {config.stills} is no folder: create it, or name one that is there")
     files: dict[str, str] = {}
     for name, path, suffix in (
         ("--record", config.record, ".rrd"),

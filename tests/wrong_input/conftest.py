@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import signal
-import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -35,9 +34,9 @@ def refused(here: Path, capfd: pytest.CaptureFixture[str]) -> Iterator[Refused]:
     handlers = {one: signal.getsignal(one) for one in STOP_SIGNALS}
     kept = logging.getLogger().handlers[:]
 
-    def refused(program: str, *settings: str) -> str:
+    def refused(program: str, *settings: str, code: int = 2) -> str:
         before = snapshot(here)
-        assert _PROGRAMS[program]([*settings, "--quiet"]) == 2
+        assert _PROGRAMS[program]([*settings, "--quiet"]) == code
         out, err = capfd.readouterr()
         assert out == ""
         return checked(err, program=program, left=snapshot(here) - before)
@@ -56,12 +55,3 @@ def pictures(here: Path) -> str:
     for index in range(2):
         cv2.imwrite(str(folder / f"{index}.png"), np.full((64, 96, 3), 40 * index, np.uint8))
     return "pictures"
-
-
-@pytest.fixture
-def taken_port() -> Iterator[int]:
-    """A TCP port of loopback on which somebody else listens."""
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        yield int(other.getsockname()[1])

@@ -15,27 +15,23 @@ pytestmark = pytest.mark.timeout(60)
 def ground(refused, free_port):
     """Refuse settings on top of a run that would otherwise work, and end by itself."""
 
-    def ground(*settings: str) -> str:
+    def ground(*settings: str, code: int = 2) -> str:
         listen = () if "--listen" in settings else ("--listen", f"tcp/127.0.0.1:{free_port}")
-        return refused("hvt-ground", *listen, "--once", "--wait", "1s", *settings)
+        return refused("hvt-ground", *listen, "--once", "--wait", "1s", *settings, code=code)
 
     return ground
 
 
-def test_a_port_in_use_leaves_nothing_behind(ground, taken_port):
+def test_a_failed_start_leaves_nothing_behind(ground):
     """A second ground would look as if it worked, and the files of the first would be touched."""
     for record in ("flight.rrd", "recordings"):
-        sentence = ground(
-            "--listen", f"tcp/127.0.0.1:{taken_port}", "--record", record, "--summary", "s.json"
-        )
-        assert str(taken_port) in sentence
-        assert "in use" in sentence
+        ground("--listen", "tcp/0.0.0.0:7999", "--record", record, "--summary", "s.json")
 
 
-def test_a_failed_start_leaves_an_old_recording_as_it_was(ground, here, taken_port):
+def test_a_failed_start_leaves_an_old_recording_as_it_was(ground, here):
     """The flight of yesterday would be gone."""
     Path("flight.rrd").write_bytes(b"yesterday")
-    ground("--listen", f"tcp/127.0.0.1:{taken_port}", "--record", "flight.rrd")
+    ground("--listen", "tcp/0.0.0.0:7999", "--record", "flight.rrd")
     assert Path("flight.rrd").read_bytes() == b"yesterday"
 
 
@@ -70,7 +66,9 @@ def test_a_file_that_cannot_be_written(ground, here, flag, path):
     """The flight would be over before anybody sees that it was not kept."""
     Path("notes.txt").write_text("not a recording")
     Path("folder").mkdir()
-    assert f"{flag} {path}" in ground(flag, path)
+    # A folder that is missing may be of a disk that is mounted later: a supervisor starts the ground again.
+    code = 1 if path.startswith("missing/") or path == "/proc/flights" else 2
+    assert f"{flag} {path}" in ground(flag, path, code=code)
 
 
 @pytest.mark.parametrize("pattern", ["UAV_*", "", "a/b", "**/x"])

@@ -36,15 +36,6 @@ def test_one_sentence_and_exit_code_2(here, module, words, told):
     assert told in checked(done.stderr, program=program, left=snapshot(here) - before)
 
 
-def test_a_second_ground_on_the_port_of_the_first(here, taken_port):
-    """Zenoh's own error would name a source file of whoever built it."""
-    done = started("hvt_ground.cli", "--listen", f"tcp/127.0.0.1:{taken_port}", folder=here)
-    assert done.returncode == 2
-    assert f"tcp/127.0.0.1:{taken_port}: the port is in use" in checked(
-        done.stderr, program="hvt-ground", left=snapshot(here)
-    )
-
-
 @pytest.mark.parametrize("module", ["hvt_edge.cli", "hvt_ground.cli"])
 def test_help_is_not_an_error(here, module):
     """Who asks for help would be told off."""

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import Redaction
 from hvt_common.units import SECOND_NS
 
-__all__ = ["FailedPart", "Failure", "Failures", "Retried", "RetryPause", "reason_of"]
+__all__ = ["Awaited", "FailedPart", "Failure", "Failures", "Retried", "RetryPause", "reason_of"]
 
 _log = logging.getLogger(__name__)
 
@@ -175,3 +175,46 @@ class Retried(Generic[_Part]):
                 self._failed = False
                 self._failures.works(self._name)
             return answer
+
+
+class Awaited(Generic[_Part]):
+    """A part that may not be there yet: opened at once, or else by `wait`, again and again until it is.
+
+    ``failures`` has it under ``name``. Raises what ``open_part`` does but `NotYetError`.
+    """
+
+    def __init__(
+        self,
+        open_part: Callable[[], _Part],
+        name: str,
+        failures: Failures,
+        *,
+        longest_s: float = 5.0,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._open_part = open_part
+        self._name = name
+        self._failures = failures
+        self._clock = clock
+        self._pause = RetryPause(longest_ns=round(longest_s * SECOND_NS))
+        self.error: UserError | None = None
+        """Why it is not there."""
+        self.part = self._tried()
+        """None while it is not there."""
+
+    def wait(self, stop: threading.Event) -> _Part | None:
+        """The part, once it is there; None where ``stop`` was set before."""
+        while self.part is None and not stop.wait(self._pause.pause_ns / SECOND_NS):
+            self.part = self._tried()
+        return self.part
+
+    def _tried(self) -> _Part | None:
+        try:
+            part = self._open_part()
+        except NotYetError as error:
+            self.error = error
+            self._pause.failed(self._clock())
+            self._failures.failed(self._name, reason_of(error))
+            return None
+        self._failures.works(self._name)
+        return part

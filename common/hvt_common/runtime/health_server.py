@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import socket
 import threading
 from collections.abc import Callable, Mapping
@@ -18,7 +19,8 @@ from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 from urllib.parse import urlsplit
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError, may_come
+from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.units import SECOND_NS
 
 __all__ = ["Answer", "HealthServer", "State", "state_answers"]
@@ -98,19 +100,40 @@ def state_answers(
 class HealthServer:
     """Serves ``answers``, by path, at ``address`` (HOST:PORT) while the context lasts; ``name`` is the option's.
 
-    Raises `UserError` where the address is none or cannot be listened on.
+    An address that is not there yet, or a port that is not free, is waited for. Raises `UserError` where the
+    address is none or can never be listened on.
     """
 
-    def __init__(self, address: str, answers: Mapping[str, Callable[[], Answer]], *, name: str) -> None:
+    def __init__(
+        self,
+        address: str,
+        answers: Mapping[str, Callable[[], Answer]],
+        *,
+        name: str,
+        failures: Failures,
+    ) -> None:
         host, port = _parsed(address, name=name)
-        try:
-            self._server = _Server(host, port, answers)
-        except OSError as error:
-            raise UserError(
-                f"{name} {address} cannot be listened on ({error.strerror or error}): give another port, or end "
-                "what uses it"
-            ) from None
-        self._thread = threading.Thread(target=self._server.serve_forever, name="hvt-health", daemon=True)
+
+        def bound() -> _Server:
+            try:
+                return _Server(host, port, answers)
+            except OSError as error:
+                kind = NotYetError if may_come(error) else UserError
+                raise kind(
+                    f"{name} {address} cannot be listened on ({error.strerror or error}): give another port, or "
+                    "end what uses it"
+                ) from None
+
+        self._server = Awaited(bound, "metrics", failures)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hvt-health", daemon=True)
+
+    def _run(self) -> None:
+        server = self._server.wait(self._stop)
+        if server is not None:
+            with server:
+                while not self._stop.is_set():
+                    server.handle_request()
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -119,13 +142,13 @@ class HealthServer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+        self._stop.set()
         self._thread.join()
 
 
 class _Server(ThreadingMixIn, HTTPServer):
     request_queue_size = 16
+    timeout = 0.2
     daemon_threads = True
     block_on_close = False
 
@@ -191,6 +214,6 @@ def _parsed(address: str, *, name: str) -> tuple[str, int]:
         host, port = parts.hostname or "", parts.port or 0
     except ValueError:
         host, port = "", 0
-    if not host or not port or parts.path or parts.query:
+    if not re.fullmatch(r"[\w.:%-]+", host) or not port or parts.path or parts.query:
         raise UserError(f"{name} {address!r} is not accepted: give HOST:PORT, such as 127.0.0.1:9464")
     return host, port

@@ -16,6 +16,7 @@ from typing import Any
 
 from hvt_common.errors import FlightError, UserError
 from hvt_common.redaction import Redaction
+from hvt_common.runtime import failures
 
 __all__ = ["LOG_FORMATS", "START_LOGGER", "STATUS_LOGGER", "Log", "log_fields", "start_log"]
 
@@ -120,6 +121,13 @@ class _HeldLog(logging.handlers.MemoryHandler):
         """Write the buffered records, and from now on each at once."""
         self._free = True
         self.flush()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """What a start waits for is said at once: it may take hours."""
+        if self._free or record.name != failures.__name__:
+            super().emit(record)
+        else:
+            self.target.handle(record)
 
     def shouldFlush(self, record: logging.LogRecord) -> bool:  # noqa: ARG002, N802 - the library's name
         """At once, when free."""

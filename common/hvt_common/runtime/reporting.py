@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from hvt_common.errors import FlightError, UserError
+from hvt_common.errors import FlightError, NotYetError, UserError
 from hvt_common.runtime.log import STATUS_LOGGER
 
 __all__ = ["StatusLine", "check_writable", "print_table", "say", "write_json"]
@@ -119,7 +119,7 @@ def check_writable(path: Path | None, *, name: str) -> None:
     if path.is_dir():
         raise UserError(f"{name} {path} is a folder: name a file")
     if not path.absolute().parent.is_dir():
-        raise UserError(
+        raise NotYetError(  # it may be of a disk that is mounted later
             f"{name} {path} is in a folder that does not exist: make {path.absolute().parent} first"
         )
     if path.exists() and not path.is_file():  # /dev/stdout or a pipe: opening it to see may block

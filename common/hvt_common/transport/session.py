@@ -6,18 +6,21 @@ loopback by default. Callbacks of Zenoh never block: they copy into an `Inbox`, 
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, EdgeKeys
+from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.transport.doctor.certificate import check_own_keys
 from hvt_common.transport.doctor.diagnose import visit
 from hvt_common.transport.inbox import Inbox, Received, ReceivedQueue
@@ -39,26 +42,78 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 _CLOSE_WITHIN_S = 0.8
+_TCP_LISTEN = "0A"
+_MAY_COME = re.compile(
+    "Cannot assign requested address|Address already in use|No such device|Network is (unreachable|down)"
+    "|failed to lookup address"
+)
+"""What Zenoh says of an address that is not there yet, or not free."""
 
 
 @contextmanager
-def open_session(settings: LinkSettings) -> Iterator[zenoh.Session]:
+def open_session(settings: LinkSettings, *, failures: Failures | None = None) -> Iterator[zenoh.Session]:
     """A running session; closed within a second on the way out, whatever state the link is in.
 
-    A connecting side does not wait for the other: it goes on trying for as long as the session is open. Raises
-    UserError for endpoints, files, keys and ports that cannot be used. With RUST_LOG set, Zenoh logs to stderr.
+    A connecting side does not wait for the other: it goes on trying for as long as the session is open. With
+    ``failures`` so does a listening one whose address is not there yet or whose port is not free. Raises UserError
+    for endpoints, files, keys and ports that cannot be used. With RUST_LOG set, Zenoh logs to stderr.
     """
     config, listen = configure(settings)
     check_own_keys(config, listen=listen, name=settings.name, now_s=time.time())
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
+    stop = threading.Event()
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        why = _open_failure(str(error), listen, config)
+        if failures is None or not _MAY_COME.search(str(error)):
+            raise UserError(why) from None
+        session = _open_listening_later(config, listen, why, failures, stop)
+    try:
+        yield session
+    finally:
+        stop.set()
+        _close(session)
+
+
+def _open_listening_later(
+    config: zenoh.Config, listen: tuple[str, ...], why: str, failures: Failures, stop: threading.Event
+) -> zenoh.Session:
+    """A session that listens as soon as it can; ``failures`` learns when."""
+    retry = {"period_init_ms": 500, "period_max_ms": 500, "period_increase_factor": 1.0}
+    for key, value in (("timeout_ms", -1), ("exit_on_failure", False), ("retry", retry)):
+        config.insert_json5(f"listen/{key}", json.dumps(value))
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
         raise UserError(_open_failure(str(error), listen, config)) from None
-    try:
-        yield session
-    finally:
-        _close(session)
+
+    wanted = {int(found[1]) for endpoint in listen if (found := re.search(r":(\d+)([?#]|$)", endpoint))}
+
+    def bound() -> bool:
+        if not wanted <= _listening_ports():
+            raise NotYetError(why)
+        return True
+
+    part = Awaited(bound, "listener", failures, longest_s=1.0)
+    threading.Thread(target=part.wait, args=[stop], name="hvt-listen", daemon=True).start()
+    return session
+
+
+def _listening_ports() -> set[int]:
+    """Ports that this process listens on, by what Linux says: Zenoh does not say when its listener has come."""
+    sockets = set()
+    for one in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # closed meanwhile
+            sockets.add(str(one.readlink()))
+    ports = set()
+    for table in ("tcp", "tcp6", "udp", "udp6"):
+        with suppress(OSError):  # a kernel without IPv6
+            for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
+                _, local, _, state, *_, inode = line.split()[:10]
+                if f"socket:[{inode}]" in sockets and (state == _TCP_LISTEN or table.startswith("udp")):
+                    ports.add(int(local.rpartition(":")[2], 16))
+    return ports
 
 
 def declare_publisher(session: zenoh.Session, channel: Channel, *, keys: EdgeKeys) -> zenoh.Publisher:

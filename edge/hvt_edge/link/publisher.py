@@ -87,7 +87,7 @@ class ZenohLink:
         refuse_duplicate_edge(settings, self._keys)
         self._listener: EdgeListener | None = None
         self._stack = ExitStack()
-        self._session = self._stack.enter_context(open_session(settings))
+        self._session = self._stack.enter_context(open_session(settings, failures=failures))
         self._publishers = {
             channel: declare_publisher(self._session, channel, keys=self._keys) for channel in _PUBLISHED
         }

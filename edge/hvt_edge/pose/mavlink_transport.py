@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import socket
@@ -14,9 +15,11 @@ from typing import Protocol, Self
 
 import serial  # type: ignore[import-untyped]
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, may_come
 
 __all__ = ["Address", "Connection"]
+
+_log = logging.getLogger(__name__)
 
 _ACCEPTED = "give mavlink:udpin:HOST:PORT, mavlink:tcp:HOST:PORT or mavlink:/dev/DEVICE[,BAUD]"
 _KINDS = ("udpin", "tcp")
@@ -108,7 +111,7 @@ class Address:
 class Connection:
     """An address that is opened again where it is lost, after pauses that grow; used by one thread.
 
-    Raises `UserError` where it cannot be opened at first.
+    What is not there yet at first is opened later, which the log says. Raises `UserError` for what can never be.
     """
 
     def __init__(self, address: Address, *, stop: threading.Event, silent_s: float = _SILENT_S) -> None:
@@ -118,12 +121,15 @@ class Connection:
         """Attempts, since something came."""
         self.trouble = ""
         """Why it is not open; read by any thread."""
+        self._link: Link | None = None
         try:
-            self._link: Link | None = self._open()
+            self._link = self._open()
         except OSError as error:
-            raise UserError(
-                f"--pose mavlink:{address.text:.200} cannot be opened: {_reason(error)}; {_ACCEPTED}"
-            ) from None
+            said = f"--pose mavlink:{address.text:.200} cannot be opened: {_reason(error)}"
+            if not may_come(error):
+                raise UserError(f"{said}; {_ACCEPTED}") from None
+            self._failed, self.trouble = 1, _reason(error)
+            _log.warning("%s; all else goes on without a pose, and it is tried again", said)
 
     def read(self) -> bytes:
         """What has come in a fraction of a second; nothing while it is not open."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import stat
 import time
@@ -10,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_edge.source.live import Shot, SignalLost
 
 __all__ = ["CameraGrabber"]
@@ -38,16 +39,15 @@ class CameraGrabber:
         path = Path(self.name)
         if not path.exists():
             found = ", ".join(sorted(str(one) for one in Path("/dev").glob("video*"))) or "none"
-            raise UserError(f"camera {self.name} does not exist; devices here: {found}")
+            raise NotYetError(f"camera {self.name} does not exist; devices here: {found}")
         # By number: a name like /dev/v4l/by-id/… is a link to it, and OpenCV takes a negative one for "any camera".
         number = re.fullmatch(r"video(\d+)", path.resolve().name)
         if number is None or not stat.S_ISCHR(path.stat().st_mode):
             raise UserError(f"camera {self.name} is no video device; accepted is /dev/videoN")
         capture = _quietly_opened(int(number[1]))
         if not capture.isOpened():
-            raise UserError(
-                f"camera {self.name} cannot be opened: it is no V4L2 camera, in use, or not permitted"
-            )
+            kind = NotYetError if os.access(path, os.R_OK | os.W_OK) else UserError
+            raise kind(f"camera {self.name} cannot be opened: it is no V4L2 camera, in use, or not permitted")
         # Uncompressed 1080p does not fit USB 2; a camera without MJPEG keeps its own format.
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, _REQUESTED_SIZE[0])

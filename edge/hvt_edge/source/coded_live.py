@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Fit, Frame, Image
 from hvt_edge.source.camera_stream import (
@@ -187,7 +187,7 @@ class CodedLiveSource(LiveSource):
             at_s = time.monotonic() - began_s if packet.at_s is None else packet.at_s
             seen.append(SeenUnit(at_s, len(unit.data), unit.keyframe))
         if grabber.size is None or len(seen) < 2:
-            raise UserError(
+            raise NotYetError(
                 f"source {grabber.name} gave no HEVC picture that can be passed on within {_MOST_SURVEY_S:g} s "
                 f"({trouble})"
             )

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.units import SECOND_NS
@@ -113,7 +113,7 @@ class LiveSource(Source):
             first_size = self._first_size(grabber, size)
         except SignalLost as error:
             grabber.close()
-            raise UserError(f"source {grabber.name} opens but delivers no picture ({error})") from error
+            raise NotYetError(f"source {grabber.name} opens but delivers no picture ({error})") from error
         except UserError:
             grabber.close()
             raise

@@ -12,7 +12,7 @@ from typing import Any
 import av
 import av.error
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
 from hvt_edge.source.decoding.container import cause_of, choose_stream
 from hvt_edge.source.decoding.notes import Notes
@@ -29,6 +29,11 @@ _UNDECODED_S = 10.0
 _MOST_TIMES = 64
 _READ_S = 2.0  # also how long closing may take
 
+_NEVER = (
+    *(av.error.HTTPUnauthorizedError, av.error.HTTPForbiddenError, av.error.HTTPBadRequestError),
+    *(av.error.ProtocolNotFoundError, av.error.InvalidDataError, av.error.PermissionError, ValueError),
+)
+"""Whatever else refuses a stream may be a camera or a server that starts after us."""
 _OPTIONS = {
     "rtsp_transport": "tcp",  # over UDP a camera's keyframes lose packets on the first busy switch
     "fflags": "nobuffer",
@@ -151,11 +156,12 @@ def _open(url: str, *, open_s: float) -> Any:
         return av.open(url, options=_OPTIONS, timeout=(open_s, _READ_S))
     except (av.error.FFmpegError, OSError, ValueError) as error:
         name, cause = redacted(url), cause_of(error)
+        kind = UserError if isinstance(error, _NEVER) else NotYetError
         if isinstance(error, av.error.InvalidDataError) and url.lower().startswith("http"):
             # A camera's JPEGs without the boundary before the first: FFmpeg finds them by their own beginnings.
             with suppress(av.error.FFmpegError, OSError):
                 return _pictures_of(av.open(url, format="mjpeg", options=_OPTIONS, timeout=(open_s, _READ_S)))
-    raise UserError(f"source {name} cannot be opened within {open_s:g} s ({cause}){_spelt(url)}")
+    raise kind(f"source {name} cannot be opened within {open_s:g} s ({cause}){_spelt(url)}")
 
 
 def _pictures_of(container: Any) -> Any:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import SECOND_NS
@@ -57,9 +57,10 @@ def check_store(config: EdgeConfig, *, live: bool) -> None:
         there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
         usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
     except OSError:  # a part of the path may not be looked into
-        usable, there = False, path
+        usable, there = False, path.absolute()
     if not usable:
-        raise UserError(
+        kind = UserError if there == path.absolute() else NotYetError
+        raise kind(
             f"--store-folder {path} cannot be used, because {there} is no folder that can be written: name another, "
             "or give --store 0 to store nothing"
         )

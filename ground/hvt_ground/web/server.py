@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import logging
+import re
 import socket
 import ssl
 import struct
@@ -19,8 +20,9 @@ from urllib.parse import urlsplit
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError, may_come
 from hvt_common.protocol.messages import Info
+from hvt_common.runtime.failures import Awaited, Failures
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Refinement
 from hvt_ground.state import GroundState
@@ -43,6 +45,8 @@ _MOST_ADDRESSES = 3
 class WebPage:
     """Serves the page at ``address`` (HOST:PORT) while the context lasts; ``clock`` is the ground's.
 
+    An address that is not there yet, or a port that is not free, is waited for; without ``failures`` nobody hears.
+
     ``keys``, a certificate and its key, encrypt it beyond loopback. ``proxy`` is the host for which a reverse proxy
     on this machine answers, ``recorded`` whether this ground writes recordings. Raises `UserError` where the address,
     the tokens or the keys cannot be used.
@@ -53,6 +57,7 @@ class WebPage:
         address: str,
         *,
         clock: Callable[[], int],
+        failures: Failures | None = None,
         keys: tuple[Path, Path] | None = None,
         proxy: str | None = None,
         recorded: bool | None = None,
@@ -66,7 +71,8 @@ class WebPage:
             _check_keys(*keys)
         self._clock = clock
         self._recorded = recorded
-        self._socket = _bound(host, port)
+        self._socket = Awaited(lambda: _bound(host, port), "web page", failures or Failures(clock))
+        self._stop = threading.Event()
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
         start = f"{'http' if keys is None else 'https'}://{shown}:{port}/"
         self.address = start if proxy is None else f"https://{proxy}/"
@@ -130,6 +136,7 @@ class WebPage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._stop.set()
         self._server.should_exit = True
         self._thread.join(_END_S + 1)
 
@@ -141,10 +148,16 @@ class WebPage:
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
         try:
-            self._loop.run_until_complete(self._server.serve(sockets=[self._socket]))
+            self._loop.run_until_complete(self._served())
         finally:
-            self._socket.close()
             self._loop.close()
+
+    async def _served(self) -> None:
+        """What sessions post is taken meanwhile."""
+        bound = await asyncio.to_thread(self._socket.wait, self._stop)
+        if bound is not None:
+            with bound:
+                await self._server.serve(sockets=[bound])
 
 
 class _BoundedProtocol(H11Protocol):
@@ -185,7 +198,7 @@ def _parsed(address: str) -> tuple[str, int]:
         host, port = parts.hostname or "", parts.port or 0
     except ValueError:
         host, port = "", 0
-    if not host or not port or parts.path or parts.query:
+    if not re.fullmatch(r"[\w.:%-]+", host) or not port or parts.path or parts.query:
         raise UserError(f"--web {address!r} is not accepted: give HOST:PORT, such as 127.0.0.1:8080")
     return host, port
 
@@ -216,13 +229,15 @@ def _bound(host: str, port: int) -> socket.socket:
         ]
         made = socket.socket(family, socket.SOCK_STREAM)
     except OSError as error:
-        raise UserError(f"--web {host}:{port} cannot be used ({error.strerror}): give another host") from None
+        kind = NotYetError if may_come(error) else UserError
+        raise kind(f"--web {host}:{port} cannot be used ({error.strerror}): give another host") from None
     made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         made.bind(where)
         made.listen(128)
     except OSError as error:
         made.close()
-        raise UserError(f"--web {host}:{port} cannot be used ({error.strerror}): give another port") from None
+        kind = NotYetError if may_come(error) else UserError
+        raise kind(f"--web {host}:{port} cannot be used ({error.strerror}): give another port") from None
     made.setblocking(False)
     return made

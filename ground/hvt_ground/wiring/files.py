@@ -6,7 +6,7 @@ from itertools import chain
 from itertools import count as count_from
 from pathlib import Path
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.reporting import check_writable
 from hvt_ground.config import GroundConfig
 from hvt_ground.sinks.transport_stream.destination import check_destination
@@ -40,7 +40,8 @@ def make_record_folder(config: GroundConfig) -> None:
     try:
         record.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(
+        kind = UserError if isinstance(error, NotADirectoryError) else NotYetError
+        raise kind(
             f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
         ) from None
 

@@ -5,6 +5,7 @@ One viewer serves every recorder of a process: open it once, give its ``url`` to
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 import subprocess
@@ -18,7 +19,7 @@ from typing import Literal, Self
 import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_ground.sinks.rerun.sdk import (
     RecordingId,
     new_recording,
@@ -30,6 +31,8 @@ from hvt_ground.sinks.rerun.sdk import (
 
 __all__ = ["LiveRecording", "LiveView", "free_port", "listening", "started_viewer"]
 
+_log = logging.getLogger(__name__)
+
 _HOST = "127.0.0.1"
 _START_S = 30.0
 _MEMORY_LIMIT = "512MB"
@@ -38,11 +41,19 @@ _MEMORY_LIMIT = "512MB"
 class LiveView:
     """A viewer process of our own; ends with the context, except the native window, which its user closes.
 
-    ``kind``: ``"spawn"`` opens the native viewer, ``"serve"`` the web viewer (at ``web_port``). Raises `UserError`
-    where a port is in use by something else, or the viewer does not start.
+    ``kind``: ``"spawn"`` opens the native viewer, ``"serve"`` the web viewer (at ``web_port``). Raises `NotYetError`
+    where a port is in use by something else, and `UserError` where the viewer does not start. With ``later`` a port
+    that is in use is said, and `start_again` starts the viewer once it is free.
     """
 
-    def __init__(self, kind: Literal["spawn", "serve"], *, port: int = 9876, web_port: int = 9090) -> None:
+    def __init__(
+        self,
+        kind: Literal["spawn", "serve"],
+        *,
+        port: int = 9876,
+        web_port: int = 9090,
+        later: bool = False,
+    ) -> None:
         self.kind = kind
         self.url = f"rerun+http://{_HOST}:{port}/proxy"
         self.page = (
@@ -51,25 +62,32 @@ class LiveView:
         """What to open in a browser; empty for the native viewer."""
         if kind == "spawn" and sys.platform == "linux" and not _display():
             raise UserError("--view needs a display and DISPLAY is not set: use --serve and a browser")
-        for taken in (port, web_port) if kind == "serve" else (port,):
-            if listening(taken):
-                raise UserError(f"port {taken} of {_HOST} is in use: the viewer needs a free one")
         self._port, self._web_port = port, web_port
         self._lock = threading.Lock()
-        self._process = self._start()
+        self._process: subprocess.Popen[bytes] | None = None
+        try:
+            self._process = self._start()
+        except NotYetError as error:
+            if not later:
+                raise
+            _log.warning("%s; all else goes on, and it is tried again with each edge", error)
 
     @property
     def pid(self) -> int:
         """The viewer's process."""
+        assert self._process is not None, "it waits for a port"
         return self._process.pid
 
     def start_again(self) -> None:
-        """Start the web viewer where it has ended; a native window is its user's to open."""
+        """Start the web viewer where it has ended; a native window is its user's to open. Raises as at first."""
         with self._lock:
-            if self.kind == "serve" and self._process.poll() is not None:
+            if self._process is None or (self.kind == "serve" and self._process.poll() is not None):
                 self._process = self._start()
 
     def _start(self) -> subprocess.Popen[bytes]:
+        for taken in (self._port, self._web_port) if self.kind == "serve" else (self._port,):
+            if listening(taken):
+                raise NotYetError(f"port {taken} of {_HOST} is in use: the viewer needs a free one")
         options = ["--server-memory-limit", _MEMORY_LIMIT]
         if self.kind == "serve":
             options += ["--serve-web", "--web-viewer-port", str(self._web_port)]
@@ -79,7 +97,7 @@ class LiveView:
 
     def close(self) -> None:
         """End the web viewer; leave a native window to its user."""
-        if self.kind == "serve" and self._process.poll() is None:
+        if self.kind == "serve" and self._process is not None and self._process.poll() is None:
             self._process.terminate()
             try:
                 self._process.wait(timeout=3)

@@ -1,0 +1,301 @@
+"""What is not there yet is waited for, with a sentence, while everything else runs: an address, a port, a device."""
+
+from __future__ import annotations
+
+import os
+import pty
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega
+
+from hvt_common.errors import NotYetError, UserError, exit_with_sentence
+from hvt_common.runtime.failures import Awaited, Failures
+from hvt_common.runtime.health_server import Answer, HealthServer
+from hvt_common.runtime.reporting import check_writable
+from hvt_common.transport.session import LinkSettings, open_session
+from hvt_edge.pose.opening import open_pose
+from hvt_edge.source.live import LiveSource, Shot, SignalLost
+from hvt_edge.source.opening import open_source
+from hvt_ground.sinks.rerun.live_view import LiveView, listening
+from hvt_ground.web import WebPage
+from programs.processes import eventually, free_ports
+from programs.rtsp_camera import RtspCamera
+
+_HOLD = """
+import socket, sys
+one = socket.socket(socket.AF_INET, getattr(socket, sys.argv[1]))
+one.bind(("127.0.0.1", 0))
+if sys.argv[1] == "SOCK_STREAM":
+    one.listen()
+print(one.getsockname()[1], flush=True)
+sys.stdin.read()
+"""
+
+
+class Holder:
+    """Another program that has a port of loopback, until it lets go."""
+
+    def __init__(self, kind: str = "SOCK_STREAM") -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _HOLD, kind], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self.port = int(self._process.stdout.readline())
+
+    def let_go(self) -> None:
+        """The port is free."""
+        self._process.communicate("")
+
+
+def answers(port: int) -> bool:
+    """Whether a TCP server is there."""
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+        return True
+    return False
+
+
+@contextmanager
+def metrics(holder: Holder, failures: Failures) -> Iterator[Callable[[], bool]]:
+    """Of either program."""
+    found = {"/": lambda: Answer(b"ok")}
+    with HealthServer(f"127.0.0.1:{holder.port}", found, name="--metrics", failures=failures):
+        yield lambda: answers(holder.port)
+
+
+@contextmanager
+def web(holder: Holder, failures: Failures) -> Iterator[Callable[[], bool]]:
+    """The page."""
+    with WebPage(f"127.0.0.1:{holder.port}", clock=time.time_ns, failures=failures):
+        yield lambda: answers(holder.port)
+
+
+@contextmanager
+def listener(holder: Holder, failures: Failures, protocol: str = "tcp") -> Iterator[Callable[[], bool]]:
+    """Of the link."""
+    settings = LinkSettings(role="ground", listen=(f"{protocol}/127.0.0.1:{holder.port}",))
+    other = LinkSettings(role="edge", connect=settings.listen)
+    with open_session(settings, failures=failures) as session, open_session(other):
+        yield lambda: bool(session.info.links())
+
+
+@pytest.mark.parametrize("opened", [metrics, web, listener])
+def test_a_port_that_another_program_holds_is_waited_for(opened, caplog):
+    """The ground of before takes a second to end, and the service is not started again: code 2 is for ever."""
+    holder, failures = Holder(), Failures(time.time_ns)
+    with opened(holder, failures) as works:
+        (failed,) = failures.now
+        assert "in use" in failed.reason
+        assert str(holder.port) in failed.reason
+        assert len([one for one in caplog.messages if failed.reason in one]) == 1
+        holder.let_go()
+        eventually(works, within_s=60, what="it works")
+        eventually(lambda: not failures.now, within_s=60, what="it says so")
+
+
+@pytest.mark.parametrize("opened", [metrics, web, listener])
+def test_who_waits_for_a_port_ends_at_once(opened):
+    """Ctrl-C would do nothing until the port is free."""
+    holder = Holder()
+    began_s = time.monotonic()
+    with opened(holder, Failures(time.time_ns)):
+        pass
+    holder.let_go()
+    assert time.monotonic() - began_s < 30
+
+
+@pytest.mark.parametrize(
+    "open_it",
+    [
+        pytest.param(
+            lambda at, failures: HealthServer(f"{at}:9464", {}, name="--metrics", failures=failures),
+            id="metrics",
+        ),
+        pytest.param(
+            lambda at, failures: WebPage(f"{at}:80", clock=time.time_ns, failures=failures), id="web"
+        ),
+    ],
+)
+@pytest.mark.parametrize("at", ["192.0.2.1", "ground.field.invalid"])
+def test_an_address_that_is_not_there_yet_is_no_wrong_setting(open_it, at, tmp_path, monkeypatch):
+    """The VPN comes up some seconds after the ground, and so does the server of names."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    failures = Failures(time.time_ns)
+    with open_it(at, failures):
+        assert at in failures.now[0].reason
+
+
+def test_a_link_waits_for_an_address(caplog):
+    """The same, of the link."""
+    failures = Failures(time.time_ns)
+    settings = LinkSettings(role="ground", listen=("tcp/192.0.2.1:7447",), insecure=True)
+    with open_session(settings, failures=failures):
+        assert "this machine has no such address" in failures.now[0].reason
+
+
+def test_the_viewer_waits_for_its_port(caplog):
+    """Somebody has a viewer open, and the ground does not start."""
+    holder, other = Holder(), free_ports(1)[0]
+    with pytest.raises(NotYetError, match=f"port {holder.port}"):
+        LiveView("serve", port=holder.port, web_port=other)
+    with LiveView("serve", port=holder.port, web_port=other, later=True) as view:
+        assert f"port {holder.port}" in caplog.text
+        with pytest.raises(NotYetError):
+            view.start_again()
+        holder.let_go()
+        view.start_again()
+        assert listening(holder.port)
+
+
+def test_a_camera_that_starts_later_is_waited_for(caplog):
+    """It boots slower than the computer: nobody would look at the drone again."""
+    (port,) = free_ports(1)
+    failures, stop = Failures(time.time_ns), threading.Event()
+    url = f"rtsp://127.0.0.1:{port}/camera"
+    awaited = Awaited(
+        lambda: open_source(url, size=(320, 240), fps=5, fit="stretch"), "source", failures, longest_s=1
+    )
+    assert awaited.part is None
+    assert url in failures.now[0].reason
+    with ExitStack() as stack:
+        found = []
+        thread = threading.Thread(target=lambda: found.append(awaited.wait(stop)))
+        thread.start()
+        stack.enter_context(RtspCamera(port))
+        eventually(lambda: found, within_s=60, what="it is found")
+        thread.join()
+        stack.enter_context(closing(found[0]))
+        assert next(found[0].frames(start_ns=0)).index == 0
+    assert not failures.now
+
+
+class Silent:
+    """A camera that opens and gives nothing."""
+
+    name = "camera"
+
+    def open(self) -> None:
+        """It opens."""
+
+    def restart(self) -> None:
+        """It opens again."""
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+    def grab(self) -> Shot:
+        """Nothing."""
+        raise SignalLost("no frame")
+
+
+@pytest.mark.parametrize(
+    ("open_it", "kind"),
+    [
+        pytest.param(lambda: open_source("/dev/video97", size=(64, 64), fps=5), NotYetError, id="no device"),
+        pytest.param(lambda: open_source("/dev/null", size=(64, 64), fps=5), UserError, id="no camera"),
+        pytest.param(
+            lambda: LiveSource(Silent(), size=(64, 64), fps=5, fit="stretch"),
+            NotYetError,
+            id="no picture yet",
+        ),
+        pytest.param(lambda: open_source("clip.mp4", size=(64, 64), fps=5), UserError, id="no clip"),
+        pytest.param(
+            lambda: check_writable(Path("/not/mounted/a.rrd"), name="--record"), NotYetError, id="no disk yet"
+        ),
+        pytest.param(lambda: check_writable(Path("/"), name="--record"), UserError, id="a folder"),
+    ],
+)
+def test_only_what_can_never_work_ends_with_code_2(open_it, kind, capsys):
+    """A supervisor starts again whatever may work then, and nothing else."""
+
+    def run(_argv: object) -> int:
+        open_it()
+        return 0
+
+    with pytest.raises(UserError) as raised:
+        open_it()
+    assert type(raised.value) is kind
+    assert exit_with_sentence(run, program="hvt", argv=None) == (1 if kind is NotYetError else 2)
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+POSITION = ardupilotmega.MAVLink(None).global_position_int_encode(0, 10**7, 2 * 10**7, 0, 0, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcp", "serial"])
+def test_an_autopilot_that_starts_later_is_waited_for(kind, caplog):
+    """A flight would not begin because its map is not ready."""
+    data = POSITION.pack(ardupilotmega.MAVLink(None))
+    with ExitStack() as stack:
+        if kind == "udpin":
+            holder = Holder("SOCK_DGRAM")
+            address, port = f"udpin:127.0.0.1:{holder.port}", holder.port
+            sender = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            send = lambda: sender.sendto(data, ("127.0.0.1", port))  # noqa: E731
+        elif kind == "tcp":
+            (port,) = free_ports(1)
+            address = f"tcp:127.0.0.1:{port}"
+        else:
+            controller, device = pty.openpty()
+            stack.callback(os.close, controller)
+            address = f"/dev/hvt-test-{os.getpid()}"
+        source = stack.enter_context(
+            closing(open_pose(f"mavlink:{address}", hfov_deg=60, clock=time.time_ns))
+        )
+        assert "is tried again" in caplog.text
+        assert source.trouble
+        if kind == "udpin":
+            holder.let_go()
+        elif kind == "tcp":
+            server = stack.enter_context(socket.create_server(("127.0.0.1", port)))
+            vehicle, _ = server.accept()
+            stack.enter_context(vehicle)
+            send = lambda: vehicle.sendall(data)  # noqa: E731
+        else:
+            link = Path(address)
+            try:
+                link.symlink_to(os.ttyname(device))
+            except OSError:
+                pytest.skip("/dev cannot be written")
+            stack.callback(link.unlink)
+            send = lambda: os.write(controller, data)  # noqa: E731
+
+        def placed() -> bool:
+            send()
+            return source.at(0, capture_ns=0) is not None
+
+        eventually(placed, within_s=60, what="there is a pose")
+        assert not source.trouble
+
+
+def test_a_whole_ground_waits_and_serves(link):
+    """All of it at once, as a service meets it after a boot."""
+    holders = [Holder() for _ in range(3)]
+    link.port = holders[0].port
+    page, numbers = (f"127.0.0.1:{one.port}" for one in holders[1:])
+    models = ("--detector", "motion", "--classifier", "none")
+    ground = link.ground("--web", page, "--metrics", numbers, *models)
+    for part in ("listener", "web page", "metrics"):
+        ground.until(f"hvt-ground: {part}: ")
+    for one in holders:
+        one.let_go()
+    for part in ("listener", "web page", "metrics"):
+        ground.until(f"{part}: works again")
+    edge = link.edge("--source", "demo", "--max-frames", "20", "--fps", "5", "--detector", "motion")
+    assert edge.wait(within_s=120) == 0
+    ground.kill()
+
+
+def test_an_edge_waits_for_its_camera_and_can_be_stopped(link):
+    """Nobody would start it again; or only kill -9 ends it."""
+    edge = link.edge("--source", "/dev/video97", "--detector", "motion")
+    edge.until("/dev/video97 does not exist")
+    edge.stop()
+    assert edge.wait(within_s=60) == 1
+    assert "stopped before the source was there" in edge.said
