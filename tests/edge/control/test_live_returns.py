@@ -88,12 +88,12 @@ def any_flight(seed: int) -> tuple[dict, dict, list[tuple[float, float]], list[f
         except UserError:
             continue
         break
-    carried = max(1.3 * budget, 1.1 * needed_bps(check(EdgeConfig(source="demo", **given)), 1.0))
-    second, steps, back = 11.0 + chance.random(), [(0.0, carried)], []
+    link_bps = max(1.3 * budget, 1.1 * needed_bps(check(EdgeConfig(source="demo", **given)), 1.0))
+    second, steps, back = 11.0 + chance.random(), [(0.0, link_bps)], []
     for _ in range(chance.randint(1, 4)):
         steps.append((second, 0.0))
         second += chance.choice([0.5, 1.5, 2, 2.5, 3, 4, 6, 12])
-        steps.append((second, carried))
+        steps.append((second, link_bps))
         back.append(second)
         second += chance.choice([6, 8, 15])
     beside = {
@@ -123,13 +123,13 @@ def test_from_every_state_live_video_is_back_within_three_seconds(seeds, loses):
             )
 
 
-@pytest.mark.parametrize(("late_s", "heard"), [(0.6, 1.0), (1.5, 1.0), (0.0, 0.4)])
-def test_reports_that_come_late_or_in_part_do_not_end_the_video(late_s, heard):
+@pytest.mark.parametrize(("late_s", "share"), [(0.6, 1.0), (1.5, 1.0), (0.0, 0.4)])
+def test_reports_that_come_late_or_in_part_do_not_end_the_video(late_s, share):
     """A ground that is badly heard would see the video stop for good."""
     chance = random.Random(3)
     flight = LiveFlight(
         SteppedLink(((0, 500_000), (12, 0), (15, 500_000))),
-        late_s=lambda _second: late_s if chance.random() < heard else None,
+        late_s=lambda _second: late_s if chance.random() < share else None,
         **largest(400_000, 3),
     )
     assert flown(flight, 60).longest_hole(20 + late_s, 60) <= BACK_S

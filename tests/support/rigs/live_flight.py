@@ -414,9 +414,9 @@ class LiveFlight:
             return
         at_ns = self.now_ns + _WAY_NS + round(late_s * SECOND_NS)
         wants = ground.messages > 0 and not ground.whole
-        self._at(at_ns, lambda: self._hear(said, wants=wants))
+        self._at(at_ns, lambda: self._on_report(said, wants=wants))
 
-    def _hear(self, said: Any, *, wants: bool) -> None:
+    def _on_report(self, said: Any, *, wants: bool) -> None:
         self.link_control.on_feedback(said)
         if wants:
             self.keyframes.request(self.now_ns)
