@@ -49,8 +49,8 @@ __all__ = ["EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge", "RequestedSt
 
 _ANSWER_S = 2.0
 _POLL_S = 0.3
-_FIRST_OUTCOME_S, _OUTCOME_S = 0.5, 2.0
-"""When the edge is first asked what became of a still that does not come, and how often then."""
+_OUTCOME_S = 0.5
+"""So often the edge is asked what became of a still that does not come."""
 _INBOX_MESSAGES = 64
 _JPEG_QUALITY_PCT = 95
 _SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -262,7 +262,7 @@ class RemoteEdge:
         on_note: Callable[[str], None],
     ) -> tuple[RoiHeader, Received]:
         """The still of that number; in between the edge is asked whether it is still to come."""
-        query_s, noted = time.monotonic() + _FIRST_OUTCOME_S, ""
+        query_s, noted = time.monotonic() + _OUTCOME_S, ""
         while (now_s := time.monotonic()) < until_s:
             item = inbox.get(timeout_s=min(_POLL_S, until_s - now_s))
             if item is not None and _has_ended(item, answer):
