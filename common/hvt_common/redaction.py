@@ -25,11 +25,17 @@ _SCHEMELESS = re.compile(
     re.IGNORECASE | re.DOTALL,
 )
 """What looks like an address with a typing error, and like no file."""
-_BEGIN = re.compile(r"://+|:\\+|\b(?:rtsps?|rtmps?|https?|srt|udp|tcp|rtp):/|\w//", re.IGNORECASE)
 _WORD = re.compile(
     r"(?:[A-Za-z]{0,12}[0-9]{0,4}|h26[45][A-Za-z]{0,12})(?:[._-](?:[A-Za-z]{0,12}[0-9]{0,4}|mp4))*", re.ASCII
 )
 _SEPARATOR = re.compile(r"[/?#\\]")
+_HOSTLIKE = r"(?:\[|localhost|(?:\d{1,3}\.){3}\d|[^/]*:\d)"
+_BEGIN = re.compile(
+    rf"://+|:\\+|\b(?:rtsps?|rtmps?|https?|srt|udp|tcp|rtp):/|\w:/(?=[^/]*@|{_HOSTLIKE})|[\w\s]//",
+    re.IGNORECASE,
+)
+_LIKELY = re.compile(rf":.*@|[#?]|@{_HOSTLIKE}|(?:^|=){_HOSTLIKE}[^/]*/")
+"""Of an address without a scheme; ``clip@2x.mp4`` is none."""
 _MOST_PORT = 65535
 
 _KEY = r"[\w.-]{0,32}(?:pass|pwd|pw|key|token|auth|secret|sig|user|cred|streamid|session|code)[\w.-]{0,32}"
@@ -109,7 +115,7 @@ class Redaction:
 def _secrets(word: str) -> Iterable[str]:
     """What of a word, an address or ``--source=`` and one, nobody may read; of a typing error rather too much."""
     found = _BEGIN.search(word)
-    if found is None and not re.search(r":.*@", word) and not _PAIR.search(word):
+    if found is None and not _LIKELY.search(word) and not _PAIR.search(word):
         return
     address = word.partition("=")[2] if word.startswith("--") else word
     body = word if found is None else word[found.end() :]
