@@ -10,7 +10,7 @@ from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
-from hvt_common.runtime.process import leave, leave_room_for_video, limit_malloc_arenas, stop_on_signals
+from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
 from hvt_common.runtime.reporting import print_table, write_json
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
@@ -53,7 +53,7 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     config = check(config)
     limit_malloc_arenas()
-    leave_room_for_video()
+    put_video_first()
     world = World()
     log = start_log(
         "hvt-edge",

@@ -11,7 +11,7 @@ from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence, needs_extra
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
-from hvt_common.runtime.process import leave, leave_room_for_video, limit_malloc_arenas, stop_on_signals
+from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
 from hvt_common.runtime.reporting import print_table, say, write_json
 from hvt_ground.config import GroundConfig, check
 
@@ -73,7 +73,7 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     config = check(config)
     limit_malloc_arenas()
-    leave_room_for_video()
+    put_video_first()
     leave_out_pandas()
     log = start_log("hvt-ground", quiet=config.quiet, form=config.log_format, redaction=redaction)
     stop = stop_on_signals()

@@ -228,12 +228,12 @@ def test_video_alone_follows_objects_once_somebody_asks_for_them(tmp_path):
             eventually(lambda: edges.names() == ["uav-1"], within_s=40, what="it flies")
             one, said, listed = edges["uav-1"], [], []
 
-            def followed() -> bool:
+            def tracked() -> bool:
                 try:
                     listed.extend(patiently(one))
                 except RefusedError as error:
                     said.append(str(error))
                 return bool(listed)
 
-            eventually(followed, within_s=60, what="objects are followed")
+            eventually(tracked, within_s=60, what="objects are followed")
     assert any("request again in a second" in one for one in said)

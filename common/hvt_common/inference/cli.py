@@ -89,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
         "--labels", type=Path, metavar="FILE", help="class names, one a line, or coco or visdrone"
     )
     one.add_argument("--provider", default="cpu", help="what runs it: auto, cpu, openvino … [cpu]")
-    one.add_argument("--threads", type=int, choices=range(1, 65), default=2, metavar="N", help="threads [2]")
+    one.add_argument("--threads", type=int, choices=range(1, 65), default=1, metavar="N", help="threads [1]")
     one.set_defaults(run=_info)
     return parser
 

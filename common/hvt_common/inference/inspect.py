@@ -51,7 +51,7 @@ def inspect_model(
     path: Path,
     *,
     provider: str = "cpu",
-    threads: int = 2,
+    threads: int = 1,
     head: str | None = None,
     labels: Path | None = None,
 ) -> ModelReport:

@@ -30,10 +30,10 @@ __all__ = [
     "NewThreads",
     "join_threads_at_exit",
     "leave",
-    "leave_room_for_video",
     "limit_malloc_arenas",
     "lower_priority",
     "notify_systemd",
+    "put_video_first",
     "stop_on_signals",
     "with_lower_priority",
 ]
@@ -163,7 +163,7 @@ def _threads() -> set[str]:
         return set()
 
 
-def leave_room_for_video() -> None:
+def put_video_first() -> None:
     """Have nothing in this process hold up a frame on its way: not the interpreter, not OpenCV's workers.
 
     A frame comes back from native code a dozen times, and waits each time for whoever tracks or reads a message: half

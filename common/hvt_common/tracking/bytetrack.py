@@ -39,7 +39,7 @@ _DUPLICATE_COST_LIMIT: Final = 0.15
 
 _LONGEST_S: Final = 10.0
 """What no detection was run for so long tells nothing of the picture now."""
-_LEAST_LOOKS: Final = 3
+_LEAST_DETECTIONS: Final = 3
 """Detections that a lost track is remembered for, where they are further apart than the buffer is long."""
 
 # Box lengths; wider, and neighbours in a queue of cars are taken for each other.
@@ -147,7 +147,7 @@ class ByteTracker:
         self._table = TrackTable.empty()
         self._frame_index: int | None = None
         self._updated_index: int | None = None
-        self._gaps: deque[int] = deque(maxlen=_LEAST_LOOKS)
+        self._gaps: deque[int] = deque(maxlen=_LEAST_DETECTIONS)
         """Frames from one update to the next, of the last ones."""
         self._next_id = 1
         if self._camera is not None:
@@ -238,7 +238,7 @@ class ByteTracker:
         Where each look comes later than the buffer is long, nothing would be remembered from one to the next.
         """
         gap = max(self._gaps, default=1)
-        return self._buffer_frames if gap <= self._buffer_frames + 1 else _LEAST_LOOKS * gap
+        return self._buffer_frames if gap <= self._buffer_frames + 1 else _LEAST_DETECTIONS * gap
 
     def _forget_stale(self, frame_index: int) -> None:
         """Drop lost tracks whose time ran out between two updates; each has had one chance to be found, though.

@@ -13,6 +13,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
+from hvt_edge.loop.perception_rest import PerceptionRest
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.passthrough import VideoStage
@@ -57,6 +58,7 @@ class RealtimePace:
 
     def __post_init__(self) -> None:
         self._missed: int | None = None
+        self._rest = PerceptionRest()
         self._must_code_ns = 0
         self._sent_ns = self._link_late_ns = 0
         """When the last frame was sent; how late a clip is because the link took its time, not yet made up."""
@@ -111,8 +113,12 @@ class RealtimePace:
         if sending_ns > max(encoded_ns - decided_ns, _LINK_BOUND_NS):
             for_budget = 2 * (self.base.budget_waited_ns - budget_ns) > sending_ns
             self._bound = self.base.holder(self._sent_ns) if for_budget else "link"
-        # Video goes first: perception gets no frame while the loop is late.
-        self.counts.unanalyzed += not self._worker.take(frame, unit, late=behind)
+        # Video goes first: perception gets no frame while the loop is late, and fewer for a while after it lost one.
+        # Where nobody uses it, it takes no time.
+        used = self.stills.is_used(frame.capture_ns)
+        rests = behind or not self._rest.lets(self.counts.dropped_cpu, now_ns=self._sent_ns)
+        taken_up = self._worker.take(frame, unit, late=rests and used)
+        self.counts.unanalyzed += used and not taken_up
 
     def __enter__(self) -> Self:
         return self

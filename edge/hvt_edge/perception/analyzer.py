@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 import numpy as np
@@ -35,15 +35,24 @@ class AnalyzedFrame:
     """One source frame with all that is known of it."""
 
     frame: Frame
-    base_bgr: Image | None
-    """The decoded base frame: what the ground has. None where the frame is not coded: no still applies to it then."""
+    base: Image | YuvPicture | None
+    """The decoded base frame: what the ground has, and what a still may build on. None where the frame is not coded:
+    no still applies to it then."""
     tracks: Tracks
     detected: bool
     """A decision step: the detector ran on this frame."""
-    picture: YuvPicture | None = None
-    """The same as `base_bgr`, as it was decoded: what a still may build on."""
-    followed: bool = True
+    tracked: bool = True
     """False where nobody used what would be known of it: it was neither decoded nor searched, and has no tracks."""
+    _bgr: list[Image] = field(default_factory=list, compare=False, repr=False)
+
+    @property
+    def base_bgr(self) -> Image | None:
+        """`base` in BGR, converted once: only decision steps look at it."""
+        if self.base is None:
+            return None
+        if not self._bgr:
+            self._bgr.append(self.base.bgr() if isinstance(self.base, YuvPicture) else self.base)
+        return self._bgr[0]
 
 
 class _Decoder(Protocol):
@@ -156,20 +165,22 @@ class Analyzer:
             seen_frames=none,
             started=np.empty(0, np.bool_),
         )
-        return AnalyzedFrame(frame, None, tracks, detected=False, picture=picture, followed=False)
+        return AnalyzedFrame(frame, picture, tracks, detected=False, tracked=False)
 
     def _analyze(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool) -> AnalyzedFrame:
         picture = None if unit is None else self._decode(frame.index, unit)
-        base_bgr = None if picture is None else picture.bgr()
-        pixels = frame.base_bgr if self._settings.candidates == "source" else base_bgr
+        bgr = [picture.bgr()] if picture is not None and self._settings.candidates == "decoded" else []
+        pixels = bgr[0] if bgr else None
+        if self._settings.candidates == "source":
+            pixels = frame.base_bgr
         due = not hurry and self._due(frame.index, coded=unit is not None)
-        detections = self._detect(frame, base_bgr) if due else None
+        detections = self._detect(frame, bgr) if due else None
         if detections is None:
             tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
-            return AnalyzedFrame(frame, base_bgr, tracks, detected=False, picture=picture)
+            return AnalyzedFrame(frame, picture, tracks, detected=False, _bgr=bgr)
         self._detected_index, self.detected_ns = frame.index, frame.capture_ns
         tracks = self._tracker.update(detections, frame_index=frame.index, image_bgr=pixels)
-        return AnalyzedFrame(frame, base_bgr, tracks, detected=True, picture=picture)
+        return AnalyzedFrame(frame, picture, tracks, detected=True, _bgr=bgr)
 
     def _decode(self, index: int, unit: AccessUnit) -> YuvPicture:
         picture = self._decoder.decode_yuv(unit.data)
@@ -189,10 +200,11 @@ class Analyzer:
             return rested or sparse
         return rested and sparse and self._settings.candidates == "source"
 
-    def _detect(self, frame: Frame, base_bgr: Image | None) -> Detections | None:
+    def _detect(self, frame: Frame, base_bgr: Sequence[Image]) -> Detections | None:
+        """``base_bgr`` is the one decoded picture, where candidates are of that."""
         if self._settings.candidates == "decoded":
-            assert base_bgr is not None, "detection on the decoded stream is due on coded frames only"
-            return self._detector.detect(base_bgr)
+            assert base_bgr, "detection on the decoded stream is due on coded frames only"
+            return self._detector.detect(base_bgr[0])
         if self._view.enlarges:
             return self._detector.detect(frame.base_bgr)
         found = self._detector.detect(frame.source_bgr)

@@ -221,14 +221,16 @@ class ShadowGround:
         capture_ns = seen.frame.capture_ns
         if seen.detected and self._scene_change.take(seen.frame.source_bgr, capture_ns=capture_ns):
             self._forget()
-        if not seen.detected or seen.base_bgr is None or capture_ns < self._next_ns:
+        if not seen.detected or seen.base is None or capture_ns < self._next_ns:
             return False
         if not self._next_ns:  # the first picture of a stream is coarser than any other
             self._next_ns = capture_ns + self._settings.quick_rest_ns
             self._last_ns = capture_ns  # what was measured before is no older
             return False
         began_ns = self._spent_ns() if self._spent_ns else 0
-        found = self._detect(seen.base_bgr)
+        base_bgr = seen.base_bgr
+        assert base_bgr is not None, "checked"
+        found = self._detect(base_bgr)
         took_ns = self._spent_ns() - began_ns if self._spent_ns else 0
         settings = self._settings
         rest_ns = (

@@ -110,14 +110,14 @@ class OnDemand:
         self._next_number = 0
         self._tracks_requested_ns: int | None = None
         """Capture time of the newest frame then."""
-        self._followed = True
+        self._tracked = True
         """Objects were, in the newest frame."""
         self._ended = False
 
     def add(self, analyzed: AnalyzedFrame) -> None:
         """Hold a frame with its tracks."""
-        self._followed = analyzed.followed
-        self.ring.add(analyzed.frame, analyzed.tracks, base=analyzed.picture or analyzed.base_bgr)
+        self._tracked = analyzed.tracked
+        self.ring.add(analyzed.frame, analyzed.tracks, base=analyzed.base)
 
     # From any thread
 
@@ -128,7 +128,7 @@ class OnDemand:
         self._check_queue()
         frame = frame_for(request, self.ring)
         if request.track_id is not None:
-            self._follow(frame.capture_ns)
+            self._want_tracks(frame.capture_ns)
         job = crop_job_for(request, frame, maker=self._maker, view=self.view, class_names=self.class_names)
         quality_pct = self._maker.quality_pct if request.quality_pct is None else request.quality_pct
         with self._lock:
@@ -162,7 +162,7 @@ class OnDemand:
         newest = self.ring.newest
         if newest is None:
             raise RefusedError("there is no frame yet, or none is kept (--ring)")
-        self._follow(newest.capture_ns)
+        self._want_tracks(newest.capture_ns)
         tracks = newest.tracks
         width, height = self.view.source_size  # a box that is only predicted may be far outside
         boxes = np.clip(self.view.to_source(tracks.boxes_xyxy_px), 0, (width, height, width, height))
@@ -252,10 +252,10 @@ class OnDemand:
         """No more is accepted."""
         self._ended = True
 
-    def _follow(self, capture_ns: int) -> None:
+    def _want_tracks(self, capture_ns: int) -> None:
         """Tracks are wanted; raises `RefusedError` where there are none because nobody wanted them until now."""
         self._tracks_requested_ns = capture_ns
-        if not self._followed:
+        if not self._tracked:
             raise RefusedError(
                 "this edge sends video alone and followed no objects; it does from now on: request again in a second"
             )

@@ -92,7 +92,7 @@ class Chooser:
         if self.method.video_only:
             return
         due = analyzed.detected or self._put_off
-        able = analyzed.base_bgr is not None or not self.maker.preferred.needs_base
+        able = analyzed.base is not None or not self.maker.preferred.needs_base
         self._put_off = due and not able
         if paused or not (due and able):
             self.memory.observe(analyzed.tracks, now_ns=now_ns)
@@ -152,9 +152,7 @@ class Chooser:
         if not self.outbox.admits(request, now_ns=now_ns):
             self.on_outcome("dropped", "queue_full")
             return
-        job = self.maker.crop(
-            analyzed.frame, request, view=self.view, base=analyzed.picture or analyzed.base_bgr
-        )
+        job = self.maker.crop(analyzed.frame, request, view=self.view, base=analyzed.base)
         if isinstance(job, NoStill):
             for one in (request.candidate, *request.also):
                 self.memory.record_refused(one.track_id, now_ns=now_ns)

@@ -89,14 +89,15 @@ class StillStage:
         ``skipped`` are units before it, of frames that were not analyzed. Where nobody uses what would come of it,
         nothing of this is done.
         """
-        if not self._has_user(frame.capture_ns):
+        if not self.is_used(frame.capture_ns):
             return self.analyzer.pass_over(frame, unit, skipped=skipped)
         analyzed = self.analyzer.analyze(frame, unit, skipped=skipped, hurry=hurry)
         if self.shadow is not None and not hurry:
             self.shadow.compare(analyzed)
         return analyzed
 
-    def _has_user(self, capture_ns: int) -> bool:
+    def is_used(self, capture_ns: int) -> bool:
+        """Whether anybody uses what `analyze` makes of a frame of that time."""
         chooser = self.chooser
         if self.tracks_used or not chooser.method.video_only:
             return True

@@ -43,6 +43,10 @@ class Unmoved:
 
     latest_tracks, any_pending = None, False
 
+    def is_used(self, capture_ns):
+        """Somebody looks at what comes of it."""
+        return True
+
     def analyze(self, frame, unit, skipped=(), *, hurry=False):
         """Nothing."""
         return frame.index

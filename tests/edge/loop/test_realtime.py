@@ -54,6 +54,11 @@ class BlockedStills:
         self.frames: list[int] = []
         self.decoded = 0
         self.detected: list[int] = []
+        self.used = True
+
+    def is_used(self, capture_ns):
+        """Somebody looks at what comes of it."""
+        return self.used
 
     def analyze(self, frame, unit, skipped=(), *, hurry):
         """As `Analyzer.analyze` does: all units, in their order."""

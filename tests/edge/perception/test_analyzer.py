@@ -18,6 +18,7 @@ from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
+from hvt_common.video.hevc import YuvPicture
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
@@ -67,24 +68,35 @@ def test_every_frame_is_decoded_and_each_nth_is_searched():
         assert 0 < np.abs(error).mean() < 6, "the decoded picture, not the camera's"
 
 
-def test_what_nobody_uses_is_not_decoded_and_goes_on_from_any_frame():
+def test_what_nobody_uses_is_not_searched_and_goes_on_from_any_frame():
     """Video alone would pay for tracks that nobody sees; or a request for them would find no picture to build on."""
     detector = RedSquares()
     used, always = make(detector=detector, detect_every=5), make(detect_every=5)
     for frame, unit in zip(FRAMES[:11], UNITS, strict=False):
         passed = used.pass_over(frame, unit)
         expected = always.analyze(frame, unit)
-        assert (passed.base_bgr, len(passed.tracks), passed.detected, passed.followed) == (
-            None,
-            0,
-            False,
-            False,
-        )
+        assert (len(passed.tracks), passed.detected, passed.tracked) == (0, False, False)
     assert (used.frames, used.spent_ns, used.detected_ns) == (0, 0, None)
     for frame, unit in zip(FRAMES[11:20], UNITS[11:20], strict=True):
         seen, expected = used.analyze(frame, unit), always.analyze(frame, unit)
         np.testing.assert_array_equal(seen.base_bgr, expected.base_bgr)
     assert seen.tracks.ids.tolist() == expected.tracks.ids.tolist()
+
+
+def test_a_picture_is_converted_where_somebody_looks_at_it(monkeypatch):
+    """Each coded frame would be converted for the one in five that is searched, a twentieth of all work."""
+    converted = []
+    convert = YuvPicture.bgr
+    monkeypatch.setattr(YuvPicture, "bgr", lambda self: converted.append(1) or convert(self))
+    tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
+    settings = AnalyzerSettings(detect_every=5, candidates="source")
+    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, settings=settings)
+    for frame, unit in zip(FRAMES, UNITS, strict=True):
+        seen = analyzer.analyze(frame, unit)
+        if seen.detected:
+            assert seen.base_bgr is seen.base_bgr, "once"
+        assert seen.base is not None
+    assert len(converted) == 6
 
 
 def test_in_a_hurry_detection_is_put_off_and_made_up_for():
