@@ -274,7 +274,12 @@ class OnnxDetector:
         runs, tops = [], []
         for picture, top in trial_pictures(size, dtype):
             laid = np.ascontiguousarray(picture.transpose(0, 2, 3, 1)) if self._channels_last else picture
-            outputs = self._run(laid)
+            try:
+                outputs = self._run(laid)
+            except UserError:
+                if not runs:
+                    raise
+                continue  # what fails on some pictures alone fails in flight, and is opened again
             # Half precision may overflow where the range of the pixels is not the network's.
             if not top or all(_is_finite(output) for output in outputs):
                 runs.append(outputs)

@@ -1,12 +1,18 @@
-"""A hint, once in a run: the embedded detector finds next to nothing, and another model may know this view."""
+"""A hint, once in a run: the detector finds nothing, or next to nothing, where something else does."""
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Callable
 
+import cv2
+import numpy as np
+
+from hvt_common.inference.letterbox import as_bgr
+from hvt_common.inference.motion import MotionDetector
 from hvt_common.inference.store import EMBEDDED_DETECTOR
-from hvt_common.values import Detections
+from hvt_common.values import Detections, Image
 
 __all__ = ["FewFoundHint"]
 
@@ -14,39 +20,95 @@ _log = logging.getLogger(__name__)
 _RUNS = 45
 """Detections on pictures: 15 s at the defaults (15 fps, every fifth frame)."""
 _LEAST_SHARE = 0.1
-"""Of the runs that found something at the confidence of use."""
+"""Of the runs that found something at the confidence of use, or in which something moved."""
 _OTHER = "yolox-s"
+_MOTION = "motion"
 
 
 class FewFoundHint:
-    """Says so after the first runs, for ``aerial-nano`` alone: who chose a model of his own needs no advice.
+    """Says so after the first runs. For any thread.
 
-    ``confidence`` is that from which a detection starts a track. For any thread.
+    Of ``aerial-nano`` it is said where it finds next to nothing, with another model that may know the view. Of
+    another model it is said where it finds nothing at all, though something moves in the pictures, or though it finds
+    something in the middle of the picture at twice or half the size. ``confidence`` is that from which a detection
+    starts a track.
     """
 
     def __init__(self, detector: str, *, confidence: float) -> None:
+        self._detector = detector
         self._confidence = confidence
         self._lock = threading.Lock()
-        self._open = detector == EMBEDDED_DETECTOR
-        self._runs = self._with_something = 0
+        self._open = detector != _MOTION
+        self._runs = self._with_something = self._with_motion = 0
+        self._motion = MotionDetector() if self._open and detector != EMBEDDED_DETECTOR else None
 
-    def take(self, found: Detections) -> None:
-        """Count what was found on one picture; at the last run that counts it may be said."""
+    def take(self, found: Detections, image_bgr: Image, detect: Callable[[Image], Detections | None]) -> None:
+        """Count what was found on one picture; at the last run that counts it may be said.
+
+        ``detect`` runs the detector once more, on another picture.
+        """
         if not self._open:
             return
         with self._lock:
             self._runs += 1
-            self._with_something += bool((found.confidences >= self._confidence).any())
+            self._with_something += self._has(found)
+            if self._motion is not None and not self._with_something:
+                self._with_motion += bool(len(self._motion.detect(image_bgr)))
             if self._runs < _RUNS or not self._open:
                 return
             self._open = False
-        if self._with_something < _LEAST_SHARE * _RUNS:
+            motion, self._motion = self._motion, None
+        if motion is None:
+            if self._with_something < _LEAST_SHARE * _RUNS:
+                self._say_other_model()
+        elif not self._with_something:
+            self._say_what_does(image_bgr, detect)
+
+    def _has(self, found: Detections | None) -> bool:
+        return found is not None and bool((found.confidences >= self._confidence).any())
+
+    def _say_other_model(self) -> None:
+        _log.warning(
+            "%s found something on %d of the first %d pictures: it knows vehicles and people from above; for "
+            "other views try hvt-models fetch %s and --detector %s (hvt-models list says what each is good for)",
+            EMBEDDED_DETECTOR,
+            self._with_something,
+            _RUNS,
+            _OTHER,
+            _OTHER,
+        )
+
+    def _say_what_does(self, image_bgr: Image, detect: Callable[[Image], Detections | None]) -> None:
+        image = as_bgr(image_bgr)
+        sizes = {"twice": _middle_enlarged(image), "half": _shrunk(image)}
+        others = [
+            f"it finds something at {name} the size" for name, one in sizes.items() if self._has(detect(one))
+        ]
+        if self._with_motion >= _LEAST_SHARE * _RUNS:
+            others.append(f"something moves in {self._with_motion} of them")
+        if others:
             _log.warning(
-                "%s found something on %d of the first %d pictures: it knows vehicles and people from above; for "
-                "other views try hvt-models fetch %s and --detector %s (hvt-models list says what each is good for)",
-                EMBEDDED_DETECTOR,
-                self._with_something,
+                "%s found nothing on the first %d pictures, and %s: hvt-models info %s says what it is taken for; "
+                "--tiles or another --size changes the size, --confidence from where detections count",
+                self._detector,
                 _RUNS,
-                _OTHER,
-                _OTHER,
+                ", and ".join(others),
+                self._detector,
             )
+
+
+def _middle_enlarged(image: Image) -> Image:
+    """The middle half of the picture at its full size."""
+    height, width = image.shape[:2]
+    middle = image[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    return np.asarray(cv2.resize(middle, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def _shrunk(image: Image) -> Image:
+    """The picture at half its size, in the middle of grey."""
+    height, width = image.shape[:2]
+    small = cv2.resize(image, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
+    whole = np.full_like(image, 114)
+    top, left = (height - small.shape[0]) // 2, (width - small.shape[1]) // 2
+    whole[top : top + small.shape[0], left : left + small.shape[1]] = small
+    return whole

@@ -51,7 +51,7 @@ class GuardedDetector(Retried[Detector]):
         """As `Detector.detect`; None while it does not work."""
         found = self.run(lambda model: model.detect(image_bgr))
         if found is not None and self._hint is not None:
-            self._hint.take(found)
+            self._hint.take(found, image_bgr, lambda other: self.run(lambda model: model.detect(other)))
         return found
 
     def detect_whole(self, image_bgr: Image) -> Detections | None:

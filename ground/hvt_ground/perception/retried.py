@@ -39,7 +39,7 @@ class RetriedDetector(Retried[Detector]):
         if found is None:
             return Detections.none()
         if self._hint is not None:
-            self._hint.take(found)
+            self._hint.take(found, image_bgr, lambda other: self.run(lambda model: model.detect(other)))
         return found
 
 

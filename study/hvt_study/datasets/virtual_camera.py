@@ -14,6 +14,7 @@ and 11 is "others", of both of which nothing is asked. Or they are YOLO's, in ``
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,7 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
-from hvt_study.datasets.labels import FrameLabels, covered_share
+from hvt_study.datasets.labels import FrameLabels, LabelDoubts, covered_share
 from hvt_study.datasets.visdrone_rows import read_image_rows
 from hvt_study.datasets.yolo_labels import IGNORED, read_yolo, yolo_names
 
@@ -43,6 +44,8 @@ __all__ = [
 
 SCHEME = "still:"
 """``still:FILE`` is a virtual camera over that picture, ``still:FILE@1.5`` one that sees 1.5 times its height."""
+
+_log = logging.getLogger(__name__)
 
 _DURATION_S = 14.0
 USUAL_VIEW = 0.87
@@ -136,7 +139,10 @@ def read_annotations(
     if path.parent.name != _YOLO:
         return _visdrone(path)
     names = yolo_names(path.parent.parent, tuple(classes) or None)
-    found = read_yolo(path, names, size)
+    doubts = LabelDoubts()
+    found = read_yolo(path, names, size, doubts)
+    for sentence in doubts.sentences():
+        _log.warning("%s", sentence)
     return Annotations(
         boxes_px=found.boxes_xyxy_px,
         classes=found.class_names,

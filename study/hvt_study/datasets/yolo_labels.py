@@ -38,15 +38,11 @@ def yolo_names(root: Path, classes: Sequence[str] | None, pictures: Sequence[Pat
     return read_class_file(path)
 
 
-def read_yolo(
-    path: Path, names: Sequence[str], size: tuple[int, int], doubts: LabelDoubts | None = None
-) -> FrameLabels:
+def read_yolo(path: Path, names: Sequence[str], size: tuple[int, int], doubts: LabelDoubts) -> FrameLabels:
     """The labels of a picture of this (width, height), in its pixels: rows of boxes, or of polygons.
 
-    What ends outside the picture is cut, and a row that cannot be is left out; ``doubts`` counts both. Without it
-    such a row is a `UserError` that names the line.
+    What ends outside the picture is cut, and a row that cannot be is left out; ``doubts`` counts both.
     """
-    own = LabelDoubts() if doubts is None else doubts
     boxes, kinds, wheres = [], [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
@@ -54,17 +50,13 @@ def read_yolo(
         try:
             kind, *corners = _yolo_row(path, number, line, len(names))
         except UserError as error:
-            if doubts is None:
-                raise
-            own.leave_out(str(error))
+            doubts.leave_out(str(error))
             continue
         boxes.append(corners)
         kinds.append(names[int(kind)])
         wheres.append(f"{path}, line {number}")
     corners_px = np.array(boxes, np.float64).reshape(-1, 4) * [*size, *size]
-    inside, rows = own.inside(corners_px, wheres, size)
-    if doubts is None:
-        own.check()
+    inside, rows = doubts.inside(corners_px, wheres, size)
     return labels_of(inside, [kinds[row] for row in rows.tolist()])
 
 

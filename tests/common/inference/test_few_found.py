@@ -1,4 +1,4 @@
-"""The hint that another model may know this view: once, and only where the embedded detector finds little."""
+"""The hint that another model, or another size, finds more: once, and only where something else does."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import pytest
 
 from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.values import Detections
+
+STILL = np.full((120, 160, 3), 90, np.uint8)
 
 
 def found(confidence: float) -> Detections:
@@ -20,7 +22,7 @@ def said(caplog, detector: str, looks: list[Detections]) -> list[str]:
     """What is logged over these looks."""
     hint = FewFoundHint(detector, confidence=0.25)
     for look in looks:
-        hint.take(look)
+        hint.take(look, STILL, lambda _: Detections.none())
     return [record.getMessage() for record in caplog.records]
 
 
@@ -41,6 +43,48 @@ def test_a_view_that_it_knows_or_a_flight_that_is_young(caplog):
 
 
 @pytest.mark.parametrize("detector", ["motion", "boat.onnx", "yolox-s", "acme-blobs:x"])
-def test_who_chose_a_model_needs_no_advice(caplog, detector):
+def test_who_chose_a_model_needs_no_advice_where_nothing_is(caplog, detector):
     """Somebody who looks for boats would be sent to a model of cars."""
     assert said(caplog, detector, [Detections.none()] * 100) == []
+
+
+def moving(index: int) -> np.ndarray:
+    """A bright square that goes right."""
+    image = STILL.copy()
+    image[40:60, 2 * index : 2 * index + 20] = 250
+    return image
+
+
+def test_a_model_that_finds_nothing_where_something_moves_is_said(caplog):
+    """A file that is read wrongly finds nothing for a whole flight, without a word."""
+    hint = FewFoundHint("boat.onnx", confidence=0.25)
+    for index in range(100):
+        hint.take(Detections.none(), moving(index % 60), lambda _: Detections.none())
+    (record,) = caplog.records
+    assert "boat.onnx found nothing on the first 45 pictures, and something moves in " in record.getMessage()
+    assert "hvt-models info boat.onnx" in record.getMessage()
+
+
+@pytest.mark.parametrize("size", ["twice", "half"])
+def test_a_model_that_finds_something_at_another_size_is_said(caplog, size):
+    """Objects too small or too large for the network are missed, and tiles or a size would show them."""
+    patch = STILL.copy()
+    patch[50:70, 70:90] = 250
+
+    def detect(image: np.ndarray) -> Detections:
+        bright = int((image[:, :, 0] > 200).sum())
+        return found(0.9) if (bright > 1000 if size == "twice" else bright < 200) else Detections.none()
+
+    hint = FewFoundHint("boat.onnx", confidence=0.25)
+    for _ in range(100):
+        hint.take(Detections.none(), patch, detect)
+    (record,) = caplog.records
+    assert f"it finds something at {size} the size" in record.getMessage()
+
+
+def test_a_model_that_finds_something_is_left_in_peace(caplog):
+    """A hint that is wrong is worse than none."""
+    hint = FewFoundHint("boat.onnx", confidence=0.25)
+    for index in range(100):
+        hint.take(found(0.9) if index == 40 else Detections.none(), moving(index % 60), lambda _: found(0.9))
+    assert not caplog.records
