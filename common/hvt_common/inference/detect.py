@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -271,7 +272,8 @@ class OnnxDetector:
     def _tried(self, size: tuple[int, int], names: int | None) -> Trial:
         dtype = self.model.inputs[0].dtype
         assert dtype is not None
-        runs, tops = [], []
+        runs: list[list[npt.NDArray[Any]]] = []
+        tops: list[int] = []
         for picture, top in trial_pictures(size, dtype):
             laid = np.ascontiguousarray(picture.transpose(0, 2, 3, 1)) if self._channels_last else picture
             try:
@@ -378,13 +380,18 @@ def _class_names(
     origin = f"labels file {labels}" if labels is not None else f"metadata of {model.path}"
     if names is None:
         count = head.classes or _UNNAMED
-        _log.warning(
-            "%s has no class names: its classes are class 0 to class %d; --labels FILE names them (or --labels %s)",
-            model.path.name,
-            count - 1,
-            ", ".join(KNOWN_LABELS),
-        )
+        _say_unnamed(model.path, count)
         return tuple(f"class {index}" for index in range(count))
     if head.classes is not None and len(names) != head.classes:
         raise UserError(f"{origin} has {len(names)} class names; {model.path} has {head.classes} classes")
     return names
+
+
+@cache  # once of a file: one that fails in flight is opened again and again
+def _say_unnamed(path: Path, count: int) -> None:
+    _log.warning(
+        "%s has no class names: its classes are class 0 to class %d; --labels FILE names them (or --labels %s)",
+        path.name,
+        count - 1,
+        ", ".join(KNOWN_LABELS),
+    )
