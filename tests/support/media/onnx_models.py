@@ -163,7 +163,9 @@ def colour_classifier(
 
 def failing_in_the_light(path: Path, *, size: tuple[int, int] = (320, 192)) -> Path:
     """A colour detector of the YOLOX kind whose run raises on any picture with a mean of 128 or more (of 255)."""
-    model = onnx.load(colour_detector(path, "yolox", size=size))
+    model = onnx.load(
+        colour_detector(path, "yolox", size=size, metadata={"names": "['blue', 'green', 'red']"})
+    )
     (output,) = model.graph.output
     model.graph.node[-1].output[0] = "plain"
     model.graph.initializer.extend(
