@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import BacklogUnit
@@ -14,6 +15,7 @@ from hvt_ground.backlog.perception import StretchTracker
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job, PerceptionWorker
+from hvt_ground.sinks import Receipt
 
 __all__ = ["Destination", "StillJob", "VideoJob"]
 
@@ -30,7 +32,7 @@ class Destination:
 
 
 class StillJob(Job):
-    """Reads one still; ``done(usable)`` is called at the end, with None where it was not taken."""
+    """Reads one still; ``done(usable)`` is called when it is written, with None where it was not taken, or lost."""
 
     def __init__(
         self, still: ReceivedStill, destination: Destination, *, done: Callable[[bool | None], None]
@@ -46,12 +48,19 @@ class StillJob(Job):
             self._done(None)
             return True
         try:
-            if target.is_new_still(self._still.header.sequence):
+            receipt, sequence = target.receipt(), self._still.header.sequence
+            new = target.is_new_still(sequence)
+            if new:
                 target.read_still(self._still)
         finally:
             self._destination.release(target)
-        self._done(True)
+        receipt.then(partial(self._end, target if new else None))
         return True
+
+    def _end(self, target: SessionBacklog | None, written: bool) -> None:  # noqa: FBT001 - partial
+        if target is not None and not written:
+            target.lose_still(self._still.header.sequence)
+        self._done(True if written else None)
 
     def fail(self, error: Exception) -> None:
         """What the machine may mend, such as a full disk, comes again."""
@@ -79,7 +88,9 @@ class VideoJob(Job):
         self._target: SessionBacklog | None = None
         self._pictures: _Pictures = iter(())
         self._last: BacklogUnit | None = None
-        self._logged: set[int] = set()
+        self._logged: dict[int, float] = {}
+        """Frame index → the seconds that it counts for."""
+        self._receipt = Receipt(())
 
     def step(self) -> bool:
         """Decode and log one frame."""
@@ -88,27 +99,45 @@ class VideoJob(Job):
             if self._target is None:
                 self._done(None)
                 return True
+            self._receipt = self._target.receipt()
             self._pictures = self._target.video.pictures(self._units)
+        if not self._target.able():
+            self._finish(self._target, None)
+            return True
         for shown in self._pictures:
-            if shown is not None and self._target.show(*shown, after=self._last):
+            lasts_s = None if shown is None else self._target.show(*shown, after=self._last)
+            if shown is not None and lasts_s is not None:
                 self._last = shown[0]
-                self._logged.add(self._last.frame_index)
+                self._logged[self._last.frame_index] = lasts_s
             return False
         if self._logged and self._target.perception is not None:
-            boxes = _BoxesJob(self._units, self._logged, self._destination)
+            boxes = _BoxesJob(self._units, self._logged.keys(), self._destination)
             if not self._worker.submit(boxes, last=True):
                 boxes.close()
-        self._done(True)
+        self._finish(self._target, True)
         return True
 
     def fail(self, error: Exception) -> None:
         """As of a `StillJob`."""
-        self._done(_usable(error))
+        if self._target is None:
+            self._done(_usable(error))
+        else:
+            self._finish(self._target, _usable(error))
 
     def close(self) -> None:
         """Release the destination."""
         if self._target is not None:
             self._destination.release(self._target)
+
+    def _finish(self, target: SessionBacklog, usable: bool | None) -> None:  # noqa: FBT001 - as of `done`
+        """Say so when it is written; frames that are lost on the way are missing again."""
+
+        def end(written: bool) -> None:  # noqa: FBT001 - a receipt
+            if not written:
+                target.lose_frames(self._logged)
+            self._done(usable if written else None)
+
+        self._receipt.then(end)
 
 
 class _BoxesJob(Job):

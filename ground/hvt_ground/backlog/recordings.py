@@ -33,12 +33,14 @@ class BacklogRecording:
         """Jobs that have it in hand, or wait for it."""
         self.sink = sink
         self._perception = perception
-        self.backlog = SessionBacklog(info, log=sink.log, perception=perception, read=self._read)
+        self.backlog = SessionBacklog(
+            info, log=sink.log, perception=perception, read=self._read, able=sink.is_open, outputs=[sink]
+        )
 
     def close(self) -> None:
         """Say what has come and close the file, without waiting for it."""
         totals = self.backlog.totals
-        if totals.first is not None:
+        if totals.first is not None and totals.amount():
             text = f"{totals.amount()} of this session arrived after it had ended"
             self.sink.log(Notice(*totals.first, "info", text))
         self.sink.close()

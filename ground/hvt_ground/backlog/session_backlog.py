@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from hvt_ground.backlog.video import BacklogVideo
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.link.sequence_window import SequenceWindow, StillSequenceWindow
 from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.sinks import QueuedSink, Receipt
 
 __all__ = ["BacklogTotals", "SessionBacklog"]
 
@@ -48,10 +49,16 @@ class BacklogTotals:
         self.video_s += lasts_s
         self._note(frame_index, capture_ns)
 
+    def take_back(self, *, stills: int, frames: int, video_s: float) -> None:
+        """What was counted is lost after all: it is to come again."""
+        self.stills -= stills
+        self.frames -= frames
+        self.video_s -= video_s
+
     def amount(self) -> str:
-        """``12 stills and 31 s of video``."""
-        parts = [f"{self.stills} still{'s' * (self.stills != 1)}"] if self.stills else []
-        if self.frames:
+        """``12 stills and 31 s of video``; empty where it is nothing."""
+        parts = [f"{self.stills} still{'s' * (self.stills != 1)}"] if self.stills > 0 else []
+        if self.frames > 0:
             parts.append(f"{self.video_s:.{int(self.video_s < 1)}f} s of video")
         return " and ".join(parts)
 
@@ -63,7 +70,8 @@ class BacklogTotals:
 class SessionBacklog:
     """Of one session, open or over. Safe for the receiving thread and the perception worker's.
 
-    ``log`` takes events that may lie before others it has; ``stills`` is the session's own where it is open.
+    ``log`` takes events that may lie before others it has; ``stills`` is the session's own where it is open. ``able``
+    says whether ``outputs``, the sinks behind ``log`` that the edge may rely on, will write what is logged now.
     """
 
     def __init__(
@@ -75,6 +83,7 @@ class SessionBacklog:
         read: Callable[[ReceivedStill], None],
         stills: StillSequenceWindow | None = None,
         able: Callable[[], bool] = lambda: True,
+        outputs: Sequence[QueuedSink[Event]] = (),
     ) -> None:
         self.info = info
         self.perception = perception
@@ -82,6 +91,7 @@ class SessionBacklog:
         self.log = log
         self.able = able
         """Whether what is logged will be written. Otherwise it is to come again, for its edge would forget it."""
+        self._outputs = outputs
         self._read = read
         self._stills = stills or StillSequenceWindow()
         self._frame_ns = round(SECOND_NS / info.fps)
@@ -103,12 +113,35 @@ class SessionBacklog:
         return self._stills.is_new_stored(sequence)
 
     def read_still(self, still: ReceivedStill) -> None:
-        """Read and count a still."""
-        self._read(still)
+        """Read and count a still; whatever goes wrong, it is new when it comes again."""
         header = still.header
+        try:
+            self._read(still)
+        except Exception:
+            self._stills.forget(header.sequence)
+            raise
         with self._lock:
             for totals in (self.totals, self._news):
                 totals.add_still(header.frame_index, header.capture_ns)
+
+    def receipt(self) -> Receipt:
+        """Of what is logged from now on: only what is written is to be acknowledged."""
+        return Receipt(self._outputs)
+
+    def lose_still(self, sequence: int) -> None:
+        """A still that was read is lost on its way into the recording: it is new again."""
+        self._stills.forget(sequence)
+        with self._lock:
+            for totals in (self.totals, self._news):
+                totals.take_back(stills=1, frames=0, video_s=0.0)
+
+    def lose_frames(self, lengths_s: Mapping[int, float]) -> None:
+        """Frames that were shown are lost on their way into the recording: they are missing again."""
+        with self._lock:
+            for frame_index in lengths_s:
+                self._frames.discard(frame_index)
+            for totals in (self.totals, self._news):
+                totals.take_back(stills=0, frames=len(lengths_s), video_s=sum(lengths_s.values()))
 
     def note(self, still: Refinement) -> None:
         """Note what became of a still, for the boxes of its frame should it be a stored one."""
@@ -119,20 +152,23 @@ class SessionBacklog:
         for named in self._late.named(event) if isinstance(event, Overlay) else (event,):
             self.log(named)
 
-    def show(self, unit: BacklogUnit, image: Image | None, *, after: BacklogUnit | None) -> bool:
-        """Log a frame that is missing; False where it is not, or cannot be shown (``image`` is None)."""
+    def show(self, unit: BacklogUnit, image: Image | None, *, after: BacklogUnit | None) -> float | None:
+        """Log a frame that is missing, and say for how many seconds it counts.
+
+        None where it is not missing, or cannot be shown (``image`` is None).
+        """
         with self._lock:
             if image is None:
                 self.totals.left_out += unit.frame_index not in self._frames
-                return False
+                return None
             if not self._frames.add([unit.frame_index]):
-                return False
+                return None
             frames = 1 if after is None else unit.frame_index - after.frame_index
             lasts_s = min(frames / self.info.fps, _LONGEST_S)
             for totals in (self.totals, self._news):
                 totals.add_frame(unit.frame_index, unit.capture_ns, lasts_s=lasts_s)
         self.log(VideoSample(unit.frame_index, unit.capture_ns, unit.data, unit.keyframe, stored=True))
-        return True
+        return lasts_s
 
     def end_boxes(self, last: BacklogUnit) -> None:
         """The boxes of a stretch end with it, where nothing goes on from there."""

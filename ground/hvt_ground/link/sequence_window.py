@@ -41,6 +41,12 @@ class SequenceWindow:
                 self._pages.popitem(last=False)
         return self.count - before
 
+    def discard(self, number: int) -> None:
+        """Take a number out again."""
+        if number in self:
+            self._pages[number >> _PAGE_BITS] ^= 1 << (number & (1 << _PAGE_BITS) - 1)
+            self.count -= 1
+
     def __contains__(self, number: int) -> bool:
         """Whether it has been, as far as is remembered."""
         return bool(self._pages.get(number >> _PAGE_BITS, 0) >> (number & (1 << _PAGE_BITS) - 1) & 1)
@@ -80,3 +86,9 @@ class StillSequenceWindow:
     def is_new_stored(self, sequence: int) -> bool:
         """Whether a still of the backlog has not come before."""
         return self.is_new(sequence, send_ns=_NEVER_NS)
+
+    def forget(self, sequence: int) -> None:
+        """One was lost on its way into a file: it is new when it comes again."""
+        with self._lock:
+            self._seen.discard(sequence)
+            self._sent_ns.pop(sequence, None)

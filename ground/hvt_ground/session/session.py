@@ -122,13 +122,15 @@ class GroundSession:
         if worker_of is None:
             worker_of = partial(LockstepWorker if self.lockstep else RealtimeWorker, name=info.edge)
         self.worker = worker_of(self._analyze, self._step, self._read)
+        outputs = [one for one in self._queued if one.for_backlog]
         self.backlog = SessionBacklog(
             info,
             log=self._emit,
             perception=backlog_perception,
             read=lambda still: self._read([still]),
             stills=self._still_window,
-            able=lambda: all(one.is_open() for one in self._queued if one.for_backlog),
+            able=lambda: all(one.is_open() for one in outputs),
+            outputs=outputs,
         )
         """What of this session was stored at the edge while the link was down."""
 
@@ -254,7 +256,7 @@ class GroundSession:
     def report_backlog(self) -> None:
         """Say in the recording how much of the backlog has come since the last time."""
         news = self.backlog.take_news()
-        if news.first is not None:
+        if news.first is not None and news.amount():
             at = time.strftime("%H:%M:%S", time.gmtime(news.first[1] // SECOND_NS))
             self.note("info", f"{news.amount()} from the outage at {at} UTC arrived")
 

@@ -7,6 +7,6 @@ Beside what is listed here there are `mcap_file`, `message_log`, `still_files`, 
 from __future__ import annotations
 
 from hvt_ground.sinks.contract import Sink, SinkWriter
-from hvt_ground.sinks.queued import Outputs, QueuedSink
+from hvt_ground.sinks.queued import Outputs, QueuedSink, Receipt
 
-__all__ = ["Outputs", "QueuedSink", "Sink", "SinkWriter"]
+__all__ = ["Outputs", "QueuedSink", "Receipt", "Sink", "SinkWriter"]

@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar
 from hvt_common.transport.inbox import Received
 from hvt_ground.events import Refinement, VideoSample
 
-__all__ = ["Sink", "SinkWriter", "size_bytes"]
+__all__ = ["Sink", "SinkWriter", "is_stored", "size_bytes"]
 
 T_contra = TypeVar("T_contra", contravariant=True)
 
@@ -35,6 +35,11 @@ class SinkWriter(Sink[T_contra], Protocol[T_contra]):
 
     def skipped(self, count: int) -> None:
         """So many items were left out before the next one."""
+
+
+def is_stored(item: object) -> bool:
+    """Whether an edge has stored it and forgets it when it is acknowledged."""
+    return isinstance(item, VideoSample | Refinement) and item.stored
 
 
 def size_bytes(item: object) -> int:

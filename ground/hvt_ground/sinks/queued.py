@@ -6,15 +6,15 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
-from hvt_ground.sinks.contract import SinkWriter, size_bytes
+from hvt_ground.sinks.contract import SinkWriter, is_stored, size_bytes
 
-__all__ = ["Outputs", "QueuedSink"]
+__all__ = ["Outputs", "QueuedSink", "Receipt"]
 
 _log = logging.getLogger(__name__)
 
@@ -52,6 +52,10 @@ class QueuedSink(Generic[T]):
         self._changed = threading.Condition()
         self._queue: deque[tuple[T, int, int]] = deque()
         """Items, their sizes, and how many were dropped before each."""
+        self._taken = 0
+        """Items that ever were queued."""
+        self._receipts: deque[tuple[int, Callable[[bool], None]]] = deque()
+        """What is to be called when so many of them are written."""
         self._queued_bytes = 0
         self._skipped = 0
         self._in_hand = False
@@ -64,6 +68,8 @@ class QueuedSink(Generic[T]):
         self._open = self._failing = self._resumed = False
         self.missing = 0
         """Items that came while the sink was failing, or for which the queue had no room."""
+        self.stored_losses = 0
+        """How often an item that an edge has stored may have been lost."""
         self._dropped = 0
         """The latter."""
         self._thread = threading.Thread(target=self._run, name=f"hvt-{part}"[:48], daemon=True)
@@ -76,16 +82,19 @@ class QueuedSink(Generic[T]):
             if self._wait_s and not self._fits(size):
                 self._changed.wait_for(lambda: self._fits(size), self._wait_s)
             if self._ending:
-                return
-            if self._failing:
+                self.stored_losses += is_stored(item)
+            elif self._failing:
                 self.missing += 1
+                self.stored_losses += is_stored(item)
             elif self._fits(size):
                 self._queue.append((item, size, self._skipped))
+                self._taken += 1
                 self._queued_bytes += size
                 self._skipped = 0
                 self._changed.notify_all()
             else:
                 self.missing += 1
+                self.stored_losses += is_stored(item)
                 self._dropped += 1
                 self._skipped += 1
                 if self._dropped.bit_count() == 1:  # 1, 2, 4, 8 …
@@ -114,10 +123,26 @@ class QueuedSink(Generic[T]):
             return not (self._queue or self._in_hand)
 
     def is_open(self, *, within_s: float = 0.0) -> bool:
-        """Whether what is logged now will be written, as far as is known; waits so long for the sink to be made."""
+        """Whether what is logged now will be written, as far as is known; waits so long for the sink to be made.
+
+        Not where half the queue is full: what can come later leaves the rest to what is live.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._open or self._failing, within_s)
-            return self._open
+            has_space = len(self._queue) < _MOST_ITEMS // 2 and self._queued_bytes < _MOST_BYTES // 2
+            return self._open and has_space
+
+    def on_written(self, done: Callable[[bool], None], *, losses: int) -> None:
+        """Call ``done(True)`` when all that was stored and logged so far is written, ``done(False)`` when it is not.
+
+        It is not where `stored_losses` is not ``losses`` any more. Called once, here or in the sink's thread.
+        """
+        with self._changed:
+            whole = self.stored_losses == losses
+            if whole and (self._queue or self._in_hand):
+                self._receipts.append((self._taken, done))
+                return
+        done(whole)
 
     def take_resumed(self) -> bool:
         """Whether it goes on after a gap since the last call: its video does with the next keyframe."""
@@ -181,8 +206,8 @@ class QueuedSink(Generic[T]):
 
     def _take(self) -> tuple[T, int] | None:
         """The next item, and how many were dropped before it; None at the end."""
+        self._give_receipts()
         with self._changed:
-            self._in_hand = False
             self._changed.wait_for(lambda: self._queue or self._ending)
             if not self._queue:
                 return None
@@ -193,6 +218,16 @@ class QueuedSink(Generic[T]):
                 self._changed.notify_all()
             return item, skipped
 
+    def _give_receipts(self) -> None:
+        """All that was taken from the queue is written."""
+        written: list[Callable[[bool], None]] = []
+        with self._changed:
+            self._in_hand = False
+            while self._receipts and self._receipts[0][0] <= self._taken - len(self._queue):
+                written.append(self._receipts.popleft()[1])
+        for done in written:
+            done(True)
+
     def _fail(self, error: BaseException) -> None:
         """What is queued is lost."""
         self._pause.failed(time.monotonic_ns())
@@ -202,9 +237,29 @@ class QueuedSink(Generic[T]):
             self._queue.clear()
             self._queued_bytes = self._skipped = 0
             self._in_hand = False
+            self.stored_losses += 1
+            lost = [done for _, done in self._receipts]
+            self._receipts.clear()
             self._changed.notify_all()
+        for done in lost:
+            done(False)
         self._failures.failed(self.part, reason_of(error))
         _log.debug("%s failed", self.part, exc_info=error)
+
+
+class Receipt:
+    """Of what is stored and logged between its making and `then` to each of ``sinks``: whether it is written."""
+
+    def __init__(self, sinks: Sequence[QueuedSink[Any]]) -> None:
+        self._sinks = [(sink, sink.stored_losses) for sink in sinks]
+
+    def then(self, done: Callable[[bool], None]) -> None:
+        """Call ``done(True)`` when all of it is written, ``done(False)`` when some is lost; once, in any thread."""
+        if not self._sinks:
+            done(True)
+            return
+        sink, losses = self._sinks.pop()
+        sink.on_written(lambda whole: self.then(done) if whole else done(False), losses=losses)
 
 
 class Outputs:

@@ -1,15 +1,22 @@
-"""Jobs of the backlog that a session's end overtakes: the recording that they hold is let go."""
+"""Jobs of the backlog: what they log is acknowledged when it is written; what a session's end overtakes is let go."""
 
 from __future__ import annotations
 
 import threading
+import time
 
-from hvt_common.protocol.messages import parse_backlog_units
+import pytest
+
+from hvt_common.protocol.messages import BacklogUnit, RoiHeader, parse_backlog_units
+from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
-from hvt_ground.backlog.jobs import Destination, VideoJob
+from hvt_ground.backlog.jobs import Destination, StillJob, VideoJob
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.perception.worker import RealtimeWorker
+from hvt_ground.events import Event, Notice, Refinement, VideoSample
+from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.worker import Job, RealtimeWorker
+from hvt_ground.sinks import QueuedSink
 from programs.processes import eventually
 from rigs.backlog_chunks import video_object
 from rigs.flight import Flight, RedSquares, SameAnswer
@@ -49,3 +56,176 @@ def test_work_that_was_never_begun_lets_its_recording_go():
     go_on.set()
     eventually(lambda: not users, within_s=20, what="the boxes that were to be found hold nothing either")
     assert None not in outcomes
+
+
+class SlowFile:
+    """Writes when the disk is ``ready``; ``breaks`` makes the next write fail."""
+
+    path = None
+
+    def __init__(self) -> None:
+        self.ready, self.writing, self.breaks = threading.Event(), threading.Event(), threading.Event()
+        self.written: list[Event] = []
+
+    def log(self, item: Event) -> None:
+        """Write when there is a disk."""
+        self.writing.set()
+        self.ready.wait(timeout=30)
+        if self.breaks.is_set():
+            self.breaks.clear()
+            raise OSError(28, "No space left on device")
+        self.written.append(item)
+
+    def skipped(self, count: int) -> None:
+        """Nothing is said of it."""
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """It has no end."""
+
+    @property
+    def frames(self) -> list[int]:
+        """Of the video that is written."""
+        return [one.frame_index for one in self.written if isinstance(one, VideoSample)]
+
+
+class Outage:
+    """Stored things of one session on their way to a slow file."""
+
+    def __init__(self) -> None:
+        self.flight = Flight(30, keyframes=(0,))
+        self.file = SlowFile()
+        self.sink: QueuedSink[Event] = QueuedSink(
+            "recording", lambda: self.file, failures=Failures(time.time_ns)
+        )
+        assert self.sink.is_open(within_s=20)
+        self.backlog = SessionBacklog(
+            self.flight.info(),
+            log=self.sink.log,
+            perception=None,
+            read=self._read,
+            able=self.sink.is_open,
+            outputs=[self.sink],
+        )
+        self.units = [
+            BacklogUnit(frame_index=i, capture_ns=u.capture_ns, data=u.data, keyframe=u.keyframe)
+            for i, u in enumerate(self.flight.units)
+        ]
+        self.said: list[bool | None] = []
+        self._to = Destination(lambda: self.backlog if self.backlog.able() else None, lambda _backlog: None)
+
+    def video(self) -> VideoJob:
+        """The edge sends its video, perhaps again."""
+        worker = RealtimeWorker(lambda *_: None, lambda *_: None, lambda _stills: None, name="x")
+        worker.close()
+        return VideoJob(self.units, self._to, worker=worker, done=self.said.append)
+
+    def still(self) -> StillJob:
+        """The edge sends a still, perhaps again."""
+        item = self.flight.still(3, 7)
+        header = RoiHeader.parse(item.attachment, item.payload)
+        return StillJob(ReceivedStill(header, item.payload), self._to, done=self.said.append)
+
+    def hold(self) -> None:
+        """The disk stops in the middle of an event."""
+        self.sink.log(Notice(0, 0, "info", "held"))
+        assert self.file.writing.wait(timeout=20)
+
+    def fill(self, count: int) -> None:
+        """So many live events come while the disk stands still."""
+        for number in range(count):
+            self.sink.log(Notice(number, number, "info", "live"))
+
+    def _read(self, still: ReceivedStill) -> None:
+        header = still.header
+        self.sink.log(
+            Refinement(
+                frame_index=header.frame_index,
+                capture_ns=header.capture_ns,
+                still_sequence=header.sequence,
+                track_id=None,
+                edge_track_id=1,
+                box_base_px=(0, 0, 9, 9),
+                still=still.data,
+                media_type="image/jpeg",
+                base_crop_bgr=None,
+                class_before="car",
+                class_after="car",
+                confidence=0.9,
+                reason="new",
+                quality_pct=75,
+                stored=True,
+            )
+        )
+
+
+def finish(job: Job) -> None:
+    """Do all steps, as a worker does them."""
+    while not job.step():
+        pass
+    job.close()
+
+
+@pytest.mark.parametrize("kind", ["video", "still"])
+def test_what_was_stored_is_acknowledged_when_it_is_written(kind):
+    """A ground that fell over before the disk had it would take it along: its edge had deleted it."""
+    outage = Outage()
+    outage.hold()
+    finish(getattr(outage, kind)())
+    assert outage.said == [], "it stands in a queue"
+    outage.file.ready.set()
+    eventually(lambda: outage.said == [True], within_s=20, what="it is written")
+    outage.sink.close()
+
+
+@pytest.mark.parametrize("kind", ["video", "still"])
+def test_stored_things_do_not_press_into_a_queue_that_is_half_full(kind):
+    """They found no room there, were counted as come, and deleted at the edge: nobody has them any more."""
+    outage = Outage()
+    outage.hold()
+    outage.fill(4200)
+    finish(getattr(outage, kind)())
+    assert outage.said == [None], "it is to come again"
+    outage.file.ready.set()
+    eventually(lambda: outage.sink.idle, within_s=20, what="the disk has kept up")
+    finish(getattr(outage, kind)())
+    eventually(lambda: outage.said == [None, True], within_s=20, what="the second time it is written")
+    assert outage.file.frames == (list(range(30)) if kind == "video" else [])
+    outage.sink.close()
+
+
+def test_a_stretch_that_meets_a_full_queue_halfway_goes_on_where_it_was():
+    """Its second coming would put frames twice into the recording, or leave out the rest of them."""
+    outage = Outage()
+    outage.hold()
+    job = outage.video()
+    for _ in range(10):
+        assert not job.step()
+    outage.fill(4200)
+    finish(job)
+    assert outage.said == []
+    outage.file.ready.set()
+    eventually(lambda: outage.said == [None], within_s=20, what="it is to come again")
+    eventually(lambda: outage.sink.idle, within_s=20, what="the disk has kept up")
+    finish(outage.video())
+    eventually(lambda: outage.said == [None, True], within_s=20, what="the rest is written")
+    assert outage.file.frames == list(range(30))
+    assert outage.backlog.totals.frames == 30
+    outage.sink.close()
+
+
+@pytest.mark.parametrize("kind", ["video", "still"])
+def test_what_a_failing_disk_took_along_is_new_when_it_comes_again(kind, monkeypatch):
+    """It would be acknowledged at its second coming, for having been here before."""
+    monkeypatch.setattr(RetryPause, "due", lambda _self, _now_ns: True)
+    outage = Outage()
+    outage.hold()
+    finish(getattr(outage, kind)())
+    outage.file.breaks.set()
+    outage.file.ready.set()
+    eventually(lambda: outage.said == [None], within_s=20, what="it is lost")
+    assert (outage.backlog.totals.frames, outage.backlog.totals.stills) == (0, 0)
+    eventually(outage.sink.is_open, within_s=20, what="there is a file again")
+    finish(getattr(outage, kind)())
+    eventually(lambda: outage.said == [None, True], within_s=20, what="it is written")
+    assert len(outage.file.written) == (30 if kind == "video" else 1)
+    outage.sink.close()

@@ -21,6 +21,7 @@ from rerun.chunk import Chunk
 from hvt_common.units import bitrate_text
 from hvt_common.video.annex_b import parameter_sets
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
+from hvt_ground.sinks.contract import is_stored
 from hvt_ground.sinks.palette import AMBER, GREY, VERMILLION, Rgb
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.live_view import LiveRecording
@@ -109,8 +110,8 @@ class Recorder:
         self._shown: dict[tuple[str, str], TableRow] = {}
         """What is on the screen: the newest row of each table whose values hold until the next."""
         self._last_sample: int | None = None
-        self._awaits_keyframe = {False: False, True: False}
-        """Whether live or stored video begins anew at its next keyframe."""
+        self._awaits_keyframe = False
+        """Whether live video begins anew at its next keyframe. What was stored comes again where it was lost."""
         self._skipped = 0
         self._settings = settings
         self._traffic_end: tuple[int, int] | None = None
@@ -218,7 +219,7 @@ class Recorder:
     def skipped(self, count: int) -> None:
         """Video goes on at its next keyframe, and the log says what is missing."""
         self._skipped += count
-        self._awaits_keyframe = {False: True, True: True}
+        self._awaits_keyframe = True
 
     def close(self, hurry: threading.Event | None = None) -> None:
         """Close the file, or the viewer's connection (`close_file`)."""
@@ -249,7 +250,7 @@ class Recorder:
     # What each event writes
 
     def _gap_rows(self, event: FrameEvent) -> list[TableRow]:
-        if not self._skipped or (isinstance(event, VideoSample | Refinement) and event.stored):
+        if not self._skipped or is_stored(event):
             return []
         text, self._skipped = f"{self._skipped} events are missing here: writing was too slow", 0
         return [TableRow(names.EVENTS, "text", LogText(text, "WARN", AMBER), len(text))]
@@ -277,10 +278,7 @@ class Recorder:
         return self._map.pose(update)
 
     def _sample(self, sample: VideoSample) -> list[TableRow]:
-        if self._awaits_keyframe[sample.stored] and not sample.keyframe:
-            return []
-        self._awaits_keyframe[sample.stored] = False
-        if not sample.stored and not self._decodable(sample):
+        if not sample.stored and not self._goes_on(sample):
             log.debug("frame %d left out of the recording: not decodable there", sample.frame_index)
             return []
         size = len(sample.data)
@@ -292,6 +290,11 @@ class Recorder:
             self._last_sample = sample.frame_index
             self._overlays.earn(size)
         return [TableRow(names.VIDEO, "video", sample.data, size)]
+
+    def _goes_on(self, sample: VideoSample) -> bool:
+        if sample.keyframe:
+            self._awaits_keyframe = False
+        return not self._awaits_keyframe and self._decodable(sample)
 
     def _decodable(self, sample: VideoSample) -> bool:
         """Rerun shows garbage for what its decoder cannot use, so begin at a keyframe and never go back."""
