@@ -109,8 +109,6 @@ class CodedLiveSource(LiveSource):
                 self._news.wait_for(lambda: self._queue or self._stop.is_set(), _IDLE_S)
                 item = self._queue.popleft() if self._queue else None
                 self._queued_bytes -= 0 if item is None else len(item.packet.data)
-            if self._failure is not None:
-                raise self._failure
             if self._stop.is_set():
                 return
             if item is None:

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.clock import SteadyClock
-from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Fit, Frame, Image
 from hvt_edge.source.camera_clock import CameraClock
@@ -85,9 +85,9 @@ class Grabber(Protocol):
 class LiveSource(Source):
     """A camera or stream, resampled to the base rate by `Gate`; slow consumers lose frames, never gain delay.
 
-    Frames are not repeated when the camera is slower than the base rate. After a loss of signal the source is
-    opened again, with growing pauses, until it is closed. ``clock`` gives Unix nanoseconds and must not go back, or
-    the source is silent for as long.
+    Frames are not repeated when the camera is slower than the base rate. After a loss of signal, or any other error
+    of the grabber, the source is opened again, with growing pauses, until it is closed. ``clock`` gives Unix
+    nanoseconds and must not go back, or the source is silent for as long.
     """
 
     live = True
@@ -124,7 +124,6 @@ class LiveSource(Source):
         self._news = threading.Condition()
         self._latest: tuple[int, Image] | None = None
         self._gate = Gate(self.fps)
-        self._failure: BaseException | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-source", daemon=True)
         self._thread.start()
@@ -140,8 +139,6 @@ class LiveSource(Source):
             with self._news:
                 self._news.wait_for(lambda: self._latest or self._stop.is_set(), _IDLE_S)
                 item, self._latest = self._latest, None
-            if self._failure is not None:
-                raise self._failure
             if self._stop.is_set():
                 return
             if item is None:
@@ -176,11 +173,9 @@ class LiveSource(Source):
                     shot = self._grabber.grab()
                     capture_ns = camera_clock.capture_ns(shot.camera_ns, now_ns=self._clock())
                     self._take(shot, capture_ns)
-                except SignalLost as error:
+                except Exception as error:  # noqa: BLE001 - a driver or a decoder raises what it likes
                     self._recover(error)
                     camera_clock = CameraClock()
-        except BaseException as error:  # noqa: BLE001 - handed to the consumer, which raises it
-            self._failure = error
         finally:
             self._grabber.close()
             self._end()
@@ -198,16 +193,17 @@ class LiveSource(Source):
             self._news.notify_all()
         self._failures.works(SOURCE_PART)
 
-    def _recover(self, error: SignalLost) -> None:
+    def _recover(self, error: Exception) -> None:
         """Open the grabber again, waiting twice as long after each failure; returns when it is open or we stop."""
         while not self._stop.is_set():  # what stops because it is closed has not failed
+            reason = str(error) if isinstance(error, SignalLost) else reason_of(error)
             self._pause.failed(self._clock())
-            self._failures.failed(SOURCE_PART, f"{self._grabber.name} stopped ({error})")
+            self._failures.failed(SOURCE_PART, f"{self._grabber.name} stopped ({reason})")
             if self._stop.wait(self._pause.pause_ns / SECOND_NS):
                 return
             try:
                 self._grabber.restart()
-            except SignalLost as again:
+            except Exception as again:  # noqa: BLE001 - see above
                 error = again
             else:
                 self.restarts += 1

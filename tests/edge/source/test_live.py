@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_edge.source.camera_clock import CameraClock
+from hvt_edge.source.live import LiveSource, Shot
 from hvt_edge.source.opening import open_source
 from programs.rtsp_camera import RtspCamera
 
@@ -91,3 +94,76 @@ def test_a_camera_that_goes_away_is_told_of_and_comes_back(free_port, caplog):
     assert first.url in failed.reason
     assert indices == list(range(len(indices)))
     assert len(caplog.records) <= 2, "said once, and once that it is back"
+
+
+class Faulty:
+    """A camera whose driver raises one of ``errors`` after each opening, as long as there are some."""
+
+    name, notes = "cam", None
+
+    def __init__(self, *errors: Exception) -> None:
+        self._errors = iter(errors)
+        self._whole = True
+        self.restarts = 0
+
+    def open(self) -> None:
+        """It is open."""
+
+    def restart(self) -> None:
+        """Every second one fails, too."""
+        self.restarts += 1
+        if self.restarts % 2:
+            raise RuntimeError("the driver is not ready")
+        self._whole = True
+
+    def grab(self) -> Shot:
+        """A picture at once, and then what goes wrong."""
+        self._whole, whole = False, self._whole
+        if not whole and (error := next(self._errors, None)) is not None:
+            raise error
+        time.sleep(0.02)
+        return Shot(partial(np.zeros, (48, 64, 3), np.uint8))
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("where", ["grab", "picture"])
+def test_an_error_that_nobody_expects_of_a_camera_costs_its_pictures_alone(monkeypatch, caplog, where):
+    """One odd frame of a driver or a decoder would end the flight."""
+    monkeypatch.setattr("hvt_edge.source.live._FIRST_WAIT_NS", SECOND_NS // 100)
+    camera, failures, waits = Faulty(ValueError("no such layout")), Failures(time.time_ns), []
+    if where == "picture":
+        monkeypatch.setattr(camera, "grab", raising_pictures(camera.grab))
+    with LiveSource(camera, size=lambda size: size, fps=25, fit="letterbox", failures=failures) as source:
+        for frame in source.steps(start_ns=0):
+            waits += [] if frame is None else [frame.index]
+            if source.restarts and len(waits) > 5:
+                break
+    assert waits == list(range(len(waits)))
+    assert (camera.restarts, source.restarts) == (2, 1)
+    (failed,) = failures.parts
+    assert (failed.part, failed.working, failed.count) == ("source", True, 2)
+    assert failed.reason == "cam stopped (RuntimeError: the driver is not ready)"
+    assert [one.message for one in caplog.records] == [
+        "source: cam stopped (ValueError: no such layout); all else goes on, and it is tried again",
+        "source: works again",
+    ]
+
+
+def raising_pictures(grab):
+    """The same, where the error comes as late as the conversion of the picture."""
+
+    def late() -> Shot:
+        try:
+            return grab()
+        except ValueError as error:
+            raised = error
+
+        def image():
+            raise raised
+
+        return Shot(image)
+
+    return late
