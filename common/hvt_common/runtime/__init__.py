@@ -1,5 +1,6 @@
 """What every process needs: `clock`, `failures`, `log`, `plug_ins`, `process` (signals), `reporting`, `statistics`.
 
-`health_server` answers who watches one, `prometheus` in the words of metrics, `status_command` in a table.
+`health_server` answers who watches one, `prometheus` in the words of metrics, `status_command` in a table;
+`host_names` are those under which a browser may ask.
 `checkup` is what a program checks before its start.
 """

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import socket
 import threading
 from collections.abc import Callable, Mapping
@@ -21,6 +20,7 @@ from urllib.parse import urlsplit
 
 from hvt_common.errors import NotYetError, UserError, may_come
 from hvt_common.runtime.failures import Awaited, Failures
+from hvt_common.runtime.host_names import host_and_port, names_this_machine, requested_host
 from hvt_common.units import SECOND_NS
 
 __all__ = ["Answer", "HealthServer", "State", "state_answers"]
@@ -112,7 +112,7 @@ class HealthServer:
         name: str,
         failures: Failures,
     ) -> None:
-        host, port = _parsed(address, name=name)
+        host, port = host_and_port(address, name=name, example="127.0.0.1:9464")
 
         def bound() -> _Server:
             try:
@@ -154,6 +154,7 @@ class _Server(ThreadingMixIn, HTTPServer):
 
     def __init__(self, host: str, port: int, answers: Mapping[str, Callable[[], Answer]]) -> None:
         self.answers = answers
+        self.host = host
         self._free = threading.BoundedSemaphore(_MOST_AT_ONCE)
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         super().__init__((host, port), _Handler)
@@ -191,8 +192,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().finish()
 
     def do_GET(self) -> None:
-        make = self.server.answers.get(urlsplit(self.path).path)
-        answer = Answer(b"not here\n", status=404) if make is None else make()
+        answer = self._answer()
         self.send_response(answer.status)
         self.send_header("Content-Type", answer.media_type)
         self.send_header("Content-Length", str(len(answer.body)))
@@ -200,20 +200,17 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(answer.body)
 
+    def _answer(self) -> Answer:
+        # A browser always says which host it asks for, a probe may say nothing.
+        said = self.headers.get_all("Host", [])
+        if any(not names_this_machine(requested_host(one), served_at=self.server.host) for one in said):
+            return Answer(b"unknown host: ask by the address of this machine\n", status=403)
+        make = self.server.answers.get(urlsplit(self.path).path)
+        return Answer(b"not here\n", status=404) if make is None else make()
+
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - http.server's name
         pass
 
     def _give_up(self) -> None:
         with contextlib.suppress(OSError):
             self.connection.shutdown(socket.SHUT_RDWR)
-
-
-def _parsed(address: str, *, name: str) -> tuple[str, int]:
-    try:
-        parts = urlsplit(f"//{address}")
-        host, port = parts.hostname or "", parts.port or 0
-    except ValueError:
-        host, port = "", 0
-    if not re.fullmatch(r"[\w.:%-]+", host) or not port or parts.path or parts.query:
-        raise UserError(f"{name} {address!r} is not accepted: give HOST:PORT, such as 127.0.0.1:9464")
-    return host, port

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import json
 import re
 from collections.abc import Mapping
@@ -15,6 +14,7 @@ import zenoh
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
+from hvt_common.runtime.host_names import is_loopback
 
 __all__ = [
     "DEFAULT_ENDPOINT",
@@ -235,19 +235,12 @@ def _insert_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...
 
 def _check_reach(endpoint: str, *, allowed: bool) -> None:
     found = _ENDPOINT.fullmatch(endpoint)
-    if allowed or (found is not None and _is_loopback(found["host"])) or endpoint.startswith("unixsock"):
+    if allowed or (found is not None and is_loopback(found["host"])) or endpoint.startswith("unixsock"):
         return
     raise UserError(
         f"listening on {endpoint} without keys would let anybody on its network watch and command: listen on "
         "127.0.0.1 or [::1], give certificates with enable_mtls in --zenoh-config, or accept it with --insecure"
     )
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _has_keys(said: dict[str, Any], endpoint: str) -> bool:

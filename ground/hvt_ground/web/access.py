@@ -21,13 +21,14 @@ from urllib.parse import urlsplit
 import platformdirs
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.host_names import is_loopback, requested_host
 
-__all__ = ["HEADERS", "ROLE_HEADER", "Access", "Role", "cookie_name", "is_loopback", "own_tokens"]
+__all__ = ["HEADERS", "ROLE_HEADER", "Access", "Role", "cookie_name", "own_tokens"]
 
 Role = Literal["viewer", "operator"]
 
 ROLE_HEADER = "X-HVT-Role"
-"""In it a reverse proxy names the role."""
+"""In it a reverse proxy names the role; once, and only under the proxy's own host, it counts."""
 HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; media-src blob:; "
@@ -40,12 +41,6 @@ HEADERS = {
 }
 _LEAST_TOKEN = 16
 _FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
-_LOOPBACK = ("localhost", "127.0.0.1", "::1")
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches it."""
-    return host in _LOOPBACK or host.startswith("127.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +54,12 @@ class Access:
         """What a request may do; None is nothing. ``token`` is that of a link, else the cookie counts."""
         if not self.tokens:
             # Another site's name may be made to lead here: only our own names are answered.
-            host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
-            if not is_loopback(host) and host != self.proxy:
-                return None
+            host = requested_host(headers.get("host", ""))
             if self.proxy is None:  # what came through a proxy that nobody told of may come from anywhere
-                return None if any(one in headers for one in _FORWARDED) else "operator"
+                through = any(one in headers for one in (*_FORWARDED, ROLE_HEADER.lower()))
+                return "operator" if is_loopback(host) and not through else None
+            if host != self.proxy:  # a page under another name can set the header itself
+                return None
             said = headers.get(ROLE_HEADER.lower())
             return next((role for role in get_args(Role) if role == said), None)
         given = (token or _cookie(headers)).encode()
@@ -76,7 +72,10 @@ class Access:
         if self.tokens:
             return "give the link that hvt-ground showed at its start", 401
         if self.proxy is not None:
-            return f"the proxy of {self.proxy} has to say in {ROLE_HEADER} who is viewer or operator", 403
+            return (
+                f"the proxy of {self.proxy} has to pass that host on and say in {ROLE_HEADER} who is viewer or "
+                "operator"
+            ), 403
         return "unknown host, or a reverse proxy without --web-proxy", 403
 
     def foreign(self, headers: Mapping[str, str]) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import logging
-import re
 import socket
 import ssl
 import struct
@@ -23,10 +22,11 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from hvt_common.errors import NotYetError, UserError, may_come
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import Awaited, Failures
+from hvt_common.runtime.host_names import host_and_port, is_loopback
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Refinement
 from hvt_ground.state import GroundState
-from hvt_ground.web.access import Access, is_loopback, own_tokens
+from hvt_ground.web.access import Access, own_tokens
 from hvt_ground.web.feed import SessionFeed, state_loads, state_message, still_name
 from hvt_ground.web.requests import EdgeRequests
 from hvt_ground.web.site import MOST_MESSAGE_BYTES, make_site
@@ -62,7 +62,7 @@ class WebPage:
         proxy: str | None = None,
         recorded: bool | None = None,
     ) -> None:
-        host, port = _parsed(address)
+        host, port = host_and_port(address, name="--web", example="127.0.0.1:8080")
         if proxy is not None:
             _check_proxy(proxy, address, local=is_loopback(host))
         tokens = {} if is_loopback(host) else own_tokens()
@@ -190,17 +190,6 @@ def _own_addresses() -> list[str]:
     used_bytes = struct.unpack("iP", answer)[0]
     known = (socket.inet_ntoa(rows[at + 20 : at + 24].tobytes()) for at in range(0, used_bytes, _ROW_BYTES))
     return [one for one in dict.fromkeys(known) if not is_loopback(one)][:_MOST_ADDRESSES]
-
-
-def _parsed(address: str) -> tuple[str, int]:
-    try:
-        parts = urlsplit(f"//{address}")
-        host, port = parts.hostname or "", parts.port or 0
-    except ValueError:
-        host, port = "", 0
-    if not re.fullmatch(r"[\w.:%-]+", host) or not port or parts.path or parts.query:
-        raise UserError(f"--web {address!r} is not accepted: give HOST:PORT, such as 127.0.0.1:8080")
-    return host, port
 
 
 def _check_proxy(proxy: str, address: str, *, local: bool) -> None:

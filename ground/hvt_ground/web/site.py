@@ -235,7 +235,11 @@ class _Guard:
             await WebSocket(scope, receive, guarded).send_denial_response(refusal)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        headers: dict[str, str] = {}
+        for name, value in scope["headers"]:  # one given twice is a list (RFC 9110, 5.3)
+            before = headers.get(name.decode("latin-1"))
+            said = value.decode("latin-1")
+            headers[name.decode("latin-1")] = said if before is None else f"{before}, {said}"
         token = None
         if scope["type"] == "http" and scope["path"] == "/":
             token = Request(scope).query_params.get("token")

@@ -10,6 +10,7 @@ import pytest
 from hvt_ground.web.access import Access, cookie_name, own_tokens
 
 GROUNDS = 8
+OPERATOR = {"x-hvt-role": "operator"}
 
 
 def test_grounds_that_start_at_once_agree_on_their_tokens(tmp_path):
@@ -65,3 +66,33 @@ def test_a_proxy_that_drops_the_port_is_told_which_header_is_wrong(host, origin,
     """The page would say "no connection" for ever, and nobody look at the proxy."""
     found = Access({}, proxy="hvt.example.org").foreign({"host": host, "origin": origin})
     assert found.count(said) if said else found == ""
+
+
+@pytest.mark.parametrize(
+    ("host", "role"),
+    [
+        ("127.0.0.1:8080", "operator"),
+        ("127.0.0.2", "operator"),
+        ("LocalHost:8080", "operator"),
+        ("[::1]:8080", "operator"),
+        ("[::ffff:127.0.0.1]", "operator"),
+        ("127.evil.example:8080", None),
+        ("127.0.0.1.evil.example", None),
+        ("localhost.evil.example", None),
+        ("127.0.0.1:8080, evil.example", None),
+        ("[127.0.0.1", None),
+        ("evil.example", None),
+        ("192.0.2.7", None),
+        ("", None),
+    ],
+)
+def test_only_an_address_of_loopback_makes_an_operator(host, role):
+    """Any website could have such a name lead here, and command the edge from its page."""
+    assert Access({}).role({"host": host}) == role
+    assert Access({}, proxy="hvt.example.org").role({"host": host} | OPERATOR) is None
+
+
+def test_a_role_counts_from_the_named_proxy_alone():
+    """A page may set any header in requests to its own origin, and would name itself operator."""
+    assert Access({}, proxy="hvt.example.org").role({"host": "hvt.example.org"} | OPERATOR) == "operator"
+    assert Access({}).role({"host": "127.0.0.1:8080"} | OPERATOR) is None, "no proxy was named"

@@ -147,7 +147,14 @@ def test_all_files_of_the_page_are_there_and_nothing_else(local):
 
 def test_another_sites_name_for_this_machine_is_not_served(local):
     """A page of another site could have its name lead here, and read everything."""
-    assert asked(local, "/", Host=f"evil.example:{local}")[0] == 403
+    for name in ("evil.example", "127.evil.example", "127.0.0.1.evil.example"):
+        host = f"{name}:{local}"
+        assert asked(local, "/", Host=host)[0] == 403
+        answer = asked(local, "/edges/uav-1/keyframe", "POST", b"{}", Host=host, Origin=f"http://{host}")
+        assert answer[0] == 403
+        with pytest.raises(InvalidStatus) as refused:
+            connect(f"ws://{host}/ws", sock=reached(local), origin=f"http://{host}")
+        assert refused.value.response.status_code == 403
 
 
 def test_a_page_of_another_site_cannot_watch_or_command(local):
@@ -177,7 +184,12 @@ def test_a_proxy_says_who_somebody_is(port):
         for role in ("", "admin", "operator, viewer"):
             assert asked(port, "/", Host=host, X_HVT_Role=role)[0] == 403
         assert asked(port, "/", Host=host)[0] == asked(port, "/")[0] == 403
-        assert asked(port, "/", Host="evil.example", X_HVT_Role="operator")[0] == 403
+        for name in ("evil.example", f"127.evil.example:{port}", f"127.0.0.1:{port}", "[127.0.0.1"):
+            assert asked(port, "/", Host=name, X_HVT_Role="operator")[0] == 403
+        with reached(port) as raw:  # one of a browser, passed on beside the proxy's
+            raw.sendall(b"GET / HTTP/1.0\r\nHost: %s\r\n" % host.encode())
+            raw.sendall(b"X-HVT-Role: viewer\r\nX-HVT-Role: operator\r\n\r\n")
+            assert b" 403 " in raw.recv(100)
 
 
 def test_a_proxy_that_nobody_told_of_lets_nobody_in(local):

@@ -1,0 +1,62 @@
+"""Names and addresses at which this machine serves HTTP, and by which a browser may ask for it.
+
+A site may have its own name lead to an address of this machine (DNS rebinding): its pages could then read all that
+a server answers, and command. So a server answers only to names that no stranger can have.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import socket
+from urllib.parse import urlsplit
+
+from hvt_common.errors import UserError
+
+__all__ = ["host_and_port", "is_loopback", "names_this_machine", "requested_host"]
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches it: `localhost`, or an address of loopback and nothing like one."""
+    address = _address(host)
+    return host == "localhost" if address is None else address.is_loopback
+
+
+def names_this_machine(host: str, *, served_at: str) -> bool:
+    """Whether no other site can be called so. ``served_at`` is the host on which is listened.
+
+    On loopback these are its own names; elsewhere any address, a name without a dot, and the one listened on.
+    """
+    if is_loopback(served_at) or not host:
+        return is_loopback(host)
+    return host in (served_at, socket.gethostname().lower()) or "." not in host or _address(host) is not None
+
+
+def requested_host(header: str) -> str:
+    """The host of a header ``Host``, in small letters and without brackets and port; empty where it is none."""
+    try:
+        parts = urlsplit(f"//{header}")
+        valid = parts.port != 0  # which raises for what is no number
+    except ValueError:
+        return ""
+    return parts.hostname or "" if valid and parts.netloc == header and "@" not in header else ""
+
+
+def host_and_port(address: str, *, name: str, example: str) -> tuple[str, int]:
+    """Of ``HOST:PORT``. Raises `UserError`, which names the option, where it is none."""
+    try:
+        parts = urlsplit(f"//{address}")
+        host, port = parts.hostname or "", parts.port or 0
+    except ValueError:
+        host, port = "", 0
+    if not re.fullmatch(r"[\w.:%-]+", host) or not port or parts.path or parts.query:
+        raise UserError(f"{name} {address!r} is not accepted: give HOST:PORT, such as {example}")
+    return host, port
+
+
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        address = ipaddress.ip_address(host.removeprefix("[").removesuffix("]"))
+    except ValueError:
+        return None
+    return getattr(address, "ipv4_mapped", None) or address

@@ -1,0 +1,60 @@
+"""Who watches a program: nobody else's page reads along."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import time
+from contextlib import suppress
+
+import pytest
+
+from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.health_server import Answer, HealthServer
+from programs.processes import eventually, free_ports
+
+STATE = {"/state.json": lambda: Answer(json.dumps({"latitude_deg": 52.1}).encode())}
+
+
+def asked(port: int, host: str | None) -> int:
+    """The status of the answer to a request under that name."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.putrequest("GET", "/state.json", skip_host=True)
+    if host is not None:
+        connection.putheader("Host", host)
+    connection.endheaders()
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+def answers(port: int) -> bool:
+    """Whether it is there."""
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+        return True
+    return False
+
+
+@pytest.mark.parametrize(
+    ("served_at", "names", "strangers"),
+    [
+        (
+            "127.0.0.1",
+            ("127.0.0.1", "LOCALHOST:9", "[::1]:9", None),
+            ("evil.example", "127.evil.example:9", "127.0.0.1.evil.example", "192.0.2.7", "[", "", "a, b"),
+        ),
+        (
+            "0.0.0.0",
+            ("127.0.0.1", "192.0.2.7:9", "[2001:db8::1]:9", "base", socket.gethostname(), None),
+            ("evil.example", "127.evil.example:9", "base.evil.example", ""),
+        ),
+    ],
+)
+def test_state_is_told_under_names_of_this_machine_alone(served_at, names, strangers):
+    """Another site could have its name lead here, and its page would read where the drone is."""
+    (port,) = free_ports(1)
+    with HealthServer(f"{served_at}:{port}", STATE, name="--metrics", failures=Failures(time.time_ns)):
+        eventually(lambda: answers(port), within_s=30, what="it serves")
+        assert {one: asked(port, one) for one in names} == dict.fromkeys(names, 200)
+        assert {one: asked(port, one) for one in strangers} == dict.fromkeys(strangers, 403)
