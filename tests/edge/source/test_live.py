@@ -132,7 +132,6 @@ class Faulty:
 @pytest.mark.parametrize("where", ["grab", "picture"])
 def test_an_error_that_nobody_expects_of_a_camera_costs_its_pictures_alone(monkeypatch, caplog, where):
     """One odd frame of a driver or a decoder would end the flight."""
-    monkeypatch.setattr("hvt_edge.source.live._FIRST_WAIT_NS", SECOND_NS // 100)
     camera, failures, waits = Faulty(ValueError("no such layout")), Failures(time.time_ns), []
     if where == "picture":
         monkeypatch.setattr(camera, "grab", raising_pictures(camera.grab))
