@@ -22,6 +22,7 @@ __all__ = [
     "Parser",
     "UserError",
     "exit_with_sentence",
+    "listening_trouble",
     "may_come",
     "needs_extra",
 ]
@@ -58,6 +59,15 @@ class NotYetError(UserError):
 def may_come(error: OSError) -> bool:
     """Whether time may mend it: something is not there or not free yet, or a name that no server knows yet."""
     return isinstance(error, socket.gaierror | TimeoutError) or error.errno in _MAY_COME
+
+
+def listening_trouble(error: OSError) -> str:
+    """Why an address and its port cannot be listened on, and what to do about it: the end of a sentence."""
+    if error.errno == errno.EADDRNOTAVAIL:
+        return "this machine has no such address"
+    if isinstance(error, socket.gaierror):
+        return f"{error.strerror}; give another host"
+    return f"{error.strerror or error}; give another port, or end what uses it"
 
 
 class FlightError(Exception):

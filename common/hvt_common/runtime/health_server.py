@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 from urllib.parse import urlsplit
 
-from hvt_common.errors import NotYetError, UserError, may_come
+from hvt_common.errors import NotYetError, UserError, listening_trouble, may_come
 from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.runtime.host_names import host_and_port, names_this_machine, requested_host
 from hvt_common.units import SECOND_NS
@@ -119,10 +119,7 @@ class HealthServer:
                 return _Server(host, port, answers)
             except OSError as error:
                 kind = NotYetError if may_come(error) else UserError
-                raise kind(
-                    f"{name} {address} cannot be listened on ({error.strerror or error}): give another port, or "
-                    "end what uses it"
-                ) from None
+                raise kind(f"{name} {address} cannot be listened on: {listening_trouble(error)}") from None
 
         self._server = Awaited(bound, "metrics", failures)
         self._stop = threading.Event()

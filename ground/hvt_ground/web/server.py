@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from hvt_common.errors import NotYetError, UserError, may_come
+from hvt_common.errors import NotYetError, UserError, listening_trouble, may_come
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.runtime.host_names import host_and_port, is_loopback
@@ -212,21 +212,18 @@ def _check_keys(certificate: Path, key: Path) -> None:
 
 
 def _bound(host: str, port: int) -> socket.socket:
+    made: socket.socket | None = None
     try:
-        family, *_, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
-            0
-        ]
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, *_, where = found[0]
         made = socket.socket(family, socket.SOCK_STREAM)
-    except OSError as error:
-        kind = NotYetError if may_come(error) else UserError
-        raise kind(f"--web {host}:{port} cannot be used ({error.strerror}): give another host") from None
-    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         made.bind(where)
         made.listen(128)
     except OSError as error:
-        made.close()
+        if made is not None:
+            made.close()
         kind = NotYetError if may_come(error) else UserError
-        raise kind(f"--web {host}:{port} cannot be used ({error.strerror}): give another port") from None
+        raise kind(f"--web {host}:{port} cannot be listened on: {listening_trouble(error)}") from None
     made.setblocking(False)
     return made

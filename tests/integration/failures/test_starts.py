@@ -122,13 +122,17 @@ def test_who_waits_for_a_port_ends_at_once(opened):
         ),
     ],
 )
-@pytest.mark.parametrize("at", ["192.0.2.1", "ground.field.invalid"])
-def test_an_address_that_is_not_there_yet_is_no_wrong_setting(open_it, at, tmp_path, monkeypatch):
-    """The VPN comes up some seconds after the ground, and so does the server of names."""
+@pytest.mark.parametrize(
+    ("at", "says"),
+    [("192.0.2.1", "this machine has no such address"), ("ground.field.invalid", "give another host")],
+)
+def test_an_address_that_is_not_there_yet_is_no_wrong_setting(open_it, at, says, tmp_path, monkeypatch):
+    """The VPN comes up some seconds after the ground, and so does the server of names; another port mends neither."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     failures = Failures(time.time_ns)
     with open_it(at, failures):
         assert at in failures.now[0].reason
+        assert failures.now[0].reason.endswith(says)
 
 
 def test_a_link_waits_for_an_address(caplog):
