@@ -34,6 +34,8 @@ _START_NS, _START_HOLD_NS = SECOND_NS // 2, 2 * SECOND_NS
 overrun at once does not let the ground ask what the session is. Who never reports gets everything after that."""
 _FORGET_NS = 15 * SECOND_NS
 """A receiver so long silent has left, where Zenoh still has the link: its lease is shorter."""
+_MEMORY_NS = 15 * SECOND_NS
+"""So long, to twice as long, the shortest round trip counts."""
 _MOST_RECORDS = 1024
 
 
@@ -57,6 +59,7 @@ class Flight:
 
     def __init__(self) -> None:
         self._base: deque[Sent] = deque(maxlen=_MOST_RECORDS)
+        self._given_up: deque[Sent] = deque(maxlen=_MOST_RECORDS)
         self._stills: deque[tuple[int, int, int]] = deque(maxlen=_MOST_RECORDS)
         """(sequence, time of sending, line bytes)."""
         self._backlog_bytes = 0.0
@@ -64,6 +67,11 @@ class Flight:
         self._total_bytes = 0
         self._messages = 0
         self._last = (-1, -1)
+
+    @property
+    def last_base(self) -> int:
+        """The sequence of the base message that went out last; -1 before the first."""
+        return self._last[0]
 
     @property
     def oldest(self) -> Sent | None:
@@ -109,8 +117,9 @@ class Flight:
         if base_sequence > self._last[0] or still_sequence > self._last[1]:
             return None
         newest: Sent | None = None
-        while self._base and self._base[0].sequence <= base_sequence:
-            newest = self._base.popleft()
+        for sent in (self._given_up, self._base):
+            while sent and sent[0].sequence <= base_sequence:
+                newest = sent.popleft()
         latest_ns = -(2**63) if newest is None else newest.sent_ns - 2 * SECOND_NS
         while self._stills and (self._stills[0][0] <= still_sequence or self._stills[0][1] < latest_ns):
             self._stills.popleft()
@@ -121,8 +130,15 @@ class Flight:
         """The link is slower than was thought: all that is not reported still waits."""
         self._backlog_bytes = max(self._backlog_bytes, self.size_bytes)
 
+    def give_up(self) -> None:
+        """What is on its way is taken for lost; a report that comes late may still name it."""
+        given_up = (*self._given_up, *self._base)
+        self.clear()
+        self._given_up.extend(given_up)
+
     def clear(self) -> None:
         """What is on its way is lost."""
+        self._given_up.clear()
         self._base.clear()
         self._stills.clear()
         self._backlog_bytes = 0.0
@@ -155,9 +171,13 @@ class Pacer:
         self._progress_ns = 0
         """When it last named a base message that was on its way."""
         self._held_ns = _FIRST_HELD_NS
-        self._round_trip = LeastDelay(15 * SECOND_NS)
+        self._round_trip, self._return = LeastDelay(_MEMORY_NS), LeastDelay(_MEMORY_NS)
         self._round_trip_ns = SECOND_NS // 2
-        self._last_sent_ns = 0
+        self._return_ns = 0
+        """How long reports are on their way, at the shortest, and the difference of the clocks."""
+        self._given_up = -1
+        """The newest base message that was taken for lost."""
+        self._last_sent_ns = self._last_bytes = 0
         self._linked: bool | None = None
         self._reports = True
         self._started_ns: int | None = None
@@ -205,7 +225,7 @@ class Pacer:
     def sent_base(self, sequence: int, line_bytes: int, *, now_ns: int, keyframe: bool = False) -> None:
         """A base message goes out."""
         with self._lock:
-            self._last_sent_ns = now_ns
+            self._last_sent_ns, self._last_bytes = now_ns, line_bytes
             if keyframe and self._started_ns is None:
                 self._started_ns = now_ns
             self._flight.sent_base(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
@@ -239,15 +259,19 @@ class Pacer:
                 silent
             ):  # at the least rate, what else was sent would be waited for longer than for what is lost
                 self._flight.clear()
-            if sent is None:
+            return_ns = now_ns - feedback.send_ns
+            if sent is None or (
+                sent.sequence <= self._given_up and not self._take_longer(sent, return_ns, now_ns)
+            ):
                 return
-            self._note_times(sent, 1000 * feedback.base_held_us, now_ns)
+            held_ns = 1000 * feedback.base_held_us
+            self._note_times(sent, held_ns, return_ns, now_ns)
             backoffs = self.backoffs
             self._controller.on_progress(
                 Progress(
                     now_ns=now_ns,
                     sent_ns=sent.sent_ns,
-                    arrived_ns=feedback.send_ns - 1000 * feedback.base_held_us,
+                    arrived_ns=feedback.send_ns - held_ns,
                     serialization_ns=sent.serialization_ns,
                     arrived_bytes=sent.up_to_bytes,
                     messages=sent.messages,
@@ -294,7 +318,9 @@ class Pacer:
                 return True
             self._give_up(now_ns, self._reported_ns)
             if now_ns - self._reported_ns > _SILENCE_NS:
-                return now_ns - self._last_sent_ns >= _PROBE_NS
+                # Stored frames have the former rate: they would stand before live video when the link is back.
+                carries_ns = 8 * SECOND_NS * self._last_bytes // self.rate_bps
+                return now_ns - self._last_sent_ns >= max(_PROBE_NS, carries_ns)
             return self._is_open(now_ns, _MOST_BACKLOG_NS)
 
     def holds(self, now_ns: int) -> bool:
@@ -320,7 +346,8 @@ class Pacer:
         if min(self._overdue_ns(now_ns), now_ns - self._progress_ns) <= _GIVEN_UP_NS:
             return False
         self._controller.on_silence(now_ns)
-        self._flight.clear()
+        self._given_up = self._flight.last_base
+        self._flight.give_up()
         return True
 
     def _may_start(self, now_ns: int) -> bool:
@@ -348,13 +375,24 @@ class Pacer:
 
     def _forget_path(self) -> None:
         self._held_ns = _FIRST_HELD_NS
-        self._round_trip = LeastDelay(15 * SECOND_NS)
+        self._round_trip, self._return = LeastDelay(_MEMORY_NS), LeastDelay(_MEMORY_NS)
         self._round_trip_ns = SECOND_NS // 2
         self._controller.forget_path()
 
-    def _note_times(self, sent: Sent, held_ns: int, now_ns: int) -> None:
+    def _take_longer(self, sent: Sent, return_ns: int, now_ns: int) -> bool:
+        """Whether reports take longer than before, where one names what was given up; else that stood in a queue."""
+        longer_ns = 0 if self._return.empty else return_ns - self._return_ns
+        if longer_ns <= 0:
+            return False
+        round_trip_ns = min(now_ns - sent.sent_ns, self._round_trip_ns + longer_ns)
+        self._round_trip, self._return = LeastDelay(_MEMORY_NS), LeastDelay(_MEMORY_NS)
+        self._round_trip.add(round_trip_ns, now_ns=now_ns)
+        return True
+
+    def _note_times(self, sent: Sent, held_ns: int, return_ns: int, now_ns: int) -> None:
         # Quickly up, slowly down: what is expected is the longest of the usual.
         held_ns = min(max(held_ns, _LEAST_HELD_NS), _MOST_HELD_NS)
         self._held_ns = max((9 * self._held_ns + held_ns) // 10, min(held_ns, 2 * self._held_ns))
         self._progress_ns = now_ns
         self._round_trip_ns = self._round_trip.add(max(0, now_ns - sent.sent_ns), now_ns=now_ns)
+        self._return_ns = self._return.add(return_ns, now_ns=now_ns)

@@ -74,6 +74,18 @@ def test_live_video_is_back_after_a_fall_of_the_link(budget, fps, falls_to):
     assert flight.longest_hole(known + 10, 60) <= 1.5
 
 
+@pytest.mark.parametrize(("budget", "fps"), [(2_000_000, 2), (800_000, 3)])
+def test_what_is_stored_does_not_stand_before_live_video(tmp_path, budget, fps):
+    """With a store the link would come back full of large frames, sent to find out whether it is back."""
+    flights = []
+    for store in (None, tmp_path / "store"):
+        link = SteppedLink(((0, 1.3 * budget), (12, 0), (20, 200_000)))
+        given = largest(budget, fps, video_share=0.85, method="M6")
+        flights.append(flown(LiveFlight(link, store=store, **given), 60))
+    live, stored = (flight.back_after(20) for flight in flights)
+    assert stored <= live + BACK_S
+
+
 def any_flight(seed: int) -> tuple[dict, dict, list[tuple[float, float]], list[float], float]:
     """Settings, what goes along, the link's steps, when it is back, and the end."""
     chance = random.Random(seed)
@@ -108,7 +120,13 @@ def any_flight(seed: int) -> tuple[dict, dict, list[tuple[float, float]], list[f
 
 
 @pytest.mark.parametrize("loses", [False, True])
-@pytest.mark.parametrize("seeds", [range(first, first + 15) for first in range(0, 60, 15)])
+@pytest.mark.parametrize(
+    "seeds",
+    [
+        range(0, 60, 6),
+        *(pytest.param(range(first, 60, 6), marks=pytest.mark.nightly) for first in range(1, 6)),
+    ],
+)
 def test_from_every_state_live_video_is_back_within_three_seconds(seeds, loses):
     """Some budget, frame rate and silence would end the video, as some did."""
     for seed in seeds:
@@ -135,18 +153,34 @@ def test_reports_that_come_late_or_in_part_do_not_end_the_video(late_s, share):
     assert flown(flight, 60).longest_hole(20 + late_s, 60) <= BACK_S
 
 
-def test_an_hour_at_two_frames_a_second_over_a_link_that_comes_and_goes():
+@pytest.mark.parametrize("late_s", [1.5, 2.5, 5])
+def test_reports_that_begin_to_come_late_are_late_and_nothing_is_lost(late_s):
+    """Over a satellite from some second on, the rate would stay at its least for the rest of the flight."""
+    flight = LiveFlight(
+        SteppedLink(((0, 500_000),)),
+        late_s=lambda second: late_s if second > 12 else 0,
+        **largest(300_000, 3),
+    )
+    flown(flight, 60)
+    assert flight.pacer is not None
+    assert flight.pacer.rate_bps == 300_000
+    assert flight.longest_hole(12, 60) <= 1.5
+
+
+@pytest.mark.parametrize("turns", [6, pytest.param(20, marks=pytest.mark.nightly)])
+def test_an_hour_at_two_frames_a_second_over_a_link_that_comes_and_goes(turns):
     """Of a long flight at a thin rate nobody would see the part behind the first hill."""
     chance, steps, away = random.Random(5), [(0.0, 400_000.0)], []
-    for turn in range(20):
+    for turn in range(turns):
         begin = 60.0 + 170 * turn + chance.uniform(0, 60)
         end = begin + chance.choice([1, 2, 3, 5, 10, 30, 60])
         steps += [(begin, 0.0 if turn % 4 else 70_000.0), (end, 400_000.0)]
         away.append((begin, end))
-    flight = flown(LiveFlight(SteppedLink(steps), **largest(300_000, 2)), 3600)
+    lasts = 180.0 * turns
+    flight = flown(LiveFlight(SteppedLink(steps), **largest(300_000, 2)), lasts)
     begin = 5.0
     for gone, back in away:
         assert flight.longest_hole(begin, gone) <= BACK_S
         assert flight.back_after(back) <= max(back, flight.drained(back)) - back + BACK_S
         begin = max(back, flight.drained(back)) + BACK_S
-    assert flight.longest_hole(begin, 3600) <= BACK_S
+    assert flight.longest_hole(begin, lasts) <= BACK_S
