@@ -22,7 +22,7 @@ from typing import Any, NoReturn, Protocol, TypeVar, cast
 
 import tomli_w
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, check_not_read
 from hvt_common.redaction import Redaction
 from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse_share, parse_size
 
@@ -221,6 +221,10 @@ def load(
     for field in dataclasses.fields(config_class):  # type: ignore[arg-type]
         if field.name in given:
             values[field.name] = _value(field, given[field.name], name=_flag(field))
+    if file is not None:
+        for name, value in values.items():
+            if isinstance(value, Path | str):
+                check_not_read(Path(value), [Path(file)], name=f"--{name.replace('_', '-')}")
     return config_class(**values), Loaded(values=values, print_config=print_config)
 
 

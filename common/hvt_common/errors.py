@@ -9,8 +9,9 @@ import select
 import socket
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import TracebackType
 from typing import NoReturn
 
@@ -21,6 +22,7 @@ __all__ = [
     "NotYetError",
     "Parser",
     "UserError",
+    "check_not_read",
     "exit_with_sentence",
     "listening_trouble",
     "may_come",
@@ -86,6 +88,20 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise `UserError`."""
         raise UserError(f"{message}; see {self.prog} --help")
+
+
+def check_not_read(path: Path, reads: Iterable[Path], *, name: str) -> None:
+    """Raise `UserError` where ``path``, which is to be written, is one of the files that are ``reads``, by any name.
+
+    Links count, symbolic and hard ones: what is read would be gone.
+    """
+    for one in reads:
+        try:
+            same = path.samefile(one)
+        except (OSError, ValueError):  # one of them is not there, or no path at all
+            continue
+        if same:
+            raise UserError(f"{name} {path} is {one} itself, which is read: name another file")
 
 
 def exit_with_sentence(

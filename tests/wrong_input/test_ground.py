@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from hvt_common.transport.inbox import Received
+from hvt_ground.sinks.message_log import MessageLog
 from media.onnx_models import colour_classifier, colour_detector
 
 pytestmark = pytest.mark.timeout(60)
@@ -201,3 +203,37 @@ def test_a_server_that_wants_a_certificate_that_is_not_there(ground, monkeypatch
     """It would be noticed in the air."""
     monkeypatch.delenv("PYTAK_TLS_CLIENT_CERT", raising=False)
     assert "PYTAK_TLS_CLIENT_CERT" in ground("--cot", "tls://127.0.0.1:8089")
+
+
+@pytest.mark.parametrize(
+    "flag", ["--summary", "--timing", "--log", "--tracks", "--mcap", "--ts", "--record", "--stills"]
+)
+def test_an_output_over_what_is_read(ground, here, flag):
+    """The model, or the file of settings, would be gone with the first flight."""
+    suffix = {"--tracks": "csv", "--mcap": "mcap", "--ts": "ts", "--record": "rrd", "--stills": "csv"}.get(
+        flag, "json"
+    )
+    model, out = Path("classes.txt"), Path(f"out.{suffix}")
+    model.write_text("car\n")
+    out.symlink_to(model)
+    assert f"{flag} {out} is classes.txt itself" in ground("--labels", "classes.txt", flag, str(out))
+    settings = Path("settings.toml")
+    settings.write_text("quiet = true\n")
+    out.unlink()
+    out.hardlink_to(settings)
+    assert f"{flag} {out} is settings.toml itself" in ground("--config", "settings.toml", flag, str(out))
+    assert settings.read_text() == "quiet = true\n"
+
+
+@pytest.mark.parametrize("flag", ["--summary", "--timing", "--tracks", "--record"])
+def test_a_replay_over_its_own_log(refused, here, flag):
+    """What was received would be gone before it is read."""
+    suffix = {"--tracks": "csv", "--record": "rrd"}.get(flag, "json")
+    log, out = Path("flight.hvtlog"), Path(f"out.{suffix}")
+    file = MessageLog(log, most_bytes=10**6)
+    file.log(Received("hvt/uav-1/status", b"x", b"", "", 1))
+    file.close()
+    out.symlink_to(log)
+    before = log.read_bytes()
+    assert f"{flag} {out} is {log} itself" in refused("hvt-ground", "replay", str(log), flag, str(out))
+    assert log.read_bytes() == before

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TextIO
@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from hvt_common.errors import FlightError, NotYetError, UserError
+from hvt_common.errors import FlightError, NotYetError, UserError, check_not_read
 from hvt_common.runtime.log import STATUS_LOGGER
 
 __all__ = ["StatusLine", "check_writable", "print_table", "say", "write_json"]
@@ -112,10 +112,11 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
         _Console(highlight=False).print(table)
 
 
-def check_writable(path: Path | None, *, name: str) -> None:
-    """Raise `UserError` now where a file could not be written later; leaves what is there as it was."""
+def check_writable(path: Path | None, *, name: str, reads: Iterable[Path] = ()) -> None:
+    """Raise `UserError` now where a file could not be written later, or is of the ``reads``; changes nothing."""
     if path is None:
         return
+    check_not_read(path, reads, name=name)
     if path.is_dir():
         raise UserError(f"{name} {path} is a folder: name a file")
     if not path.absolute().parent.is_dir():

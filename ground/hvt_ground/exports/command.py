@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from hvt_common.errors import Parser, UserError, needs_extra
+from hvt_common.errors import Parser, UserError, check_not_read, needs_extra
 from hvt_common.runtime.reporting import say
 from hvt_ground.exports.maps import write_geojson, write_kml
 from hvt_ground.exports.pictures import write_coco, write_stills
@@ -59,6 +59,8 @@ def run(argv: Sequence[str]) -> int:
     if given.burn_in and kind not in CONTAINERS:
         raise UserError(f"--burn-in draws into video, and --to is {kind}: give {', '.join(CONTAINERS)}")
     out = given.out or _beside(given.recordings[0], kind)
+    reads = [*given.recordings, *([] if given.terrain is None else [given.terrain])]
+    check_not_read(out, reads, name="--out")
     surface = make_surfaces(given.terrain)(given.recordings[0].name)
     recorded = read_recordings(given.recordings, surface=surface)
     if kind in _FOLDERS:

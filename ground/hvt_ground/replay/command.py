@@ -85,7 +85,9 @@ def run(argv: Sequence[str]) -> int:
     _check_given(loaded.values)
     if config.provider == "auto":  # by its speed it may choose one this time and another the next
         config = replace(config, provider="cpu")
-    sessions = _Replay(check(config), messages, speed=given.speed).run()
+    config = check(config)
+    check_outputs(config, reads=files)
+    sessions = _Replay(config, messages, speed=given.speed).run()
     for content in sessions:
         print_table(f"{content['edge']}: received", table(content))
     if not sessions:
@@ -144,7 +146,6 @@ class _Replay:
     def run(self) -> list[dict[str, Any]]:
         """Play all of it; a summary a session."""
         check_edge_pattern(self._config.edges)
-        check_outputs(self._config)
         infos = _infos(self._messages())
         make_record_folder(self._config)
         models = Models(self._config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import chain
 from itertools import count as count_from
 from pathlib import Path
@@ -14,19 +15,25 @@ from hvt_ground.sinks.transport_stream.destination import check_destination
 __all__ = ["backlog_path", "check_outputs", "free_path", "make_record_folder", "output_path"]
 
 
-def check_outputs(config: GroundConfig) -> None:
-    """Refuse files that cannot be written, before anything is received; `UserError`."""
-    check_writable(config.summary, name="--summary")
-    check_writable(config.timing, name="--timing")
-    check_writable(config.log, name="--log")
-    check_destination(config.ts)
+def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
+    """Refuse files that cannot be written, or are read (``reads``, too), before anything is received; `UserError`."""
+    given = (
+        *(config.detector, config.classifier, config.labels, config.detector_labels),
+        *(config.zenoh_config, config.cot_types, config.terrain),
+    )
+    reads = [*reads, *(Path(one) for one in given if one is not None)]
+    check_writable(config.summary, name="--summary", reads=reads)
+    check_writable(config.timing, name="--timing", reads=reads)
+    check_writable(config.log, name="--log", reads=reads)
+    check_destination(config.ts, reads=reads)
     for path, suffix, name in (
         (config.tracks, ".csv", "--tracks"),
         (config.mcap, ".mcap", "--mcap"),
+        (config.stills, ".csv", "--stills"),
         (config.record, ".rrd", "--record"),
     ):
         if path is not None and path.suffix == suffix and not path.is_dir():
-            check_writable(path, name=name)
+            check_writable(path, name=name, reads=reads)
     record = config.record
     if record is not None and record.suffix != ".rrd" and record.exists() and not record.is_dir():
         raise UserError(f"--record {record} is neither a folder nor named .rrd: give FILE.rrd or a folder")

@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, check_not_read
 from hvt_common.inference.class_names import kind_of
 from hvt_common.inference.detect import Detector, open_detector
 from hvt_common.inference.heads.choose import HEAD_NAMES
@@ -110,6 +110,9 @@ def run(arguments: argparse.Namespace) -> int:
     )
     word: _Word = as_one if arguments.vehicles_as_one else kind_of
     classes = _counted(pictures, _list(arguments.labelled), word)
+    reads = [*arguments.pictures, *(one.path for one in pictures)]
+    for written in ("detections.csv", "score.json", "false-alarms.png", "misses.png"):
+        check_not_read(arguments.out / written, reads, name="--out")
     arguments.out.mkdir(parents=True, exist_ok=True)
     paths, frames, skipped = [], [], 0
     with (arguments.out / "detections.csv").open("w", encoding="utf-8", newline="") as file:

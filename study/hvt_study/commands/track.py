@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, check_not_read
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_study.datasets.annotation_rows import LAST_FRAME
 from hvt_study.datasets.mot_files import detections_by_frame, read_detections, rows_of_tracks, write_mot
@@ -61,8 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Track all frames, write the tracks, print one line."""
     settings = _settings(arguments)
     source, out = arguments.detections, arguments.out
-    if source.exists() and out.exists() and source.samefile(out):
-        raise UserError(f"--out is {out}, the file of detections itself; name another file")
+    check_not_read(out, [source], name="--out")
     rows = read_detections(source)
     tracker = ByteTracker(settings, fps=arguments.fps)
     tracks = [tracker.update(seen, frame_index=frame) for frame, seen in detections_by_frame(rows)]

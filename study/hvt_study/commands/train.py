@@ -190,8 +190,11 @@ def _checked(arguments: argparse.Namespace) -> tuple[_Size, Path]:
         raise UserError(f"--out {arguments.out} is not accepted: give a file whose name ends with .onnx")
     if not arguments.out.parent.is_dir():
         raise UserError(f"--out {arguments.out} cannot be written: there is no folder {arguments.out.parent}")
-    check_writable(arguments.out, name="--out")
-    return size, resolve_model(arguments.start, role="start")
+    start = resolve_model(arguments.start, role="start")
+    labels = [Path(uri.partition(":")[2]).expanduser() for uri in (*arguments.data, *arguments.held_out)]
+    for suffix in (".onnx", ".json", ".jsonl"):
+        check_writable(arguments.out.with_suffix(suffix), name="--out", reads=[start, *labels])
+    return size, start
 
 
 def _labelled(uri: str, names: Sequence[str]) -> list[LabelledPicture]:

@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, check_not_read
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.metrics.bits import Accounting
 from hvt_study.report.data.arms import settings
@@ -29,6 +29,8 @@ def join_studies(folders: Sequence[Path], out: Path) -> None:
     Raises:
         UserError: a table cannot be used, two runs that differ are at one place, or ``out`` cannot be written.
     """
+    if len(folders) > 1:  # of one study a table of the same runs is written
+        check_not_read(out / RESULTS, (folder / RESULTS for folder in folders), name="--out")
     tables = [read_results(folder / RESULTS) for folder in folders]
     accounting: Accounting = next((row["accounting"] for rows in tables for row in rows), "span")
     joined = {row["key"]: row for rows in reversed(tables) for row in in_accounting(rows, accounting)}

@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 from motmetrics.io import loadtxt
 
 import hvt_ground.cli
+from hvt_common.errors import UserError
 from hvt_common.units import Limit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
@@ -314,3 +315,32 @@ def test_json_of_coco_is_plain(recording, tmp_path):
     assert {"id", "image_id", "category_id", "bbox", "area", "iscrowd", "track_id", "score"} == set(
         content["annotations"][0]
     )
+
+
+@pytest.mark.parametrize("name", ["itself", "a symbolic link", "a hard link", "over a folder"])
+@pytest.mark.parametrize("kind", ["csv", "mp4"])
+def test_no_export_goes_over_the_recording_that_it_reads(recording, tmp_path, capsys, name, kind):
+    """The only recording of the flight would be a table of it."""
+    source = tmp_path / "flight.rrd"
+    shutil.copyfile(recording, source)
+    out = source if name == "itself" else tmp_path / f"out.{kind}"
+    if name == "a symbolic link":
+        out.symlink_to(source)
+    elif name == "a hard link":
+        out.hardlink_to(source)
+    elif name == "over a folder":
+        (tmp_path / "more").mkdir()
+        out = tmp_path / "more" / ".." / "flight.rrd"
+    assert hvt_ground.cli.main(["export", str(source), "--to", kind, "--out", str(out)]) == 2
+    assert f"--out {out} is {source} itself, which is read: name another file" in capsys.readouterr().err
+    assert source.read_bytes() == recording.read_bytes()
+    assert hvt_ground.cli.main(["export", str(source), "--to", kind, "--out", str(tmp_path / "new")]) == 0
+
+
+def test_recordings_are_not_joined_into_one_of_them(recording, tmp_path):
+    """What the other edge saw would be all that is left."""
+    source = tmp_path / "flight.rrd"
+    shutil.copyfile(recording, source)
+    with pytest.raises(UserError, match=f"--out {source} is {source} itself"):
+        join_recordings([source], source, base_size=SIZE, fps=15)
+    assert source.read_bytes() == recording.read_bytes()

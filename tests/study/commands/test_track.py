@@ -171,7 +171,7 @@ def test_wrong_files_and_arguments_are_one_sentence(
     assert "is not a text file" in sentence(capsys, "track", binary, "--out", out)
     assert "cannot be read" in sentence(capsys, "track", tmp_path, "--out", out)
     assert "cannot be written" in sentence(capsys, "track", source, "--out", tmp_path / "no" / "out.txt")
-    assert "the file of detections itself" in sentence(capsys, "track", source, "--out", source)
+    assert f"--out {source} is {source} itself" in sentence(capsys, "track", source, "--out", source)
     for fps in ("0", "-5", "nan", "inf", "fast"):
         assert f"--fps: is {fps}," in sentence(capsys, "track", source, "--out", out, f"--fps={fps}")
     assert "--track-thresh: is 2," in sentence(capsys, "track", source, "--out", out, "--track-thresh=2")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rerun.chunk import Chunk, RrdReader
 
-from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.errors import UserError, check_not_read, exit_with_sentence
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.blueprint import comparison
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
@@ -28,6 +28,7 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
     Raises:
         UserError: a file is no recording, or two are of the same edge.
     """
+    check_not_read(out, paths, name="--out")
     read = [_read(path) for path in paths]
     edges = [edge for edge, _ in read]
     if len(set(edges)) < len(edges):

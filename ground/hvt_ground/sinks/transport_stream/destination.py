@@ -6,7 +6,7 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -76,14 +76,14 @@ def destination(text: str) -> Address | Path:
     return address
 
 
-def check_destination(text: str | None) -> None:
-    """Refuse before anything is received what could not be written; `UserError`."""
+def check_destination(text: str | None, *, reads: Iterable[Path] = ()) -> None:
+    """Refuse before anything is received what could not be written, or is of the ``reads``; `UserError`."""
     if text is None:
         return
     where = destination(text)
     if isinstance(where, Path):
         if not where.is_dir():
-            check_writable(where, name="--ts")
+            check_writable(where, name="--ts", reads=reads)
     elif where.scheme == "srt" and not _has_srt():
         raise UserError(
             f"--ts {where.shown} needs SRT, and this PyAV {av.__version__} is built without it: "
