@@ -44,6 +44,7 @@ def status(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
+@pytest.mark.nightly
 def test_a_ground_in_service_can_be_watched(tmp_path):
     """A team would learn of a lost link from the one who looks at the screen."""
     address = f"127.0.0.1:{free_ports(1)[0]}"

@@ -23,6 +23,10 @@ FRAMES = 90
 Run = Callable[..., dict[str, Any]]
 
 
+EACH_TIME = ("M0", "M1", "M5", "M6", "R0")
+"""Methods that `make test` flies; `make nightly` flies all."""
+
+
 @pytest.fixture
 def run(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
     """Play six seconds of drone_carpark with more settings, keyframes among them, without a ground."""
@@ -61,7 +65,10 @@ def held(summary: dict[str, Any], *, budget_bps: int, base_bps: int) -> None:
     assert summary["base_bps"] >= 0.8 * base_bps, "bits that were paid for and not used"
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method",
+    [pytest.param(name, marks=() if name in EACH_TIME else pytest.mark.nightly) for name in METHODS],
+)
 def test_every_method_holds_the_budget(run, method):
     """A method that overdraws would stall the video on the link it was chosen for."""
     summary = run("--method", method, "--size", "640x360", "--budget", "400kbps")

@@ -259,6 +259,7 @@ def test_either_side_stops_before_anybody_came(link, scene, sign):
     assert edge.finish()["frames"] == 0
 
 
+@pytest.mark.nightly
 def test_a_lockstep_edge_does_not_wait_for_a_dead_ground(link, long_scene):
     """A long run of a study, or Ctrl-C, would hang on a ground that crashed."""
     ground = link.ground(*ANALYSES, "--record", "recordings")

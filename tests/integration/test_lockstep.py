@@ -130,6 +130,7 @@ def test_the_grounds_opinion_counts(plays):
     assert mute.stills != one.stills
 
 
+@pytest.mark.nightly
 def test_what_auto_decides_is_the_same_and_stands_in_the_recording(tmp_path: Path):
     """It goes by what the ground reports it sees; and nobody could tell from a recording why there were no tracks."""
     runs = []

@@ -59,6 +59,7 @@ def test_a_broken_plug_in_is_one_sentence(link, scene, acme):
     assert "Traceback" not in edge.said
 
 
+@pytest.mark.nightly
 def test_a_ground_without_the_codec_gets_jpeg(link, scene, acme, monkeypatch):
     """One unknown codec would take the operator's stills away, or the whole picture."""
     with_codec = os.environ["PYTHONPATH"]
@@ -124,6 +125,7 @@ def with_encoder(link: Link, source: str, name: str, *settings: str) -> Running:
 
 
 @pytest.mark.parametrize(("name", "lowered"), [("acme-obedient", False), ("acme-greedy", True)])
+@pytest.mark.nightly
 def test_another_encoder_flies_within_the_budget(link, scene, acme, name, lowered):
     """Who has an encoder in his board would need a fork of HVT, or one that takes more than it says would be late."""
     ground = link.ground("--once", "--classifier", "none", "--detector", "motion")

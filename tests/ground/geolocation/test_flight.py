@@ -83,6 +83,7 @@ def test_the_recording_shows_camera_and_tracks_on_a_map(flight):
     assert recording.rows("/map/tracks", "GeoPoints:positions")
 
 
+@pytest.mark.nightly
 def test_a_pose_that_ends_is_said_to_be_stale_and_places_nothing_more(tmp_path):
     """Tracks would be put where the camera was ten seconds ago."""
     (tmp_path / "short.csv").write_text(

@@ -181,6 +181,7 @@ def test_stills_are_where_the_remarks_say(flight):
     assert all(one.is_absolute() and one.is_file() for one in named)
 
 
+@pytest.mark.nightly
 def test_without_a_pose_nothing_is_sent_and_it_is_said_once(tmp_path):
     """A map without anything on it says nothing about why."""
     (port,) = free_ports(1)
@@ -192,6 +193,7 @@ def test_without_a_pose_nothing_is_sent_and_it_is_said_once(tmp_path):
     assert said.count("its tracks are not reported, because it says no pose") == 1
 
 
+@pytest.mark.nightly
 def test_a_server_that_is_not_there_changes_nothing_else(tmp_path):
     """The flight would wait for a map that nobody looks at."""
     (port,) = free_ports(1)
