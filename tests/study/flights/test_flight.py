@@ -121,7 +121,9 @@ def test_a_thin_link_delivers_late(clip):
 
 def test_stills_cross_and_are_counted(rough_clip):
     """Without them the comparison would be of video with video."""
-    report = flown(rough_clip, "--method", "M5", "--cooldown", "0s", "--budget", "120kbps", "--still-codec", "residual")
+    report = flown(
+        rough_clip, "--method", "M5", "--cooldown", "0s", "--budget", "120kbps", "--still-codec", "residual"
+    )
     assert report.messages["roi"] > 0
     assert sum(report.account.outcomes["sent"].values()) == report.messages["roi"]
     assert report.bps("roi") == report.account.roi_bps
