@@ -152,6 +152,7 @@ def test_a_second_run_does_nothing_anew(scene, done):
     assert (done / "results.parquet").read_bytes() == clocks  # to the byte: what was timed is remembered too
 
 
+@pytest.mark.nightly
 def test_damaged_entries_are_made_again(scene, done, tmp_path):
     """What a full disk or a bad sector left of an entry would count as a result."""
     cache, first = done / "cache", table(done)
@@ -191,6 +192,7 @@ def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkey
     assert len(table(out)) == len(before)
 
 
+@pytest.mark.nightly
 def test_a_method_that_is_added_stands_beside_the_others(scene, done, tmp_path, capsys):
     """The table of a finished study would be gone without a word."""
     out = tmp_path / "out"

@@ -16,7 +16,7 @@ from hvt_study.datasets.clip import Clip
 from hvt_study.flights.flight import FlightPlan, coded_frames, fly
 from hvt_study.flights.flight_ground import SharedModels
 from media.clips import smooth_pictures
-from rigs.flight import SIZE, RedSquares, square_box
+from rigs.flight import SIZE, RedSquares, grainy_pictures, square_box
 from studies.metric_frames import list_f1
 
 FRAMES = 46
@@ -33,14 +33,9 @@ def clip(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rough_clip(tmp_path_factory):
-    """The same with a grain on the square, of which the base shows little: a still has something to tell."""
-    pictures, rng = np.stack(smooth_pictures(FRAMES, size=SIZE)), np.random.default_rng(4)
-    for index, picture in enumerate(pictures):
-        x1, y1, x2, y2 = np.asarray(square_box(index), int)
-        square = picture[y1:y2, x1:x2]
-        square[..., 1] = rng.integers(0, 120, square.shape[:2], np.uint8)
+    """The same with a grain on the square."""
     path = tmp_path_factory.mktemp("rough") / "clip.bgr"
-    path.write_bytes(pictures.tobytes())
+    path.write_bytes(np.stack(grainy_pictures(FRAMES)).tobytes())
     return Clip("drawn", SIZE, FRAMES, path)
 
 

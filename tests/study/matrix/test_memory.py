@@ -60,6 +60,7 @@ def peak_mb(uri, cache, frames):
     return int(done.stdout) / 1024
 
 
+@pytest.mark.nightly
 def test_a_longer_clip_takes_no_more_memory(uri, tmp_path):
     """A study of long clips would end in the middle of the night for want of memory."""
     short, long = (peak_mb(uri, tmp_path / f"{frames}", frames) for frames in (60, LONG))

@@ -14,6 +14,7 @@ from studies.small_study import PATIENT_S, arguments, entries, flights, said, st
 METHODS = ("--methods", "M0,R0,M5", "--regimes", "150kbps")
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("full_for", ["detections", "flights"])
 def test_a_full_disk_is_one_sentence_and_what_is_finished_stays(scene, tmp_path, full_for):
     """Hours of flights would be lost with the one that no longer fitted."""

@@ -35,7 +35,17 @@ from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 from media.clips import START_NS, framed, smooth_pictures
 
-__all__ = ["CLASSES", "Flight", "Port", "RedSquares", "SameAnswer", "pipeline_of", "square_box", "tracks_at"]
+__all__ = [
+    "CLASSES",
+    "Flight",
+    "Port",
+    "RedSquares",
+    "SameAnswer",
+    "grainy_pictures",
+    "pipeline_of",
+    "square_box",
+    "tracks_at",
+]
 
 SIZE = (320, 192)
 CLASSES = ("car", "bus")
@@ -46,6 +56,15 @@ def square_box(index: int) -> tuple[float, float, float, float]:
     """Where `smooth_pictures` draws the red square in this picture."""
     left = (7 * index) % (SIZE[0] - 40)
     return float(left), SIZE[1] / 3, left + 32.0, SIZE[1] / 3 + 32.0
+
+
+def grainy_pictures(count: int) -> list[np.ndarray]:
+    """`smooth_pictures` with a grain on the square, of which a thin base shows little: stills tell something."""
+    pictures, rng = smooth_pictures(count, size=SIZE), np.random.default_rng(4)
+    for index, picture in enumerate(pictures):
+        x1, y1, x2, y2 = np.asarray(square_box(index), int)
+        picture[y1:y2, x1:x2, 1] = rng.integers(0, 120, (y2 - y1, x2 - x1), np.uint8)
+    return pictures
 
 
 def tracks_at(index: int, boxes: dict[int, tuple[float, float, float, float]], *, class_id=0) -> Tracks:
