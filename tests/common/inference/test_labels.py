@@ -25,7 +25,7 @@ def test_one_name_a_line(tmp_path: Path) -> None:
         (b" \n\n", "empty"),
         (b"car\n\nbus\n", "no name in line 2"),
         (b"car\n" + b"x" * 201, "201 characters in line 2"),
-        (b"\xff\xfe\x00car", "not UTF-8"),
+        (b"\xff\x00car", "not UTF-8"),
         (b"car\x00\x01\n", "not text in line 1"),
         (b"a\n" * 100_001, "100001 lines"),
         (b"a" * (9 << 20), "larger than"),
