@@ -59,7 +59,7 @@ def test_the_recording_holds_the_cameras_own_units(link, name, more, pace):
 
 
 def test_a_closer_look_and_a_keyframe_are_refused_with_their_reasons(link):
-    """Bits would go to a still of the pixels that the video has; a ground that joins would ask for a keyframe for ever."""
+    """Bits would go to a still of the pixels that the video has; whoever joins would ask for a keyframe for ever."""
     clip = write_clip(link.folder / "camera.mp4", smooth_pictures(200, size=SIZE), keyint=30)
     ground = ground_of(link)
     edge = with_camera(link, clip, "--still-codec", "residual", "--edge-id", "uav-1")
