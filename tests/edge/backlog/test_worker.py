@@ -249,7 +249,7 @@ def test_a_folder_that_vanishes_in_mid_flight_is_made_again(tmp_path, caplog):
         assert not worker.offer(UNITS[0])
         assert not store.exists(), "the next try comes after a pause"
         link.now_ns += 2 * S
-        eventually(lambda: not worker.failed, within_s=10, what="it is tried again")
+        eventually(lambda: len(caplog.messages) == 2, within_s=10, what="it is tried again, and said")
     assert [one.partition(": ")[0] for one in caplog.messages] == ["store", "store"], "once that, once this"
     (part,) = link.failures.parts
     assert (part.part, part.count, part.working) == ("store", 1, True)
