@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -9,11 +10,11 @@ from typing import NoReturn
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
 from hvt_common.redaction import Redaction
-from hvt_common.runtime.log import start_log
+from hvt_common.runtime.log import START_LOGGER, start_log
 from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
 from hvt_common.runtime.reporting import print_table, write_json
 from hvt_edge.app import Edge
-from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
 from hvt_edge.doctor import command as doctor
 from hvt_edge.health import watch
 from hvt_edge.summary import in_vain, table, title
@@ -63,6 +64,8 @@ def _run(argv: Sequence[str] | None) -> int:
         edge=config.edge_id,
         session=f"{world.session_id:016x}",
     )
+    if note := note_on_share(config, given=given.values):
+        logging.getLogger(START_LOGGER).info("%s", note)
     stop = stop_on_signals()
     with log.ending():
         content = redaction.value(Edge(config, stop=stop, on_started=log.release, world=world).run())

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from hvt_common.config import (
     AUTO,
@@ -49,6 +49,7 @@ __all__ = [
     "check",
     "check_rate",
     "least_budget_bps",
+    "note_on_share",
     "stream_text",
     "with_profile",
 ]
@@ -451,6 +452,16 @@ def check(config: EdgeConfig) -> EdgeConfig:
     if config.fixed_size is not None:
         check_rate(config, config.fixed_size)
     return config
+
+
+def note_on_share(config: EdgeConfig, *, given: Mapping[str, Any]) -> str:
+    """What is to be said where the share that the user has ``given`` is not that of the checked ``config``."""
+    share = given.get("video_share", config.video_share)
+    if share == config.video_share:
+        return ""
+    return (
+        f"--video-share {share} does not count: method {config.method} sends video alone, in the whole budget"
+    )
 
 
 def check_rate(config: EdgeConfig, size: tuple[int, int]) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError
-from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
 from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.policy.registry import METHODS
 from hvt_edge.video.encoder_settings import keyframe_floor_bytes
@@ -75,6 +75,30 @@ def test_budget_regime_and_share_settle_to_two_rates(argv, total, base):
     """The drone would spend other bits than the user pays for."""
     config = settled(*argv)
     assert (config.budget_bps, config.base_bps) == (total, base)
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (
+            ["--method", "M0", "--video-share", "0.8"],
+            "--video-share 0.8 does not count: method M0 sends video",
+        ),
+        (["--profile", "tracks", "--video-share", "auto"], "--video-share auto does not count: method M0"),
+        (["--method", "M0", "--video-share", "1"], ""),
+        (["--method", "M5", "--video-share", "0.8"], ""),
+        (["--method", "M0"], ""),
+        (["--regime", "moderate"], ""),
+        ([], ""),
+    ],
+)
+def test_a_share_that_does_not_count_is_said(argv, said):
+    """Whoever gave it would look for the rest of the budget."""
+    config, loaded = load(EdgeConfig, ["--source", "demo", *argv], program="p", description="d")
+    config = check(with_profile(config, given=loaded.values))
+    note = note_on_share(config, given=loaded.values)
+    assert note.startswith(said)
+    assert bool(note) == bool(said)
 
 
 def test_the_regimes_are_the_papers():

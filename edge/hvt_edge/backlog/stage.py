@@ -68,7 +68,7 @@ class BacklogLink:
 class BacklogStage:
     """One for each run in real time.
 
-    `store_still` is for the stills' thread, `on_feedback` for any, the rest for the frame loop.
+    `store_still` is for the threads of stills, `on_feedback` for any, the rest for the frame loop.
 
     ``in_flight`` holds what the transmitter has sent of the base; ``on_outcome`` is called for each stored still that
     arrived. What else an outage loses is the outbox's: it takes its own for lost whenever `breaks` has grown.
@@ -235,7 +235,7 @@ class BacklogStage:
             self._lose_in_flight()
             self._worker.intake.end_segment()
 
-    # The stills' thread
+    # The threads of stills
 
     def store_still(self, still: BacklogStill, *, number: int, capture_ns: int, utility: float) -> None:
         """Store a still."""

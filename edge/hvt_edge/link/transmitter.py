@@ -1,14 +1,15 @@
 """The one place where bytes leave the edge: header, ledger and budget of every message in one step.
 
-Base first, then metadata, stills by utility, the backlog. Four threads send:
+Base first, then metadata, stills by utility, the backlog. Five threads send:
 
 * the frame loop: `base`, `status`, `pose`, and what it stores in place of sending; it waits for video alone;
 * the stills' thread: `tracks` and `still`;
+* that of requested stills: `still`;
 * the store's thread: `backlog`;
 * the link's callbacks: `reply`, what grounds asked of ``info`` and ``control``.
 
-The lock covers header, ledger and budget, never a wait or a ``put``. So a still whose ``put`` blocks holds up the
-stills' thread alone; a base frame finds the lock free and a publisher of its own.
+The lock covers header, ledger and budget, never a wait or a ``put``. So a still whose ``put`` blocks holds up stills
+alone; a base frame finds the lock free and a publisher of its own.
 
 ``now_ns`` is the time that windows go by: the wall clock in real time, media time in lockstep, so that the same input
 gives the same stills. It is also the time of sending that goes on the wire, so that the ground's ledger has the very

@@ -113,7 +113,9 @@ class LockstepPace:
         frame, coded_index, held, analysis = self._analysis
         self._analysis = None
         self._wait_for_answers(before=frame.index - self._ahead_frames + 1)
-        sent = self.stills.send(analysis.result(), now_ns=frame.capture_ns, held=held)
+        analyzed = analysis.result()
+        sent = self.stills.send_requested(now_ns=frame.capture_ns, held=held)
+        sent |= self.stills.send(analyzed, now_ns=frame.capture_ns, held=held)
         # Of other frames the ground learns nothing, and answers nothing.
         if sent or coded_index == frame.index:
             self._in_flight.append((frame.index, coded_index, sent))

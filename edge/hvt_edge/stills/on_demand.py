@@ -1,9 +1,9 @@
 """Stills that a ground requests: cropped at once from the frames of the last seconds, sent before all others.
 
-A request only crops (`OnDemand.request`, in the link's callback); coding and sending are the stills' thread's, within
-the budget as every other still. `code_requested` says how: at the source's pixels, and better than the base. For its
-bytes frames of the video are left out (`hvt_edge.link.loan`), whatever share of the budget stills have. While one is
-pending, no other still is sent.
+A request only crops (`OnDemand.request`, in the link's callback). Coding and sending have a thread of their own
+(`hvt_edge.stills.worker`), so that no detection stands before them, within the budget as every other still.
+`code_requested` says how: at the source's pixels, and better than the base. For its bytes frames of the video are
+left out (`hvt_edge.link.loan`), whatever share of the budget stills have. While one is pending, no other is sent.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from hvt_common.protocol.messages import MAX_TRACKS_NOW, TrackNow
+from hvt_common.runtime.failures import reason_of
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image, Still, View
 from hvt_common.video.base_crop import base_crop
@@ -33,7 +34,7 @@ from hvt_edge.stills.on_demand_crop import (
 )
 from hvt_edge.stills.outbox import Outbox, OutboxStill
 from hvt_edge.stills.policy.cost import CostModel
-from hvt_edge.stills.requested_coding import Capacity, NothingCloser, code_requested
+from hvt_edge.stills.requested_coding import Capacity, CodedRequest, NothingCloser, code_requested
 
 __all__ = ["REQUEST_PARAMETER", "OnDemand", "OnDemandStill", "RequestedLine"]
 
@@ -178,12 +179,12 @@ class OnDemand:
         ]
         return newest.frame_index, tuple(listed)
 
-    # In the stills' thread
-
     def wants_tracks(self, capture_ns: int) -> bool:
         """Whether a ground has requested tracks shortly before this frame."""
         requested_ns = self._tracks_requested_ns
         return requested_ns is not None and capture_ns - requested_ns < _TRACKED_NS
+
+    # In the thread of requested stills
 
     def code(self, pending: OnDemandStill, *, now_ns: int, sequence: int, paced: bool) -> Still | None:
         """The coded still, where it may go now. None: it waits, or was given up, and is no longer in the outbox.
@@ -225,7 +226,11 @@ class OnDemand:
             most_bytes=max(0, most_bytes - _MARGIN_BYTES),
             total_bps=self.line.total_bps,
         )
-        coded = code_requested(job, codec=codec, quality_pct=pending.quality_pct, capacity=capacity)
+        coded: CodedRequest | NothingCloser
+        try:
+            coded = code_requested(job, codec=codec, quality_pct=pending.quality_pct, capacity=capacity)
+        except Exception as error:  # noqa: BLE001 - the codec may be anybody's, and somebody waits
+            coded = NothingCloser(f"it could not be coded ({reason_of(error)})")
         if isinstance(coded, NothingCloser):
             self._give_up(pending, coded.reason, now_ns=now_ns)
             return False

@@ -62,7 +62,7 @@ class OutboxStill:
     utility: float
     """As the method scored it; infinite where a ground requested it."""
     since_ns: int | None
-    """Since when it is pending; None until the stills' thread has met it."""
+    """Since when it is pending; None until the thread that sends it has met it."""
     again: bool = False
     """The ground could not decode the first still of this crop."""
     state: StillState = StillState.PENDING
@@ -125,6 +125,8 @@ class Outbox:
         self.settings = settings
         self._reports = reports
         self._lock = threading.RLock()
+        self.turn = threading.RLock()
+        """Held from when a still gets its number until it has gone out: two threads send, and numbers go up."""
         self._pending: dict[int, OutboxStill] = {}
         """By the track that leads."""
         self._on_demand: deque[OutboxStill] = deque()
@@ -205,13 +207,18 @@ class Outbox:
             return max(self._pending.values(), key=_order, default=None)
 
     def expire(self, now_ns: int) -> list[tuple[OutboxStill, str]]:
-        """Give up what has been pending for too long."""
-        settings = self.settings
+        """Give up what of the method has been pending for too long."""
+        with self._lock:
+            old = [one for one in self.pending if now_ns - _since_ns(one) > self.settings.max_pending_ns]
+            return [self._expire(one, "stale") for one in old]
+
+    def expire_on_demand(self, now_ns: int) -> list[tuple[OutboxStill, str]]:
+        """The same of those that grounds requested."""
         with self._lock:
             for one in self._on_demand:
                 one.since_ns = now_ns if one.since_ns is None else one.since_ns
-            old = [one for one in self._on_demand if now_ns - _since_ns(one) > settings.max_on_demand_ns]
-            old += [one for one in self.pending if now_ns - _since_ns(one) > settings.max_pending_ns]
+            most_ns = self.settings.max_on_demand_ns
+            old = [one for one in self._on_demand if now_ns - _since_ns(one) > most_ns]
             return [self._expire(one, "stale") for one in old]
 
     def give_up(self, pending: OutboxStill) -> None:
@@ -227,7 +234,7 @@ class Outbox:
     # Coded
 
     def sequence(self, *, store: bool) -> int:
-        """The number of the next still: for the link, or for the backlog."""
+        """The number of the next still: for the link, or for the backlog; of one `turn`."""
         return self._next_sequences[store]
 
     def sent(self, pending: OutboxStill, still: Still, *, now_ns: int, resend: CropJob | None = None) -> None:
@@ -363,8 +370,8 @@ class Outbox:
     def _leave_pending(self, pending: OutboxStill) -> None:
         if pending in self._on_demand:
             self._on_demand.remove(pending)
-        else:
-            self._pending.pop(pending.track_id, None)
+        elif self._pending.get(pending.track_id) is pending:
+            del self._pending[pending.track_id]
 
     def _drop_crop(self, sent: OutboxStill) -> None:
         """It will not be coded again."""

@@ -7,7 +7,7 @@ candidate that rides along in the still of a neighbour shares that one's.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 
 from hvt_common.values import Still, View
@@ -22,7 +22,10 @@ from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, Method, Request, S
 from hvt_edge.stills.policy.cost import CostModel
 from hvt_edge.stills.suppression import Gate, Suppression
 
-__all__ = ["Chooser", "ChooserSettings"]
+__all__ = ["Chooser", "ChooserSettings", "Coded"]
+
+Coded = Generator[OutboxStill, None, None]
+"""Stills that are coded and may go. Closing it gives other threads their turn."""
 
 _FULL_SHARE = 0.9
 """With so much of the most a still can ever be given, it is no use to wait for more."""
@@ -52,7 +55,8 @@ class Chooser:
 
     ``on_outcome(outcome, reason)`` is called with ``deferred`` or ``dropped`` for every candidate that a step did not
     simply pass over, and whose still does not go to the link; ``observe(candidates, step)`` with all tracks of each
-    step, those that rest included. Stills that grounds request go before all others.
+    step, those that rest included. Stills that grounds request go before all others: `requested` may run in a thread
+    of its own, beside all else.
 
     A still that is overdue is sent again, as it was, before pending ones that are less useful, and only where it is
     allowed: it holds up nobody, because what it shows grows old.
@@ -164,28 +168,28 @@ class Chooser:
 
     # Which stills go now
 
-    def requested(self, *, now_ns: int, store: bool = False) -> Iterator[OutboxStill]:
-        """Yield coded stills that grounds requested, as `stills` does."""
-        self._count_left(self.outbox.expire(now_ns), now_ns=now_ns)
+    def requested(self, *, now_ns: int, store: bool = False) -> Coded:
+        """Yield coded stills that grounds requested, as `stills` does those of the method."""
+        self._count_left(self.outbox.expire_on_demand(now_ns), now_ns=now_ns)
         while isinstance(pending := self.outbox.on_demand, OnDemandStill) and self.on_demand is not None:
             sequence = self.outbox.sequence(store=store)
             still = self.on_demand.code(pending, now_ns=now_ns, sequence=sequence, paced=not store)
             if still is not None:
-                self._coded(pending, still, now_ns=now_ns, store=store)
-                yield pending
+                with self.outbox.turn:
+                    self._coded(pending, still, now_ns=now_ns, store=store)
+                    yield pending
             elif self.outbox.on_demand is pending:
                 return  # it waits
 
-    def stills(self, *, now_ns: int, allowance: Allowance, store: bool = False) -> Iterator[OutboxStill]:
-        """Yield coded stills that fit ``allowance``; the caller sends each before it takes the next.
+    def stills(self, *, now_ns: int, allowance: Allowance, store: bool = False) -> Coded:
+        """Yield coded stills of the method that fit ``allowance``; the caller sends each before it takes the next.
 
-        ``store``: they go to the backlog. Then none builds on the base, which may come later still, or never.
+        ``store``: they go to the backlog. Then none builds on the base, which may come later still, or never. None is
+        sent while a requested one waits for its allowance.
         """
         self._count_left(self.outbox.offer_undecodable(now_ns), now_ns=now_ns)
-        yield from self.requested(now_ns=now_ns, store=store)
-        if self.outbox.on_demand is not None:
-            return  # it waits for its allowance; none of the others takes that away
-        while (pending := self.outbox.best()) is not None:
+        self._count_left(self.outbox.expire(now_ns), now_ns=now_ns)
+        while self.outbox.on_demand is None and (pending := self.outbox.best()) is not None:
             yield from self._overdue(over=pending.utility, now_ns=now_ns, allowance=allowance)
             job = pending.crop
             if store:
@@ -193,8 +197,11 @@ class Chooser:
             limit_bytes = allowance(replace(job.header, sequence=self.outbox.sequence(store=store)))
             if not self._may_go(pending, job, limit_bytes, now_ns=now_ns):
                 break  # the most useful waits for its allowance; a lesser one does not slip in before it
-            if self._code(pending, job, now_ns=now_ns, allowance=allowance, store=store):
-                yield pending
+            made = self._code(pending, job, now_ns=now_ns, allowance=allowance, store=store)
+            if made is not None and self.outbox.on_demand is None:  # else one was requested meanwhile
+                with self.outbox.turn:
+                    self._record_coded(pending, job, made, now_ns=now_ns, store=store)
+                    yield pending
         else:
             yield from self._overdue(over=-math.inf, now_ns=now_ns, allowance=allowance)
         held = {pending.track_id for pending in self.outbox.pending}
@@ -203,7 +210,7 @@ class Chooser:
     def _overdue(self, *, over: float, now_ns: int, allowance: Allowance) -> Iterator[OutboxStill]:
         """Those to be sent again that are more useful than ``over``, and fit."""
         for sent in self.outbox.overdue(now_ns):
-            if sent.utility <= over:
+            if sent.utility <= over or self.outbox.on_demand is not None:
                 return
             # Something newer of its track says more.
             if sent.track_id not in self.outbox and len(sent.still.data) <= allowance(sent.still):
@@ -229,15 +236,22 @@ class Chooser:
 
     def _code(
         self, pending: OutboxStill, job: CropJob, *, now_ns: int, allowance: Allowance, store: bool
-    ) -> bool:
-        """Code it to its allowance; False where no still comes of it."""
+    ) -> Still | None:
+        """Code it to its allowance; None where no still comes of it."""
         assert pending.request is not None, "it is of the method"
-        self._held_up.pop(pending.track_id, None)
         made = self.maker.code(job, sequence=self.outbox.sequence(store=store), allowance=allowance)
         if isinstance(made, NoStill):
+            self._held_up.pop(pending.track_id, None)
             self.outbox.give_up(pending)
             self._refuse(pending.request.candidate, made.reason, now_ns=now_ns)
-            return False
+            return None
+        return made
+
+    def _record_coded(
+        self, pending: OutboxStill, job: CropJob, made: Still, *, now_ns: int, store: bool
+    ) -> None:
+        assert pending.request is not None, "it is of the method"
+        self._held_up.pop(pending.track_id, None)
         height, width = job.crop_bgr.shape[:2]
         self._cost_of(made.codec).observe(area_px=width * height, size_bytes=len(made.data))
         resend = None
@@ -250,7 +264,6 @@ class Chooser:
             ):  # it builds on the base, and a ground may lack that
                 resend = job.recoded(self.maker.without_base, reason=made.reason)
         self._coded(pending, made, now_ns=now_ns, store=store, resend=resend)
-        return True
 
     def _coded(
         self,
@@ -261,6 +274,9 @@ class Chooser:
         store: bool,
         resend: CropJob | None = None,
     ) -> None:
+        """It goes out, with the number that is next now: while it was coded another may have gone."""
+        if still.sequence != (number := self.outbox.sequence(store=store)):
+            still = replace(still, sequence=number)
         if store:
             self.outbox.stored(pending, still)
             self.on_outcome("deferred", "stored")

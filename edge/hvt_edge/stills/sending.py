@@ -16,7 +16,10 @@ __all__ = ["StillSender"]
 
 @dataclass(eq=False)
 class StillSender:
-    """For the stills' thread, and after its end for the one that ends the run; ``backlog`` may be None."""
+    """`put` is for both threads of stills, the rest for that of the method's, or who ends the run after its end.
+
+    ``backlog`` may be None.
+    """
 
     outbox: Outbox
     _: KW_ONLY

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import KW_ONLY, dataclass
 
 from hvt_common.inference.class_names import same_kind
@@ -17,7 +18,7 @@ from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
 from hvt_edge.perception.detected import Detected
 from hvt_edge.perception.shadow import ShadowGround
 from hvt_edge.stills.outbox import Outbox
-from hvt_edge.stills.scheduler import Chooser
+from hvt_edge.stills.scheduler import Chooser, Coded
 from hvt_edge.stills.sending import StillSender
 
 __all__ = ["StillStage"]
@@ -67,11 +68,6 @@ class StillStage:
         return len(self.outbox)
 
     @property
-    def any_pending(self) -> bool:
-        """Whether a still is pending, one that a ground requested included."""
-        return self.outbox.any_pending
-
-    @property
     def any_requested(self) -> bool:
         """Whether one that a ground requested is pending."""
         return self.outbox.on_demand is not None
@@ -104,7 +100,7 @@ class StillStage:
         return chooser.on_demand is not None and chooser.on_demand.wants_tracks(capture_ns)
 
     def send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
-        """Choose, and send the stills that may go now; return their sequence numbers.
+        """Choose, and send the stills of the method that may go now; return their sequence numbers.
 
         ``now_ns`` is the time that windows go by. With ``held`` none is sent, because a keyframe is to come; None
         asks the plan.
@@ -123,21 +119,31 @@ class StillStage:
         return self.send_pending(now_ns=now_ns, held=held)
 
     def send_pending(self, *, now_ns: int, held: bool | None = None) -> set[int]:
-        """Send those that are pending and may go now, without another frame; the rest as of `send`."""
+        """Send those of the method that are pending and may go now, without another frame; the rest as of `send`."""
         self.sender.store_lost(now_ns)
         store = self.sender.offline
-        sent: set[int] = set()
         if not store and (self.keyframes.due(now_ns) if held is None else held):
-            if self.keyframes.requested:
-                return sent
-            stills = self.chooser.requested(now_ns=now_ns)  # a keyframe of the schedule can wait for them
-        else:
-            allowance = self.sender.allowance(now_ns, paced=not store)
-            stills = self.chooser.stills(now_ns=now_ns, allowance=allowance, store=store)
-        for coded in stills:
-            self.sender.put(coded, now_ns=now_ns, store=store)
-            if not store:
-                sent.add(coded.still.sequence)
+            return set()
+        allowance = self.sender.allowance(now_ns, paced=not store)
+        stills = self.chooser.stills(now_ns=now_ns, allowance=allowance, store=store)
+        return self._put(stills, now_ns=now_ns, store=store)
+
+    def send_requested(self, *, now_ns: int, held: bool | None = None) -> set[int]:
+        """Send those that grounds requested and may go now; the rest as of `send`. May run beside all else."""
+        store = self.sender.offline
+        held = not store and (self.keyframes.due(now_ns) if held is None else held)
+        if held and self.keyframes.requested:
+            return set()  # a keyframe of the schedule can wait for them, this one cannot
+        stills = self.chooser.requested(now_ns=now_ns, store=store)
+        return self._put(stills, now_ns=now_ns, store=store)
+
+    def _put(self, stills: Coded, *, now_ns: int, store: bool) -> set[int]:
+        sent: set[int] = set()
+        with closing(stills):
+            for coded in stills:
+                self.sender.put(coded, now_ns=now_ns, store=store)
+                if not store:
+                    sent.add(coded.still.sequence)
         return sent
 
     def on_results(self, results: Sequence[StillResult], *, detected: Detected | None = None) -> None:

@@ -1,4 +1,7 @@
-"""The thread of perception and stills in real time, so that detection never delays the base stream."""
+"""The threads of perception and stills in real time.
+
+Detection delays neither the base stream nor a still that somebody waits for.
+"""
 
 from __future__ import annotations
 
@@ -23,22 +26,26 @@ __all__ = ["MAX_QUEUE_BYTES", "StillWorker"]
 
 _log = logging.getLogger(__name__)
 
-_PART = "stills"
+_PART, _REQUESTED_PART = "stills", "requested stills"
 _BEHIND_FRAMES = 3
 """With more frames queued than this, detection is put off; decoding never is."""
 _LEAST_FRAMES = 2
 MAX_QUEUE_BYTES = 24 * 2**20
 """Of frames that are queued: 4 of 1280x720, 2 of 1920x1080 and more."""
 _RETRY_S = 0.025
+_FAILED_S = 1.0
 
 
 @dataclass(eq=False)
 class StillWorker:
-    """Runs a `StillStage` in a thread of its own.
+    """Runs a `StillStage` in a thread of its own, and the stills that grounds request in another.
 
     The queue is bounded in frames and in bytes. Before each frame the thread takes what grounds have reported:
     ``results()`` of stills, and what is ``detected()`` there. An error in it stops stills and perception
     for a while, never the video: what is queued is given up, and the stage goes on from a keyframe.
+
+    The other thread has no queue, and not the lower priority: it codes and sends what is requested while a detection,
+    a decision or an automatic still takes its time.
     """
 
     stage: StillStage
@@ -62,7 +69,9 @@ class StillWorker:
         self._skipped = SkippedUnits()
         self._given_up = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-stills", daemon=True)
+        self._requested = threading.Thread(target=self._run_requested, name="hvt-requested", daemon=True)
         self._thread.start()
+        self._requested.start()
 
     @property
     def queued(self) -> int:
@@ -87,13 +96,15 @@ class StillWorker:
         return True
 
     def close(self) -> None:
-        """Let the thread finish what it has, at most for ``finish_s``, then leave the rest; join it."""
+        """Let the threads finish what they have, at most for ``finish_s``, then leave the rest; join them."""
         until_s = time.monotonic() + self.finish_s
         with contextlib.suppress(queue.Full):
             self._frames.put(None, timeout=self.finish_s)
         self._thread.join(timeout=max(0.0, until_s - time.monotonic()))
         self._given_up.set()
-        self._thread.join(timeout=self.finish_s)
+        until_s = time.monotonic() + self.finish_s
+        for thread in (self._thread, self._requested):
+            thread.join(timeout=max(0.0, until_s - time.monotonic()))
 
     def __enter__(self) -> Self:
         return self
@@ -107,16 +118,24 @@ class StillWorker:
             try:
                 if (item := self._next()) is None:
                     return
-                # Whoever looks closer waits: a detection takes longer than what he asked for.
-                behind = self._frames.qsize() >= _BEHIND_FRAMES or self.stage.any_requested
-                if self.stage.any_requested:
-                    self.stage.send_pending(now_ns=self.clock())
+                behind = self._frames.qsize() >= _BEHIND_FRAMES
                 self.stage.on_results(self.results(), detected=self.detected())
                 analyzed = self.stage.analyze(*item, hurry=behind)
                 self.stage.send(analyzed, now_ns=self.clock())
                 self.failures.works(_PART)
             except Exception as error:  # noqa: BLE001 - it ends stills for a while, never the flight
                 self._fail(error)
+
+    def _run_requested(self) -> None:
+        while not self._given_up.wait(_RETRY_S):
+            try:
+                if self.stage.any_requested:
+                    self.stage.send_requested(now_ns=self.clock())
+                    self.failures.works(_REQUESTED_PART)
+            except Exception as error:  # noqa: BLE001 - it ends one requested still, never the flight
+                _log.debug("a requested still failed", exc_info=error)
+                self.failures.failed(_REQUESTED_PART, f"one was not sent ({type(error).__name__}: {error})")
+                self._given_up.wait(_FAILED_S)
 
     def _fail(self, error: Exception) -> None:
         _log.debug("stills failed", exc_info=error)
@@ -138,5 +157,5 @@ class StillWorker:
             try:
                 return self._frames.get(timeout=_RETRY_S)
             except queue.Empty:
-                if self.stage.any_pending and self._pause.due(self.clock()):
+                if self.stage.pending and self._pause.due(self.clock()):
                     self.stage.send_pending(now_ns=self.clock())

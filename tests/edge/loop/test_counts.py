@@ -41,7 +41,7 @@ class Nowhere:
 class Unmoved:
     """Perception that finds nothing."""
 
-    latest_tracks, any_pending = None, False
+    latest_tracks, pending, any_requested = None, 0, False
 
     def is_used(self, capture_ns):
         """Somebody looks at what comes of it."""
@@ -50,6 +50,10 @@ class Unmoved:
     def analyze(self, frame, unit, skipped=(), *, hurry=False):
         """Nothing."""
         return frame.index
+
+    def send_requested(self, *, now_ns, held):
+        """Nothing."""
+        return set()
 
     def send(self, seen, *, now_ns, held=None):
         """Nothing."""

@@ -64,6 +64,10 @@ class Stills:
         self.seen.append((frame.index, unit and unit.frame_index))
         return frame.index
 
+    def send_requested(self, *, now_ns, held):
+        """Nothing."""
+        return set()
+
     def send(self, seen, *, now_ns, held):
         """Nothing."""
         self.sends += 1

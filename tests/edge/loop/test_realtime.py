@@ -49,7 +49,7 @@ class BlockedStills:
     """Decodes what it is given; sending its first still takes until it is released."""
 
     def __init__(self) -> None:
-        self.latest_tracks, self.any_pending = None, False
+        self.latest_tracks, self.pending, self.any_requested = None, 0, False
         self.released, self.decoder = threading.Event(), BaseDecoder()
         self.frames: list[int] = []
         self.decoded = 0

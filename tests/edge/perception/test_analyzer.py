@@ -384,9 +384,10 @@ def test_closing_a_busy_worker_is_quick_and_leaves_nothing_running():
         clock=lambda: FRAMES[0].capture_ns,
         finish_s=1.2,
     )
-    (running,) = set(threading.enumerate()) - before
+    running = set(threading.enumerate()) - before
+    assert {one.name for one in running} == {"hvt-stills", "hvt-requested"}
     for frame, unit in zip(FRAMES[:16], UNITS, strict=False):
         worker.take(frame, unit)
     worker.close()
-    assert running not in threading.enumerate()
+    assert running.isdisjoint(threading.enumerate())
     assert rig.stage.analyzer.frames < 16, "what was not in hand was left"

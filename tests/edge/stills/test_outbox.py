@@ -163,10 +163,11 @@ def test_what_grounds_request_waits_in_its_own_queue_in_order():
     other = pending(1, 9.0)
     outbox.offer(other)
     assert (outbox.on_demand, outbox.on_demand_pending, len(outbox)) == (first, 2, 1)
-    assert outbox.expire(5 * S) == [(other, "stale")], "their own time begins when they are met"
+    assert outbox.expire_on_demand(5 * S) == [], "their own time begins when they are met"
+    assert outbox.expire(5 * S) == [(other, "stale")]
     outbox.sent(first, replace(HEADER, data=b"x"), now_ns=6 * S)
     assert outbox.on_demand is second
-    assert outbox.expire(16 * S) == [(second, "stale")]
+    assert outbox.expire_on_demand(16 * S) == [(second, "stale")]
     assert not outbox.any_pending
 
 
@@ -381,6 +382,7 @@ def test_stills_thread_and_link_may_act_at_once():
             lambda index: outbox.lose() if index % 50 == 0 else None,
             lambda index: outbox.offer_on_demand(OutboxStill(crop(-1), None, 1.0, None)),
             lambda index: outbox.expire(index * S),
+            lambda index: outbox.expire_on_demand(index * S),
         )
     ]
     for one in threads:

@@ -18,17 +18,20 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Frame, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
-from hvt_common.video.still_codecs import JpegCodec
+from hvt_common.video.still_codecs import JpegCodec, StillCodec
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
+from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.on_demand_crop import OnDemandRequest
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from media.base_coded import StandIn
 from media.clips import framed, smooth_pictures
+from programs.processes import eventually
 from rigs.flight import CLASSES, SIZE, RedSquares, square_box
 from rigs.still_stage import make_still_stage
 
@@ -77,7 +80,13 @@ class Rig:
     """A still stage whose stills build on the base, with a real budget of 200 kbps for them."""
 
     def __init__(
-        self, *, reports: bool = False, sparse: bool = False, analyzer: Analyzer | None = None
+        self,
+        *,
+        reports: bool = False,
+        sparse: bool = False,
+        analyzer: Analyzer | None = None,
+        codec: StillCodec | None = None,
+        ring: FrameRing | None = None,
     ) -> None:
         self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframeRequests()
         self.sender = Transmitter(
@@ -96,8 +105,9 @@ class Rig:
             outcomes=self.outcomes,
             view=VIEW,
             class_names=CLASSES,
-            maker=StillMaker(codec=StandIn(), fallback=JpegCodec()),
+            maker=StillMaker(codec=codec or StandIn(), fallback=JpegCodec()),
             reporter=self if reports else None,
+            ring=ring,
         )
         self.plan = KeyframePlan(self.keyframes)
         self.plan.done(FRAMES[0].capture_ns)
@@ -240,6 +250,78 @@ def test_frames_that_wait_are_bounded_in_bytes():
         time.sleep(0.001)
     assert not roomy.full, "one frame always has its place"
     roomy.close()
+
+
+class Blocking:
+    """Somebody else's work that does not end before it is let go."""
+
+    def __init__(self) -> None:
+        self.began, self.released = threading.Event(), threading.Event()
+
+    def __call__(self) -> None:
+        """Do it."""
+        self.began.set()
+        assert self.released.wait(60)
+
+
+def requested_beside(rig: Rig, blocking: Blocking) -> None:
+    """Fly until something blocks; a still that is requested then goes out meanwhile."""
+    on_demand = rig.stage.chooser.on_demand
+    assert on_demand is not None
+    now_ns = FRAMES[0].capture_ns
+    worker = StillWorker(
+        rig.stage, results=list, failures=Failures(time.time_ns), clock=lambda: now_ns, finish_s=30
+    )
+    try:
+        for frame, unit in zip(FRAMES[:16], UNITS, strict=False):
+            eventually(
+                lambda: worker.queued < 2 or blocking.began.is_set(), within_s=20, what="it is not hurried"
+            )
+            if blocking.began.is_set():
+                break
+            worker.take(frame, unit)
+        eventually(blocking.began.is_set, within_s=20, what="the other work has begun")
+        before = len(rig.out.stills)
+        on_demand.request(OnDemandRequest(box_xywh_px=(40, 40, 96, 64)))
+        eventually(lambda: len(rig.out.stills) > before, within_s=20, what="the requested still is there")
+        assert not blocking.released.is_set()
+        assert rig.out.stills[-1][0].reason == "asked"
+    finally:
+        blocking.released.set()
+        worker.close()
+
+
+def test_a_requested_still_goes_out_while_a_detection_takes_its_time():
+    """Whoever looks closer would wait for the detector of a slow board: 4.9 s where there is room for it at once."""
+    blocking = Blocking()
+
+    class Slow(RedSquares):
+        detections = 0
+
+        def detect(self, image_bgr):
+            self.detections += 1
+            if self.detections > 1:
+                blocking()
+            return super().detect(image_bgr)
+
+    requested_beside(Rig(analyzer=make_analyzer(detector=Slow()), ring=FrameRing()), blocking)
+
+
+def test_a_requested_still_goes_out_while_an_automatic_one_is_coded_and_numbers_go_up():
+    """It would wait for what nobody asked for; or two stills would have one number, and one of them be lost."""
+    blocking = Blocking()
+
+    class Slow(StandIn):
+        def encode(self, crop_bgr, *, quality_pct, base_bgr=None):
+            if not blocking.released.is_set():
+                blocking()
+            return super().encode(crop_bgr, quality_pct=quality_pct, base_bgr=base_bgr)
+
+    rig = Rig(codec=Slow(), ring=FrameRing())
+    requested_beside(rig, blocking)
+    headers = [header for header, _ in rig.out.stills]
+    assert [one.sequence for one in headers] == list(range(len(headers)))
+    assert [one.reason == "asked" for one in headers[:2]] == [True, False]
 
 
 def test_a_pending_still_holds_no_frame():

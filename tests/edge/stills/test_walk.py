@@ -27,7 +27,7 @@ from media.clips import framed, smooth_pictures
 from rigs.flight import CLASSES, SIZE, RedSquares
 from rigs.still_stage import make_still_stage
 
-MOST_FILES = 16
+MOST_FILES = 17
 
 
 class Out:

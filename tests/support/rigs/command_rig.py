@@ -159,9 +159,10 @@ class Rig:
                 self.budget.record_base(size, now_ns=self.budget.earliest_ns(size, now_ns=now_ns, base=True))
             self.chooser.consider(seen, now_ns=self.now_ns, allowance_bytes=1000)
             sender = StillSender(self.outbox, maker=self.maker, transmitter=self.sender)
-            for coded in self.chooser.stills(
-                now_ns=self.now_ns, allowance=sender.allowance(self.now_ns, paced=True)
-            ):
+            for coded in self.chooser.requested(now_ns=self.now_ns):
+                sender.put(coded, now_ns=self.now_ns, store=False)
+            allowance = sender.allowance(self.now_ns, paced=True)
+            for coded in self.chooser.stills(now_ns=self.now_ns, allowance=allowance):
                 sender.put(coded, now_ns=self.now_ns, store=False)
 
     def ask(self, command: str, **arguments) -> ControlAnswer:

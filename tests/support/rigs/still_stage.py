@@ -10,7 +10,9 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
+from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
@@ -34,9 +36,18 @@ def make_still_stage(
     outbox: Outbox | None = None,
     reporter=None,
     backlog: BacklogStage | None = None,
+    ring: FrameRing | None = None,
 ) -> StillStage:
-    """Of method M1, without suppression; ``outcomes`` counts what becomes of candidates."""
+    """Of method M1, without suppression; ``outcomes`` counts what becomes of candidates.
+
+    Grounds may request stills of what ``ring`` holds.
+    """
     outbox, maker = Outbox() if outbox is None else outbox, maker or StillMaker()
+    on_demand = None
+    if ring is not None:
+        on_demand = OnDemand(
+            ring, outbox=outbox, maker=maker, view=view, class_names=class_names, line=transmitter
+        )
     chooser = Chooser(
         method("M1"),
         outbox=outbox,
@@ -47,6 +58,7 @@ def make_still_stage(
         class_names=class_names,
         settings=ChooserSettings(fps=15, most_bytes=10_000),
         on_outcome=lambda *outcome: outcomes.update([outcome]),
+        on_demand=on_demand,
     )
     return StillStage(
         analyzer,
