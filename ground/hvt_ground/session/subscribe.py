@@ -116,6 +116,9 @@ class GroundLink:
         """Begin with the edges that are this member's now, and leave those that are another's."""
         with self._lock:
             known = self._alive | self._ports.keys()
+            evicted = self._subscribers.keys() - self._ports.keys()
+        for edge in evicted:
+            self._unsubscribe(edge)
         for edge in sorted(known - self._leaving):
             served, serves = edge in self._subscribers, group.serves(edge)
             if serves and not served:
@@ -144,11 +147,17 @@ class GroundLink:
         ]
 
     def _leave(self, edge: str) -> None:
-        self._leaving.add(edge)
+        self._unsubscribe(edge)
+        with self._lock:
+            port = self._ports.pop(edge, None)
+        if port is not None:  # or it has made space for another in this very round
+            self._leaving.add(edge)
+            port.close()
+
+    def _unsubscribe(self, edge: str) -> None:
+        """Not while the lock is held: Zenoh may wait for a callback that wants it."""
         for one in self._subscribers.pop(edge):
             one.undeclare()  # type: ignore[no-untyped-call]
-        with self._lock:
-            self._ports.pop(edge).close()
 
     def _port(self, key: str, *, alive: bool = False) -> EdgePort | None:
         parsed = parse_key(key)
@@ -173,6 +182,8 @@ class GroundLink:
         for edge, port in self._ports.items():
             if not port.present.is_set() and not port.used.is_set():
                 del self._ports[edge]
+                if edge in self._subscribers:
+                    self._leaving.add(edge)
                 port.close()
                 return True
         return False

@@ -298,3 +298,47 @@ def test_silent_edges_hold_up_nobody(free_port: int) -> None:
             one.drop()
         for one in (*queryables, *tokens):
             one.undeclare()
+
+
+class Shared:
+    """A group whose edges are all this member's, but those that are ``elsewhere``."""
+
+    def __init__(self) -> None:
+        self.elsewhere: set[str] = set()
+
+    def serves(self, edge: str) -> bool:
+        """Whether it is this member's."""
+        return edge not in self.elsewhere
+
+    def release(self, edge: str) -> None:
+        """Another may have it."""
+
+    def forget(self, *, except_for: set[str]) -> None:
+        """Others are gone."""
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_in_a_group_an_edge_that_made_space_may_come_back_or_move(free_port: int, moves: bool) -> None:  # noqa: FBT001
+    """The member, and with it the video of 63 others, ended with a KeyError."""
+    endpoint, group = f"tcp/127.0.0.1:{free_port}", Shared()
+    with (
+        open_session(LinkSettings("ground", listen=(endpoint,))) as session,
+        GroundLink(session, edges="*", group=group) as link,  # type: ignore[arg-type]
+        joined(endpoint) as outsider,
+    ):
+        tokens = [
+            outsider.liveliness().declare_token(f"hvt/uav-{number}/alive") for number in range(MAX_EDGES)
+        ]
+        eventually(lambda: len(link.ports()) == MAX_EDGES, within_s=30, what="all are served")
+        (first,) = [one for one in link.ports() if one.edge == "uav-0"]
+        tokens[0].undeclare()  # type: ignore[no-untyped-call]
+        eventually(lambda: not first.present.is_set(), within_s=20, what="it is gone, without a picture")
+        tokens.append(outsider.liveliness().declare_token("hvt/new/alive"))
+        eventually(lambda: "new" in served(link), within_s=20, what="it has made space")
+        assert len(link.ports()) == MAX_EDGES
+        link.closed(first)
+        group.elsewhere |= {"uav-0"} if moves else {"uav-1"}
+        tokens.append(outsider.liveliness().declare_token("hvt/uav-0/alive"))
+        eventually(lambda: link.is_known("uav-0"), within_s=20, what="it is back")
+        eventually(lambda: ("uav-0" in served(link)) is not moves, within_s=20, what="it is where it belongs")
+        assert len(link.ports()) == MAX_EDGES
