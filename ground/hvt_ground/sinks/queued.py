@@ -47,7 +47,6 @@ class QueuedSink(Generic[T]):
     ) -> None:
         self.part = part
         self.for_backlog = for_backlog
-        self._open_sink = open_sink
         self._wait_s = wait_s
         self._changed = threading.Condition()
         self._queue: deque[tuple[T, int, int]] = deque()
@@ -72,7 +71,9 @@ class QueuedSink(Generic[T]):
         """How often an item that an edge has stored may have been lost."""
         self._dropped = 0
         """The latter."""
-        self._thread = threading.Thread(target=self._run, name=f"hvt-{part}"[:48], daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, args=(open_sink,), name=f"hvt-{part}"[:48], daemon=True
+        )
         self._thread.start()
 
     def log(self, item: T) -> None:
@@ -162,18 +163,19 @@ class QueuedSink(Generic[T]):
 
     # In its own thread
 
-    def _run(self) -> None:
-        while not self._use():
+    def _run(self, open_sink: Callable[[], SinkWriter[T]]) -> None:
+        # Not an attribute: the sink of an ended session is kept for its counts, and what it was made of is not.
+        while not self._use(open_sink):
             while not self._pause.due(time.monotonic_ns()):
                 with self._changed:
                     if self._changed.wait_for(lambda: self._ending, _POLL_S):
                         return
 
-    def _use(self) -> bool:
+    def _use(self, open_sink: Callable[[], SinkWriter[T]]) -> bool:
         """Make the sink and write until the end; False where that failed."""
         sink: SinkWriter[T] | None = None
         try:
-            sink = self._open_sink()
+            sink = open_sink()
             self._begin(sink)
             while (taken := self._take()) is not None:
                 item, skipped = taken

@@ -9,15 +9,17 @@ import socket
 import ssl
 import struct
 import threading
+import time
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 from urllib.parse import urlsplit
 
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from hvt_common.errors import NotYetError, UserError, listening_trouble, may_come
 from hvt_common.protocol.messages import Info
@@ -35,7 +37,14 @@ from hvt_ground.web.viewers import EdgePage, Hub
 __all__ = ["WebPage"]
 
 _MOST_CONNECTIONS = 256
-_FIRST_REQUEST_S = 10.0
+_MOST_OPEN = _MOST_CONNECTIONS + 64
+"""With those that are told that it is too many, or are in the middle of TLS."""
+_REQUEST_S = 10.0
+"""So long a client may take for TLS, and from an answer to the next whole request."""
+_STALL_S = 20.0
+"""So long nothing of what was sent may be taken."""
+_CLOSE_S = 5.0
+"""So long a closed connection may take for what is left."""
 _END_S = 2.0
 _LIST_ADDRESSES, _ROW_BYTES = 0x8912, 40 if struct.calcsize("P") == 8 else 32
 """SIOCGIFCONF and struct ifreq of netdevice(7)."""
@@ -95,7 +104,7 @@ class WebPage:
             ssl_certfile=None if keys is None else keys[0],
             ssl_keyfile=None if keys is None else keys[1],
             http=_BoundedProtocol,
-            ws="websockets-sansio",
+            ws=_BoundedSocket,
             loop="asyncio",
             lifespan="off",
             log_config=None,
@@ -103,12 +112,12 @@ class WebPage:
             ws_max_size=MOST_MESSAGE_BYTES,
             ws_per_message_deflate=False,
             h11_max_incomplete_event_size=16384,
-            timeout_keep_alive=10,
+            timeout_keep_alive=round(_REQUEST_S),
             timeout_graceful_shutdown=1,
             server_header=False,
         )
         logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)  # what browsers send is their affair
-        self._server = uvicorn.Server(config)
+        self._server = _Server(config)
         self._thread = threading.Thread(target=self._run, name="hvt-web", daemon=True)
 
     def use(self, client: EdgeClient) -> None:
@@ -160,8 +169,83 @@ class WebPage:
                 await self._server.serve(sockets=[bound])
 
 
-class _BoundedProtocol(H11Protocol):
-    """Refuses connections above a number, and closes those that ask for nothing."""
+class _Listener(socket.socket):
+    """Accepts so many connections and closes what comes above, before TLS: each has a descriptor of the process."""
+
+    _open: Sequence[socket.socket] = ()
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """As of the base class; asyncio tries again after a `ConnectionAbortedError`."""
+        connection, address = super().accept()
+        self._open = [one for one in self._open if one.fileno() >= 0]
+        if len(self._open) >= _MOST_OPEN:
+            connection.close()
+            raise ConnectionAbortedError
+        self._open.append(connection)
+        return connection, address
+
+
+class _Server(uvicorn.Server):
+    """One whose handshakes end, and that cuts off who does not take the rest of a closed connection."""
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self._closing: dict[object, float] = {}
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Without lifespan; uvicorn's own leaves a silent TLS connection a minute."""
+        config, loop = self.config, asyncio.get_running_loop()
+        handshake_s, shutdown_s = (_REQUEST_S, _CLOSE_S) if config.ssl else (None, None)
+
+        def protocol() -> asyncio.Protocol:
+            return _BoundedProtocol(config=config, server_state=self.server_state, app_state={}, _loop=loop)
+
+        self.servers = [
+            await loop.create_server(
+                protocol,
+                sock=one,
+                ssl=config.ssl,
+                ssl_handshake_timeout=handshake_s,
+                ssl_shutdown_timeout=shutdown_s,
+            )
+            for one in sockets or ()
+        ]
+        self.started = True
+
+    async def on_tick(self, counter: int) -> bool:
+        """Each tenth of a second."""
+        now_s = time.monotonic()
+        transports = [one.transport for one in self.server_state.connections if one.transport.is_closing()]
+        self._closing = {one: self._closing.get(one, now_s) for one in transports}
+        for one in transports:
+            if now_s - self._closing[one] > _CLOSE_S:
+                one.abort()
+        return await super().on_tick(counter)
+
+
+class _NoStall(asyncio.Protocol):
+    """Ends a connection whose other side takes nothing: to close it would wait for what it does not take."""
+
+    transport: asyncio.Transport
+    loop: asyncio.AbstractEventLoop
+    _stalled: asyncio.TimerHandle | None = None
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._stalled = self.loop.call_later(_STALL_S, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        if self._stalled is not None:
+            self._stalled.cancel()
+
+
+class _BoundedSocket(_NoStall, WebSocketsSansIOProtocol):
+    """A viewer's."""
+
+
+class _BoundedProtocol(_NoStall, H11Protocol):
+    """Closes connections that ask for nothing, or never come to the end of it."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -171,11 +255,20 @@ class _BoundedProtocol(H11Protocol):
             )
             transport.close()
             return
-        self.loop.call_later(_FIRST_REQUEST_S, self._close_silent, transport)
+        self._await_request(None)
 
-    def _close_silent(self, transport: asyncio.Transport) -> None:
-        if self.cycle is None and transport.get_protocol() is self:
-            transport.close()
+    def on_response_complete(self) -> None:
+        answered = self.cycle
+        super().on_response_complete()
+        self._await_request(answered)
+
+    def _await_request(self, before: object) -> None:
+        """A byte now and then is no request."""
+        self.loop.call_later(_REQUEST_S, self._close_silent, before)
+
+    def _close_silent(self, before: object) -> None:
+        if self.cycle is before and self.transport.get_protocol() is self:
+            self.transport.abort()
 
 
 def _own_addresses() -> list[str]:
@@ -216,7 +309,7 @@ def _bound(host: str, port: int) -> socket.socket:
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, *_, where = found[0]
-        made = socket.socket(family, socket.SOCK_STREAM)
+        made = _Listener(family, socket.SOCK_STREAM)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         made.bind(where)
         made.listen(128)

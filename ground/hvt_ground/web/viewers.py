@@ -21,7 +21,8 @@ _MOST_QUEUED = 400
 _MOST_QUEUED_BYTES = 4 * 2**20
 """Of a viewer; above, it loses pictures up to the next keyframe."""
 _MOST_TEXTS = 2000
-"""What is not video is not dropped: who lets so much of it lie is gone."""
+_MOST_TEXT_BYTES = 4 * 2**20
+"""What is not video is not dropped: who lets so much of it lie is given up."""
 _MOST_RETAINED_BYTES = 16 * 2**20
 _MOST_RETAINED = 2000
 """Fragments since the last keyframe."""
@@ -52,25 +53,29 @@ class Viewer:
         self.lost = 0
         """Messages of video that it was too slow for."""
         self.hopeless = False
-        """It takes nothing at all any more."""
+        """It takes nothing at all any more: nothing is kept for it, and `take` raises."""
         self._queue: deque[tuple[str | bytes, bool]] = deque()
         self._bytes = 0
-        self._texts = 0
+        self._texts = self._text_bytes = 0
         self._waits_for_keyframe = False
         self._there = asyncio.Event()
 
     def put(self, message: str | bytes) -> None:
         """Queue what is not to be lost."""
-        if self._texts >= _MOST_TEXTS:
+        if self._texts >= _MOST_TEXTS or self._text_bytes + len(message) > _MOST_TEXT_BYTES:
             self.hopeless = True
+            self._queue.clear()
+            self._bytes = self._texts = self._text_bytes = 0
+        if self.hopeless:
             self._there.set()
             return
         self._texts += 1
+        self._text_bytes += len(message)
         self._add(message, video=False)
 
     def put_video(self, message: str | bytes, *, begins: bool) -> None:
         """Queue a message of the live picture; ``begins``: it can be used without those before it."""
-        if self._waits_for_keyframe and not begins:
+        if self.hopeless or (self._waits_for_keyframe and not begins):
             self.lost += 1
             return
         if len(self._queue) - self._texts >= _MOST_QUEUED or self._bytes >= _MOST_QUEUED_BYTES:
@@ -93,15 +98,17 @@ class Viewer:
         return not self._queue
 
     async def take(self) -> str | bytes:
-        """The next message."""
-        while not self._queue:
+        """The next message. Raises `ConnectionError` where the viewer is hopeless."""
+        while not self._queue and not self.hopeless:
             self._there.clear()
             await self._there.wait()
-            if self.hopeless:
-                raise ConnectionError("the viewer takes nothing")
+        if self.hopeless:
+            raise ConnectionError("the viewer takes nothing")
         message, video = self._queue.popleft()
         self._bytes -= len(message)
-        self._texts -= not video
+        if not video:
+            self._texts -= 1
+            self._text_bytes -= len(message)
         return message
 
     def _add(self, message: str | bytes, *, video: bool) -> None:

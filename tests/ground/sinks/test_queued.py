@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+import weakref
 from contextlib import suppress
 from pathlib import Path
 
@@ -67,6 +68,19 @@ def test_one_that_never_answers_does_not_keep_the_ground_from_ending(tmp_path):
     assert [(one.part, one.working) for one in failures.parts] == [("tracks table", False)]
     with pipe.open():  # so that the test's own process has no thread left
         eventually(lambda: sink.ended, within_s=20, what="the thread ends")
+
+
+def test_a_sink_that_has_ended_keeps_nothing_of_what_made_it(tmp_path):
+    """A ground knows hundreds of ended sessions: each would keep its page with all pictures of its stills."""
+
+    def open_sink() -> LineFile:
+        return LineFile(tmp_path / "a.csv", ("a",))
+
+    maker = weakref.ref(open_sink)
+    sink = Outputs(Failures(time.time_ns)).open("page", open_sink)
+    del open_sink
+    assert sink.join(time.monotonic() + 60)
+    assert maker() is None
 
 
 def test_in_lockstep_a_full_queue_is_waited_for(tmp_path):

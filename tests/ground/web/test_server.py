@@ -18,8 +18,8 @@ from websockets.sync.client import ClientConnection, connect
 
 from hvt_common.errors import UserError
 from hvt_common.transport.zenoh_config import key_pair
-from hvt_ground.events import Refinement
-from hvt_ground.web import WebPage
+from hvt_ground.events import Notice, Refinement
+from hvt_ground.web import WebPage, server
 from programs.fleet_keys import Fleet
 from programs.processes import eventually, free_ports
 from rigs.flight import Flight
@@ -359,6 +359,80 @@ def test_five_hundred_connections_that_say_nothing_leave_room(local):
     for one in silent:
         one.close()
     eventually(lambda: lets_in(local), within_s=10, what="others are let in")
+
+
+def is_closed(connection: socket.socket) -> bool:
+    """Whether the server has ended it; what it sent meanwhile is taken."""
+    connection.setblocking(False)
+    with suppress(BlockingIOError):
+        try:
+            return connection.recv(4096) == b""
+        except ConnectionError:
+            return True
+    return False
+
+
+def test_a_byte_now_and_then_holds_no_connection(port, monkeypatch):
+    """A few hundred such connections would keep everybody else out for ever."""
+    monkeypatch.setattr(server, "_REQUEST_S", 0.5)
+    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns), ExitStack() as held:
+        eventually(lambda: lets_in(port), within_s=30, what="it serves")
+        for request in (b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"):
+            one = held.enter_context(reached(port))
+            one.sendall(request)
+            if request:
+                assert one.recv(10_000).startswith(b"HTTP/1.1 200")
+            one.sendall(b"G")
+            eventually(lambda one=one: is_closed(one), within_s=60, what="it is closed")
+
+
+def test_silent_connections_take_no_more_descriptors_than_others(port, tmp_path, monkeypatch):
+    """Before TLS nobody counted them: recordings found no descriptor for their next file."""
+    monkeypatch.setattr(server, "_MOST_OPEN", 8)
+    fleet = Fleet(tmp_path / "own")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    with WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=key_pair(fleet.settings("base", "ground"))):
+        silent = [reached(port) for _ in range(40)]
+        eventually(lambda: sum(map(is_closed, silent)) >= 32, within_s=30, what="most are closed")
+        for one in silent:
+            one.close()
+
+
+def test_who_begins_no_tls_is_closed(port, tmp_path, monkeypatch):
+    """Its place would be taken for a minute, again and again."""
+    monkeypatch.setattr(server, "_REQUEST_S", 0.5)
+    fleet = Fleet(tmp_path / "own")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    keys = key_pair(fleet.settings("base", "ground"))
+    with WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=keys), reached(port) as silent:
+        eventually(lambda: is_closed(silent), within_s=40, what="it is closed")
+
+
+def test_a_viewer_that_reads_nothing_is_closed(port, monkeypatch):
+    """It would keep its place for ever: to close it waits for what it does not take."""
+    monkeypatch.setattr(server, "_STALL_S", 0.5)
+    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns) as page:
+        eventually(lambda: lets_in(port), within_s=30, what="it serves")
+        feed = page.feed(Flight(1).info())()
+        with socket.socket() as raw:
+            raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            raw.connect(("127.0.0.1", port))
+            raw.sendall(
+                f"GET /ws HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nOrigin: http://127.0.0.1:{port}\r\n".encode()
+                + b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+                + b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+            )
+            assert b" 101 " in raw.recv(100)
+
+            def is_reset() -> bool:
+                feed.log(Notice(0, 0, "info", "x" * 200_000))
+                try:
+                    raw.sendall(b"\x8a\x80\0\0\0\0")  # a pong that nobody asked for
+                except ConnectionError:
+                    return True
+                return False
+
+            eventually(is_reset, within_s=60, what="it is closed")
 
 
 def test_what_is_no_http_disturbs_nothing(local):

@@ -116,6 +116,17 @@ def test_who_takes_nothing_at_all_is_given_up():
     for _ in range(3000):
         viewer.put("words")
     assert viewer.hopeless
+    with pytest.raises(ConnectionError):
+        asyncio.run(viewer.take())
+
+
+def test_few_long_words_are_too_much_too():
+    """Sixty viewers that hang would take gigabytes, two thousand messages each."""
+    viewer = Viewer()
+    for _ in range(1000):
+        viewer.put("x" * 60_000)
+    assert viewer.hopeless
+    assert viewer.empty
 
 
 def test_a_reload_shows_the_last_picture_of_an_edge_that_is_silent(hub):
