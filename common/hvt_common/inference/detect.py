@@ -91,6 +91,7 @@ def open_detector(
     head: str | None = None,
     threads: int = 1,
     provider: str = "cpu",
+    niceness: int = 0,
 ) -> Detector:
     """Open a detector: ``motion``, the name of a model (see `resolve_model`), a file, or a plug-in's name.
 
@@ -98,8 +99,9 @@ def open_detector(
     ``head`` is one of `heads.choose.HEAD_NAMES`; else the file tells, or what it answers. ``confidence`` is the least
     of a detection, ``nms_iou`` the largest overlap of two of one class, both 0…1. ``size`` is (width, height) of the
     network's input where the model leaves it free; else each image gets the multiples of the network's stride that
-    hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). A plug-in gets none of these;
-    ``confidence`` is applied to its answer. Raises `UserError` where there is no such model, it is no detector, its
+    hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). ``niceness``: see `ModelSettings`. A
+    plug-in gets none of these; ``confidence`` is applied to its answer.
+    Raises `UserError` where there is no such model, it is no detector, its
     labels do not fit, or a setting is out of its range.
     """
     for name, value in (("confidence", confidence), ("NMS IoU", nms_iou)):
@@ -116,7 +118,7 @@ def open_detector(
             raise UserError(f"labels file {labels} has no say: detector {spec!r} brings its own class names")
         return PlugInDetector(plug_in, spec, confidence=confidence)
     path = resolve_model(spec, role="detector", words=(MOTION, *plug_in_names()))
-    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
+    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider, niceness=niceness))
     return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size, head=head)
 
 

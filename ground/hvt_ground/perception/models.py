@@ -11,6 +11,7 @@ from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.process import NETWORK_NICENESS
 from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
 from hvt_ground.perception.retried import RetriedClassifier, RetriedDetector
@@ -57,6 +58,7 @@ class Models:
             head=config.head,
             threads=config.threads,
             provider=config.provider,
+            niceness=NETWORK_NICENESS,
         )
         hint = FewFoundHint(config.detector, confidence=track_confidence(config))
         return RetriedDetector(open_one, "detector", self.failures, hint=hint)
@@ -85,6 +87,7 @@ class Models:
             labels=config.labels,
             threads=config.threads,
             provider=config.provider,
+            niceness=NETWORK_NICENESS,
         )
         return detector, RetriedClassifier(open_one, "classifier", self.failures)
 

@@ -29,7 +29,7 @@ from hvt_common.inference.runtimes.ir_file import ir_metadata, is_ir
 from hvt_common.inference.runtimes.onnx_file import check_onnx_file, onnx_version, opset_versions
 from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
 from hvt_common.inference.runtimes.providers import ONNXRUNTIME_PROVIDERS, ProviderChoice, choose_provider
-from hvt_common.runtime.process import NETWORK_NICENESS, lower_priority
+from hvt_common.runtime.process import lower_priority
 
 __all__ = ["ModelSettings", "OnnxModel", "Port", "open_model"]
 
@@ -81,6 +81,8 @@ class ModelSettings:
     """CPU threads inside one operator, 1 or more."""
     provider: str = "cpu"
     """One of `hvt_common.inference.runtimes.providers.PROVIDERS`."""
+    niceness: int = 0
+    """Linux's niceness of the thread that runs it and of its workers; 0: the calling thread runs it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,18 +146,20 @@ class OnnxModel:
 
 
 class _Background:
-    """A thread of the lowest priority that opens and runs one network, and whose workers have that priority too.
+    """Where one network is opened and runs: a thread of this niceness, which its workers have too; 0: the caller's.
 
     Whoever waits for the answer keeps its own: what it computes with the interpreter's lock held may hold up video.
     """
 
-    def __init__(self) -> None:
-        self._thread = ThreadPoolExecutor(
-            1, thread_name_prefix="hvt-network", initializer=partial(lower_priority, NETWORK_NICENESS)
-        )
+    def __init__(self, niceness: int) -> None:
+        self._thread = None
+        if niceness:
+            self._thread = ThreadPoolExecutor(
+                1, thread_name_prefix="hvt-network", initializer=partial(lower_priority, niceness)
+            )
 
     def do(self, call: Callable[[], _T]) -> _T:
-        return self._thread.submit(call).result()
+        return call() if self._thread is None else self._thread.submit(call).result()
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +232,7 @@ def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
             f"model {path} is OpenVINO's, which is not installed here: pip install 'hvt[openvino]'"
         )
     bf16 = found.bf16 and settings.provider != "cpu"
-    background = _Background()
+    background = _Background(settings.niceness)
     openvino = background.do(lambda: OpenVinoRunner(path, threads=settings.threads, bf16=bf16))
     inputs, outputs = (tuple(Port(*port) for port in ports) for ports in openvino.ports)
     runner = _InBackground(background, openvino)
@@ -271,7 +275,7 @@ def _seconds(model: OnnxModel, feed: npt.NDArray[Any]) -> Iterator[float]:
 
 
 def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxModel:
-    background = _Background()
+    background = _Background(settings.niceness)
     if choice.provider == "openvino":
         described = _session(path, settings, ("CPUExecutionProvider",), optimised=False)
         found = find_openvino()
@@ -349,11 +353,14 @@ def _port(value: Any) -> Port:
 def _cause(path: Path, error: Exception) -> str:
     """Why onnxruntime does not open a file: what was found, what is supported here, and what to do."""
     text = " ".join(str(error).split())
-    version, producer = onnx_version(path)
+    try:
+        (version, producer), opset = onnx_version(path), opset_versions(path).get("", 0)
+    except ValueError:  # damaged in a part that only this reads
+        return _reason(error)
     known = {
         "here": f"onnxruntime {ort.__version__}",
         "version": version,
-        "opset": opset_versions(path).get("", 0),
+        "opset": opset,
         "by": f" (written by {producer})" if producer else "",
     }
     for pattern, sentence in _CAUSES.items():

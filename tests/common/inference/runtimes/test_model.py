@@ -43,13 +43,23 @@ def test_a_network_runs_below_everything_else(tmp_path: Path, threads: int) -> N
     others = {one.name for one in Path("/proc/self/task").iterdir()}
     own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     model = open_model(
-        colour_detector(tmp_path / "m.onnx", "yolox", size=None), settings=ModelSettings(threads=threads)
+        colour_detector(tmp_path / "m.onnx", "yolox", size=None),
+        settings=ModelSettings(threads=threads, niceness=19),
     )
     model.run(np.zeros((1, 3, 64, 64), np.float32))
     started = {one.name for one in Path("/proc/self/task").iterdir()} - others
     assert len(started) >= threads
     assert {os.getpriority(os.PRIO_PROCESS, int(one)) for one in started} == {19}
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == own
+
+
+def test_a_network_of_a_study_gives_way_to_nobody(tmp_path: Path) -> None:
+    """A study beside any other program would stand still, though nobody waits for video there."""
+    before = threading.active_count()
+    open_model(colour_detector(tmp_path / "m.onnx", "yolox", size=None)).run(
+        np.zeros((1, 3, 64, 64), np.float32)
+    )
+    assert threading.active_count() == before
 
 
 def test_free_sizes_are_none(tmp_path: Path) -> None:
