@@ -30,6 +30,7 @@ swallowed tick ticks told unchanging waiting weigh weighed whereabouts wish wish
 _NO_NAME = frozenset(_ONCE_NAMES.split())
 _NO_CLASS = frozenset({"Early", "Reception", "Row", "Seen"})
 _OF_LIBRARIES = """
+on_tick
 ask haveImageWriter in_waiting keep_blank_values keep_trailing_newline
 set_log_tick_enabled set_xticks set_yticks tick_params timeout_keep_alive xticks yticks
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from hvt_common.runtime.failures import Awaited
 from hvt_edge.cli import main
 
 SECRET = "S3CRETpw"
@@ -34,6 +35,12 @@ FORMS = {
     "printed": lambda address: ["--source", address, "--print-config"],
     "pose": lambda address: ["--source", "demo", "--pose", address],
 }
+
+
+@pytest.fixture(autouse=True)
+def stopped_at_once(monkeypatch):
+    """A camera that is not there is waited for until somebody stops the program: here at once."""
+    monkeypatch.setattr(Awaited, "wait", lambda awaited, _stop: awaited.part)
 
 
 @pytest.mark.timeout(120)

@@ -37,11 +37,11 @@ from hvt_ground.web.viewers import EdgePage, Hub
 __all__ = ["WebPage"]
 
 _MOST_CONNECTIONS = 256
-_MOST_OPEN = _MOST_CONNECTIONS + 64
+MOST_OPEN = _MOST_CONNECTIONS + 64
 """With those that are told that it is too many, or are in the middle of TLS."""
-_REQUEST_S = 10.0
+REQUEST_S = 10.0
 """So long a client may take for TLS, and from an answer to the next whole request."""
-_STALL_S = 20.0
+STALL_S = 20.0
 """So long nothing of what was sent may be taken."""
 _CLOSE_S = 5.0
 """So long a closed connection may take for what is left."""
@@ -112,7 +112,7 @@ class WebPage:
             ws_max_size=MOST_MESSAGE_BYTES,
             ws_per_message_deflate=False,
             h11_max_incomplete_event_size=16384,
-            timeout_keep_alive=round(_REQUEST_S),
+            timeout_keep_alive=round(REQUEST_S),
             timeout_graceful_shutdown=1,
             server_header=False,
         )
@@ -178,7 +178,7 @@ class _Listener(socket.socket):
         """As of the base class; asyncio tries again after a `ConnectionAbortedError`."""
         connection, address = super().accept()
         self._open = [one for one in self._open if one.fileno() >= 0]
-        if len(self._open) >= _MOST_OPEN:
+        if len(self._open) >= MOST_OPEN:
             connection.close()
             raise ConnectionAbortedError
         self._open.append(connection)
@@ -195,7 +195,7 @@ class _Server(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Without lifespan; uvicorn's own leaves a silent TLS connection a minute."""
         config, loop = self.config, asyncio.get_running_loop()
-        handshake_s, shutdown_s = (_REQUEST_S, _CLOSE_S) if config.ssl else (None, None)
+        handshake_s, shutdown_s = (REQUEST_S, _CLOSE_S) if config.ssl else (None, None)
 
         def protocol() -> asyncio.Protocol:
             return _BoundedProtocol(config=config, server_state=self.server_state, app_state={}, _loop=loop)
@@ -232,7 +232,7 @@ class _NoStall(asyncio.Protocol):
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self._stalled = self.loop.call_later(_STALL_S, self.transport.abort)
+        self._stalled = self.loop.call_later(STALL_S, self.transport.abort)
 
     def resume_writing(self) -> None:
         super().resume_writing()
@@ -264,7 +264,7 @@ class _BoundedProtocol(_NoStall, H11Protocol):
 
     def _await_request(self, before: object) -> None:
         """A byte now and then is no request."""
-        self.loop.call_later(_REQUEST_S, self._close_silent, before)
+        self.loop.call_later(REQUEST_S, self._close_silent, before)
 
     def _close_silent(self, before: object) -> None:
         if self.cycle is before and self.transport.get_protocol() is self:

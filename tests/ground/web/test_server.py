@@ -374,7 +374,7 @@ def is_closed(connection: socket.socket) -> bool:
 
 def test_a_byte_now_and_then_holds_no_connection(port, monkeypatch):
     """A few hundred such connections would keep everybody else out for ever."""
-    monkeypatch.setattr(server, "_REQUEST_S", 0.5)
+    monkeypatch.setattr(server, "REQUEST_S", 0.5)
     with WebPage(f"127.0.0.1:{port}", clock=time.time_ns), ExitStack() as held:
         eventually(lambda: lets_in(port), within_s=30, what="it serves")
         for request in (b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"):
@@ -388,7 +388,7 @@ def test_a_byte_now_and_then_holds_no_connection(port, monkeypatch):
 
 def test_silent_connections_take_no_more_descriptors_than_others(port, tmp_path, monkeypatch):
     """Before TLS nobody counted them: recordings found no descriptor for their next file."""
-    monkeypatch.setattr(server, "_MOST_OPEN", 8)
+    monkeypatch.setattr(server, "MOST_OPEN", 8)
     fleet = Fleet(tmp_path / "own")
     fleet.keys("add-ground", "base", "--host", "127.0.0.1")
     with WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=key_pair(fleet.settings("base", "ground"))):
@@ -400,7 +400,7 @@ def test_silent_connections_take_no_more_descriptors_than_others(port, tmp_path,
 
 def test_who_begins_no_tls_is_closed(port, tmp_path, monkeypatch):
     """Its place would be taken for a minute, again and again."""
-    monkeypatch.setattr(server, "_REQUEST_S", 0.5)
+    monkeypatch.setattr(server, "REQUEST_S", 0.5)
     fleet = Fleet(tmp_path / "own")
     fleet.keys("add-ground", "base", "--host", "127.0.0.1")
     keys = key_pair(fleet.settings("base", "ground"))
@@ -410,7 +410,7 @@ def test_who_begins_no_tls_is_closed(port, tmp_path, monkeypatch):
 
 def test_a_viewer_that_reads_nothing_is_closed(port, monkeypatch):
     """It would keep its place for ever: to close it waits for what it does not take."""
-    monkeypatch.setattr(server, "_STALL_S", 0.5)
+    monkeypatch.setattr(server, "STALL_S", 0.5)
     with WebPage(f"127.0.0.1:{port}", clock=time.time_ns) as page:
         eventually(lambda: lets_in(port), within_s=30, what="it serves")
         feed = page.feed(Flight(1).info())()
