@@ -1,6 +1,6 @@
 """What a process sets up for itself: the signals that stop it, its threads' priority, its memory allocator.
 
-Priorities, as Linux's niceness: 0 for what the operator sees move, 10 for perception, 19 for the networks in it.
+Priorities, as Linux's niceness: 0 for what the operator sees move, 10 for perception, 11 for the networks in it.
 
 And what it tells systemd.
 """
@@ -42,8 +42,8 @@ T = TypeVar("T")
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _NICENESS = 10
-NETWORK_NICENESS = 19
-"""x265 sets its own workers to 10 (threadpool.cpp): networks of 10 would have as much of the cores."""
+NETWORK_NICENESS = 11
+"""x265 sets its own workers to 10 (threadpool.cpp); far below them a network stands still beside other programs."""
 _SWITCH_S = 0.0005
 _ZENOH_CALLBACK = "(pyo3-closure)"
 """Zenoh's Python package runs each callback in a thread of such a name, and joins none."""

@@ -58,6 +58,9 @@ def test_a_ground_that_is_killed_and_started_again(
         first = link.ground(*GROUND)
         edge = link.edge(*EDGE)
         eventually(lambda: len(list(folder.glob("*.rrd"))) >= 3, within_s=120, what="there are three files")
+        eventually(
+            lambda: any(one.whole for one in read_index(folder)), within_s=120, what="the first is described"
+        )
         first.kill()
         left = [one for one in sorted(folder.glob("*.rrd")) if one.stat().st_size]
         known = {one.file: one for one in read_index(folder)}
