@@ -62,7 +62,7 @@ class RrdFile:
         self._id = recording_id
         self._screen = screen
         self._compacted_bytes = self.size_bytes = 0
-        fresh = not path.exists() or (path.is_file() and not path.stat().st_size)
+        fresh = not path.exists() or not path.stat().st_size
         self._file = _created(path)
         self._recording = new_recording(recording_id)
         self._stream = rr.binary_stream(self._recording)
