@@ -13,7 +13,6 @@ from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.wiring import output_path
-from hvt_ground.wiring.files import backlog_path, free_path
 
 
 def read(*argv: str) -> GroundConfig:
@@ -113,13 +112,3 @@ def test_no_recording_is_written_over_another(tmp_path):
     names = [output_path(named, suffix=".rrd", edge=edge, stamp="t", taken=taken).name for edge in edges]
     assert names == ["flight.rrd", "flight-uav-2.rrd", "flight-uav-2-2.rrd", "flight-uav-1.rrd"]
     assert len(set(names)) == 4
-
-
-def test_two_grounds_of_one_folder_never_get_one_name(tmp_path):
-    """Both would write one file, and neither flight could be read."""
-    names = [output_path(tmp_path, suffix=".rrd", edge="uav-1", stamp="t", taken=set()) for _ in range(3)]
-    late = [backlog_path(tmp_path, edge="uav-1", stamp="t", taken=set()) for _ in range(3)]
-    numbered = [free_path([tmp_path / "timing.csv"], set(), number=2) for _ in range(3)]
-    assert len({*names, *late, *numbered}) == 9
-    (tmp_path / "t.rrd").symlink_to(tmp_path / "nowhere")  # a link that leads nowhere is a name that is taken
-    assert free_path([tmp_path / "t.rrd"], set(), number=2).name == "t-2.rrd"

@@ -72,7 +72,7 @@ def run(argv: Sequence[str]) -> int:
             if kind in CONTAINERS
             else _FILES[kind]
         )
-        with whole_file(out, new=given.out is None) as part:
+        with whole_file(out) as part:
             write(recorded, part)
     say(f"{out}: {recorded.edge}, {len(recorded.video)} pictures, {len(recorded.stills)} stills")
     return 0

@@ -10,27 +10,13 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 
-__all__ = ["LineFile", "check_there", "claim_name"]
+__all__ = ["LineFile", "check_there"]
 
 
 def check_there(file: int, path: Path) -> None:
     """Raise `FileNotFoundError` where the open file has been removed: what is written to it would be in none."""
     if os.fstat(file).st_nlink == 0:
         raise FileNotFoundError(None, "it was removed", str(path))
-
-
-def claim_name(path: Path) -> bool:
-    """Whether the name was free: from now on it is ours, with an empty file, and no other process gets it.
-
-    True as well where no file can be made there; whoever opens it says why.
-    """
-    try:
-        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644))
-    except FileExistsError:
-        return False
-    except OSError:
-        return True
-    return True
 
 
 class LineFile:

@@ -10,7 +10,6 @@ from pathlib import Path
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.reporting import check_writable
 from hvt_ground.config import GroundConfig
-from hvt_ground.sinks.line_file import claim_name
 from hvt_ground.sinks.transport_stream.destination import check_destination
 
 __all__ = ["backlog_path", "check_outputs", "free_path", "make_record_folder", "output_path"]
@@ -30,6 +29,7 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
     for path, suffix, name in (
         (config.tracks, ".csv", "--tracks"),
         (config.mcap, ".mcap", "--mcap"),
+        (config.stills, ".csv", "--stills"),
         (config.record, ".rrd", "--record"),
     ):
         if path is not None and path.suffix == suffix and not path.is_dir():
@@ -79,14 +79,11 @@ def backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path]
 
 
 def free_path(names: list[Path], taken: set[Path], *, number: int, may_exist: Path | None = None) -> Path:
-    """The first that is free of the names and of the last one with a number from ``number`` on; it is taken.
-
-    It is an empty file then, unless it is ``may_exist``: two grounds may share a folder.
-    """
+    """The first that is free of the names and of the last one with a number from ``number`` on; it is taken."""
     last = names[-1]
     numbered = (last.with_name(f"{last.stem}-{count}{last.suffix}") for count in count_from(number))
     path = next(
-        one for one in chain(names, numbered) if one not in taken and (one == may_exist or claim_name(one))
+        one for one in chain(names, numbered) if one not in taken and (one == may_exist or not one.exists())
     )
     taken.add(path)
     return path

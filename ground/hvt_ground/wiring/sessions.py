@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -198,16 +198,10 @@ class SessionFactory:
         with self._naming:
             path = name(taken=self._paths)
         with ExitStack() as undo:
-            undo.callback(self._give_up, path)
+            undo.callback(self._paths.discard, path)
             sink = make(path)
             undo.pop_all()
         return sink
-
-    def _give_up(self, path: Path) -> None:
-        self._paths.discard(path)
-        with suppress(OSError):
-            if path.is_file() and not path.stat().st_size:
-                path.unlink()
 
     def _recorder_settings(self, info: Info) -> RecorderSettings:
         config = self._config

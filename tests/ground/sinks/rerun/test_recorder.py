@@ -538,14 +538,3 @@ def test_colours_tell_kinds_apart() -> None:
     }
     assert len(kinds) == 8
     assert class_colour("dragonfly") == class_colour("dragonfly")
-
-
-def test_a_recording_that_another_ground_writes_is_left_alone(tmp_path):
-    """Two grounds with one --record FILE.rrd: the second would cut the first one's flight down to nothing."""
-    path = tmp_path / "flight.rrd"
-    with Recorder(RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 5e5)) as first:
-        first.log(Notice(0, START_NS, "info", "of the first ground"))
-        before = path.read_bytes()
-        with pytest.raises(UserError, match="another program is at work on it"):
-            Recorder(RecorderSettings(path, "uav-2", "00aa", (320, 192), 15.0, 5e5))
-        assert path.read_bytes() == before
