@@ -169,7 +169,8 @@ def test_what_cannot_be_is_said_in_one_sentence(flight, tmp_path, capsys):
         (["replay", log, "--edges", "UAV"], "edge pattern 'UAV' is not usable"),
         (["replay", log, "--tracks", str(tmp_path / "absent" / "t.csv")], "--tracks"),
     ):
-        assert hvt_ground.cli.main(words) == 2, words
+        # A folder may be of a disk that is mounted later: 2 is what can never work.
+        assert hvt_ground.cli.main(words) == (1 if "--tracks" in words else 2), words
         error = capsys.readouterr().err
         assert said in error
         assert len(error.splitlines()) == 1, error
