@@ -146,20 +146,29 @@ class OnnxModel:
 
 
 class _Background:
-    """Where one network is opened and runs: a thread of this niceness, which its workers have too; 0: the caller's.
+    """Where one network is opened and runs: a thread of this niceness; 0: the caller's.
 
-    Whoever waits for the answer keeps its own: what it computes with the interpreter's lock held may hold up video.
+    It has that after its first run: a start beside other programs waits for it. Where the network has ``workers`` of
+    its own it begins so, since they get the niceness of the thread that starts them. Whoever waits for the answer
+    keeps its own: what it computes with the interpreter's lock held may hold up video.
     """
 
-    def __init__(self, niceness: int) -> None:
+    def __init__(self, niceness: int, *, workers: bool) -> None:
+        self._niceness = niceness
+        self._lowered = workers or not niceness
         self._thread = None
         if niceness:
-            self._thread = ThreadPoolExecutor(
-                1, thread_name_prefix="hvt-network", initializer=partial(lower_priority, niceness)
-            )
+            first = partial(lower_priority, niceness) if workers else None
+            self._thread = ThreadPoolExecutor(1, thread_name_prefix="hvt-network", initializer=first)
 
     def do(self, call: Callable[[], _T]) -> _T:
         return call() if self._thread is None else self._thread.submit(call).result()
+
+    def lower(self) -> None:
+        """After a run."""
+        if not self._lowered:
+            self._lowered = True
+            self.do(lambda: lower_priority(self._niceness))
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +179,9 @@ class _InBackground:
     runner: _Runner
 
     def run(self, feed: npt.NDArray[Any], *more: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
-        return self.background.do(lambda: self.runner.run(feed, *more))
+        outputs = self.background.do(lambda: self.runner.run(feed, *more))
+        self.background.lower()
+        return outputs
 
 
 class _OnnxRuntimeRunner:
@@ -232,7 +243,7 @@ def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
             f"model {path} is OpenVINO's, which is not installed here: pip install 'hvt[openvino]'"
         )
     bf16 = found.bf16 and settings.provider != "cpu"
-    background = _Background(settings.niceness)
+    background = _Background(settings.niceness, workers=settings.threads > 1)
     openvino = background.do(lambda: OpenVinoRunner(path, threads=settings.threads, bf16=bf16))
     inputs, outputs = (tuple(Port(*port) for port in ports) for ports in openvino.ports)
     runner = _InBackground(background, openvino)
@@ -275,7 +286,7 @@ def _seconds(model: OnnxModel, feed: npt.NDArray[Any]) -> Iterator[float]:
 
 
 def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxModel:
-    background = _Background(settings.niceness)
+    background = _Background(settings.niceness, workers=settings.threads > 1)
     if choice.provider == "openvino":
         described = _session(path, settings, ("CPUExecutionProvider",), optimised=False)
         found = find_openvino()

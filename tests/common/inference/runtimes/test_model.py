@@ -59,7 +59,7 @@ def test_a_network_of_a_study_gives_way_to_nobody(tmp_path: Path) -> None:
     open_model(colour_detector(tmp_path / "m.onnx", "yolox", size=None)).run(
         np.zeros((1, 3, 64, 64), np.float32)
     )
-    assert threading.active_count() == before
+    assert threading.active_count() <= before
 
 
 def test_free_sizes_are_none(tmp_path: Path) -> None:
