@@ -27,9 +27,9 @@ endif
 demo: setup      ## three edges and one ground on the drawn scene: a table, demo.png, demo.rrd
 	@$(BIN)/python deploy/demo.py
 
-# Many tests wait for other processes, so that more run at once than there are processors. Flights that a busy machine
-# would spoil run alone afterwards. Nothing has a second chance.
-JOBS ?= $(shell echo $$((2 + $$(getconf _NPROCESSORS_ONLN))))
+# A flight is three processes, and its networks give way to everything else: more at once than there are processors would
+# leave them none. Flights that a busy machine would spoil run alone afterwards. Nothing has a second chance.
+JOBS ?= $(shell getconf _NPROCESSORS_ONLN)
 
 test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS=
 	@$(BIN)/python -m pytest -m 'not realtime' --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder; \
