@@ -267,6 +267,7 @@ const MESSAGES: Record<string, { most: number; payload?: number; fields: Fields 
       ...numbers("base_messages roi_messages backlog_messages meta_messages", int(0, U53)),
       ["worst_window_bps", exactly(3, int(0, U53))], ["sent", reasons], ["deferred", reasons], ["dropped", reasons],
       ["health", nested(health)], ["failed", list(8, nested(failedPart))], ["levers", text(120)],
+      ["frames", list(32, int(0, U53)), []], ["coded_fps", int(0, 100000), 0n], ["auto_fps", bool, false],
     ],
   },
   InfoRequest: { most: 1024, fields: [["requester_id", int(0, U64)], ["still_codecs", list(24, text(24))]] },
@@ -278,7 +279,7 @@ const MESSAGES: Record<string, { most: number; payload?: number; fields: Fields 
     most: 4096,
     fields: [
       session, ["accepted", bool], ["reason", text(200)], ["still_request", int(-1, U32)],
-      ["frame_index", int(-1, U32)], ["tracks", list(64, nested(trackNow))],
+      ["frame_index", int(-1, U32)], ["tracks", list(64, nested(trackNow))], ["note", text(200), ""],
     ],
   },
   Feedback: {

@@ -206,18 +206,15 @@ def test_a_server_that_wants_a_certificate_that_is_not_there(ground, monkeypatch
     assert "PYTAK_TLS_CLIENT_CERT" in ground("--cot", "tls://127.0.0.1:8089")
 
 
-@pytest.mark.parametrize(
-    "flag", ["--summary", "--timing", "--log", "--tracks", "--mcap", "--ts", "--record", "--stills"]
-)
+@pytest.mark.parametrize("flag", ["--summary", "--timing", "--log", "--tracks", "--mcap", "--ts", "--record"])
 def test_an_output_over_what_is_read(ground, here, flag):
     """The model, or the file of settings, would be gone with the first flight."""
-    suffix = {"--tracks": "csv", "--mcap": "mcap", "--ts": "ts", "--record": "rrd", "--stills": "csv"}.get(
-        flag, "json"
-    )
-    model, out = Path("classes.txt"), Path(f"out.{suffix}")
-    model.write_text("car\n")
+    suffix = {"--tracks": "csv", "--mcap": "mcap", "--ts": "ts", "--record": "rrd"}.get(flag, "json")
+    model, out = colour_classifier(Path("model.onnx")), Path(f"out.{suffix}")
+    before = model.read_bytes()
     out.symlink_to(model)
-    assert f"{flag} {out} is classes.txt itself" in ground("--labels", "classes.txt", flag, str(out))
+    assert f"{flag} {out} is model.onnx itself" in ground("--classifier", "model.onnx", flag, str(out))
+    assert model.read_bytes() == before
     settings = Path("settings.toml")
     settings.write_text("quiet = true\n")
     out.unlink()

@@ -29,7 +29,6 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
     for path, suffix, name in (
         (config.tracks, ".csv", "--tracks"),
         (config.mcap, ".mcap", "--mcap"),
-        (config.stills, ".csv", "--stills"),
         (config.record, ".rrd", "--record"),
     ):
         if path is not None and path.suffix == suffix and not path.is_dir():
