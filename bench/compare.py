@@ -1,7 +1,7 @@
 """``make bench-compare``: every method at every rate on a real clip and on small objects, judged against the goals.
 
-Writes build/compare/CLIP.json and CLIP.png; with ``--docs`` also plots and tables of docs/design-notes/compare.md.
-``python -m bench.compare [--docs] [CLIP …]``: carpark, highway (reference labels), street (exact labels), or all.
+Writes build/compare/CLIP.json and CLIP.png.
+``python -m bench.compare [CLIP …]``: carpark, highway (reference labels), street (exact labels), or all.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -19,7 +18,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.material import ROOT, data
+from bench.material import data
 from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.compare import print_result
 from hvt_study.matrix.compare import ComparePlan, CompareResult, CompareRow, compare
@@ -34,8 +33,6 @@ _CLIPS = {
     "street": "still:visdrone/0000001_02999_d_0000005.jpg@1.2",
 }
 _OUT = Path("build/compare")
-_DOC = ROOT / "docs" / "design-notes" / "compare.md"
-_BEGIN, _END = "<!-- results of make bench-compare -->", "<!-- end of results -->"
 
 Goal = tuple[str, str, bool | None]
 """What was asked for, what was measured, and whether it holds; None where it cannot be judged."""
@@ -44,25 +41,17 @@ Goal = tuple[str, str, bool | None]
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.compare", description=__doc__)
     parser.add_argument("clips", nargs="*", metavar="CLIP", help=", ".join(_CLIPS))
-    parser.add_argument(
-        "--docs", action="store_true", help="also write docs/design-notes/compare.md's tables and plots"
-    )
     arguments = parser.parse_args(argv)
     unknown = [name for name in arguments.clips if name not in _CLIPS]
     if unknown:
         parser.error(f"clip {unknown[0]} is not known: choose from {', '.join(_CLIPS)}")
     _OUT.mkdir(parents=True, exist_ok=True)
     console = Console(highlight=False)
-    sections = []
     for name in arguments.clips or _CLIPS:
         result = _fly(name)
         print_result(result)
-        goals = list(_goals(name, result))
-        for goal, measured, holds in goals:
+        for goal, measured, holds in _goals(name, result):
             console.print(f"{_WORDS[holds]:>15}  {goal}: {measured}", markup=False, soft_wrap=True)
-        sections.append((name, result, goals))
-    if arguments.docs:
-        _document(sections)
     return 0
 
 
@@ -191,50 +180,6 @@ def _value_at(bps: float, curve: list[CompareRow], value: Callable[[CompareRow],
             part = math.log(bps / low["total_bps"]) / span if span else 0.0
             return value(low) + part * (value(high) - value(low))
     return value(curve[-1])
-
-
-# docs/design-notes/compare.md
-
-_HEADS = (
-    *("kbps", "method", "named F1", "1st, 2nd half", "false a frame", "F1", "class", "in all", "base"),
-    *("stills", "tracks", "fps", "largest frame", "delay p95", "edge CPU"),
-)
-
-
-def _document(sections: list[tuple[str, CompareResult, list[Goal]]]) -> None:
-    images = ROOT / "docs" / "images"
-    parts = []
-    for name, result, goals in sections:
-        shutil.copyfile(_OUT / f"{name}.png", images / f"compare-{name}.png")
-        parts.append(_section(name, result, goals))
-    text = _DOC.read_text(encoding="utf-8")
-    before, _, rest = text.partition(_BEGIN)
-    _, _, after = rest.partition(_END)
-    _DOC.write_text(f"{before}{_BEGIN}\n\n" + "\n".join(parts) + f"\n{_END}{after}", encoding="utf-8")
-
-
-def _section(name: str, result: CompareResult, goals: list[Goal]) -> str:
-    lines = [
-        f"### {name} ({result.labels} labels)\n",
-        f"![named F1 and false objects a frame over kbps](../images/compare-{name}.png)\n",
-        "| " + " | ".join(_HEADS) + " |",
-        "|" + "---|" * len(_HEADS),
-    ]
-    for whole, first, second in result.flights:
-        lines.append(
-            f"| {whole['rate_kbps']:g} | {whole['method']} | {whole['named_f1']:.3f} "
-            f"| {first['named_f1']:.3f}, {second['named_f1']:.3f} | {whole['false_per_frame']:.1f} "
-            f"| {whole['f1']:.3f} | {whole['class_agreement']:.3f} | {whole['total_bps'] / 1e3:.0f} "
-            f"| {whole['base_bps'] / 1e3:.0f} | {whole['roi_bps'] / 1e3:.0f} | {whole['track_bps'] / 1e3:.1f} "
-            f"| {whole['fps']:.1f} | {whole['max_frame_bytes'] / 1e3:.1f} kB | {whole['delay_p95_ms']:.0f} ms "
-            f"| {whole['edge_cpu_ms']:.0f} ms |"
-        )
-    lines += [
-        f"\nNot available: {one.method} at {one.rate_kbps:g} kbps ({one.reason})." for one in result.missing
-    ]
-    lines += ["", "| goal | measured | |", "|---|---|---|"]
-    lines += [f"| {goal} | {measured} | {_WORDS[holds]} |" for goal, measured, holds in goals]
-    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

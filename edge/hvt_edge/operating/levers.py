@@ -56,7 +56,7 @@ class LeverSettings:
     least_gain: float = 0.005
     """From so much net gain on that is sure tracks are sent, until the net gain, sure or not, falls below it."""
     gain_per_doubling: float = 0.07
-    """What twice the bits give video: .05 to .11 between 100 and 400 kbps (docs/design-notes/compare.md)."""
+    """What twice the bits give video: .05 to .11 between 100 and 400 kbps (docs/design-notes/study-results.md)."""
     least_comparisons: float = 1.5
     """Before so many comparisons no tracks are sent, for a single picture may be an exception, unless …"""
     plain_gain: float = 0.2
