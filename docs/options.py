@@ -15,7 +15,8 @@ PAGE = Path(__file__).with_name("options.md")
 _HEAD = """\
 # All options
 
-You can set every option below as a flag or as a TOML key of `--config FILE`; a flag overrides the file.
+You can set every option below as a flag, or in a TOML file as a key without the dashes (`--config FILE`). A flag
+overrides the file.
 `make docs` writes this page from the code.
 
     hvt-edge --help                              # the common options
@@ -51,7 +52,7 @@ def _program(name: str, config: type) -> Iterator[str]:
     for group, fields in groups.items():
         if group:
             yield f"### {group[0].upper()}{group[1:]}\n"
-        yield "| option | TOML key | default | meaning |\n|---|---|---|---|"
+        yield "| option | default | meaning |\n|---|---|---|"
         yield from map(_row, fields)
         yield ""
 
@@ -60,10 +61,10 @@ def _row(field: dataclasses.Field[Any]) -> str:
     key, meaning = field.name.replace("_", "-"), field.metadata["help"].replace("|", r"\|")
     star = " *" if field.metadata.get("rare") else ""
     if field.metadata.get("switch"):
-        return f"| `--{key}`, `--no-{key}`{star} | `{key}` | {'yes' if field.default else 'no'} | {meaning} |"
+        return f"| `--{key}`, `--no-{key}`{star} | {'yes' if field.default else 'no'} | {meaning} |"
     kind, many = field.metadata["kind"], field.metadata["many"]
     value = kind.metavar.replace("|", r"\|")
-    return f"| `--{key} {value}`{', list' if many else ''}{star} | `{key}` | {_default(field)} | {meaning} |"
+    return f"| `--{key} {value}`{', list' if many else ''}{star} | {_default(field)} | {meaning} |"
 
 
 def _default(field: dataclasses.Field[Any]) -> str:
