@@ -5,6 +5,9 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.hvt-setup
 UV     := $(shell command -v uv 2>/dev/null)
 
+# Containers often forbid bytecode; each start of a program would then compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: setup demo test check arm lint type format docs bench bench-fleet bench-stills bench-compare bench-peers link soak kills failures fuzz training clean help
 
 .PHONY: nightly nightly-tests

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,10 @@ ROOT = Path(__file__).resolve().parent.parent
 # break a property that holds. Here and not in a fixture: `@settings` takes what is loaded when its module is read.
 settings.register_profile("hvt", deadline=None)
 settings.load_profile("hvt")
+
+# Containers often forbid bytecode; each start of a program would then compile all that it imports, a second and more.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # A signal that is ignored (`nohup`, a job of a script in the background) stays ignored in every process that a test
 # starts, and a test of how a program ends on it would wait for ever. What is handled here begins there as usual.
