@@ -33,10 +33,11 @@ demo: setup      ## three edges and one ground on the drawn scene: a table, demo
 # A flight is three processes, and its networks give way to everything else: more at once than there are processors would
 # leave them none. Flights that a busy machine would spoil run alone afterwards. Nothing has a second chance.
 JOBS ?= $(shell getconf _NPROCESSORS_ONLN)
+CHOSEN := $(if $(CORE),--ignore=tests/extras)
 
-test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS=
-	@$(BIN)/python -m pytest -m 'not realtime' --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder; \
-		together=$$?; $(BIN)/python -m pytest -m realtime && exit $$together
+test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS= CORE=1
+	@$(BIN)/python -m pytest $(CHOSEN) -m 'not realtime' --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder; \
+		together=$$?; $(BIN)/python -m pytest $(CHOSEN) -m realtime && exit $$together
 
 nightly: setup   ## an hour: the nightly tests, training, every scenario at full length, kills, fuzzers, parts taken away, soak; fails where a bar is missed; COUNT= RUNS= LASTS=
 	@failed=; for part in nightly-tests training link 'kills COUNT=$(or $(COUNT),50)' 'fuzz RUNS=$(or $(RUNS),15000)' \

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hvt_edge.config import EdgeConfig
-from hvt_ground.config import GroundConfig
+from hvt_ground.extras import config_class
 
 PAGE = Path(__file__).with_name("options.md")
 
@@ -40,7 +40,7 @@ A wrong value ends the program before the first frame with one sentence and exit
 
 def page() -> str:
     """The whole page."""
-    lines = [_HEAD, *_program("hvt-edge", EdgeConfig), *_program("hvt-ground", GroundConfig)]
+    lines = [_HEAD, *_program("hvt-edge", EdgeConfig), *_program("hvt-ground", config_class())]
     return "\n".join(lines)
 
 

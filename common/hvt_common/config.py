@@ -3,7 +3,7 @@
 A field is declared by its `Group`: its kind (how text becomes a value and back) and its help.
 Every value passes through its kind whether it comes from the file or from the command line, so both say the
 same sentence when it is wrong. ``--help`` leaves out what is ``rare``; ``--help-all`` lists everything. A class
-may name in ``GONE`` what it no longer takes: name → what to do in its place.
+may name in ``GONE`` what it does not take (any more): name → the end of the sentence, with what to do in its place.
 """
 
 from __future__ import annotations
@@ -261,7 +261,7 @@ def _refuse_gone(config_class: type, words: Sequence[str]) -> None:
     for word in words:
         name = word.partition("=")[0].removeprefix("--").removeprefix("no-")
         if word.startswith("--") and name in _gone(config_class):
-            raise UserError(f"--{name} is no longer accepted: {_gone(config_class)[name]}")
+            raise UserError(f"--{name} {_gone(config_class)[name]}")
 
 
 def to_toml(config: Any) -> str:
@@ -376,9 +376,7 @@ def _from_file(config_class: type, file: Path) -> dict[str, Any]:
     for key, given in table.items():
         field = fields.get(key.replace("_", "-"))
         if key.replace("_", "-") in _gone(config_class):
-            raise UserError(
-                f"{key} in {file} is no longer accepted: {_gone(config_class)[key.replace('_', '-')]}"
-            )
+            raise UserError(f"{key} in {file} {_gone(config_class)[key.replace('_', '-')]}")
         if field is None:
             near = difflib.get_close_matches(key, fields, n=1) or sorted(fields)
             raise UserError(f"--config {file} has an unknown key {key!r}: did you mean {', '.join(near)}?")

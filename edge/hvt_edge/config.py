@@ -72,7 +72,9 @@ TRACKS_BPS = 8_000
 """What ``--send-tracks`` takes of the budget: about that for 45 boxes three times a second."""
 
 
-_REFRESH_GONE = "give --fps auto, which shows more for the same bits, or --roi-depth 0.1 for the tracks alone"
+_REFRESH_GONE = (
+    "is no longer accepted: give --fps auto, which shows more for the same bits, or --roi-depth 0.1"
+)
 _SOURCE, _LINK, _SENT = Group("source"), Group("budget and link"), Group("what to send")
 _MODELS, _FILES = Group("models"), Group("files")
 _SOURCE_RARE, _LINK_RARE, _SENT_RARE, _MODELS_RARE, _FILES_RARE = (
@@ -86,7 +88,7 @@ class EdgeConfig:
 
     GONE: ClassVar[Mapping[str, str]] = MappingProxyType(
         {
-            "lend": "give --borrow-unused",
+            "lend": "is no longer accepted: give --borrow-unused",
             "pulse": _REFRESH_GONE,
             "pulse-depth": _REFRESH_GONE,
             "rolling": _REFRESH_GONE,

@@ -13,7 +13,6 @@ from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
 from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
 from hvt_common.runtime.reporting import print_table, say, write_json
-from hvt_ground.config import GroundConfig, check
 
 __all__ = ["main", "program"]
 
@@ -65,13 +64,14 @@ def _run(argv: Sequence[str] | None) -> int:
             return control.run(words)
     with needs_extra("'hvt[ground]'"):  # only now: without Rerun this is a sentence, not a traceback
         from hvt_ground.app import Ground  # noqa: PLC0415
+        from hvt_ground.extras import checked, config_class  # noqa: PLC0415
         from hvt_ground.sinks.rerun.sdk import leave_out_pandas  # noqa: PLC0415
-    config, requested = load(GroundConfig, argv, program="hvt-ground", description=_DESCRIPTION)
+    config, requested = load(config_class(), argv, program="hvt-ground", description=_DESCRIPTION)
     redaction = Redaction([*words, *(str(one) for one in requested.values.values())])
     if requested.print_config:
         print(redaction.text(to_toml(config)), end="")
         return 0
-    config = check(config)
+    config = checked(config)
     limit_malloc_arenas()
     put_video_first()
     leave_out_pandas()

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from hvt_common.config import BYTES, DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
 from hvt_common.errors import NotYetError, UserError
@@ -33,24 +32,8 @@ def _age(text: str, *, name: str) -> Limit:
     return limit
 
 
-def _cot_url(text: str, *, name: str) -> str:
-    """``udp``, ``tcp`` or ``tls``, a host and a port. No IPv6 address: the client, pytak, knows none."""
-    try:
-        parts = urlsplit(text)
-        good = parts.scheme in ("udp", "tcp", "tls") and bool(parts.hostname) and bool(parts.port)
-    except ValueError:
-        good = False
-    if not good or re.fullmatch(r"[a-z]+://[\w.-]+:[0-9]+", text, re.ASCII) is None:
-        raise UserError(
-            f"{name} {text!r} is not accepted: give udp://HOST:PORT, tcp://HOST:PORT or tls://HOST:PORT, with a "
-            "name or an IPv4 address"
-        )
-    return text
-
-
 _LIMIT = SettingType("LIMIT", parse_limit)
 _AGE = SettingType("AGE", _age)
-_COT = SettingType("URL", _cot_url)
 
 _LINK, _MODELS, _FILES = Group("link and edges"), Group("models"), Group("files and views")
 _LINK_RARE, _MODELS_RARE, _FILES_RARE = (replace(group, rare=True) for group in (_LINK, _MODELS, _FILES))
@@ -156,15 +139,6 @@ class GroundConfig:
     tracks: Path | None = _FILES.option(
         PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
     )
-    mcap: Path | None = _FILES.option(
-        PATH, None, "also write MCAP for Foxglove: FILE.mcap, or a folder for one file a session"
-    )
-    ts: str | None = _FILES_RARE.option(
-        TEXT,
-        None,
-        "also write MPEG-TS with KLV (docs/klv.md): FILE.ts, a folder for one file a session, udp://HOST:PORT or "
-        "srt://HOST:PORT",
-    )
     stills: Path | None = _FILES.option(
         PATH, None, "also write each still as a picture, with a table of them: a folder that is there"
     )
@@ -173,16 +147,6 @@ class GroundConfig:
     )
     log_size: int = _FILES_RARE.option(
         BYTES, 4_000_000_000, "how large the log may become: then its older half makes room"
-    )
-    cot: tuple[str, ...] = _FILES_RARE.option(
-        _COT,
-        (),
-        "also report the camera and the tracks to ATAK as Cursor on Target, for example udp://239.2.3.1:6969 or "
-        "tls://takserver:8089 (docs/atak.md)",
-        many=True,
-    )
-    cot_types: Path | None = _FILES_RARE.option(
-        PATH, None, "with --cot: FILE.toml, which class and which edge is of which type (docs/atak.md)"
     )
     timing: Path | None = _FILES_RARE.option(
         PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
@@ -229,14 +193,15 @@ class GroundConfig:
         return 5.0 if self.once else 600.0
 
 
-def check(config: GroundConfig) -> GroundConfig:
-    """Return the configuration; `UserError` where settings contradict."""
-    _check_files(config)
+def check(config: GroundConfig, *, files: Iterable[tuple[str, Path]] = ()) -> GroundConfig:
+    """Return the configuration; `UserError` where settings contradict.
+
+    ``files`` are further ones that are written, each with the option that names it.
+    """
+    _check_files(config, files)
     _check_retention(config)
     if config.web_proxy is not None and config.web is None:
         raise UserError(f"--web-proxy {config.web_proxy} is given without --web: give --web too")
-    if config.cot_types is not None and not config.cot:
-        raise UserError(f"--cot-types {config.cot_types} is given without --cot: give --cot too")
     if config.group is not None:
         GroupKeys(config.group)
     if config.log_size < LEAST_LOG_BYTES:
@@ -274,7 +239,7 @@ def _check_retention(config: GroundConfig) -> None:
             )
 
 
-def _check_files(config: GroundConfig) -> None:
+def _check_files(config: GroundConfig, more: Iterable[tuple[str, Path]]) -> None:
     """Two files must not be one. What is written into a folder has names of its own, and a device takes anything."""
     if config.stills is not None and not config.stills.is_dir():
         kind = UserError if config.stills.exists() else NotYetError
@@ -283,11 +248,10 @@ def _check_files(config: GroundConfig) -> None:
     for name, path, suffix in (
         ("--record", config.record, ".rrd"),
         ("--tracks", config.tracks, ".csv"),
-        ("--mcap", config.mcap, ".mcap"),
-        ("--ts", None if config.ts is None or "://" in config.ts else Path(config.ts), ".ts"),
         ("--timing", config.timing, None),
         ("--log", config.log, None),
         ("--summary", config.summary, None),
+        *((name, path, None) for name, path in more),
     ):
         if path is None or (suffix is not None and path.suffix != suffix):
             continue

@@ -20,8 +20,8 @@ import yaml
 from hvt_common.config import load
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
-from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
+from hvt_ground.extras import config_class
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 IMAGE_PATHS = {"/opt/hvt/router.py": DEPLOY / "router.py", "/opt/hvt/zenoh": DEPLOY / "zenoh"}
@@ -70,7 +70,7 @@ def test_the_commands_are_accepted_by_the_real_parsers(compose: dict[str, Any]) 
     assert check_edge(edge).source == "demo"
     program, *arguments = compose["services"]["ground"]["command"]
     assert program == "hvt-ground"
-    ground, _ = load(GroundConfig, arguments, program=program, description="")
+    ground, _ = load(config_class(), arguments, program=program, description="")
     assert check_ground(ground).connect == edge.connect == ("tcp/router:7447",)
     router = _module(DEPLOY / "router.py")
     python, script, *arguments = compose["services"]["router"]["command"]

@@ -12,8 +12,8 @@ from hvt_common.config import load
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_edge.config import EdgeConfig, with_profile
 from hvt_edge.config import check as check_edge
-from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
+from hvt_ground.extras import config_class
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 
@@ -47,13 +47,16 @@ def test_sample_of_the_edge_is_for_a_300_kbps_radio(tmp_path: Path) -> None:
 def test_sample_of_the_ground_listens_on_this_machine_only(tmp_path: Path) -> None:
     """Copied as it is, it must not open the machine to its network."""
     sample = DEPLOY / "config" / "ground.toml"
-    config, _ = load(GroundConfig, ["--config", str(sample)], program="hvt-ground", description="")
+    config, _ = load(config_class(), ["--config", str(sample)], program="hvt-ground", description="")
     config = check_ground(config)
     settings = LinkSettings(role="ground", listen=config.listen, insecure=config.insecure)
     assert configure(settings)[1] == ("tcp/127.0.0.1:7447",)
     assert not config.insecure
     everything, asked = load(
-        GroundConfig, ["--config", str(_uncommented(sample, tmp_path))], program="hvt-ground", description=""
+        config_class(),
+        ["--config", str(_uncommented(sample, tmp_path))],
+        program="hvt-ground",
+        description="",
     )
     check_ground(everything)
     assert {"connect", "classifier", "labels"} <= set(asked.values)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hvt_edge.config import EdgeConfig
-from hvt_ground.config import GroundConfig
+from hvt_ground.extras import config_class
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(str(page.relative_to(ROOT)) for page in ROOT.glob("docs/**/*.md"))
@@ -52,7 +52,7 @@ def _prose_words(text: str) -> int:
 def _known_flags() -> set[str]:
     settings = {
         "--" + no + field.name.replace("_", "-")
-        for config in (EdgeConfig, GroundConfig)
+        for config in (EdgeConfig, config_class())
         for field in dataclasses.fields(config)
         for no in ("", "no-")
     }

@@ -15,8 +15,8 @@ from hvt_common.config import load
 from hvt_common.protocol.channels import EdgeKeys
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
-from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
+from hvt_ground.extras import config_class
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
@@ -63,7 +63,7 @@ def test_ground_unit_starts_with_the_sample_configuration() -> None:
     at = arguments.index("--config") + 1
     assert arguments[at] == "/etc/hvt/ground.toml"
     arguments[at] = str(DEPLOY / "config" / "ground.toml")
-    config, _ = load(GroundConfig, arguments, program="hvt-ground", description="")
+    config, _ = load(config_class(), arguments, program="hvt-ground", description="")
     assert check_ground(config).record == Path()
 
 

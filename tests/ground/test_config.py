@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError
-from hvt_ground.config import GroundConfig, check
+from hvt_ground.config import GroundConfig
+from hvt_ground.extras import checked, config_class
 from hvt_ground.wiring import output_path
 
 
 def read(*argv: str) -> GroundConfig:
     """What a command line gives."""
-    return check(load(GroundConfig, list(argv), program="hvt-ground", description="")[0])
+    return checked(load(config_class(), list(argv), program="hvt-ground", description="")[0])
 
 
 def test_without_flags_it_listens_and_needs_no_model():
@@ -42,7 +43,7 @@ def test_without_flags_it_listens_and_needs_no_model():
         (["--timing", "a.csv", "--tracks", "./a.csv"], "--tracks and --timing both name a.csv: give each"),
         (["--timing", "a.csv", "--summary", "b/../a.csv"], "--timing and --summary both name b/../a.csv"),
         (["--record", "a.rrd", "--summary", "a.rrd"], "--record and --summary both name a.rrd"),
-        (["--ts", "a.ts", "--summary", "./a.ts"], "--ts and --summary both name a.ts"),
+        (["--ts", "a.ts", "--summary", "./a.ts"], "--summary and --ts both name a.ts"),
         (["--detect-every", "0"], "whole number from 1"),
         (["--threads", "many"], "whole number from 1"),
     ],
@@ -64,9 +65,9 @@ def test_folders_and_devices_may_be_named_twice(tmp_path):
 def test_every_flag_explains_itself(capsys):
     """Somebody at a ground station would have to read the source."""
     with pytest.raises(SystemExit):
-        load(GroundConfig, ["--help-all"], program="hvt-ground", description="")
+        load(config_class(), ["--help-all"], program="hvt-ground", description="")
     out = " ".join(capsys.readouterr().out.split())
-    for one in dataclasses.fields(GroundConfig):
+    for one in dataclasses.fields(config_class()):
         assert "--" + one.name.replace("_", "-") in out
         assert len(one.metadata["help"]) > 8
     assert "[aerial-nano]" in out.replace("- ", "-"), "argparse breaks lines at hyphens"
@@ -75,7 +76,7 @@ def test_every_flag_explains_itself(capsys):
 
 @given(
     st.builds(
-        GroundConfig,
+        config_class(),
         listen=st.lists(st.sampled_from(["tcp/127.0.0.1:7447", "tls/[::1]:7448"]), max_size=2).map(tuple),
         edges=st.sampled_from(["*", "uav-*", "a"]),
         detector=st.sampled_from(["motion", "a b.onnx"]),
@@ -94,7 +95,7 @@ def test_what_is_printed_reads_back_the_same(tmp_path_factory, config):
     """``--print-config`` could not be kept and used again."""
     path = tmp_path_factory.getbasetemp() / "ground.toml"
     path.write_text(to_toml(config), encoding="utf-8")
-    assert load(GroundConfig, ["--config", str(path)], program="hvt-ground", description="")[0] == config
+    assert load(config_class(), ["--config", str(path)], program="hvt-ground", description="")[0] == config
 
 
 def test_no_recording_is_written_over_another(tmp_path):

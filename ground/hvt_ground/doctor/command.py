@@ -23,9 +23,10 @@ from hvt_common.runtime.checkup import (
 )
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.transport.reach import check_link
-from hvt_ground.config import GroundConfig, check
+from hvt_ground.config import GroundConfig
+from hvt_ground.extras import all_extras, checked, config_class
 from hvt_ground.perception.models import Models
-from hvt_ground.wiring import check_cot, make_link_settings
+from hvt_ground.wiring import make_link_settings
 
 __all__ = ["run"]
 
@@ -40,14 +41,14 @@ _LITTLE_H = 1.0
 def run(argv: Sequence[str]) -> int:
     """0 where a ground could start, 2 where something is wrong."""
     words = [one for one in argv if one != "--json"]
-    config, _ = load(GroundConfig, words, program="hvt-ground doctor", description=_DESCRIPTION)
-    config = check(config)
+    config, _ = load(config_class(), words, program="hvt-ground doctor", description=_DESCRIPTION)
+    config = checked(config)
     logging.getLogger("hvt_common.inference.runtimes.model").setLevel(logging.INFO)  # what a network runs on
     checks: dict[str, Callable[[], Finding]] = {
         "models": lambda: _models(config),
         "recordings": lambda: _recordings(config),
         "ports": lambda: _ports(config),
-        **({"reports": lambda: _reports(config)} if config.cot else {}),
+        **dict(one for extra in all_extras() for one in extra.checks(config).items()),
         "clock": check_clock,
         "link": lambda: check_link(make_link_settings(config), _edges, other="edge"),
     }
@@ -101,12 +102,6 @@ def _ports(config: GroundConfig) -> Finding:
             check_port(address, name=name, packages=packages)
             free.append(f"{address} for {name}")
     return Finding("ok", f"free: {', '.join(free)}" if free else "no --web, no --metrics")
-
-
-def _reports(config: GroundConfig) -> Finding:
-    """Whether they could be sent; not whether anybody is there, for who connects is shown to others."""
-    check_cot(config)
-    return Finding("ok", f"to {', '.join(config.cot)}; types and certificates can be read")
 
 
 def _edges(session: zenoh.Session) -> str:

@@ -1,1 +1,4 @@
-"""What leaves a recording for other programs: `command`, `recorded` (reads it), and one file a kind."""
+"""Writes recordings for other programs: `command`, `video`, and one file a kind.
+
+Extras bring further kinds (`hvt_ground.extras`).
+"""

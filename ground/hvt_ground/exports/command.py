@@ -10,14 +10,15 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from hvt_common.errors import Parser, UserError, check_not_read, needs_extra
+from hvt_common.errors import Parser, UserError, check_not_read
 from hvt_common.runtime.reporting import say
 from hvt_ground.exports.maps import write_geojson, write_kml
 from hvt_ground.exports.pictures import write_coco, write_stills
 from hvt_ground.exports.tables import write_csv, write_mot, write_parquet
 from hvt_ground.exports.video import CONTAINERS, write_video
 from hvt_ground.exports.whole import whole_file, whole_folder
-from hvt_ground.recordings.recorded import Recorded, RecordedStill, read_recordings
+from hvt_ground.extras import all_extras
+from hvt_ground.recordings.recorded import Recorded, read_recordings
 from hvt_ground.wiring import make_surfaces
 
 __all__ = ["run"]
@@ -27,29 +28,22 @@ _SUFFIXES = {"mot": ".txt"}
 """Where it is not the kind's own name."""
 
 
-def _write_mcap(recorded: Recorded, path: Path) -> None:
-    with needs_extra("'hvt[mcap]'"):
-        from hvt_ground.sinks.mcap_file import McapFile  # noqa: PLC0415 - who writes none needs no protobuf
-    file = McapFile(path, edge=recorded.edge)
-    try:
-        for item in recorded.all():
-            if isinstance(item, RecordedStill):
-                file.still(item.jpeg, frame_index=item.frame_index, capture_ns=item.capture_ns)
-            else:
-                file.log(item)
-    finally:
-        file.close()
-
-
 _FILES: dict[str, Callable[[Recorded, Path], None]] = {
     "csv": write_csv,
     "geojson": write_geojson,
     "kml": write_kml,
-    "mcap": _write_mcap,
     "mot": write_mot,
     "parquet": write_parquet,
 }
-_KINDS = (*CONTAINERS, *_FILES, *_FOLDERS)
+
+
+def _kinds() -> tuple[str, ...]:
+    return tuple(dict.fromkeys((*CONTAINERS, *_FILES, *_brought(), *_FOLDERS)))
+
+
+def _brought() -> dict[str, Callable[[Recorded, Path], None]]:
+    """Kinds of the extras, which may take the place of a plain container."""
+    return {kind: write for extra in all_extras() for kind, write in extra.exports.items()}
 
 
 def run(argv: Sequence[str]) -> int:
@@ -67,11 +61,12 @@ def run(argv: Sequence[str]) -> int:
         with whole_folder(out) as part:
             _FOLDERS[kind](recorded, part)
     else:
-        write = (
-            partial(write_video, container=kind, burn_in=given.burn_in)
-            if kind in CONTAINERS
-            else _FILES[kind]
-        )
+        brought = {} if given.burn_in else _brought()
+        write: Callable[[Recorded, Path], None]
+        if kind in CONTAINERS and kind not in brought:
+            write = partial(write_video, container=kind, burn_in=given.burn_in)
+        else:
+            write = (_FILES | brought)[kind]
         with whole_file(out) as part:
             write(recorded, part)
     say(f"{out}: {recorded.edge}, {len(recorded.video)} pictures, {len(recorded.stills)} stills")
@@ -79,9 +74,9 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _kind_of(out: Path | None) -> str:
-    kind = "" if out is None else next((one for one in _KINDS if out.suffix == _suffix(one)), "")
+    kind = "" if out is None else next((one for one in _kinds() if out.suffix == _suffix(one)), "")
     if not kind:
-        raise UserError(f"--to is missing: give one of {', '.join(_KINDS)}")
+        raise UserError(f"--to is missing: give one of {', '.join(_kinds())}")
     return kind
 
 
@@ -105,8 +100,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--to",
         metavar="KIND",
-        choices=_KINDS,
-        help=f"{', '.join(_KINDS)} (default: by the end of --out)",
+        choices=_kinds(),
+        help=f"{', '.join(_kinds())} (default: by the end of --out)",
     )
     parser.add_argument(
         "--out",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import io
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -16,36 +15,29 @@ from av.container import OutputContainer
 
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Image, View
+from hvt_common.values import Image
 from hvt_common.video.annex_b import parameter_sets
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Overlay, VideoSample
 from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.palette import class_colour
-from hvt_ground.sinks.transport_stream.stream import stream_file
-from hvt_ground.sinks.transport_stream.uas import Platform
 
-__all__ = ["CONTAINERS", "pictures", "write_video"]
+__all__ = ["CONTAINERS", "from_keyframe", "pictures", "write_video"]
 
 CONTAINERS = {"mp4": "mp4", "mkv": "matroska", "ts": "mpegts"}
 """By name, libavformat's."""
 _TIME_BASE = Fraction(1, 1000)
 """MP4 has 32 bits for the time between two pictures: 24 days."""
 _CRF = "20"
-_USUAL_FPS = 15.0
-"""A recording does not say it; it counts where a clock was set."""
 
 
 def write_video(recorded: Recorded, path: Path, *, container: str, burn_in: bool) -> None:
     """Write the pictures with their capture times, from 0 on; ``creation_time`` is when the first was taken.
 
-    ``burn_in`` draws boxes, ids and classes into them, which codes them again (H.264). MPEG-TS has KLV beside them,
-    as ``--ts`` has, but not beside pictures with boxes. Raises `UserError` where the recording has no video.
+    ``burn_in`` draws boxes, ids and classes into them, which codes them again (H.264).
+    Raises `UserError` where the recording has no video.
     """
-    samples = _from_keyframe(recorded)
-    if container == "ts" and not burn_in:
-        _write_stream(recorded, samples[0], path)
-        return
+    samples = from_keyframe(recorded)
     taken = datetime.fromtimestamp(samples[0].capture_ns / SECOND_NS, UTC).isoformat()
     with av.open(str(path.absolute()), "w", format=CONTAINERS[container]) as output:
         output.metadata["creation_time"] = taken
@@ -60,7 +52,7 @@ def pictures(recorded: Recorded) -> Iterator[tuple[VideoSample, Image, Overlay]]
     """Each sample that can be decoded, its picture (uint8 (H, W, 3) BGR, base pixels) and what was drawn on it."""
     decoder = BaseDecoder()
     overlays = recorded.overlays()  # at every sample, and at some frames between
-    for sample in _from_keyframe(recorded):
+    for sample in from_keyframe(recorded):
         overlay = next(one for one in overlays if one.frame_index == sample.frame_index)
         if sample.keyframe:
             decoder.reset()
@@ -69,7 +61,8 @@ def pictures(recorded: Recorded) -> Iterator[tuple[VideoSample, Image, Overlay]]
             yield sample, picture, overlay
 
 
-def _from_keyframe(recorded: Recorded) -> list[VideoSample]:
+def from_keyframe(recorded: Recorded) -> list[VideoSample]:
+    """The samples from the first that can be decoded on; `UserError` where there is none."""
     first = next(
         (number for number, one in enumerate(recorded.video) if one.keyframe and parameter_sets(one.data)),
         None,
@@ -77,27 +70,6 @@ def _from_keyframe(recorded: Recorded) -> list[VideoSample]:
     if first is None:
         raise UserError(f"the recording of {recorded.edge} has no video: it was removed, or none came")
     return list(recorded.video[first:])
-
-
-def _write_stream(recorded: Recorded, first: VideoSample, path: Path) -> None:
-    if recorded.info is not None:
-        view = recorded.info.view
-    elif recorded.poses:
-        view = recorded.poses[0].view
-    else:
-        with av.open(io.BytesIO(first.data), format="hevc") as probe:
-            size = probe.streams.video[0].width, probe.streams.video[0].height
-        view = View.fitted(size, size, fit="letterbox")
-    platform = Platform(recorded.edge, recorded.session, view, recorded.surface)
-    stream = stream_file(path, platform=platform, fps=_USUAL_FPS, trail=recorded.trail)
-    items: Iterator[VideoSample | Overlay] = heapq.merge(
-        recorded.video, recorded.overlays(), key=lambda one: one.frame_index
-    )
-    try:
-        for item in items:
-            stream.log(item)
-    finally:
-        stream.close()
 
 
 def _copy(samples: list[VideoSample], output: OutputContainer, container: str) -> None:

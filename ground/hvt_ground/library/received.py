@@ -21,8 +21,9 @@ from hvt_common.runtime.process import join_threads_at_exit
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.app import Ground
-from hvt_ground.config import GroundConfig, check
+from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
+from hvt_ground.extras import checked, config_class
 
 __all__ = ["Listening", "Picture", "Received", "listen"]
 
@@ -62,8 +63,8 @@ def listen(**settings: object) -> Listening:
     Nothing is recorded unless ``record`` says so. Raises `UserError` where a setting is unknown or wrong.
     """
     words = settings_words({"quiet": True, **settings})
-    config, _ = load(GroundConfig, words, program="hvt_ground.listen", description="")
-    return Listening(check(config))
+    config, _ = load(config_class(), words, program="hvt_ground.listen", description="")
+    return Listening(checked(config))
 
 
 class Listening:

@@ -28,7 +28,8 @@ from hvt_common.runtime.reporting import print_table, say, write_json
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.recordings import BacklogRecordings
-from hvt_ground.config import GroundConfig, check
+from hvt_ground.config import GroundConfig
+from hvt_ground.extras import checked, config_class
 from hvt_ground.perception.models import Models
 from hvt_ground.recordings.recorded import read_recordings
 from hvt_ground.replay.from_recording import messages_of
@@ -71,7 +72,9 @@ def run(argv: Sequence[str]) -> int:
     given, words = parser.parse_known_args(list(argv))
     files = [Path(one) for one in takewhile(lambda one: not one.startswith("-"), words)]
     if given.help:
-        load(GroundConfig, ["--help"], program=f"{parser.prog} FILE … [--speed 1]", description=str(__doc__))
+        load(
+            config_class(), ["--help"], program=f"{parser.prog} FILE … [--speed 1]", description=str(__doc__)
+        )
     if not files:
         raise UserError(
             "give the files first: hvt-ground replay FILE.hvtlog|FILE.rrd … [--speed 1] [settings of hvt-ground]"
@@ -80,12 +83,12 @@ def run(argv: Sequence[str]) -> int:
         raise UserError(f"--speed {given.speed:g} is not accepted: give more than 0; 1 is as it came")
     messages = messages_in(files)
     config, loaded = load(
-        GroundConfig, words[len(files) :], program="hvt-ground replay", description=str(__doc__)
+        config_class(), words[len(files) :], program="hvt-ground replay", description=str(__doc__)
     )
     _check_given(loaded.values)
     if config.provider == "auto":  # by its speed it may choose one this time and another the next
         config = replace(config, provider="cpu")
-    config = check(config)
+    config = checked(config)
     check_outputs(config, reads=files)
     sessions = _Replay(config, messages, speed=given.speed).run()
     for content in sessions:

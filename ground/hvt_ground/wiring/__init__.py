@@ -1,17 +1,16 @@
 """From settings to objects: what is made for each session of an edge, as one tree."""
 
 from hvt_ground.perception.models import Models
-from hvt_ground.wiring.extras import check_cot, make_surfaces
 from hvt_ground.wiring.files import check_outputs, make_record_folder, output_path
 from hvt_ground.wiring.link import make_link_settings
 from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline
 from hvt_ground.wiring.sessions import OpenSink, SessionFactory
+from hvt_ground.wiring.terrain import make_surfaces
 
 __all__ = [
     "Models",
     "OpenSink",
     "SessionFactory",
-    "check_cot",
     "check_outputs",
     "make_backlog_perception",
     "make_link_settings",

@@ -10,7 +10,7 @@ from pathlib import Path
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.reporting import check_writable
 from hvt_ground.config import GroundConfig
-from hvt_ground.sinks.transport_stream.destination import check_destination
+from hvt_ground.extras import all_extras
 
 __all__ = ["backlog_path", "check_outputs", "free_path", "make_record_folder", "output_path"]
 
@@ -19,16 +19,18 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
     """Refuse files that cannot be written, or are read (``reads``, too), before anything is received; `UserError`."""
     given = (
         *(config.detector, config.classifier, config.labels, config.detector_labels),
-        *(config.zenoh_config, config.cot_types, config.terrain),
+        *(config.zenoh_config, config.terrain),
     )
     reads = [*reads, *(Path(one) for one in given if one is not None)]
+    for extra in all_extras():
+        reads += extra.reads(config)
+    for extra in all_extras():
+        extra.check_outputs(config, reads=reads)
     check_writable(config.summary, name="--summary", reads=reads)
     check_writable(config.timing, name="--timing", reads=reads)
     check_writable(config.log, name="--log", reads=reads)
-    check_destination(config.ts, reads=reads)
     for path, suffix, name in (
         (config.tracks, ".csv", "--tracks"),
-        (config.mcap, ".mcap", "--mcap"),
         (config.record, ".rrd", "--record"),
     ):
         if path is not None and path.suffix == suffix and not path.is_dir():

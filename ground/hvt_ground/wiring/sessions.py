@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -17,28 +18,24 @@ from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.recordings import BacklogRecording
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Refinement
-from hvt_ground.geolocation.surface import Surface
+from hvt_ground.extras import Flight, all_extras
 from hvt_ground.perception.models import Models
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
-from hvt_ground.sinks.cot.reporter import StillAddress
 from hvt_ground.sinks.message_log import MessageLog
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.still_files import StillFiles, picture_of
 from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.sinks.tracks_table import TrackTable
-from hvt_ground.sinks.transport_stream.destination import Addresses, destination
-from hvt_ground.sinks.transport_stream.stream import live_stream, stream_file
-from hvt_ground.sinks.transport_stream.uas import Platform
-from hvt_ground.wiring.extras import make_cot, make_surfaces, mcap_file
 from hvt_ground.wiring.files import backlog_path, free_path, output_path
 from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline
+from hvt_ground.wiring.terrain import make_surfaces
 
-if TYPE_CHECKING:  # who serves no page needs no web server, nor protobuf who writes no MCAP
+if TYPE_CHECKING:  # who serves no page needs no web server
     from hvt_ground.web import WebPage
 
 __all__ = ["OpenSink", "SessionFactory"]
@@ -82,12 +79,9 @@ class SessionFactory:
         """Whether there are recordings: a program takes their place unless they are asked for."""
         self._paths: set[Path] = set()
         """Taken by this process."""
-        self._addresses = Addresses()
         self._naming = threading.Lock()
-        if config.mcap is not None:
-            mcap_file()  # that it is there
         self._surface_of = make_surfaces(config.terrain)
-        self._cot = make_cot(config, outputs)
+        self._extras = [extra.start(config, outputs) for extra in all_extras()]
         self._timing: QueuedSink[str] | None = None
         if config.timing is not None:
             names = partial(free_path, [config.timing], number=2, may_exist=config.timing)
@@ -124,21 +118,21 @@ class SessionFactory:
         files: dict[str, QueuedSink[Event]] = {}
         for target, what, suffix, make in (
             (config.tracks, "tracks table", ".csv", TrackTable),
-            (config.mcap, "MCAP file", ".mcap", lambda path: mcap_file()(path, edge=edge)),
             (config.stills, "stills", ".csv", StillFiles),
         ):
             if target is not None:
-                names = partial(output_path, target, suffix=suffix, edge=edge, stamp=stamp)
-                open_file = partial(self._opened, make, names)
+                open_file = self._new_file(target, suffix, make, edge=edge, stamp=stamp)
                 files[what] = self._outputs.open(f"{what} of {edge}", open_file, wait_s=wait_s)
         sinks += files.values()
-        if config.ts is not None:
-            opens_stream = self._transport_stream(info, config.ts, stamp=stamp, surface=surface)
-            sinks.append(self._outputs.open(f"MPEG-TS of {edge}", opens_stream, wait_s=wait_s))
-        if self._cot is not None:
-            address = self._still_address(info, files.get("stills"))
-            open_reporter = partial(self._cot, info, clock=self._clock, still_address=address)
-            sinks.append(self._outputs.open(f"CoT of {edge}", open_reporter))
+        flight = Flight(
+            info,
+            surface=surface,
+            clock=self._clock,
+            new_file=partial(self._new_file, edge=edge, stamp=stamp),
+            still_address=self._still_address(info, files.get("stills")),
+        )
+        for one in chain.from_iterable(opens(flight) for opens in self._extras):
+            sinks.append(self._outputs.open(one.part, one.open, wait_s=wait_s if one.waits else 0.0))
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
         return GroundSession(
@@ -161,19 +155,13 @@ class SessionFactory:
         perception = make_backlog_perception(self._config, self._models, info=info)
         return BacklogRecording(info, sink=sink, perception=perception)
 
-    def _transport_stream(
-        self, info: Info, target: str, *, stamp: str, surface: Surface
-    ) -> Callable[[], SinkWriter[Event]]:
-        platform = Platform(info.edge, f"{info.session_id:016x}", info.view, surface)
-        where = destination(target)
-        if isinstance(where, Path):
-            make = partial(stream_file, platform=platform, fps=info.fps)
-            names = partial(output_path, where, suffix=".ts", edge=info.edge, stamp=stamp)
-            return partial(self._opened, make, names)
-        address = where.of_edge(info.edge)
-        return partial(live_stream, address, platform=platform, fps=info.fps, addresses=self._addresses)
+    def _new_file(
+        self, target: Path, suffix: str, make: Callable[[Path], S], *, edge: str, stamp: str
+    ) -> Callable[[], S]:
+        names = partial(output_path, target, suffix=suffix, edge=edge, stamp=stamp)
+        return partial(self._opened, make, names)
 
-    def _still_address(self, info: Info, files: QueuedSink[Event] | None) -> StillAddress:
+    def _still_address(self, info: Info, files: QueuedSink[Event] | None) -> Callable[[Refinement], str]:
         """Where the picture of a still is: on the page, else in the folder of ``--stills``, else nowhere."""
         page = self._page
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from hvt_common.geodesy import metres_per_degree
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose, View
+from hvt_gateways.transport_stream.uas import Platform, sensor_angles, uas_local_set
+from hvt_gateways.transport_stream.vmti import MOST_BYTES
 from hvt_ground.events import Overlay, Places
-from hvt_ground.sinks.transport_stream.uas import Platform, sensor_angles, uas_local_set
-from hvt_ground.sinks.transport_stream.vmti import MOST_BYTES
 from media.klv_reader import KlvPacket, packets_of
 
 NOW_NS = 1_790_000_000 * SECOND_NS + 123_456_789

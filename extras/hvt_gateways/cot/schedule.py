@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from hvt_common.units import SECOND_NS
-from hvt_ground.sinks.cot.motion import Place, metres_between
+from hvt_gateways.cot.motion import Place, metres_between
 
 __all__ = ["STALE_NS", "PlacedTrack", "Reported", "TrackSchedule"]
 

@@ -28,7 +28,7 @@ with warnings.catch_warnings():
     from pytak.client_functions import get_ssl_ctx, get_tls_config
 
 from hvt_common.errors import UserError
-from hvt_ground.sinks.cot.event import CotMessage
+from hvt_gateways.cot.event import CotMessage
 
 __all__ = ["VARIABLES", "CotConnection", "check_connection"]
 

@@ -5,8 +5,10 @@ MISB ST 1402, asynchronous carriage: a KLV packet has the time of its frame, and
 
 from __future__ import annotations
 
+import heapq
+import io
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -16,20 +18,25 @@ from av.container import OutputContainer
 from av.stream import Stream
 
 from hvt_common.errors import UserError
+from hvt_common.values import View
+from hvt_gateways.transport_stream.destination import Address, Addresses, Datagrams, Output, StreamFile
+from hvt_gateways.transport_stream.moments import Moment, Moments
+from hvt_gateways.transport_stream.timeline import TIME_BASE, Timeline
+from hvt_gateways.transport_stream.uas import Platform, uas_local_set
 from hvt_ground.events import Event, Overlay, PoseUpdate, VideoSample
+from hvt_ground.exports.video import from_keyframe
 from hvt_ground.geolocation.trail import PoseTrail
+from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.decodable import DecodableRun
-from hvt_ground.sinks.transport_stream.destination import Address, Addresses, Datagrams, Output, StreamFile
-from hvt_ground.sinks.transport_stream.moments import Moment, Moments
-from hvt_ground.sinks.transport_stream.timeline import TIME_BASE, Timeline
-from hvt_ground.sinks.transport_stream.uas import Platform, uas_local_set
 
-__all__ = ["TransportStream", "live_stream", "stream_file"]
+__all__ = ["TransportStream", "live_stream", "stream_file", "write_recorded"]
 
 _BUFFER_BYTES: Final = 24 * 7 * 188
 """Of whole datagrams of whole packets."""
 _DELAY_US: Final = "200000"
 """By so much a receiver's clock is behind the times in the stream: what metadata may come later than its picture."""
+_USUAL_FPS: Final = 15.0
+"""A recording does not say it; it counts where a clock was set."""
 
 
 class TransportStream:
@@ -154,6 +161,28 @@ def live_stream(address: Address, *, platform: Platform, fps: float, addresses: 
             fps=fps,
             ended=lambda: addresses.free(address),
         )
+
+
+def write_recorded(recorded: Recorded, path: Path) -> None:
+    """Write a recording as ``--ts`` would have; `UserError` where it has no video."""
+    if recorded.info is not None:
+        view = recorded.info.view
+    elif recorded.poses:
+        view = recorded.poses[0].view
+    else:
+        with av.open(io.BytesIO(from_keyframe(recorded)[0].data), format="hevc") as probe:
+            size = probe.streams.video[0].width, probe.streams.video[0].height
+        view = View.fitted(size, size, fit="letterbox")
+    platform = Platform(recorded.edge, recorded.session, view, recorded.surface)
+    stream = stream_file(path, platform=platform, fps=_USUAL_FPS, trail=recorded.trail)
+    items: Iterator[VideoSample | Overlay] = heapq.merge(
+        recorded.video, recorded.overlays(), key=lambda one: one.frame_index
+    )
+    try:
+        for item in items:
+            stream.log(item)
+    finally:
+        stream.close()
 
 
 def _streams(container: OutputContainer, platform: Platform) -> tuple[Stream, Stream]:

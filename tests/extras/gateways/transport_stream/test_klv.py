@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_ground.sinks.transport_stream.klv import (
+from hvt_gateways.transport_stream.klv import (
     ber_length,
     ber_oid,
     imapb,

@@ -20,11 +20,11 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose, View
 from hvt_common.video.annex_b import nal_units, parameter_sets
 from hvt_common.video.hevc import BaseDecoder
+from hvt_gateways.transport_stream.destination import Address, Addresses
+from hvt_gateways.transport_stream.stream import TransportStream, live_stream, stream_file
+from hvt_gateways.transport_stream.uas import Platform
 from hvt_ground.events import Event, Overlay, PoseUpdate, VideoSample
 from hvt_ground.sinks import QueuedSink
-from hvt_ground.sinks.transport_stream.destination import Address, Addresses
-from hvt_ground.sinks.transport_stream.stream import TransportStream, live_stream, stream_file
-from hvt_ground.sinks.transport_stream.uas import Platform
 from media.klv_reader import ReadStream, read_stream
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes
 from programs.processes import eventually, free_ports

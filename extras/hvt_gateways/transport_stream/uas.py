@@ -12,11 +12,11 @@ import numpy.typing as npt
 
 from hvt_common.geodesy import turned_deg
 from hvt_common.values import Orientation, Pose, View
+from hvt_gateways.transport_stream.klv import item, packet, signed, unsigned
+from hvt_gateways.transport_stream.vmti import vmti_local_set
 from hvt_ground.events import Overlay
 from hvt_ground.geolocation.footprint import Footprint, fields_of_view, footprint
 from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
-from hvt_ground.sinks.transport_stream.klv import item, packet, signed, unsigned
-from hvt_ground.sinks.transport_stream.vmti import vmti_local_set
 
 __all__ = ["KEY", "Platform", "sensor_angles", "uas_local_set"]
 

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 
 from hvt_common.geodesy import turned_deg
+from hvt_gateways.transport_stream.klv import ber_length, ber_oid, imapb, item, whole
 from hvt_ground.events import Overlay
-from hvt_ground.sinks.transport_stream.klv import ber_length, ber_oid, imapb, item, whole
 
 __all__ = ["MOST_BYTES", "vmti_local_set"]
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from hvt_common.geodesy import metres_per_degree, turned_deg
 from hvt_common.units import SECOND_NS
-from hvt_ground.sinks.cot.event import Motion
+from hvt_gateways.cot.event import Motion
 
 __all__ = ["MotionTrail", "metres_between"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_ground.sinks.cot.type_table import default_types, read_types
+from hvt_gateways.cot.type_table import default_types, read_types
 
 
 def test_classes_have_types_and_nobody_is_an_enemy():

@@ -53,7 +53,7 @@ class TypeTable:
 
 def default_types() -> TypeTable:
     """What ``types.toml`` beside this file says."""
-    text = (files("hvt_ground.sinks.cot") / "types.toml").read_text(encoding="utf-8")
+    text = (files("hvt_gateways.cot") / "types.toml").read_text(encoding="utf-8")
     return _parsed(tomllib.loads(text), where="types.toml")
 
 

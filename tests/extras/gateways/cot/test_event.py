@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from hvt_ground.sinks.cot.event import CotEvent, Motion, Parent, Point, Sensor
+from hvt_gateways.cot.event import CotEvent, Motion, Parent, Point, Sensor
 
 NOW_NS = 1_800_000_000_123_000_000
 EVENT = CotEvent(

@@ -18,9 +18,9 @@ from cryptography.x509 import load_pem_x509_certificate
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
+from hvt_gateways.cot.connection import CotConnection, check_connection
+from hvt_gateways.cot.event import CotMessage
 from hvt_ground.sinks import QueuedSink
-from hvt_ground.sinks.cot.connection import CotConnection, check_connection
-from hvt_ground.sinks.cot.event import CotMessage
 from programs.fleet_keys import EXPIRED, Fleet
 from programs.processes import eventually, free_ports
 

@@ -10,7 +10,7 @@ import av.error
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_ground.sinks.transport_stream.destination import (
+from hvt_gateways.transport_stream.destination import (
     Address,
     Addresses,
     Datagrams,

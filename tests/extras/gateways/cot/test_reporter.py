@@ -13,10 +13,10 @@ from hvt_common.geodesy import moved
 from hvt_common.protocol.channels import Channel
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose, View
+from hvt_gateways.cot.event import CotMessage
+from hvt_gateways.cot.reporter import SessionReporter, sensor_of
+from hvt_gateways.cot.type_table import default_types
 from hvt_ground.events import MessageTiming, Overlay, Places, PoseUpdate, Refinement
-from hvt_ground.sinks.cot.event import CotMessage
-from hvt_ground.sinks.cot.reporter import SessionReporter, sensor_of
-from hvt_ground.sinks.cot.type_table import default_types
 from rigs.messages import INFO
 
 VIEW = View.fitted((1920, 1080), (1280, 720), fit="letterbox")

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.units import SECOND_NS
+from hvt_gateways.transport_stream.moments import Moment, Moments
+from hvt_gateways.transport_stream.timeline import Timeline
 from hvt_ground.events import Overlay
-from hvt_ground.sinks.transport_stream.moments import Moment, Moments
-from hvt_ground.sinks.transport_stream.timeline import Timeline
 
 STEP_NS = SECOND_NS // 15
 

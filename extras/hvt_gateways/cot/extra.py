@@ -1,0 +1,104 @@
+"""The settings of Cursor on Target, and how the ground comes to send it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from hvt_common.config import PATH, Group, SettingType
+from hvt_common.errors import UserError, needs_extra
+from hvt_common.runtime.checkup import Finding
+from hvt_gateways.cot.type_table import read_types
+from hvt_ground.config import GroundConfig
+from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
+from hvt_ground.sinks import Outputs
+
+__all__ = ["CotExtra"]
+
+_GATEWAYS = Group("gateways", rare=True)
+
+
+def _url(text: str, *, name: str) -> str:
+    """``udp``, ``tcp`` or ``tls``, a host and a port. No IPv6 address: the client, pytak, knows none."""
+    try:
+        parts = urlsplit(text)
+        good = parts.scheme in ("udp", "tcp", "tls") and bool(parts.hostname) and bool(parts.port)
+    except ValueError:
+        good = False
+    if not good or re.fullmatch(r"[a-z]+://[\w.-]+:[0-9]+", text, re.ASCII) is None:
+        raise UserError(
+            f"{name} {text!r} is not accepted: give udp://HOST:PORT, tcp://HOST:PORT or tls://HOST:PORT, with a "
+            "name or an IPv4 address"
+        )
+    return text
+
+
+@dataclass(frozen=True)
+class CotOptions:
+    """What ``hvt-ground`` takes for it."""
+
+    cot: tuple[str, ...] = _GATEWAYS.option(
+        SettingType("URL", _url),
+        (),
+        "also report the camera and the tracks to ATAK as Cursor on Target, for example udp://239.2.3.1:6969 or "
+        "tls://takserver:8089 (docs/atak.md)",
+        many=True,
+    )
+    cot_types: Path | None = _GATEWAYS.option(
+        PATH, None, "with --cot: FILE.toml, which class and which edge is of which type (docs/atak.md)"
+    )
+
+
+class CotExtra(Extra):
+    """A reporter a session, and a connection a target that all of them share."""
+
+    options = CotOptions
+
+    def check(self, config: GroundConfig) -> None:
+        """Refuse types without a target."""
+        if isinstance(config, CotOptions) and config.cot_types is not None and not config.cot:
+            raise UserError(f"--cot-types {config.cot_types} is given without --cot: give --cot too")
+
+    def reads(self, config: GroundConfig) -> Iterable[Path]:
+        """The table of types."""
+        return [config.cot_types] if isinstance(config, CotOptions) and config.cot_types is not None else []
+
+    def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:  # noqa: ARG002
+        """Refuse types and certificates that cannot be used."""
+        if isinstance(config, CotOptions) and config.cot:
+            with needs_extra("'hvt[cot]'"):
+                from hvt_gateways.cot.connection import check_connection  # noqa: PLC0415 - who has none needs no pytak
+            read_types(config.cot_types)
+            for url in config.cot:
+                check_connection(url)
+
+    def checks(self, config: GroundConfig) -> Mapping[str, Callable[[], Finding]]:
+        """Whether reports could be sent; not whether anybody is there, for who connects is shown to others."""
+        return (
+            {"reports": partial(self._found, config)} if isinstance(config, CotOptions) and config.cot else {}
+        )
+
+    def _found(self, config: CotOptions) -> Finding:
+        self.check_outputs(config, reads=())  # type: ignore[arg-type]
+        return Finding("ok", f"to {', '.join(config.cot)}; types and certificates can be read")
+
+    def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:
+        """Open the connections."""
+        if not isinstance(config, CotOptions) or not config.cot:
+            return lambda _flight: ()
+        self.check_outputs(config, reads=())
+        from hvt_gateways.cot.connection import CotConnection  # noqa: PLC0415 - as above
+        from hvt_gateways.cot.reporter import SessionReporter  # noqa: PLC0415 - as above
+
+        targets = [outputs.open(f"CoT {url}", partial(CotConnection, url)) for url in config.cot]
+        reporter = partial(SessionReporter, targets=targets, types=read_types(config.cot_types))
+
+        def sinks(flight: Flight) -> Iterable[Opening]:
+            opens = partial(reporter, flight.info, clock=flight.clock, still_address=flight.still_address)
+            yield Opening(f"CoT of {flight.info.edge}", opens, waits=False)
+
+        return sinks

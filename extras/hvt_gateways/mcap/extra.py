@@ -1,0 +1,82 @@
+"""The settings of MCAP, and how the ground comes to write it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hvt_common.config import PATH, Group
+from hvt_common.errors import needs_extra
+from hvt_common.runtime.reporting import check_writable
+from hvt_ground.config import GroundConfig
+from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
+from hvt_ground.recordings.recorded import Recorded, RecordedStill
+from hvt_ground.sinks import Outputs
+
+if TYPE_CHECKING:
+    from hvt_gateways.mcap.file import McapFile
+
+__all__ = ["McapExtra"]
+
+
+@dataclass(frozen=True)
+class McapOptions:
+    """What ``hvt-ground`` takes for it."""
+
+    mcap: Path | None = Group("gateways").option(
+        PATH, None, "also write MCAP for Foxglove: FILE.mcap, or a folder for one file a session"
+    )
+
+
+class McapExtra(Extra):
+    """One file a session."""
+
+    options = McapOptions
+
+    def writes(self, config: GroundConfig) -> Iterable[tuple[str, Path]]:
+        """The file that is named."""
+        if isinstance(config, McapOptions) and config.mcap is not None and config.mcap.suffix == ".mcap":
+            yield "--mcap", config.mcap
+
+    def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
+        """Refuse what cannot be written."""
+        for name, path in self.writes(config):
+            if not path.is_dir():
+                check_writable(path, name=name, reads=reads)
+
+    def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
+        """`UserError` where the package is missing."""
+        target = config.mcap if isinstance(config, McapOptions) else None
+        if target is None:
+            return lambda _flight: ()
+        file = _file()
+
+        def sinks(flight: Flight) -> Iterable[Opening]:
+            edge = flight.info.edge
+            yield Opening(f"MCAP file of {edge}", flight.new_file(target, ".mcap", partial(file, edge=edge)))
+
+        return sinks
+
+
+def _export(recorded: Recorded, path: Path) -> None:
+    file = _file()(path, edge=recorded.edge)
+    try:
+        for item in recorded.all():
+            if isinstance(item, RecordedStill):
+                file.still(item.jpeg, frame_index=item.frame_index, capture_ns=item.capture_ns)
+            else:
+                file.log(item)
+    finally:
+        file.close()
+
+
+McapExtra.exports = {"mcap": _export}
+
+
+def _file() -> type[McapFile]:
+    with needs_extra("'hvt[mcap]'"):
+        from hvt_gateways.mcap.file import McapFile  # noqa: PLC0415 - who writes none needs no protobuf
+    return McapFile

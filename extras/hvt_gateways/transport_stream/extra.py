@@ -1,0 +1,67 @@
+"""The settings of MPEG-TS with KLV, and how the ground comes to write it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from hvt_common.config import TEXT, Group
+from hvt_gateways.transport_stream.destination import Addresses, check_destination, destination
+from hvt_gateways.transport_stream.stream import live_stream, stream_file, write_recorded
+from hvt_gateways.transport_stream.uas import Platform
+from hvt_ground.config import GroundConfig
+from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
+from hvt_ground.sinks import Outputs
+
+__all__ = ["TransportStreamExtra"]
+
+
+@dataclass(frozen=True)
+class TransportStreamOptions:
+    """What ``hvt-ground`` takes for it."""
+
+    ts: str | None = Group("gateways", rare=True).option(
+        TEXT,
+        None,
+        "also write MPEG-TS with KLV (docs/klv.md): FILE.ts, a folder for one file a session, udp://HOST:PORT or "
+        "srt://HOST:PORT",
+    )
+
+
+class TransportStreamExtra(Extra):
+    """A file or a live stream a session."""
+
+    options = TransportStreamOptions
+    exports = {"ts": write_recorded}  # noqa: RUF012
+
+    def writes(self, config: GroundConfig) -> Iterable[tuple[str, Path]]:
+        """The file that is named."""
+        if isinstance(config, TransportStreamOptions) and config.ts is not None and "://" not in config.ts:
+            path = Path(config.ts)
+            if path.suffix == ".ts":
+                yield "--ts", path
+
+    def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
+        """Refuse what cannot be written or sent to."""
+        if isinstance(config, TransportStreamOptions):
+            check_destination(config.ts, reads=reads)
+
+    def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
+        """What opens the stream of a session."""
+        if not isinstance(config, TransportStreamOptions) or config.ts is None:
+            return lambda _flight: ()
+        where, addresses = destination(config.ts), Addresses()
+
+        def sinks(flight: Flight) -> Iterable[Opening]:
+            info = flight.info
+            platform = Platform(info.edge, f"{info.session_id:016x}", info.view, flight.surface)
+            if isinstance(where, Path):
+                opens = flight.new_file(where, ".ts", partial(stream_file, platform=platform, fps=info.fps))
+            else:
+                address = where.of_edge(info.edge)
+                opens = partial(live_stream, address, platform=platform, fps=info.fps, addresses=addresses)
+            yield Opening(f"MPEG-TS of {info.edge}", opens)
+
+        return sinks

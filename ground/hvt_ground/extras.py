@@ -1,0 +1,120 @@
+"""The door for extras: packages that bring settings, sinks, checks and kinds of export of their own.
+
+An extra is what an entry point of the group ``hvt.ground`` names, see `Extra`. It may use all of the
+ground. The ground imports none, and runs the same where one is absent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, make_dataclass
+from functools import cache
+from pathlib import Path
+from typing import ClassVar, cast
+
+from hvt_common.protocol.messages import Info
+from hvt_common.runtime.checkup import Finding
+from hvt_common.runtime.plug_ins import installed, loaded
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.events import Event, Refinement
+from hvt_ground.geolocation.surface import Surface
+from hvt_ground.recordings.recorded import Recorded
+from hvt_ground.sinks import Outputs, SinkWriter
+
+__all__ = ["Extra", "Flight", "NewFile", "OpenSinks", "Opening", "all_extras", "checked", "config_class"]
+
+_GROUP = "hvt.ground"
+_BROUGHT_BY = {"cot": "cot", "cot-types": "cot", "mcap": "mcap", "ts": "ground"}
+"""Settings of the extras that come with HVT, and what to install for each."""
+
+NewFile = Callable[[Path, str, Callable[[Path], SinkWriter[Event]]], Callable[[], SinkWriter[Event]]]
+"""Opens a file, or one of the suffix in a folder, by a name that no other session of this ground has."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """One session of an edge, for an extra's sinks."""
+
+    info: Info
+    surface: Surface
+    """What its tracks stand on."""
+    clock: Callable[[], int]
+    """The ground's steady clock, nanoseconds."""
+    new_file: NewFile
+    still_address: Callable[[Refinement], str]
+    """Where the picture of a still can be seen; empty where nowhere."""
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """A sink to open: ``part`` names it in status and summary, as in "MCAP file of uav-1: disk full"."""
+
+    part: str
+    open: Callable[[], SinkWriter[Event]]
+    waits: bool = True
+    """Whether an edge in lockstep waits for it; one that sends to others does not hold it up."""
+
+
+OpenSinks = Callable[[Flight], Iterable[Opening]]
+
+
+class Extra:
+    """What an extra may bring; each method gets the whole configuration, which is an instance of ``options`` too."""
+
+    options: ClassVar[type]
+    """A frozen dataclass without slots whose fields are declared by `hvt_common.config.Group`."""
+    exports: ClassVar[Mapping[str, Callable[[Recorded, Path], None]]] = {}
+    """Kinds of ``hvt-ground export``, with what writes one: a file that ends in the kind's name."""
+
+    def check(self, config: GroundConfig) -> None:
+        """Raise `UserError` where its settings contradict each other or the ground's."""
+
+    def reads(self, config: GroundConfig) -> Iterable[Path]:  # noqa: ARG002
+        """The files that it reads: no output may be one of them."""
+        return ()
+
+    def writes(self, config: GroundConfig) -> Iterable[tuple[str, Path]]:  # noqa: ARG002
+        """The files that it writes, each with the option that names it; no folders, no addresses."""
+        return ()
+
+    def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
+        """Raise `UserError` where it could not write, or send, what is asked for."""
+
+    def checks(self, config: GroundConfig) -> Mapping[str, Callable[[], Finding]]:  # noqa: ARG002
+        """What ``hvt-ground doctor`` looks at for it, by name."""
+        return {}
+
+    def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:
+        """Open what all sessions share; return what opens the sinks of one."""
+        raise NotImplementedError
+
+
+@cache
+def all_extras() -> tuple[Extra, ...]:
+    """Those that are installed, by name; `UserError` where one does not load."""
+    return tuple(
+        cast("Extra", loaded(entry, lambda extra: extra(), what="extra"))
+        for _, (entry, *_) in sorted(installed(_GROUP).items())
+    )
+
+
+@cache
+def config_class(extras: tuple[Extra, ...] | None = None) -> type[GroundConfig]:
+    """`GroundConfig` with the settings of ``extras``, by default all; what an absent one brings is refused."""
+    options = [extra.options for extra in (all_extras() if extras is None else extras)]
+    whole = make_dataclass("GroundConfig", (), bases=(*options, GroundConfig), frozen=True)
+    known = {field.name.replace("_", "-") for field in fields(whole)}
+    absent = {
+        name: f"is of an extra that is not installed: pip install 'hvt[{package}]'"
+        for name, package in _BROUGHT_BY.items()
+        if name not in known
+    }
+    whole.GONE = absent  # type: ignore[attr-defined]
+    return cast("type[GroundConfig]", whole)
+
+
+def checked(config: GroundConfig) -> GroundConfig:
+    """Return the configuration, `UserError` where settings contradict, those of extras too."""
+    for extra in all_extras():
+        extra.check(config)
+    return check(config, files=[one for extra in all_extras() for one in extra.writes(config)])

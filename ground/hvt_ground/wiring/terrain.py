@@ -1,0 +1,25 @@
+"""What the tracks of a flight stand on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from hvt_common.errors import needs_extra
+from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
+
+__all__ = ["make_surfaces"]
+
+
+def make_surfaces(terrain: Path | None) -> Callable[[str], Surface]:
+    """What makes the ground of one flight, by the name of whose it is.
+
+    The file is looked at once, here: `UserError` where it is no elevation model. One that goes later ends no flight.
+    """
+    if terrain is None:
+        return lambda _flight: FLAT_GROUND
+    with needs_extra("'hvt[terrain]'"):
+        from hvt_ground.geolocation.elevation import ElevationModel  # noqa: PLC0415 - who has none needs no GDAL
+        from hvt_ground.geolocation.terrain import Terrain  # noqa: PLC0415 - as above
+    return partial(Terrain, ElevationModel(terrain))
