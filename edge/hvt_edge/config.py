@@ -30,6 +30,7 @@ from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import parse_tiles
 from hvt_common.protocol.channels import EdgeKeys
+from hvt_common.protocol.ledger import MOST_WINDOW_NS
 from hvt_common.runtime.log import LOG_FORMATS
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import bitrate_text
@@ -57,7 +58,7 @@ __all__ = [
 
 DEFAULT_FPS = 15.0
 DEFAULT_SIZE = (1280, 720)
-_LEAST_WINDOW_S, _MOST_WINDOW_S = 0.5, 60.0
+_LEAST_WINDOW_S, _MOST_WINDOW_S = 0.5, MOST_WINDOW_NS / 1e9
 _R0_DEPTH = 0.1
 _MIN_BUDGET_BPS = 100_000
 _STORE_BYTES = 200_000_000

@@ -248,7 +248,7 @@ const MESSAGES: Record<string, { most: number; payload?: number; fields: Fields 
       ["source_size", exactly(2, int(1, 32767))], ["base_size", exactly(2, int(1, 32767))],
       ["view_scale", float(0.0001, 10000)], ["view_offset_px", exactly(2, float(-32767, 32767))],
       ["fps", float(0.01, 1000)], ["codec", text(24)], ["pace", int(0, 1)], ["method", text(48)],
-      ["budget_bps", int(0, U53)], ["base_bps", int(0, U53)], ["window_ns", int(1, 3600000000000)],
+      ["budget_bps", int(0, U53)], ["base_bps", int(0, U53)], ["window_ns", int(1, 60000000000)],
       ["class_names", list(2048, text(64))], ["received_ns", int(0, I63)], ["answered_ns", int(0, I63)],
       ["still_codecs", list(8, text(24)), []], ["channels", list(16, text(16)), []],
     ],

@@ -14,6 +14,7 @@ from enum import Enum
 from typing import Literal
 
 __all__ = [
+    "MOST_WINDOW_NS",
     "STANDARD_ENCODINGS",
     "Account",
     "Ledger",
@@ -39,7 +40,10 @@ class Account(Enum):
 
 _MOST_REASONS = 23
 """Of one outcome, each by its own name; a status carries one more."""
-_MOST_PENDING = 65_536
+MOST_WINDOW_NS = 60_000_000_000
+"""The longest window, which an edge may name."""
+_MOST_PENDING = _MOST_IN_WINDOW = 65_536
+"""Messages; in a flood of more the windows hold the newest."""
 
 # Measured between two peers of eclipse-zenoh 1.10 over TCP, with `ss -ti` (bytes_sent) and a veth's tx_bytes. It is
 # the length of a batch (2), frame header and sequence number (7) and push, key and put headers (5), without the
@@ -148,7 +152,7 @@ class Ledger:
 
     def __init__(self, *, window_ns: int = 1_000_000_000, slack_ns: int = 2_000_000_000) -> None:
         """``window_ns``: length of the rolling window. ``slack_ns``: how far out of order a message may come."""
-        self.window_ns = window_ns
+        self.window_ns = window_ns = min(window_ns, MOST_WINDOW_NS)
         self._slack_ns = slack_ns
         self._pending: list[tuple[int, str, int]] = []
         self._windows = _Windows(window_ns)
@@ -215,12 +219,12 @@ class Ledger:
 
         Exact for any ``now_ns`` not further back than the slack from the newest message.
         """
-        name = None if channel is None else channel.value
+        name = "total" if channel is None else channel.value
         after_ns = now_ns - self.window_ns
-        return sum(
-            line
-            for at_ns, entry, line in (*self._windows.entries, *self._pending)
-            if after_ns < at_ns <= now_ns and name in (None, entry)
+        windows, pending = self._windows.copy(), tuple(self._pending)
+        windows.forget(until_ns=after_ns)
+        return windows.sums[name] + sum(
+            line for at_ns, entry, line in pending if after_ns < at_ns <= now_ns and name in ("total", entry)
         )
 
     @property
@@ -232,20 +236,20 @@ class Ledger:
         bits = {name: round(line * 8 * 1e9 / self.window_ns) for name, line in windows.worst.items()}
         return WindowRates(base=bits["base"], roi=bits["roi"], total=bits["total"])
 
+    def mean_bps(self, duration_s: float) -> int:
+        """Line bits a second, of everything; ``duration_s`` as of `summary`."""
+        return _rate(self.line_bytes, duration_s)
+
     def summary(self, duration_s: float) -> LedgerSummary:
         """The account; ``duration_s`` is the length of the stream: last minus first frame, plus one interval."""
-
-        def rate(line: int) -> int:
-            return round(line * 8 / duration_s) if duration_s > 0 else 0
-
         return LedgerSummary(
             duration_s=duration_s,
             **{f"{account.value}_bytes": size for account, size in self._bytes.items()},
             overhead_bytes=self._overhead_bytes,
             messages={channel.value: number for channel, number in self._messages.items()},
-            base_bps=rate(self._line[Account.BASE]),
-            roi_bps=rate(self._line[Account.ROI]),
-            total_bps=rate(self.line_bytes),
+            base_bps=_rate(self._line[Account.BASE], duration_s),
+            roi_bps=_rate(self._line[Account.ROI], duration_s),
+            total_bps=self.mean_bps(duration_s),
             worst_window_bps=self.worst_window_bps,
             outcomes={outcome: dict(reasons) for outcome, reasons in self._outcomes.items()},
         )
@@ -283,14 +287,23 @@ class _Windows:
 
     def add(self, at_ns: int, channel: str, line: int) -> None:
         """The window that ends with this message is the fullest that holds it and nothing later."""
-        while self.entries and self.entries[0][0] <= at_ns - self.window_ns:
-            _, left, gone = self.entries.popleft()
-            self.sums[left] -= gone
-            self.sums["total"] -= gone
+        self.forget(until_ns=at_ns - self.window_ns)
+        if len(self.entries) >= _MOST_IN_WINDOW:
+            self._drop_oldest()
         self.entries.append((at_ns, channel, line))
         for name in (channel, "total"):
             self.sums[name] += line
             self.worst[name] = max(self.worst[name], self.sums[name])
+
+    def forget(self, *, until_ns: int) -> None:
+        """Leave out the messages of this time and before."""
+        while self.entries and self.entries[0][0] <= until_ns:
+            self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        _, channel, line = self.entries.popleft()
+        self.sums[channel] -= line
+        self.sums["total"] -= line
 
     def copy(self) -> _Windows:
         """An independent copy. Each part is copied in one step, which no other thread can interrupt."""
@@ -300,6 +313,10 @@ class _Windows:
         """Forget the messages of the window but not the worst."""
         self.entries.clear()
         self.sums = dict.fromkeys(self.sums, 0)
+
+
+def _rate(line_bytes: int, duration_s: float) -> int:
+    return round(line_bytes * 8 / duration_s) if duration_s > 0 else 0
 
 
 def _ceil(amount: int, part: int) -> int:

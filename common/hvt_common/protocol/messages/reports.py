@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from hvt_common.protocol.frame_account import FrameAccount
+from hvt_common.protocol.ledger import MOST_WINDOW_NS
 from hvt_common.protocol.messages.envelope import Message, Nested
 from hvt_common.protocol.messages.fields import (
     I63,
@@ -78,7 +79,7 @@ class Info(Message):
     budget_bps: int = wire_field(_BPS)
     base_bps: int = wire_field(_BPS)
     """The part of the budget that the base stream may use."""
-    window_ns: int = wire_field(Int(1, 3_600_000_000_000))
+    window_ns: int = wire_field(Int(1, MOST_WINDOW_NS))
     """Length of the rolling window that the budget holds over."""
     class_names: tuple[str, ...] = wire_field(ListOf(Text(_CLASS_NAME_BYTES), _CLASS_NAMES))
     """Of the edge's detector."""
