@@ -1,4 +1,7 @@
-"""Detects a flood: far more messages of one kind than a working peer sends. Pure: time is an argument."""
+"""Detects a flood, far more messages of one kind than a working peer sends, and bounds what comes of one.
+
+Pure: time is an argument.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,30 @@ from collections.abc import Hashable
 
 from hvt_common.units import SECOND_NS
 
-__all__ = ["FloodWatch"]
+__all__ = ["FloodWatch", "TokenBucket"]
 
 _AGAIN_NS = 60 * SECOND_NS
 """Between two warnings: a flood is not to fill the log."""
+
+
+class TokenBucket:
+    """Grants ``burst`` at once, and after that one each ``every_ns``; for one thread.
+
+    Where the clock was set back it goes on from there.
+    """
+
+    def __init__(self, *, burst: int, every_ns: int) -> None:
+        self._burst_ns, self._every_ns = burst * every_ns, every_ns
+        self._paid_ns: int | None = None
+        """Grants are paid for up to this time."""
+
+    def take(self, now_ns: int) -> bool:
+        """Whether there is one more now."""
+        earliest_ns = now_ns - self._burst_ns
+        paid_ns = earliest_ns if self._paid_ns is None else min(max(self._paid_ns, earliest_ns), now_ns)
+        granted = paid_ns + self._every_ns <= now_ns
+        self._paid_ns = paid_ns + self._every_ns * granted
+        return granted
 
 
 class FloodWatch:

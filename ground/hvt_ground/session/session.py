@@ -26,6 +26,7 @@ from hvt_common.protocol.messages import (
     TrackStepDecoder,
 )
 from hvt_common.protocol.still_words import counts_text
+from hvt_common.transport.flood import TokenBucket
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Tracks
@@ -49,6 +50,8 @@ __all__ = ["GroundSession", "WorkerFactory"]
 _MILLION = 1_000_000
 _ANEW_NS = 5 * SECOND_NS
 """What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""
+_MOST_NOTICES, _NOTICE_NS = 60, SECOND_NS
+"""Lines in the log of a session: so many at once, then one a second. Each goes to every viewer of every edge."""
 _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""
 
@@ -110,6 +113,8 @@ class GroundSession:
         self.last_status: Status | None = None
         self.levers = ""
         """What the edge last said that it sends beside the video, and why."""
+        self._notices = TokenBucket(burst=_MOST_NOTICES, every_ns=_NOTICE_NS)
+        self._notices_left_out = 0
         self._last_step = -1
         self._stepped_ns = self._status_ns = 0
         """When the newest report of tracks came, and the newest status."""
@@ -261,7 +266,19 @@ class GroundSession:
             self.note("info", f"{news.amount()} from the outage at {at} UTC arrived")
 
     def note(self, level: str, text: str) -> None:
-        """Put a line into the recording's log."""
+        """Put a line into the recording's log; in a flood of them some are left out, and counted."""
+        if not self._notices.take(self._clock()):
+            self._notices_left_out += 1
+            return
+        self._note_left_out()
+        self._note(level, text)
+
+    def _note_left_out(self) -> None:
+        count, self._notices_left_out = self._notices_left_out, 0
+        if count:
+            self._note("warning", f"{count} lines were left out here: the edge gave rise to too many")
+
+    def _note(self, level: str, text: str) -> None:
         assert level in ("info", "warning", "error")
         self._emit(Notice(max(0, self._last_index), self._last_capture_ns, level, text))  # type: ignore[arg-type]
 
@@ -285,11 +302,12 @@ class GroundSession:
         self.raise_error()
 
     def _note_end(self) -> None:
+        self._note_left_out()
         if self.failure:
-            self.note("error", f"the session failed: {self.failure}")
+            self._note("error", f"the session failed: {self.failure}")
         if self.not_sent:
-            self.note("info", f"stills that the edge did not send: {counts_text(self.not_sent)}")
-        self.note("info", f"session {self.info.session_id:016x} ended")
+            self._note("info", f"stills that the edge did not send: {counts_text(self.not_sent)}")
+        self._note("info", f"session {self.info.session_id:016x} ended")
 
     # What is known of it
 

@@ -6,7 +6,7 @@ import pickle
 from dataclasses import replace
 
 from hvt_common.protocol.ledger import Account, Ledger
-from hvt_common.transport.flood import FloodWatch
+from hvt_common.transport.flood import FloodWatch, TokenBucket
 from hvt_common.transport.inbox import Inbox, Received
 
 SECOND_NS = 1_000_000_000
@@ -24,6 +24,15 @@ def test_a_flood_is_told_of_once_a_minute_and_never_where_there_is_none():
     assert [n for n in told if n is not None] == [101, 101]
     first, second = (index for index, n in enumerate(told) if n is not None)
     assert second - first >= 60 * 500
+
+
+def test_of_a_flood_some_comes_through():
+    """All or nothing of it would be said; and after a step of the clock nothing any more."""
+    bucket = TokenBucket(burst=3, every_ns=SECOND_NS)
+    granted = [bucket.take(n * SECOND_NS // 4) for n in range(20)]
+    assert granted == [True] * 3 + [n % 4 == 0 for n in range(3, 20)]
+    assert [bucket.take(100 * SECOND_NS) for _ in range(4)] == [True] * 3 + [False]
+    assert [bucket.take(SECOND_NS), bucket.take(2 * SECOND_NS)] == [False, True], "the clock was set back"
 
 
 def test_one_row_does_not_keep_the_others_out_of_the_inbox():

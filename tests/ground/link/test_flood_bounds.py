@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from hvt_common.protocol.messages import BaseHeader, RoiHeader, Status, TrackStep
-from hvt_ground.events import MessageTiming
+from hvt_ground.events import MessageTiming, Notice
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import Arrival
 from hvt_ground.perception.stills.decode import ReceivedStill
@@ -79,6 +79,20 @@ def test_a_forged_status_number_does_not_silence_the_edge_for_good(rig, flight):
     rig.now_ns += 5 * SECOND_NS
     rig.session.status(replace(real, sequence=real.sequence + 6, state="ended"), item)
     assert rig.session.last_status.state == "ended"
+
+
+def test_an_edge_that_reports_without_end_does_not_talk_to_all_viewers(rig, flight):
+    """Each line of its log goes to every viewer of every edge: nobody would see a picture any more."""
+    item = flight.status(base=3)
+    real = Status.parse(item.payload)
+    for number in range(1, 2000):
+        rig.now_ns += SECOND_NS // 1000
+        rig.session.status(replace(real, sequence=real.sequence + number, levers=f"report {number}"), item)
+    rig.session.close()
+    said = [one.text for one in rig.events if isinstance(one, Notice)]
+    assert len([one for one in said if one.startswith("report")]) == 61
+    assert sum(int(one.split()[0]) for one in said if "left out" in one) == 1999 - 61
+    assert said[-1].endswith("ended"), "how it ended is said in any case"
 
 
 def test_a_forged_step_number_does_not_end_the_tracks_for_good(rig, flight):
