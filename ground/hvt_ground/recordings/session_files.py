@@ -28,6 +28,9 @@ from hvt_ground.sinks.rerun.recording_file import RecordingFile
 __all__ = ["SessionFiles"]
 
 _REPORT_S = 10.0
+_SMALL_BYTES, _MOST_SMALL = 128 * 2**10, 8
+"""A file costs 190 kB beside what came. Where less than this has come, the next begins only so often in a session, or
+once half its time has passed here, too: capture times are the edge's word."""
 _BEHIND_S = 3.0
 """For so long a former file waits for perception."""
 _MOST_LATE_OPEN, _MOST_LATE = 4, 32
@@ -62,6 +65,9 @@ class SessionFiles:
         """Frame and capture time of the keyframes at which the files after the first begin."""
         self._began_ns: int | None = None
         """Capture time of the newest file's first picture."""
+        self._began_s, self._came_bytes = time.monotonic(), 0
+        """When that came, and how much video since then."""
+        self._small_left = _MOST_SMALL
         self._next: RecordingFile | None = None
         """Takes the video already, while the recorder's own file waits for perception."""
         self._late: OrderedDict[int, RecordingFile] = OrderedDict()
@@ -108,22 +114,32 @@ class SessionFiles:
             behind = item.frame_index - self._starts[-1][0]
             if behind > _BEHIND_S * self._settings.fps or (isinstance(item, Overlay) and behind >= 0):
                 self._settle(None)
-        if isinstance(item, VideoSample) and item.keyframe and self._recorder.begins_with(item):
+        if not isinstance(item, VideoSample):
+            return
+        if item.keyframe and self._recorder.begins_with(item):
             if self._began_ns is None:
                 self._began_ns = item.capture_ns
             elif self._is_full(self._split, item.capture_ns - self._began_ns):
                 self._settle(None)
                 self._began_ns = item.capture_ns
+                self._began_s, self._came_bytes = time.monotonic(), 0
                 path = self._numbered(len(self._parts) + 1)
                 self._next = self._opened(self._recorder.open_file(path))
                 self._parts.append(path)
                 self._starts.append((item.frame_index, item.capture_ns))
+        self._came_bytes += len(item.data)
 
     def _is_full(self, split: Limit, lasted_ns: int) -> bool:
         if split.size_bytes is not None:
             return self._recorder.size_bytes >= split.size_bytes
+        seconds = split.seconds or 0.0
         # A clock that was set back is a reason too: it would take as long again.
-        return not 0 <= lasted_ns < (split.seconds or 0.0) * SECOND_NS
+        if 0 <= lasted_ns < seconds * SECOND_NS:
+            return False
+        if self._came_bytes >= _SMALL_BYTES or time.monotonic() - self._began_s >= seconds / 2:
+            return True
+        self._small_left -= 1
+        return self._small_left >= 0
 
     def _settle(self, hurry: threading.Event | None) -> None:
         """The former file ends."""

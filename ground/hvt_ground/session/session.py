@@ -26,14 +26,13 @@ from hvt_common.protocol.messages import (
     TrackStepDecoder,
 )
 from hvt_common.protocol.still_words import counts_text
-from hvt_common.transport.flood import TokenBucket
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
+from hvt_ground.events import Event, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
 from hvt_ground.geolocation.locate import Geolocation
 from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
 from hvt_ground.link.packets import BasePacket
@@ -43,6 +42,7 @@ from hvt_ground.link.statistics import ReceptionStatistics, SessionAccount
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.session.session_log import Level, SessionLog
 from hvt_ground.sinks import QueuedSink, Sink
 
 __all__ = ["GroundSession", "WorkerFactory"]
@@ -50,8 +50,6 @@ __all__ = ["GroundSession", "WorkerFactory"]
 _MILLION = 1_000_000
 _ANEW_NS = 5 * SECOND_NS
 """What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""
-_MOST_NOTICES, _NOTICE_NS = 60, SECOND_NS
-"""Lines in the log of a session: so many at once, then one a second. Each goes to every viewer of every edge."""
 _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""
 
@@ -91,8 +89,7 @@ class GroundSession:
         self.receive_latency = self._account.receive_latency
         self.overlay_latency = self._account.overlay_latency
         self.pipeline = pipeline_of(self._emit)
-        self.frames_decoded = 0
-        self.frames_received = 0
+        self.frames_decoded = self.frames_received = 0
         self.stills_received = 0
         self.steps_received = 0
         """Reports of the edge's tracks."""
@@ -113,8 +110,7 @@ class GroundSession:
         self.last_status: Status | None = None
         self.levers = ""
         """What the edge last said that it sends beside the video, and why."""
-        self._notices = TokenBucket(burst=_MOST_NOTICES, every_ns=_NOTICE_NS)
-        self._notices_left_out = 0
+        self._log = SessionLog(self._emit, clock=clock)
         self._last_step = -1
         self._stepped_ns = self._status_ns = 0
         """When the newest report of tracks came, and the newest status."""
@@ -265,22 +261,9 @@ class GroundSession:
             at = time.strftime("%H:%M:%S", time.gmtime(news.first[1] // SECOND_NS))
             self.note("info", f"{news.amount()} from the outage at {at} UTC arrived")
 
-    def note(self, level: str, text: str) -> None:
-        """Put a line into the recording's log; in a flood of them some are left out, and counted."""
-        if not self._notices.take(self._clock()):
-            self._notices_left_out += 1
-            return
-        self._note_left_out()
-        self._note(level, text)
-
-    def _note_left_out(self) -> None:
-        count, self._notices_left_out = self._notices_left_out, 0
-        if count:
-            self._note("warning", f"{count} lines were left out here: the edge gave rise to too many")
-
-    def _note(self, level: str, text: str) -> None:
-        assert level in ("info", "warning", "error")
-        self._emit(Notice(max(0, self._last_index), self._last_capture_ns, level, text))  # type: ignore[arg-type]
+    def note(self, level: Level, text: str, *, last: bool = False) -> None:
+        """Put a line into the recording's log, unless there is a flood of them (`SessionLog`)."""
+        self._log.note(level, text, at=(max(0, self._last_index), self._last_capture_ns), last=last)
 
     def close(self) -> None:
         """Finish what is queued (for a second or two) and close the sinks, each whatever the others do.
@@ -302,12 +285,11 @@ class GroundSession:
         self.raise_error()
 
     def _note_end(self) -> None:
-        self._note_left_out()
         if self.failure:
-            self._note("error", f"the session failed: {self.failure}")
+            self.note("error", f"the session failed: {self.failure}", last=True)
         if self.not_sent:
-            self._note("info", f"stills that the edge did not send: {counts_text(self.not_sent)}")
-        self._note("info", f"session {self.info.session_id:016x} ended")
+            self.note("info", f"stills that the edge did not send: {counts_text(self.not_sent)}", last=True)
+        self.note("info", f"session {self.info.session_id:016x} ended", last=True)
 
     # What is known of it
 

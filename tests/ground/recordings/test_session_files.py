@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.units import Limit
+from hvt_common.units import SECOND_NS, Limit
 from hvt_common.values import Pose, View
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, VideoSample
 from hvt_ground.recordings.recorded import read_recordings
@@ -257,3 +257,14 @@ def test_a_later_file_does_not_begin_with_an_old_pose(tmp_path, events):
     files, _ = recorded(tmp_path, [*events[:at], old, *events[at:]])
     poses = [[one.capture_ns for one in read_recordings([file]).poses] for file in files]
     assert poses == [[said_ns], *[[] for _ in files[1:]]]
+
+
+def test_capture_times_that_jump_do_not_fill_the_disk(tmp_path, events):
+    """Each file costs 190 kB: an edge whose clock says another hour at each keyframe would begin one at each."""
+    key = next(one for one in events if isinstance(one, VideoSample) and one.keyframe)
+    sink = SessionFiles(settings(tmp_path / "flight.rrd"), split=Limit(seconds=3600.0))
+    for number in range(12):
+        jump_ns = number % 2 * 7200 * SECOND_NS
+        sink.log(replace(key, frame_index=number, capture_ns=START_NS + number + jump_ns))
+    sink.close()
+    assert len(list(tmp_path.glob("*.rrd"))) == 9

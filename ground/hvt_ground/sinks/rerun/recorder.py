@@ -52,6 +52,10 @@ _PLOT_GAP_NS = 2_500_000_000
 """Plots have a hole where nothing was measured for longer."""
 _BYTES_EACH = {"boxes": 6, "identity": 2, "places": 4, "words": 5}
 """About what the component costs a track; others cost little more than their row."""
+_MOST_CLASSES = 256
+"""Names of classes in a recording; more are `OTHER`. A new name is written with all before it, and an edge may name
+thousands."""
+OTHER = "other"
 _MOMENTARY = ("video", "text", "lines", "jpeg", "message", "pose", "map points")
 """Tables whose values hold for one frame: a file that begins later does not begin with them."""
 _LAYER_PATHS: dict[Layer, str] = {
@@ -107,6 +111,7 @@ class Recorder:
         """Whether there was ever a pose."""
         self._class_ids: dict[tuple[str, int], int] = {}
         """By name and level of brightness; of all files, which may be opened together."""
+        self._class_names: set[str] = {OTHER}
         self._shown: dict[tuple[str, str], TableRow] = {}
         """What is on the screen: the newest row of each table whose values hold until the next."""
         self._last_sample: int | None = None
@@ -345,7 +350,10 @@ class Recorder:
         return CodedIdentity(identity.track_ids, before, tuple(self._class_id(*one) for one in shown))
 
     def _class_id(self, name: str, level: int) -> int:
-        return self._class_ids.setdefault((name, level), len(self._class_ids))
+        if len(self._class_names) < _MOST_CLASSES:
+            self._class_names.add(name)
+        known = name if name in self._class_names else OTHER
+        return self._class_ids.setdefault((known, level), len(self._class_ids))
 
     def _new_classes(self, layer: Layer) -> list[Chunk]:
         """Names and colours, where some are new to the layer."""

@@ -18,6 +18,9 @@ from hvt_ground.sinks.rerun.tables import TABLE_BYTES, SizeLimit, Table, TableRo
 
 __all__ = ["RecordingFile"]
 
+_CLASS_BYTES = 40
+"""What a class takes each time that names and colours are written: they go with the next compaction."""
+
 
 class RecordingFile:
     """Takes rows whose time is known. What was written is in the file; ``size_limit`` is told what it costs."""
@@ -79,6 +82,7 @@ class RecordingFile:
         if self._classes_written.get(layer, 0) == len(class_ids):
             return []
         self._classes_written[layer] = len(class_ids)
+        self._pending_bytes += _CLASS_BYTES * len(class_ids)
         self._contexts[layer] = class_chunk(path, class_ids)
         shown = tuple(dict.fromkeys(name for name, _ in class_ids))
         if shown == self._legend:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -18,6 +19,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.palette import class_colour
+from hvt_ground.sinks.rerun import recorder as recorder_module
 from hvt_ground.sinks.rerun.live_view import LiveView, free_port, viewer_program
 from hvt_ground.sinks.rerun.overlays import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -538,3 +540,20 @@ def test_colours_tell_kinds_apart() -> None:
     }
     assert len(kinds) == 8
     assert class_colour("dragonfly") == class_colour("dragonfly")
+
+
+def test_a_new_class_a_frame_fills_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each new name is written with all before it: an edge that names 2048 would write gigabytes."""
+    monkeypatch.setattr(recorder_module, "_MOST_CLASSES", 60)
+    path, largest = tmp_path / "flight.rrd", 0
+    with Recorder(settings(path, compact_bytes=20_000)) as written:
+        box = moving_boxes(0, 1, SIZE)
+        for number in range(120):
+            name = (f"class {number} of a hostile edge",)
+            written.log(
+                replace(overlay(number, box), track_ids=np.array([number]), classes=name, base_classes=name)
+            )
+            largest = max(largest, path.stat().st_size)
+    legend = Recording(path).rows("/base/legend", "Points2D:labels")[-1][2]
+    assert (len(legend), "other" in legend) == (60, True)
+    assert largest < 250_000
