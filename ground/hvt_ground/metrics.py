@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter as Counts
 from collections.abc import Iterator
 
 from prometheus_client.core import Metric
 
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.still_words import STILL_WORDS
 from hvt_common.runtime.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
 from hvt_common.units import SECOND_NS
 from hvt_ground.state import GroundState, SessionState
@@ -13,6 +16,15 @@ from hvt_ground.state import GroundState, SessionState
 __all__ = ["metrics_text"]
 
 _LINKS = ("waiting", "up", "thin", "lost", "ended")
+_OTHER = "other"
+"""A word of the edge's that is none of these: each new one would be a series for ever."""
+_REASONS = frozenset(STILL_WORDS)
+_EDGE_PARTS = frozenset(
+    (
+        *("source", "encoder", "video", "passthrough", "local copy", "stills", "requested stills", "reports"),
+        *("pose", "store", "backlog", "detector", "metrics", "listener", *map(str, Channel)),
+    )
+)
 
 _GAUGES: Table[SessionState] = {
     "hvt_budget_bits_per_second": ("The edge's budget.", lambda one: one.budget_bps),
@@ -77,12 +89,20 @@ def _metrics(state: GroundState) -> Iterator[Metric]:
         since.add_metric((one.edge,), one.link_since_ns / SECOND_NS)
         unusable.add_metric((one.edge,), one.unusable_messages)
         ended.add_metric((one.edge,), one.sessions_ended)
-        at_edge = () if one.session is None else one.session.edge_failed
-        for part in (*one.failed, *at_edge):
-            failed.add_metric((part.part, one.edge), 1)
-        for reason, count in ({} if one.session is None else one.session.stills_not_sent).items():
+        session = one.session
+        at_edge = () if session is None else session.edge_failed
+        for name in {part.part for part in one.failed} | {_known(part.part, _EDGE_PARTS) for part in at_edge}:
+            failed.add_metric((name, one.edge), 1)
+        reasons = Counts[str]()
+        for reason, count in ({} if session is None else session.stills_not_sent).items():
+            reasons[_known(reason, _REASONS)] += count
+        for reason, count in reasons.items():
             not_sent.add_metric((one.edge, reason), count)
     yield from (link, since, unusable, ended, failed, not_sent)
     sessions = [(one.edge, one.session) for one in state.edges if one.session is not None]
     yield from of_table(_GAUGES, Gauge, sessions)
     yield from of_table(_COUNTERS, Counter, sessions)
+
+
+def _known(word: str, known: frozenset[str]) -> str:
+    return word if word in known else _OTHER

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from hvt_common.protocol.frame_account import FrameAccount
-from hvt_common.protocol.messages import Info, Status
+from hvt_common.protocol.messages import FailedPart, Info, Status
 from hvt_common.runtime.failures import Failures
+from hvt_ground.metrics import metrics_text
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
@@ -162,3 +163,27 @@ def test_a_state_can_be_written_as_json(ground):
     read = json.loads(json.dumps(state.as_dict()))
     assert read["edges"][0]["session"]["method"] == ground.sessions.session.info.method
     assert read["edges"][0]["session"]["stills_not_sent"]["base_good"] == 49
+
+
+def test_words_of_an_edge_do_not_become_series_without_end(ground):
+    """Each new reason or part that a hostile edge names would stay in the database of whoever watches."""
+    item = ground.port.flight.status(base=5)
+    evil = FailedPart(part="evil", reason="x", failures=1, failed_ns=1, working=False)
+    said = replace(
+        Status.parse(item.payload),
+        sequence=9,
+        deferred={f"evil {n}": 1 for n in range(20)} | {"base_good": 5},
+        failed=(evil, replace(evil, part="evil 2"), replace(evil, part="encoder")),
+    )
+    ground.sessions.handle(replace(item, payload=said.pack()))
+    text = metrics_text(ground.maker.make([("uav-1", ground.sessions)])).decode()
+    ground.sessions.close()
+    ground.outputs.close()
+    assert "evil" not in text
+    for line in (
+        'hvt_stills_not_sent_total{edge="uav-1",reason="other"} 20.0',
+        'hvt_stills_not_sent_total{edge="uav-1",reason="base_good"} 5.0',
+        'hvt_part_failed{edge="uav-1",part="other"} 1.0',
+        'hvt_part_failed{edge="uav-1",part="encoder"} 1.0',
+    ):
+        assert line in text

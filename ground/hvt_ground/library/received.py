@@ -27,8 +27,8 @@ from hvt_ground.extras import checked, config_class
 
 __all__ = ["Listening", "Picture", "Received", "listen"]
 
-_MOST_QUEUED = 32
-"""Events, of which each may be a picture."""
+_MOST_QUEUED, _MOST_QUEUED_BYTES = 32, 128 * 2**20
+"""Events, of which each may be a picture, and their pixels."""
 _POLL_S = 0.2
 
 
@@ -76,7 +76,7 @@ class Listening:
 
     def __init__(self, config: GroundConfig) -> None:
         self.summaries: list[dict[str, Any]] = []
-        self._queue: queue.Queue[Received] = queue.Queue(_MOST_QUEUED)
+        self._queue = _Events()
         self._stop = threading.Event()
         self._error: BaseException | None = None
         self._ground = Ground(config, stop=self._stop, program=self._sink_of)
@@ -122,12 +122,33 @@ class Listening:
             self._error = error
 
 
+class _Events(queue.Queue[Received]):
+    """It is full, too, where its pictures take too much."""
+
+    def __init__(self) -> None:
+        super().__init__(_MOST_QUEUED)
+        self._bytes = 0
+
+    def _put(self, item: Received) -> None:
+        super()._put(item)
+        self._weigh(item, by=1)
+
+    def _get(self) -> Received:
+        item = super()._get()
+        self._weigh(item, by=-1)
+        return item
+
+    def _weigh(self, item: Received, *, by: int) -> None:
+        self._bytes += by * item.event.image_bgr.nbytes if isinstance(item.event, Picture) else 0
+        self.maxsize = _MOST_QUEUED if self._bytes < _MOST_QUEUED_BYTES else max(1, len(self.queue))
+
+
 class _Queue:
     """The events of one session, decoded, for the program's queue; waits while that is full."""
 
     path: Path | None = None
 
-    def __init__(self, events: queue.Queue[Received], stop: threading.Event, info: Info) -> None:
+    def __init__(self, events: _Events, stop: threading.Event, info: Info) -> None:
         self._events = events
         self._stop = stop
         self._info = info

@@ -76,8 +76,10 @@ class PipelineParts:
     fusion: Fusion
     path: CameraPath
     """The one that ``fusion`` moves boxes by."""
-    turns: Turns | None = None
-    """Of the sessions that share the detector; None always detects where that is due."""
+    turns: Turns
+    """Of the sessions that share the detector."""
+    patient: bool = False
+    """Wait for a turn, however long: what is due is always detected, as lockstep needs it."""
 
 
 class Pipeline:
@@ -101,7 +103,7 @@ class Pipeline:
         self._detect_every = detect_every
         self._base_size = view.base_size
         self._frame_ns = SECOND_NS / fps
-        self._turn_s = _TURN_SHARE / fps
+        self._turn_s = None if parts.patient else _TURN_SHARE / fps
         self._turn_key = object()
         """Stands for this session among those that take turns, and keeps nothing of it alive."""
         self._farthest = round(_FARTHEST_S * fps)
@@ -244,14 +246,13 @@ class Pipeline:
         parts, last = self._parts, self._detected_frame
         frames = None if last is None else index - last
         due = frames is None or frames >= (_PUT_OFF if hurry else 1) * self._detect_every
-        if due and (parts.turns is None or parts.turns.take(self._turn_key, within_s=self._turn_s)):
+        if due and parts.turns.take(self._turn_key, within_s=self._turn_s):
             self._detected_frame = index
             self.detections_run += 1
             try:
                 found = parts.detector.detect(image)
             finally:
-                if parts.turns is not None:
-                    parts.turns.release()
+                parts.turns.release()
             own = parts.tracker.update(found, frame_index=index, image_bgr=image)
             self.objects_detected = int((own.seen_frames == index).sum())
         else:

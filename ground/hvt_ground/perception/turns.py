@@ -27,8 +27,8 @@ class Turns:
         """How many turns each session had that asked lately; a newcomer begins with the least of the others."""
         self._requested_s: dict[object, float] = {}
 
-    def take(self, who: object, *, within_s: float) -> bool:
-        """Whether it became this session's turn within that time; the turn lasts until `release`."""
+    def take(self, who: object, *, within_s: float | None) -> bool:
+        """Whether it became this session's turn within that time (None: however long); it lasts until `release`."""
         with self._changed:
             self._note(who)
             self._queue[who] = None

@@ -11,7 +11,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from hvt_common.runtime.failures import reason_of
@@ -23,8 +23,9 @@ __all__ = ["Analyze", "Job", "LockstepWorker", "PerceptionWorker", "Read", "Real
 
 _log = logging.getLogger(__name__)
 
-_MOST_PICTURES = 12
-"""How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
+_MOST_PICTURES, _MOST_PICTURE_BYTES = 12, 48 * 2**20
+"""How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked. The newest waits,
+however large."""
 _OLDEST_S = 0.6
 """A frame that has waited for longer goes untracked, if there is a newer one: a ground of too many edges would show
 all of them ever later."""
@@ -165,7 +166,7 @@ class RealtimeWorker(PerceptionWorker):
         self._finish_s = finish_s
         self._leave_s = leave_s
         self._lock = threading.Lock()
-        self._pictures: deque[tuple[DecodedFrame, float]] = deque(maxlen=_MOST_PICTURES)
+        self._pictures: deque[tuple[DecodedFrame, float]] = deque()
         """Each with the moment at which it came."""
         self._stills: deque[ReceivedStill] = deque()
         self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_MOST_STEPS)
@@ -203,7 +204,12 @@ class RealtimeWorker(PerceptionWorker):
     def picture(self, picture: DecodedFrame) -> None:
         """Queue a frame; where the queue is full the oldest goes untracked."""
         with self._lock:
-            self.untracked += len(self._pictures) == _MOST_PICTURES
+            queued_bytes = sum(one.picture.nbytes for one, _ in self._pictures) + picture.picture.nbytes
+            while len(self._pictures) >= _MOST_PICTURES or (
+                self._pictures and queued_bytes > _MOST_PICTURE_BYTES
+            ):
+                queued_bytes -= self._pictures.popleft()[0].picture.nbytes
+                self.untracked += 1
             self._pictures.append((picture, time.monotonic()))
         self._wake.set()
 
@@ -215,8 +221,7 @@ class RealtimeWorker(PerceptionWorker):
     def still(self, still: ReceivedStill) -> None:
         """Queue a still; where the queue is full it is dropped."""
         with self._lock:
-            queued_bytes = sum(len(one.data) for one in self._stills)
-            if len(self._stills) < _MOST_STILLS and queued_bytes + len(still.data) <= _MOST_STILL_BYTES:
+            if _fits(still, self._stills):
                 self._stills.append(still)
             else:
                 self.dropped["overflow"] += 1
@@ -353,10 +358,10 @@ class LockstepWorker(PerceptionWorker):
         if still.header.frame_index <= self._newest_frame:
             self._submit(self._worker.submit(self._read, [still]))
             return
-        self._early.append(still)
-        if len(self._early) > _MOST_STILLS:
+        while not _fits(still, self._early):
             self._early.pop(0)
             self.dropped["overflow"] += 1
+        self._early.append(still)
 
     def submit(self, job: Job, *, last: bool = False) -> bool:  # noqa: ARG002 - one after the other
         """Do it after what was handed over before."""
@@ -393,3 +398,8 @@ class LockstepWorker(PerceptionWorker):
                 pass
         finally:
             job.close()
+
+
+def _fits(still: ReceivedStill, queued: Collection[ReceivedStill]) -> bool:
+    size_bytes = len(still.data) + sum(len(one.data) for one in queued)
+    return not queued or (len(queued) < _MOST_STILLS and size_bytes <= _MOST_STILL_BYTES)

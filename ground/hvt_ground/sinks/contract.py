@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from hvt_common.transport.inbox import Received
-from hvt_ground.events import Refinement, VideoSample
+from hvt_ground.events import Overlay, Refinement, VideoSample
 
 __all__ = ["Sink", "SinkWriter", "is_stored", "size_bytes"]
 
 T_contra = TypeVar("T_contra", contravariant=True)
 
 _SMALL_BYTES = 512
+_TRACK_BYTES = 64
+"""Of an overlay, each."""
 
 
 class Sink(Protocol[T_contra]):
@@ -52,4 +54,6 @@ def size_bytes(item: object) -> int:
         case Refinement():
             pictures = (item.still_bgr, item.base_crop_bgr)
             return len(item.still) + sum(one.nbytes for one in pictures if one is not None) + _SMALL_BYTES
+        case Overlay():
+            return _TRACK_BYTES * len(item.track_ids) + _SMALL_BYTES
     return _SMALL_BYTES

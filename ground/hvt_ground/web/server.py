@@ -136,7 +136,8 @@ class WebPage:
     def show(self, state: GroundState) -> None:
         """Give out how all edges are; for any thread."""
         message, loads = state_message(state, recorded=self._recorded), state_loads(state)
-        self._hub.post(lambda: self._hub.state(message, loads))
+        known = frozenset(one.edge for one in state.edges)
+        self._hub.post(lambda: self._hub.state(message, loads, known=known))
 
     def __enter__(self) -> Self:
         self._thread.start()

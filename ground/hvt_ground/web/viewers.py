@@ -179,6 +179,8 @@ class Hub:
         self._streams = self._demands = 0
         self._state = ""
         self._loads: dict[str, deque[Sequence[float]]] = {}
+        self._absent: set[str] = set()
+        """Edges that the newest state does not have."""
 
     def post(self, call: Callable[[], None]) -> None:
         """Have it done in the loop's thread; for any thread. After the loop's end nothing is done."""
@@ -193,6 +195,7 @@ class Hub:
     def begin(self, edge: EdgePage, session: dict[str, Any]) -> None:
         """A session begins: the streams of the former one are over."""
         self.edges[edge.edge] = edge
+        self._absent.discard(edge.edge)
         edge.session = session
         edge.streams.clear()
         self._to_all(text("session", **session))
@@ -241,9 +244,18 @@ class Hub:
         edge.notices.append(message)
         self._to_all(message)
 
-    def state(self, message: str, loads: Mapping[str, Sequence[float]]) -> None:
-        """How all edges are; ``loads`` is what the plot shows of each, and is remembered for newcomers."""
+    def state(self, message: str, loads: Mapping[str, Sequence[float]], *, known: frozenset[str]) -> None:
+        """How all edges are; ``loads`` is what the plot shows of each, and is remembered for newcomers.
+
+        An edge that is not ``known`` any more is forgotten, with its pictures, at the second state without it: one
+        that has just come may not be in the first.
+        """
         self._state = message
+        absent = self.edges.keys() - known
+        for edge in absent & self._absent:
+            del self.edges[edge]
+            self._loads.pop(edge, None)
+        self._absent = absent & self.edges.keys()
         for edge, load in loads.items():
             self._loads.setdefault(edge, deque(maxlen=_MOST_LOADS)).append(load)
         self._to_all(message)

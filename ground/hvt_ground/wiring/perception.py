@@ -45,8 +45,9 @@ def make_pipeline(
         vocabulary=vocabulary,
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path, base_per_source=info.view.scale),
         path=path,
+        turns=models.turns,
         # In lockstep the same input gives the same detections, however long they take.
-        turns=None if info.pace == "lockstep" else models.turns,
+        patient=info.pace == "lockstep",
     )
     return Pipeline(
         parts,

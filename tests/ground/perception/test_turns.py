@@ -5,10 +5,18 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.turns import Turns
+from hvt_ground.wiring import Models
+from hvt_ground.wiring.perception import make_pipeline
+from rigs.flight import Flight
 
 
 def flown(fps: dict[str, float], *, detect_s: float, lasts_s: float) -> Counter[str]:
@@ -89,3 +97,29 @@ def test_of_those_that_wait_the_one_with_fewest_turns_is_next():
     for one in threads:
         one.join()
     assert order == ["seldom", "often"]
+
+
+def test_who_is_patient_waits_and_takes_no_turn_of_others():
+    """An edge that says lockstep would have the detector whenever it likes, and others would have none."""
+    turns = Turns()
+    assert turns.take("a", within_s=0.0)
+    with ThreadPoolExecutor(1) as other:
+        patient = other.submit(turns.take, "b", within_s=None)
+        assert not patient.done()
+        turns.release()
+        assert patient.result(timeout=20)
+    assert not turns.take("a", within_s=0.0)
+    turns.release()
+
+
+def test_lockstep_takes_turns_with_all_others():
+    """It is no way around them."""
+    config = check(GroundConfig(detector="motion", classifier="none"))
+    models = Models(config)
+    waits = []
+    models.turns.take = lambda _who, *, within_s: waits.append(within_s) or True
+    for pace in ("realtime", "lockstep"):
+        info = replace(Flight(1).info(), pace=pace)
+        pipeline = make_pipeline(config, models, info=info, emit=lambda _: None)
+        pipeline.analyze(DecodedFrame(0, 0, 0, np.zeros((192, 320, 3), np.uint8)), hurry=False)
+    assert waits == [pytest.approx(0.5 / 15), None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -115,3 +116,28 @@ def test_in_lockstep_a_pose_counts_from_the_same_frame_on_however_long_perceptio
         time.sleep(0.03 * (not slow))
     worker.close()
     assert done == [0, 1, 2, "pose", 3, 4, "pose", 5]
+
+
+def test_large_pictures_that_wait_have_a_bound_in_bytes():
+    """A picture of 8192x4352 costs an edge a hundred bytes, and the ground 53 MB: twelve would fill it."""
+    rig = Rig()
+    large = np.broadcast_to(np.uint8(0), (4352, 8192, 1))
+    rig.worker.picture(picture(0))
+    assert rig.begun.wait(timeout=20)
+    for index in range(1, 6):
+        rig.worker.picture(DecodedFrame(index, index, index, large))
+    for index in range(6, 9):
+        rig.worker.picture(picture(index))
+    assert rig.worker.untracked == 4
+    assert [which for _, which in rig.finish()] == [0, 5, 6, 7, 8]
+
+
+def test_early_stills_have_a_bound_in_bytes(flight):
+    """In lockstep stills wait for their frame: 256 of the largest would be a gigabyte."""
+    worker = LockstepWorker(lambda *_: None, lambda *_: None, lambda _: None, name="x")
+    early = replace(still(flight, 2, 0), data=bytes(2**22))
+    for _ in range(12):
+        worker.still(early)
+    assert worker.dropped["overflow"] == 4
+    worker.close()
+    assert worker.dropped["ended"] == 8

@@ -140,3 +140,15 @@ def test_a_reload_shows_the_last_picture_of_an_edge_that_is_silent(hub):
     hub.show_wall(viewer, shown=True)
     hub.watch(viewer, "uav-1", "h264")
     assert "thumbnail" in kinds(viewer)
+
+
+def test_edges_that_the_ground_has_left_are_forgotten(hub):
+    """Who invents names would fill its memory, and every wall; a newcomer is there before the state knows it."""
+    for name in ("gone", "here"):
+        hub.begin(EdgePage(name), {"edge": name})
+    hub.state("{}", {"gone": (0, 1.0, 1.0, 1.0)}, known=frozenset({"gone", "here"}))
+    hub.state("{}", {}, known=frozenset({"here"}))
+    hub.begin(EdgePage("new"), {"edge": "new"})
+    assert hub.edges.keys() == {"gone", "here", "new"}
+    hub.state("{}", {}, known=frozenset({"here"}))
+    assert hub.edges.keys() == {"here", "new"}

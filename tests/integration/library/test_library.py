@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import subprocess
 import sys
 import threading
@@ -16,7 +17,7 @@ import hvt_ground
 from hvt_common.errors import FlightError, UserError
 from hvt_edge.library.pushed import PushedEdge
 from hvt_ground.events import Overlay
-from hvt_ground.library.received import Picture
+from hvt_ground.library.received import Picture, Received, _Events
 from media.recorded_feed import drawn_frames
 from programs.processes import free_ports
 
@@ -185,3 +186,18 @@ time.sleep(1)
         [sys.executable, "-c", program, endpoint], capture_output=True, text=True, check=False, timeout=120
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_large_pictures_that_nobody_takes_have_a_bound_in_bytes(monkeypatch):
+    """32 pictures of 8192x4352 would be three gigabytes, of an edge that sent a few kilobytes."""
+    monkeypatch.setattr("hvt_ground.library.received._MOST_QUEUED_BYTES", 1000)
+    events, large = _Events(), Picture(0, 0, np.zeros((10, 10, 3), np.uint8))
+    for _ in range(4):
+        events.put(Received("uav-1", 1, large), block=False)
+    with pytest.raises(queue.Full):
+        events.put(Received("uav-1", 1, large), block=False)
+    events.get()
+    events.put(Received("uav-1", 1, large), block=False)
+    for _ in range(4):
+        events.get()
+    events.put(Received("uav-1", 1, large), block=False)

@@ -33,6 +33,7 @@ from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import DecodedStill, FrameReadings, ObjectReading
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary
+from hvt_ground.perception.turns import Turns
 from media.clips import START_NS, framed, smooth_pictures
 
 __all__ = [
@@ -143,6 +144,7 @@ def pipeline_of(
         vocabulary=vocabulary,
         fusion=Fusion(fps=15, edge_classes=places, path=path),
         path=path,
+        turns=Turns(),
     )
     view = View.fitted(SIZE, SIZE, fit="letterbox")
     return Pipeline(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)

@@ -26,7 +26,7 @@ SAME_DB, OTHER_DB = 38.0, 26.0
 """Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
 _MOST_SPOILT, _SPOILT_FRAMES = 32, 150
 """After so many undecodable stills in so many frames the next are dropped unseen until the time is over."""
-MAX_PENDING = 64
+MAX_PENDING, MAX_PENDING_BYTES = 64, 16 * 2**20
 """Stills that wait for their base frame; beyond, the oldest is read without it."""
 
 
@@ -94,9 +94,11 @@ class StillStage:
         ready = [still for still in self._pending if not self._may_wait(still.header, now)]
         if ready:
             self._pending = [still for still in self._pending if self._may_wait(still.header, now)]
-        surplus = len(self._pending) - MAX_PENDING
-        if surplus > 0:
-            ready, self._pending = ready + self._pending[:surplus], self._pending[surplus:]
+        while (
+            len(self._pending) > MAX_PENDING
+            or sum(len(one.data) for one in self._pending) > MAX_PENDING_BYTES
+        ):
+            ready.append(self._pending.pop(0))
         self._read(ready, now)
         for resolved in self._refiner.settle(
             self._history, now_frame=now.frame_index, known_as=self._fusion.known_as
