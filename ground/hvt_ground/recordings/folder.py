@@ -133,7 +133,10 @@ class IndexWriter:
             now_ns=now.unix_ns,
         )
         for name in found.remove:
-            self._remove(name, "all are larger than --keep allows, and it is the oldest")
+            self._remove(
+                name,
+                "all are larger than --keep allows, and it is the oldest of an edge above its share",
+            )
         if self._doubted_ns is not None and now.steady_ns - self._doubted_ns < _DOUBT_NS:
             return
         any(self._remove(name, "it is older than --keep allows") for name in found.outdated)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections import Counter
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS, Limit
@@ -55,8 +56,10 @@ def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Container
     |---|---|
     | that is written to (``in_use``) | left alone, but counts among the bytes |
     | whose last byte is older than a time of ``limits``, and its name too | removed |
-    | that is the oldest left while all have more bytes than ``limits`` allow | removed |
+    | of an edge above its share, the oldest of these, while all have more bytes than ``limits`` allow | removed |
     | with video, older than ``video_age`` as above | stripped of it |
+
+    Each edge has the same share of the bytes that ``limits`` allow: one that sends much evicts nobody else's.
     """
     ordered = sorted(rows, key=lambda row: (row.written_ns, row.file))
     outdated = dict.fromkeys(
@@ -68,13 +71,7 @@ def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Container
     removed: dict[str, None] = {}
     for limit in retention.limits:
         if limit.size_bytes is not None:
-            excess = sum(row.size_bytes for row in ordered) - limit.size_bytes
-            for row in ordered:
-                if excess <= 0:
-                    break
-                if row.file not in in_use:
-                    removed[row.file] = None
-                    excess -= row.size_bytes
+            removed |= dict.fromkeys(_surplus(ordered, limit.size_bytes, in_use))
     video = retention.video_age
     stripped = tuple(
         row.file
@@ -87,6 +84,31 @@ def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Container
         and row.file not in in_use
     )
     return Due(tuple(removed), tuple(outdated), stripped)
+
+
+def _surplus(ordered: Sequence[RecordingRow], most_bytes: int, in_use: Container[str]) -> Iterator[str]:
+    """Files beyond so many bytes, the oldest first.
+
+    The oldest of all whose edge has more than its share goes. An edge below its share never gets above it here, so
+    one pass finds them; only files in use may be left over, and then others' go as well.
+    """
+    held = Counter[str]()
+    for row in ordered:
+        held[row.edge] += row.size_bytes
+    excess, share = held.total() - most_bytes, most_bytes / max(1, len(held))
+    spared = []
+    for fair in (True, False):
+        for row in ordered if fair else spared:
+            if excess <= 0:
+                return
+            if row.file in in_use:
+                continue
+            if fair and held[row.edge] <= share:
+                spared.append(row)
+                continue
+            held[row.edge] -= row.size_bytes
+            excess -= row.size_bytes
+            yield row.file
 
 
 def _older(row: RecordingRow, limit: Limit, now_ns: int) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -52,6 +53,17 @@ def test_the_oldest_go_first(keep, remove, outdated):
     """The disk would fill, or the flight of today be gone."""
     found = due(ROWS, Retention(keep), in_use=(), now_ns=NOW_NS)
     assert found == Due(names(*remove), names(*outdated))
+
+
+def test_an_edge_that_sends_much_evicts_nobody_else():
+    """One with valid keys would have all flights of the others removed, within an hour."""
+    rows = [replace(row(20 - number / 10), edge="uav-2") for number in range(2)]
+    rows += [replace(row(10 - number / 100), edge="evil") for number in range(50)]
+    wanted = Retention((Limit(size_bytes=1_000_000_000),))
+    removed = due(rows, wanted, in_use=(), now_ns=NOW_NS).remove
+    assert removed == tuple(one.file for one in rows[2:44]), "its own oldest"
+    in_use = [one.file for one in rows[2:]]
+    assert due(rows, wanted, in_use=in_use, now_ns=NOW_NS).remove == tuple(one.file for one in rows[:2])
 
 
 def test_what_is_written_stays_and_counts():
