@@ -96,7 +96,7 @@ def _surplus(ordered: Sequence[RecordingRow], most_bytes: int, in_use: Container
     for row in ordered:
         held[row.edge] += row.size_bytes
     excess, share = held.total() - most_bytes, most_bytes / max(1, len(held))
-    spared = []
+    spared: list[RecordingRow] = []
     for fair in (True, False):
         for row in ordered if fair else spared:
             if excess <= 0:
