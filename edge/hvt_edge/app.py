@@ -356,6 +356,8 @@ class Edge:
             session=f"{self._world.session_id:016x}",
             method=now.method,
             levers=now.levers.says,
+            preset=now.preset,
+            preset_says=now.preset_says,
             frames=counts.account(coded_fps=config.nominal_fps / now.decimation, auto_fps=config.auto_fps),
             unanalyzed=counts.unanalyzed,
             clip_paused_s=counts.paused_ns / SECOND_NS,

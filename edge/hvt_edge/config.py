@@ -41,6 +41,7 @@ from hvt_edge.source.contract import check_shape
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
 from hvt_edge.video.encoder_settings import PRESETS, keyframe_total_bps, least_base_bps
 from hvt_edge.video.encoders.registry import PASSTHROUGH, X265, check_encoder
+from hvt_edge.video.preset import SLOWEST
 from hvt_edge.video.share import FIRST_SHARE
 
 __all__ = [
@@ -226,7 +227,11 @@ class EdgeConfig:
         X265,
         "x265, hevc_nvenc, hevc_qsv, hevc_v4l2m2m, one that a package brings, or passthrough: a camera's own HEVC",
     )
-    preset: str = _SENT_RARE.option(choice(*PRESETS), "veryfast", "x265 preset")
+    preset: str = _SENT_RARE.option(
+        choice(AUTO, *PRESETS),
+        AUTO,
+        "x265 preset; auto: veryfast, in real time a faster one where that takes too much of the processor",
+    )
 
     detector: str = _MODELS.option(
         TEXT,
@@ -365,6 +370,11 @@ class EdgeConfig:
         return self.send_tracks or self.roi_depth > 0
 
     @property
+    def auto_preset(self) -> bool:
+        """Whether the preset is measured; in lockstep time does not matter."""
+        return self.preset == AUTO and self.pace == "realtime" and self.encoder == X265
+
+    @property
     def passes_through(self) -> bool:
         """Whether the camera's own units are the base stream: its size, rate and keyframes are not the edge's."""
         return self.encoder == PASSTHROUGH
@@ -428,6 +438,8 @@ def check(config: EdgeConfig) -> EdgeConfig:
             f"--regime {config.regime} already sets --budget and --video-share: leave one or the other out"
         )
     check_encoder(config.encoder)
+    if config.preset == AUTO and not config.auto_preset:
+        config = replace(config, preset=SLOWEST)
     config = _with_rates(config)
     if config.roi_depth and config.encoder != X265:
         raise UserError(

@@ -96,6 +96,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
             f"auto, {content['method']}: {content['levers']}" if content["levers"] else content["method"],
         ),
         ("frames", f"{content['frame_account']['text']}; {content['duration_s']:.1f} s"),
+        *([("", content["preset_says"])] if content["preset_says"] else []),
         *_too_slow(content),
     ]
     failed = [("failed", _failure(one)) for one in content["failed"]]

@@ -16,6 +16,8 @@ def summary_of(**changed):
         "session": "0",
         "method": "M6",
         "levers": "no tracks: the video hides 0 objects; stills: 2 of 3 renamed something",
+        "preset": "superfast",
+        "preset_says": "preset superfast: veryfast would take 0.5 of a core",
         "frames": FrameAccount({"sent": 9}),
         "unanalyzed": 0,
         "clip_paused_s": 0.0,
@@ -53,6 +55,7 @@ def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
         "80 frames came: 9 sent, 1 left out by auto's 7.5 a second, 3 had no room in the budget, "
         "1 the link did not carry, 66 the processor had no time for; 5.3 s"
     )
+    assert "preset superfast: veryfast would take 0.5 of a core" in said
     assert "encoder and detector need 1.6 cores, 1.1 were free" in said
     assert "the clip took 14 s longer than it is: this machine is too slow for it" in said
     assert "8 of 80 frames not analyzed" in said

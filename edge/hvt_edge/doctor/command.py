@@ -30,10 +30,11 @@ from hvt_common.transport.session import declare_publisher
 from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check, with_profile
-from hvt_edge.loop.cpu import Cores, CpuMeter
+from hvt_edge.loop.cpu import Cores, CpuMeter, processors
 from hvt_edge.source.contract import Source
 from hvt_edge.source.opening import shown
 from hvt_edge.video.encoders.contract import Encoder
+from hvt_edge.video.preset import PresetChoice, choose_preset, share_of
 from hvt_edge.wiring import (
     as_the_camera_is,
     check_codecs,
@@ -182,14 +183,13 @@ class _Checks:
             return Finding("unknown", "not tried without a source")
         config, meter = self._config, CpuMeter()
         size = self._source.view.base_size
-        encoder, fps = self._encoder(size), self._source.fps / first_decimation(config, size)
-        began_s, cpu_s = time.monotonic(), time.process_time()
-        count = 0
-        while time.monotonic() - began_s < _SAMPLE_S / 2:
-            encoder.encode(self._frames[count % len(self._frames)])
-            count += 1
-        encode_s = (time.process_time() - cpu_s) / count
-        most_fps = count / (time.monotonic() - began_s)
+        fps = self._source.fps / first_decimation(config, size)
+        encode_s, most_fps = self._coded(self._encoder(size))
+        choice = PresetChoice()
+        if config.auto_preset:
+            choice = choose_preset(encode_s * fps, most_cores=share_of(processors()))
+        if choice.says:
+            encode_s, most_fps = self._coded(self._encoder(size, preset=choice.preset))
         meter.measure(scale=1.0, short=False)
         every = detect_every(config.detect_every, fps=self._source.fps)
         networks = 2 if config.measures else 1  # it looks at the source and at what the base shows of it
@@ -200,9 +200,10 @@ class _Checks:
         codes = f"{config.encoder} codes {most_fps:.0f} fps of {fps:g} here"
         if config.passes_through:
             codes = "the camera codes"
+        codes = "; ".join(filter(None, (codes, choice.says)))
         found = f"about {needed:.1f} cores of {free:.1f} that are free; {codes}"
         if needed > free or most_fps < fps:
-            todo = "lower --fps or --size, give --preset ultrafast or --method M0; else frames are left out"
+            todo = "lower --fps or --size, or give --method M0; else frames are left out"
             return Finding("warning", found, todo)
         return Finding("ok", found)
 
@@ -244,7 +245,16 @@ class _Checks:
 
         return check_link(settings, find_peer, other="ground")
 
-    def _encoder(self, size: tuple[int, int]) -> Encoder:
+    def _coded(self, encoder: Encoder) -> tuple[float, float]:
+        """(processor seconds a frame, frames a second) of it."""
+        began_s, cpu_s = time.monotonic(), time.process_time()
+        count = 0
+        while time.monotonic() - began_s < _SAMPLE_S / 2:
+            encoder.encode(self._frames[count % len(self._frames)])
+            count += 1
+        return (time.process_time() - cpu_s) / count, count / (time.monotonic() - began_s)
+
+    def _encoder(self, size: tuple[int, int], *, preset: str = "") -> Encoder:
         config = self._config
         return make_encoder(
             config,
@@ -252,4 +262,5 @@ class _Checks:
             total_bps=config.budget_bps,
             base_bps=config.base_bps,
             decimation=first_decimation(config, size),
+            preset=preset,
         )

@@ -63,6 +63,8 @@ class OperatingState:
     """Each n-th source frame is coded."""
     profile: str | None
     preset: str
+    preset_says: str
+    """Why it is a faster one than it would be with more time; empty where it is not."""
     budget_bps: int
     """As set or commanded."""
     allowed_bps: int
@@ -251,7 +253,8 @@ class StateMaker:
                 fps=config.nominal_fps / now.decimation,
                 decimation=now.decimation,
                 profile=config.profile,
-                preset=config.preset,
+                preset=now.preset,
+                preset_says=now.preset_says,
                 budget_bps=now.budget_bps,
                 allowed_bps=now.total_bps,
                 base_budget_bps=now.base_bps,

@@ -47,9 +47,10 @@ def _link(link: dict[str, Any], at_ns: int) -> str:
 
 
 def _sends(state: dict[str, Any]) -> str:
-    width, height = state["operating"]["base_size"]
-    video = f"{width}x{height} at {state['operating']['fps']:g} fps"
-    return _listed(state["method"], video, state["levers"]["says"])
+    operating = state["operating"]
+    width, height = operating["base_size"]
+    video = f"{width}x{height} at {operating['fps']:g} fps"
+    return _listed(state["method"], video, operating["preset_says"], state["levers"]["says"])
 
 
 def _bits(state: dict[str, Any]) -> str:

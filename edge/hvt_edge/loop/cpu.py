@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Cores", "CpuMeter"]
+__all__ = ["Cores", "CpuMeter", "processors"]
 
 _STAT = Path("/proc/stat")
 _MOST_SHORT = 600
@@ -53,7 +53,7 @@ class CpuMeter:
         self._last = here
         wall_s, own_s = here.wall_s - last.wall_s, here.own_s - last.own_s
         others = max(0.0, here.busy_s - last.busy_s - own_s) / wall_s
-        self.now = Cores(needed=own_s / wall_s * scale, free=max(0.0, len(_cores()) - others))
+        self.now = Cores(needed=own_s / wall_s * scale, free=max(0.0, processors() - others))
         if short:
             self._short = [*self._short[-_MOST_SHORT:], self.now]
 
@@ -64,6 +64,11 @@ class CpuMeter:
         return Cores(
             sum(one.needed for one in self._short) / count, sum(one.free for one in self._short) / count
         )
+
+
+def processors() -> int:
+    """How many this process may use."""
+    return len(_cores())
 
 
 def _cores() -> set[int]:

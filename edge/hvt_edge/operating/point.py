@@ -2,7 +2,7 @@
 
 Settings are frozen; what commands, the link and measurements change lives here. Three write:
 `hvt_edge.control.commands` what a ground commanded, the frame loop (`hvt_edge.video.reconfigure`) what the link
-allows and what x265 was opened for, and `hvt_edge.operating.levers` what is worth sending beside the video.
+allows and what x265 was opened for and with, and `hvt_edge.operating.levers` what is worth sending beside the video.
 The encoder, the budget, ``info``, status and summary all read the same.
 """
 
@@ -43,6 +43,10 @@ class OperatingPoint:
     """Each n-th source frame is coded."""
     highest_budget_bps: int
     """Of all budgets that were in force."""
+    preset: str = ""
+    """Of x265."""
+    preset_says: str = ""
+    """Why it is that, in one line for people; empty where nothing had to be given up."""
     levers: Levers = Levers()
     started_ns: int = 0
     """When the first frame was taken; 0 before."""
@@ -59,9 +63,19 @@ class Operating:
         base_bps: int,
         method: str,
         decimation: int,
+        preset: str = "",
+        preset_says: str = "",
     ) -> None:
         self._point = OperatingPoint(
-            budget_bps, video_share, method, budget_bps, base_bps, decimation, highest_budget_bps=budget_bps
+            budget_bps,
+            video_share,
+            method,
+            budget_bps,
+            base_bps,
+            decimation,
+            highest_budget_bps=budget_bps,
+            preset=preset,
+            preset_says=preset_says,
         )
         self._lock = threading.Lock()
 
@@ -88,6 +102,10 @@ class Operating:
     def open(self, *, total_bps: int, base_bps: int, decimation: int) -> None:
         """What x265 is opened for, and the total that goes with it."""
         self._set(total_bps=total_bps, base_bps=base_bps, decimation=decimation)
+
+    def encode_with(self, preset: str, says: str) -> None:
+        """What x265 is opened with, from the next keyframe on."""
+        self._set(preset=preset, preset_says=says)
 
     def pull(self, levers: Levers) -> None:
         """What was measured decides anew what is sent beside the video."""

@@ -1,4 +1,4 @@
-"""What changes with a keyframe: frame rate, the base's share, the total. x265 is opened anew for each."""
+"""What changes with a keyframe: frame rate, the base's share, the total, the preset. x265 is opened anew for each."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import Step
 from hvt_edge.video.encoder_settings import least_base_bps, most_keyframe_bytes
 from hvt_edge.video.encoders.contract import Encoder
+from hvt_edge.video.preset import PresetControl
 from hvt_edge.video.share import FIRST_SHARE, Split
 
 __all__ = ["EncoderReconfiguration", "OpenEncoder", "ReconfigurationSettings"]
@@ -63,6 +64,8 @@ class EncoderReconfiguration:
     transmitter: Transmitter
     split: Split | None
     pacer: Pacer | None = None
+    presets: PresetControl | None = None
+    """None where the preset is set."""
 
     def __post_init__(self) -> None:
         self._trigger = ReconfigurationTrigger()
@@ -145,15 +148,20 @@ class EncoderReconfiguration:
     def __call__(self, decimation: int, now_ns: int) -> Encoder | None:
         """Return the encoder to go on with from this keyframe, or None for the one there is."""
         changed = self._take_command()
+        same_preset = self.presets is None or not self.presets.wants_another(now_ns)
         if self.pacer is not None:
-            return self._at_links_rate(self.pacer, decimation, now_ns, changed=changed)
+            return self._at_links_rate(
+                self.pacer, decimation, now_ns, changed=changed, same_preset=same_preset
+            )
         now = self.operating.now
         base_bps, total_bps = self._proposed_bps(decimation, changed=changed), now.budget_bps
-        if not changed and (decimation, base_bps) == (now.decimation, now.base_bps):
+        if same_preset and not changed and (decimation, base_bps) == (now.decimation, now.base_bps):
             return None
         return self._open(total_bps, base_bps, decimation, now_ns=now_ns, encoder_total_bps=total_bps)
 
-    def _at_links_rate(self, pacer: Pacer, decimation: int, now_ns: int, *, changed: bool) -> Encoder | None:
+    def _at_links_rate(
+        self, pacer: Pacer, decimation: int, now_ns: int, *, changed: bool, same_preset: bool
+    ) -> Encoder | None:
         now = self.operating.now
         if changed:
             floor_bps = min(now.budget_bps, self.settings.min_budget_bps)
@@ -161,7 +169,7 @@ class EncoderReconfiguration:
         self._proposed_bps(decimation, changed=changed)  # which moves the share
         base_bps = self._base_of(pacer.steady_bps)
         near = abs(base_bps / now.base_bps - 1) <= _WORTH and not (pacer.at_ceiling or changed)
-        if decimation == now.decimation and (near or base_bps == now.base_bps):
+        if same_preset and decimation == now.decimation and (near or base_bps == now.base_bps):
             return None
         self._trigger.done(now_ns)
         total_bps = max(base_bps, pacer.steady_bps)

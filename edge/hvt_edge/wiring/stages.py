@@ -51,9 +51,10 @@ from hvt_edge.wiring.stills import make_chooser, make_method, make_on_demand, ma
 from hvt_edge.wiring.storing import make_backlog
 from hvt_edge.wiring.trial import Beginning
 from hvt_edge.wiring.video import (
-    make_encoder,
+    encoder_opener,
     make_frame_skip,
     make_keyframes,
+    make_presets,
     make_regions,
     reconfiguration_settings,
 )
@@ -110,10 +111,13 @@ def build_stages(
         base_bps=base_bps,
         method=config.method,
         decimation=decimation,
+        preset=beginning.preset.preset,
+        preset_says=beginning.preset.says,
     )
     keyframes = make_keyframes(config, source)
     pacer = make_pacer(config, source.camera_stream, view.base_size)
-    open_encoder = partial(make_encoder, config, size=view.base_size, headroom=headroom)
+    presets = make_presets(config, operating)
+    open_encoder = encoder_opener(config, operating, size=view.base_size, headroom=headroom, presets=presets)
     encoder = open_encoder(total_bps=config.budget_bps, base_bps=base_bps, decimation=decimation)
     budget = make_budget(config, base_bps=base_bps, decimation=decimation)
     # Files come after all that may be refused: a failed start leaves nothing behind.
@@ -140,6 +144,7 @@ def build_stages(
         transmitter=transmitter,
         split=make_split(config, view.base_size, first_share=beginning.share),
         pacer=pacer,
+        presets=presets,
     )
     still_readers = StillReaders(clock)
     maker = make_still_maker(config, readable=still_readers.read)

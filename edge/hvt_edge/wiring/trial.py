@@ -1,22 +1,27 @@
-"""What ``--profile auto`` begins with: the first second of the scene is coded before the flight, and looked at."""
+"""What ``auto`` begins with, profile or preset: the first second of the scene is coded before the flight."""
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from hvt_common.runtime.log import START_LOGGER
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame, View
 from hvt_edge.config import EdgeConfig
+from hvt_edge.loop.cpu import processors
 from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.perception.shadow import UNMEASURED, Shadow
 from hvt_edge.source.contract import Source
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.video.encoder_settings import least_base_bps
 from hvt_edge.video.encoders.registry import X265
+from hvt_edge.video.preset import PresetChoice, choose_preset, share_of
 from hvt_edge.video.share import FIRST_SHARE
 from hvt_edge.video.trial import trial_frames, trial_quantiser
+from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.link import SPARSE_SHARE, lever_settings
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.video import first_decimation, make_encoder, scene
@@ -37,6 +42,8 @@ class Beginning:
     """Each n-th source frame is coded."""
     share: float
     """Of the budget, for the base stream."""
+    preset: PresetChoice
+    """Of x265."""
     shadow: Shadow = UNMEASURED
     """What the base stream showed of the source."""
 
@@ -54,31 +61,50 @@ def try_scene(
     decimation = first_decimation(config, size)
     fps = config.nominal_fps / decimation
     feasible = config.base_bps >= least_base_bps(size, fps, edge_id=config.edge_id)
-    if not (config.measures and feasible) or config.encoder != X265:
-        return Beginning(decimation, _share(config, source.view, decimation))
-    shadow = make_shadow(config, detector)
-    if shadow is None and not (config.auto_fps and decimation > 1):  # nothing would come of it
-        return Beginning(decimation, _share(config, source.view, decimation))
+    measures = config.measures and feasible and config.encoder == X265
+    shadow = make_shadow(config, detector) if measures else None
+    rates = measures and (shadow is not None or (config.auto_fps and decimation > 1))
+    if not (rates or config.auto_preset):  # nothing would come of it
+        return Beginning(decimation, _share(config, source.view, decimation), PresetChoice(config.preset))
     count = trial_frames(fps)
     analyzer = make_analyzer(config, detector=detector, view=source.view)
     until_ns = None if config.pace == "lockstep" else clock() + _MOST_NS
 
+    encoder = make_encoder(
+        config, size=size, decimation=decimation, total_bps=config.budget_bps, base_bps=config.base_bps
+    )
+    assert isinstance(encoder, BaseEncoder), "x265 alone is tried"
+    spent: list[tuple[int, int]] = []
+
     def compare(frame: Frame, unit: AccessUnit) -> None:
+        spent.append(encoder.spent)
         if shadow is not None and (until_ns is None or clock() < until_ns):
             shadow.compare(analyzer.analyze(frame, unit))
 
     quantiser = trial_quantiser(
-        make_encoder(
-            config, size=size, decimation=decimation, total_bps=config.budget_bps, base_bps=config.base_bps
-        ),
+        encoder,
         scene(source, decimation=decimation, count=count, clock=clock, stop=stop),
         count=count,
         on_unit=compare,
     )
-    if config.auto_fps and quantiser < _FINE:
+    if rates and config.auto_fps and quantiser < _FINE:
         decimation = _most_frames(config, size, decimation)
     seen = UNMEASURED if shadow is None else shadow.now
-    return Beginning(decimation, _share(config, source.view, decimation, seen), seen)
+    preset = PresetChoice(config.preset)
+    if config.auto_preset:
+        preset = _preset(spent, fps=config.nominal_fps / decimation)
+    return Beginning(decimation, _share(config, source.view, decimation, seen), preset, seen)
+
+
+def _preset(spent: Sequence[tuple[int, int]], *, fps: float) -> PresetChoice:
+    """By what the frames after the keyframe took; a scene of one frame tells nothing."""
+    if len(spent) < 2:
+        return PresetChoice()
+    frame_ns = (spent[-1][0] - spent[0][0]) / (spent[-1][1] - spent[0][1])
+    choice = choose_preset(frame_ns / SECOND_NS * fps, most_cores=share_of(processors()))
+    if choice.says:
+        logging.getLogger(START_LOGGER).info("%s", choice.says)
+    return choice
 
 
 def _most_frames(config: EdgeConfig, size: tuple[int, int], decimation: int) -> int:

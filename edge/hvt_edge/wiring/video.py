@@ -14,7 +14,9 @@ from hvt_common.runtime.log import START_LOGGER
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Fit, Frame, View
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, least_budget_bps
+from hvt_edge.loop.cpu import processors
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
+from hvt_edge.operating.point import Operating
 from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, shown
 from hvt_edge.video.encoder_settings import (
@@ -29,9 +31,11 @@ from hvt_edge.video.encoders.qualification import allowed, headroom_of, run_fram
 from hvt_edge.video.encoders.registry import X265, open_encoder
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.keyframes import keyframe_interval_s
+from hvt_edge.video.preset import SLOWEST, PresetControl, share_of
 from hvt_edge.video.rate_model import LEAST_SIDE_PX, PROMPT, SPARING, choose_base, most_decimation, sizes_of
-from hvt_edge.video.reconfigure import ReconfigurationSettings
+from hvt_edge.video.reconfigure import OpenEncoder, ReconfigurationSettings
 from hvt_edge.video.regions import TrackRegions
+from hvt_edge.video.x265 import BaseEncoder
 
 _log = logging.getLogger(__name__)
 
@@ -151,16 +155,18 @@ def make_encoder(
     total_bps: int,
     base_bps: int,
     decimation: int,
+    preset: str = "",
     headroom: float = 1.0,
 ) -> Encoder:
     """The encoder at the rate that the budget leaves it; with several threads only where bytes need not repeat.
 
-    It is asked for ``headroom`` (0…1) of that rate. Raises `UserError` where it does not take the settings.
+    It is asked for ``headroom`` (0…1) of that rate, and has the ``preset`` of the settings unless another is given;
+    with ``--preset auto`` the slowest. Raises `UserError` where it does not take the settings.
     """
     settings = encoder_settings(
         size=size,
         fps=config.nominal_fps / decimation,
-        preset=config.preset,
+        preset=preset or (SLOWEST if config.auto_preset else config.preset),
         # What is kept for tracks may be the base's while none are sent.
         total_bps=_video_bps(config, total_bps=total_bps, base_bps=base_bps),
         base_bps=base_bps,
@@ -170,6 +176,40 @@ def make_encoder(
     threads = 1 if config.pace == "lockstep" else min(_MOST_ENCODER_THREADS, os.cpu_count() or 1)
     bitrate_bps = max(1, round(settings.bitrate_bps * headroom))
     return open_encoder(config.encoder, replace(settings, bitrate_bps=bitrate_bps, threads=threads))
+
+
+def encoder_opener(
+    config: EdgeConfig,
+    operating: Operating,
+    *,
+    size: tuple[int, int],
+    headroom: float,
+    presets: PresetControl | None,
+) -> OpenEncoder:
+    """Opens encoders in flight, with the preset that is in force then."""
+
+    def open_for(*, total_bps: int, base_bps: int, decimation: int) -> Encoder:
+        encoder = make_encoder(
+            config,
+            size=size,
+            total_bps=total_bps,
+            base_bps=base_bps,
+            decimation=decimation,
+            preset=operating.now.preset,
+            headroom=headroom,
+        )
+        if presets is not None and isinstance(encoder, BaseEncoder):
+            presets.watch(lambda: encoder.spent)
+        return encoder
+
+    return open_for
+
+
+def make_presets(config: EdgeConfig, operating: Operating) -> PresetControl | None:
+    """What steps to another preset in flight; None where it is set."""
+    if not config.auto_preset:
+        return None
+    return PresetControl(operating, nominal_fps=config.nominal_fps, most_cores=share_of(processors()))
 
 
 def _video_bps(config: EdgeConfig, *, total_bps: int, base_bps: int) -> int:
@@ -191,20 +231,22 @@ def qualify_encoder(
         _qualify_camera(config, source)
         return 1.0
     size, decimation = source.view.base_size, first_decimation(config, source.view.base_size)
-    rates = {"total_bps": config.budget_bps, "base_bps": config.base_bps}
+    total_bps, base_bps = config.budget_bps, config.base_bps
     fps = config.nominal_fps / decimation
     limit = allowed(
         size=size,
         fps=fps,
-        total_bps=_video_bps(config, **rates),
-        base_bps=config.base_bps,
+        total_bps=_video_bps(config, total_bps=total_bps, base_bps=base_bps),
+        base_bps=base_bps,
         window_s=config.window,
     )
     count = run_frames(fps, limit)
 
     headroom = headroom_of(
         config.encoder,
-        open_at=lambda share: make_encoder(config, size=size, decimation=decimation, headroom=share, **rates),
+        open_at=lambda share: make_encoder(
+            config, size=size, total_bps=total_bps, base_bps=base_bps, decimation=decimation, headroom=share
+        ),
         scene=lambda: scene(source, decimation=decimation, count=count, clock=clock, stop=stop),
         frames=count,
         limit=limit,

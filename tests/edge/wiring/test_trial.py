@@ -14,7 +14,7 @@ from hvt_common.config import load
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.source.contract import Source
 from hvt_edge.source.opening import open_source
-from hvt_edge.wiring import Beginning, make_detector, try_scene
+from hvt_edge.wiring import Beginning, make_detector, trial, try_scene
 
 
 def settings(source: str, budget: str, *flags: str) -> EdgeConfig:
@@ -100,3 +100,20 @@ def test_nothing_is_measured_where_nothing_depends_on_it(flags):
     """Nor by a detector that remembers the pictures of one stream: there the settings decide alone."""
     with open_source("demo", size=(640, 360), fps=15) as source:
         assert tried(settings("demo", "100kbps", *flags), source).shadow.comparisons == 0
+
+
+@pytest.mark.parametrize(("most_cores", "preset"), [(1e9, "veryfast"), (1e-9, "ultrafast")])
+@pytest.mark.parametrize("flags", [("--method", "M0"), ("--detector", "motion")])
+def test_auto_begins_with_the_preset_that_there_is_time_for(
+    tmp_path, monkeypatch, caplog, flags, most_cores, preset
+):
+    """The first second of a flight would lose its frames, and a keyframe would be spent on finding out."""
+    monkeypatch.setattr(trial, "share_of", lambda _cores: most_cores)
+    words = ["--source", str(moving(tmp_path, coarse=60, frames=5)), "--size", "320x192", *flags]
+    loaded, given = load(EdgeConfig, words, program="hvt-edge", description="")
+    config = check(with_profile(loaded, given=given.values))
+    detector = make_detector(check(EdgeConfig(source="demo", detector="motion")))
+    with caplog.at_level("INFO"), open_source(str(tmp_path), size=(320, 192), fps=15) as source:
+        beginning = try_scene(config, source, detector=detector, clock=time.time_ns, stop=threading.Event())
+    assert beginning.preset.preset == preset
+    assert caplog.messages == ([beginning.preset.says] if preset == "ultrafast" else [])
