@@ -12,13 +12,7 @@ from hvt_common.errors import exit_with_sentence
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import START_LOGGER, start_log
 from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
-from hvt_common.runtime.reporting import print_table, write_json
-from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
-from hvt_edge.doctor import command as doctor
-from hvt_edge.health import watch
-from hvt_edge.summary import in_vain, table, title
-from hvt_edge.world import World
 
 __all__ = ["main", "program"]
 
@@ -42,8 +36,12 @@ def program() -> NoReturn:
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     if words and words[0] == "status":
+        from hvt_edge.health import watch  # noqa: PLC0415 - each command imports its own
+
         return watch.run(words[1:])
     if words and words[0] == "doctor":
+        from hvt_edge.doctor import command as doctor  # noqa: PLC0415
+
         limit_malloc_arenas()
         return doctor.run(words[1:])
     config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
@@ -53,6 +51,11 @@ def _run(argv: Sequence[str] | None) -> int:
         print(redaction.text(to_toml(config)), end="")
         return 0
     config = check(config)
+    from hvt_common.runtime.reporting import print_table, write_json  # noqa: PLC0415
+    from hvt_edge.app import Edge  # noqa: PLC0415
+    from hvt_edge.summary import in_vain, table, title  # noqa: PLC0415
+    from hvt_edge.world import World  # noqa: PLC0415
+
     limit_malloc_arenas()
     put_video_first()
     world = World()

@@ -12,7 +12,6 @@ from hvt_common.errors import exit_with_sentence, needs_extra
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
 from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
-from hvt_common.runtime.reporting import print_table, say, write_json
 
 __all__ = ["main", "program"]
 
@@ -62,16 +61,18 @@ def _run(argv: Sequence[str] | None) -> int:
 
         if words[0] in control.COMMANDS:
             return control.run(words)
-    with needs_extra("'hvt[ground]'"):  # only now: without Rerun this is a sentence, not a traceback
-        from hvt_ground.app import Ground  # noqa: PLC0415
-        from hvt_ground.extras import checked, config_class  # noqa: PLC0415
-        from hvt_ground.sinks.rerun.sdk import leave_out_pandas  # noqa: PLC0415
+    from hvt_ground.extras import checked, config_class  # noqa: PLC0415
+
     config, requested = load(config_class(), argv, program="hvt-ground", description=_DESCRIPTION)
     redaction = Redaction([*words, *(str(one) for one in requested.values.values())])
     if requested.print_config:
         print(redaction.text(to_toml(config)), end="")
         return 0
     config = checked(config)
+    with needs_extra("'hvt[ground]'"):  # only now: without Rerun this is a sentence, not a traceback
+        from hvt_common.runtime.reporting import write_json  # noqa: PLC0415
+        from hvt_ground.app import Ground  # noqa: PLC0415
+        from hvt_ground.sinks.rerun.sdk import leave_out_pandas  # noqa: PLC0415
     limit_malloc_arenas()
     put_video_first()
     leave_out_pandas()
@@ -89,6 +90,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _print(sessions: list[dict[str, Any]]) -> None:
+    from hvt_common.runtime.reporting import print_table, say  # noqa: PLC0415
     from hvt_ground.status import table  # noqa: PLC0415
 
     for content in sessions:

@@ -8,15 +8,17 @@ they count only where no other box covers them (slicing aided inference, Akyon e
 from __future__ import annotations
 
 import re
-from typing import Final, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Final, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.inference.detect import Detector
 from hvt_common.inference.nms import MAX_DETECTIONS, components, suppress
 from hvt_common.values import Boxes, Detections, Image
+
+if TYPE_CHECKING:
+    from hvt_common.inference.detect import Detector
 
 __all__ = [
     "MOST_RUNS",

@@ -17,6 +17,7 @@ from hvt_common.errors import UserError
 __all__ = [
     "DELIVERIES",
     "GROUP_ROOT",
+    "MAX_PAYLOAD_BYTES",
     "MSGPACK_ENCODING",
     "ROOT",
     "Channel",
@@ -29,6 +30,9 @@ __all__ = [
     "parse_key",
     "selector",
 ]
+
+MAX_PAYLOAD_BYTES = 4 * 2**20
+"""No access unit and no still is larger; a larger payload is refused unread."""
 
 ROOT = "hvt"
 GROUP_ROOT = "hvt-group"

@@ -22,8 +22,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NoReturn, Self, TypeVar
 
-import cv2
-
 __all__ = [
     "NETWORK_NICENESS",
     "STOP_SIGNALS",
@@ -184,6 +182,8 @@ def put_video_first() -> None:
     a millisecond at most from now on, instead of five. OpenCV works in the thread that calls it; workers of its own
     have the priority of whoever called it first.
     """
+    import cv2  # noqa: PLC0415 - programs that handle no picture set themselves up here too
+
     sys.setswitchinterval(_SWITCH_S)
     cv2.setNumThreads(1)
 

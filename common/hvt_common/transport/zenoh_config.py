@@ -7,14 +7,14 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
-
-import json5
-import zenoh
+from typing import TYPE_CHECKING, Any, Literal
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
+from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
 from hvt_common.runtime.host_names import is_loopback
+
+if TYPE_CHECKING:
+    import zenoh
 
 __all__ = [
     "DEFAULT_ENDPOINT",
@@ -135,6 +135,9 @@ def key_pair(settings: LinkSettings) -> tuple[Path, Path] | None:
 
 def _read_config(path: Path | None) -> tuple[zenoh.Config, dict[str, Any]]:
     """The user's file as Zenoh reads it, and as plain values."""
+    import json5  # noqa: PLC0415 - settings alone need neither
+    import zenoh  # noqa: PLC0415
+
     if path is None:
         return zenoh.Config(), {}
     try:
@@ -226,6 +229,8 @@ def _check_endpoint(endpoint: str) -> None:
 
 
 def _insert_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) -> None:
+    import zenoh  # noqa: PLC0415
+
     try:
         config.insert_json5(f"{side}/endpoints", json.dumps(endpoints))
     except zenoh.ZError as error:  # what stands behind ? and # is Zenoh's to judge

@@ -10,10 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import Step
 from hvt_edge.stills.policy.m6 import ExpectedGain
+
+if TYPE_CHECKING:
+    from hvt_edge.perception.candidates import Candidate
 
 __all__ = ["FIRST_SHARE", "Split", "SplitSettings"]
 

@@ -13,6 +13,7 @@ from hvt_edge.config import EdgeConfig, check
 from hvt_edge.operating.point import Operating
 from hvt_edge.video.preset import PresetControl, choose_preset, share_of
 from hvt_edge.video.reconfigure import EncoderReconfiguration
+from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.video import encoder_opener, reconfiguration_settings
 
 SECOND = 1_000_000_000
@@ -102,7 +103,7 @@ def test_a_step_opens_x265_at_the_same_rates_and_video_goes_on():
     assert reconfiguration(1, 0) is None
     assert decoder.decode_yuv(first.encode(Frame(0, 0, picture, picture), keyframe=True).data) is not None
     second = reconfiguration(1, 31 * SECOND)
-    assert second is not None
+    assert isinstance(second, BaseEncoder)
     assert operating.now.preset == "ultrafast"
     assert (operating.now.base_bps, operating.now.total_bps) == (280_000, 300_000)
     unit = second.encode(Frame(1, 0, picture, picture), keyframe=True)

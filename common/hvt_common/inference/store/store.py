@@ -15,12 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import filelock
-import platformdirs
-import tomli_w
-
 from hvt_common.errors import UserError
-from hvt_common.inference.store.download import DownloadError, download
 from hvt_common.inference.store.manifest import (
     MAX_SIZE_BYTES,
     ModelEntry,
@@ -39,7 +34,11 @@ _ADDED = "added.toml"
 def cache_folder() -> Path:
     """Where models lie: ``HVT_MODELS``, else ``hvt/models`` in the platform's cache folder."""
     own = os.environ.get("HVT_MODELS")
-    return Path(own).expanduser() if own else Path(platformdirs.user_cache_path("hvt")) / "models"
+    if own:
+        return Path(own).expanduser()
+    import platformdirs  # noqa: PLC0415 - a start that names no model needs none of these
+
+    return Path(platformdirs.user_cache_path("hvt")) / "models"
 
 
 def file_digest(path: Path) -> str:
@@ -114,6 +113,8 @@ class Store:
         the same model; then this one waits for it. ``pauses_s`` are the seconds after each try that brought
         nothing. Raises `UserError` where no address gives the pinned file, or the folder cannot be written.
         """
+        from hvt_common.inference.store.download import DownloadError  # noqa: PLC0415 - as above
+
         entry, path = self.entry(name), self.path(name)
         with self._lock(name, on_wait):
             if path.exists() and not _what_is_wrong(path, entry):
@@ -177,6 +178,8 @@ class Store:
     def _note(self, entry: ModelEntry) -> None:
         """Write ``entry`` into ``added.toml``, whole or not at all."""
         file = self.folder / _ADDED
+        import tomli_w  # noqa: PLC0415 - as above
+
         with self._lock("added-toml"):
             entries = {**self._added(), entry.name: entry}
             tables = {name: _table(one) for name, one in entries.items()}
@@ -190,6 +193,8 @@ class Store:
 
     @contextmanager
     def _lock(self, name: str, on_wait: Callable[[], None] = lambda: None) -> Iterator[None]:
+        import filelock  # noqa: PLC0415 - as above
+
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             lock = filelock.FileLock(self.folder / f".{name}.lock")
@@ -233,6 +238,8 @@ def _from_address(
     url: str, part: Path, entry: ModelEntry, *, progress: Callable[[int], None], pauses_s: Sequence[float]
 ) -> None:
     """Bring ``part`` to the pinned file; `DownloadError` where this address does not give it."""
+    from hvt_common.inference.store.download import DownloadError, download  # noqa: PLC0415 - as above
+
     went_on = part.exists()
     download(url, part, size_bytes=entry.size_bytes, progress=progress, pauses_s=pauses_s)
     wrong = _what_is_wrong(part, entry)

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 import msgpack
 
+from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
 from hvt_common.protocol.messages.fields import Kind, WireError
 
 __all__ = [
@@ -40,8 +41,6 @@ READ_VERSIONS = (3, 4)
 """A message of version 3 is one of version 4 without the fields that were added since; it had to be exact."""
 MOST_UNKNOWN_FIELDS = 16
 """So many fields behind the last known one are skipped, in each array; with more it is no message of ours."""
-MAX_PAYLOAD_BYTES = 4 * 2**20
-"""No access unit and no still is larger; a larger payload is refused unread."""
 
 _CRC_BYTES = 5
 _CRC_TAG = 0xCE

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.cost import CostEstimate
+
+if TYPE_CHECKING:
+    from hvt_edge.perception.candidates import Candidate
 
 __all__ = ["STILL_OVERHEAD_BYTES", "Method", "Request", "Step", "ranked"]
 

@@ -8,11 +8,13 @@ starts. Other codecs start elsewhere (`CostModel.of_codec`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from hvt_edge.perception.candidates import Candidate
+if TYPE_CHECKING:
+    from hvt_edge.perception.candidates import Candidate
 
 __all__ = ["CostEstimate", "CostModel"]
 

@@ -14,10 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from hvt_common.inference.class_names import MOVING, same_kind
-from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import Request, Step, ranked
+
+if TYPE_CHECKING:
+    from hvt_edge.perception.candidates import Candidate
 
 __all__ = ["ExpectedGain"]
 

@@ -9,9 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import Request, Step, ranked
+
+if TYPE_CHECKING:
+    from hvt_edge.perception.candidates import Candidate
 
 __all__ = ["OnStart", "Periodic", "Small", "TracksFirst", "Uncertain", "Utility", "VideoOnly"]
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.regions import Region
+
+if TYPE_CHECKING:
+    from hvt_edge.video.regions import Region
 
 __all__ = ["Encoder", "MakeEncoder"]
 

@@ -1,16 +1,10 @@
-"""Encoders of graphics cards and boards, through PyAV: one class, one row for each.
-
-None of them has been run by the project: the rows were written from FFmpeg's documentation. What keeps a wrong row
-from a flight is the qualification run at the start.
-"""
+"""Encoders of graphics cards and boards, through PyAV: one class for all (`hardware_rows`)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from fractions import Fraction
-from types import MappingProxyType
 
 import av.error
 from av.video.frame import PictureType
@@ -19,47 +13,16 @@ from av.video.reformatter import VideoReformatter
 from hvt_common.errors import UserError
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoders.hardware_rows import HardwareRow
 from hvt_edge.video.regions import Region
 from hvt_edge.video.x265 import encoder_context, mean_qp_of, yuv_picture
 
-__all__ = ["HARDWARE", "HardwareEncoder", "HardwareRow"]
+__all__ = ["HardwareEncoder"]
 
 _BT709, _LIMITED = 1, 1
 """Of ITU-T H.273, and of FFmpeg's AVColorRange."""
 _GOP_FRAMES = 60_000
 """No keyframe comes by itself for an hour at 15 fps; more does not fit hevc_qsv's 16 bits."""
-
-
-@dataclass(frozen=True, slots=True)
-class HardwareRow:
-    """One encoder of FFmpeg."""
-
-    codec: str
-    """Its name there, and of ``--encoder``."""
-    pixel_format: str
-    needs: str
-    """What has to be in the machine."""
-    options: Mapping[str, str] = field(default_factory=dict)
-    """Zero latency, constant rate, and an IDR where a keyframe is forced."""
-
-
-_ROWS = (
-    HardwareRow(
-        "hevc_nvenc",
-        "yuv420p",
-        "an NVIDIA GPU with NVENC and its driver",
-        {"preset": "p4", "tune": "ull", "rc": "cbr", "delay": "0", "zerolatency": "1", "forced-idr": "1"},
-    ),
-    HardwareRow(
-        "hevc_qsv",
-        "nv12",
-        "an Intel GPU with Quick Sync and its driver",
-        {"preset": "medium", "async_depth": "1", "low_delay_brc": "1", "look_ahead": "0", "forced_idr": "1"},
-    ),
-    HardwareRow("hevc_v4l2m2m", "nv12", "a board whose kernel has an HEVC encoder as a V4L2 device"),
-)
-HARDWARE: Mapping[str, HardwareRow] = MappingProxyType({row.codec: row for row in _ROWS})
-"""By name."""
 
 
 class HardwareEncoder:

@@ -9,11 +9,8 @@ from __future__ import annotations
 from hvt_common.errors import UserError
 from hvt_common.runtime.plug_ins import installed, loaded, the_one
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.encoders.checked import CheckedEncoder
 from hvt_edge.video.encoders.contract import Encoder
-from hvt_edge.video.encoders.hardware import HARDWARE, HardwareEncoder
-from hvt_edge.video.encoders.passthrough import Passthrough
-from hvt_edge.video.x265 import BaseEncoder
+from hvt_edge.video.encoders.hardware_rows import HARDWARE
 
 __all__ = ["GROUP", "PASSTHROUGH", "X265", "check_encoder", "encoder_names", "open_encoder"]
 
@@ -42,6 +39,12 @@ def check_encoder(name: str) -> None:
 
 def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
     """Open it. Raises `UserError` where there is none, or it does not load or take the settings."""
+    # Imported for who opens one: names alone are checked at each start.
+    from hvt_edge.video.encoders.checked import CheckedEncoder  # noqa: PLC0415
+    from hvt_edge.video.encoders.hardware import HardwareEncoder  # noqa: PLC0415
+    from hvt_edge.video.encoders.passthrough import Passthrough  # noqa: PLC0415
+    from hvt_edge.video.x265 import BaseEncoder  # noqa: PLC0415
+
     if name == X265:
         return BaseEncoder(settings)
     if name == PASSTHROUGH:

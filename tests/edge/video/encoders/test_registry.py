@@ -11,7 +11,8 @@ from hvt_common.errors import UserError
 from hvt_common.runtime import plug_ins
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.encoders.hardware import HARDWARE, HardwareEncoder, HardwareRow
+from hvt_edge.video.encoders.hardware import HardwareEncoder
+from hvt_edge.video.encoders.hardware_rows import HARDWARE, HardwareRow
 from hvt_edge.video.encoders.registry import check_encoder, encoder_names, open_encoder
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures
