@@ -20,6 +20,7 @@ __all__ = [
     "parse_limit",
     "parse_share",
     "parse_size",
+    "shown_text",
 ]
 
 SECOND_NS = 1_000_000_000
@@ -133,3 +134,10 @@ def bitrate_text(bps: float) -> str:
 def exact_rate(fps: float) -> Fraction:
     """The rate as a fraction, so that no clip is long enough to drift: 29.97 is 2997/100, 30000/1001 itself."""
     return Fraction(fps).limit_denominator(1001)
+
+
+def shown_text(text: str) -> str:
+    """Text of any origin for a terminal: what this Python does not know as printable is ``?``; lines stay."""
+    if text.isprintable():
+        return text
+    return "".join(one if one.isprintable() or one == "\n" else "?" for one in text)

@@ -1,11 +1,14 @@
 // A reader of the wire that knows docs/wire.md, wire-messages.md, wire-tracks.md and wire-stills.md and no line of the Python:
-// it shows that they are enough, and that the code holds to them. It checks every vector of docs/conformance.
+// it shows that they are enough, and that the code holds to them. It checks every vector of docs/conformance, and has the
+// fields of messages and their bounds from docs/wire.json.
 //
-//   tsc --target es2020 --module commonjs --strict --outDir OUT lab/conformance/reader.ts && node OUT/reader.js docs/conformance
+//   tsc --target es2020 --module commonjs --strict --outDir OUT lab/conformance/reader.ts
+//   node OUT/reader.js docs/wire.json docs/conformance
 
 declare function require(name: string): any;
 declare const process: any;
 const fs = require("fs");
+const SCHEMA: any = JSON.parse(fs.readFileSync(process.argv[2], "utf-8"));
 
 // What cannot be read. Another version is no damage: it is counted apart.
 class Refused extends Error {
@@ -29,13 +32,14 @@ function crc32(...parts: Uint8Array[]): number {
 }
 
 const unhex = (text: string): Uint8Array => Uint8Array.from(text.match(/../g) ?? [], (pair) => parseInt(pair, 16));
+// As vectors write them.
+const bytesOf = (json: any): Uint8Array => (typeof json === "string" ? unhex(json) : new Uint8Array(json.zeros));
 const hex = (bytes: Uint8Array): string => Array.from(bytes, (byte) => byte.toString(16).padStart(2, "0")).join("");
 
 // ---- MessagePack ------------------------------------------------------------------------------------------------
 
 // Whole numbers are bigint and fractions number, so that the two cannot be taken for one another.
 type Value = null | boolean | bigint | number | string | Uint8Array | Value[] | Map<string, Value>;
-const DEEPEST = 16;
 
 function unpack(data: Uint8Array): Value {
   const view = new DataView(data.buffer, data.byteOffset, data.byteLength);
@@ -58,20 +62,21 @@ function unpack(data: Uint8Array): Value {
     }
   };
   const array = (length: number, depth: number): Value[] => {
+    if (depth > SCHEMA.limits.depth) throw new Refused("it is nested too deep");
     if (length > data.length) throw new Refused("an array is longer than the message");
     return Array.from({ length }, () => next(depth));
   };
   const map = (length: number, depth: number): Map<string, Value> => {
+    if (depth > SCHEMA.limits.depth) throw new Refused("it is nested too deep");
     const found = new Map<string, Value>();
     for (let entry = 0; entry < length; entry++) {
       const key = next(depth);
-      if (typeof key !== "string") throw new Refused("a key is no text");
+      if (typeof key !== "string" || found.has(key)) throw new Refused("a key is no text, or is there twice");
       found.set(key, next(depth));
     }
     return found;
   };
   const next = (depth: number): Value => {
-    if (depth > DEEPEST) throw new Refused("it is nested too deep");
     const tag = size(1);
     if (tag < 0x80) return BigInt(tag);
     if (tag < 0x90) return map(tag & 15, depth + 1);
@@ -110,32 +115,37 @@ function unpack(data: Uint8Array): Value {
   return value;
 }
 
-// ---- The tables of wire-messages.md -----------------------------------------------------------------------------
+// ---- The fields of docs/wire.json -------------------------------------------------------------------------------
 
 // Throws Refused; gives the value without what is skipped in it, or nothing where it is as it came.
 type Kind = (value: Value) => Value | void;
-type Fields = [string, Kind, Value?][];  // name, kind, and the value where an earlier sender has none
+type Fields = { name: string; kind: Kind; missing?: Value }[];  // and the value where an earlier sender has none
 
-const [U32, U53, U64, I63] = [2n ** 32n - 1n, 2n ** 53n - 1n, 2n ** 64n - 1n, 2n ** 63n - 1n];
+const U53 = 2n ** 53n - 1n;
 const utf8 = (text: string): number => new TextEncoder().encode(text).length;
 
 function need(holds: boolean, reason: string): asserts holds {
   if (!holds) throw new Refused(reason);
 }
-const int = (low: bigint | number, high: bigint | number): Kind => (value) =>
-  need(typeof value === "bigint" && value >= BigInt(low) && value <= BigInt(high), `no whole number ${low}…${high}`);
+const int = (low: bigint, high: bigint): Kind => (value) =>
+  need(typeof value === "bigint" && value >= low && value <= high, `no whole number ${low}…${high}`);
 const float = (low: number, high: number): Kind => (value) =>
   need(typeof value === "number" && value >= low && value <= high, `no fraction ${low}…${high}`);
 const text = (most: number): Kind => (value) =>
-  need(typeof value === "string" && utf8(value) <= most && printable(value), `no printable text of ${most} bytes`);
-const bin = (most: number): Kind => (value) =>
-  need(value instanceof Uint8Array && value.length <= most, `no ${most} bytes`);
+  need(typeof value === "string" && utf8(value) <= most && allowed(value), `no text of ${most} bytes`);
+const bin = (least: number, most: number): Kind => (value) =>
+  need(value instanceof Uint8Array && value.length >= least && value.length <= most, `not ${least} to ${most} bytes`);
 const bool: Kind = (value) => need(typeof value === "boolean", "neither true nor false");
-const list = (most: number, of: Kind, least = 0): Kind => (value) => {
+const list = (least: number, most: number, of: Kind): Kind => (value) => {
   need(Array.isArray(value) && value.length >= least && value.length <= most, `no array of ${least} to ${most}`);
   return value.map((one) => of(one) ?? one);
 };
-const exactly = (count: number, of: Kind): Kind => list(count, of, count);
+const box = (of: Kind, empty: boolean): Kind => (value) => {
+  list(4, 4, of)(value);
+  const [x1, y1, x2, y2] = value as bigint[];
+  need(x1 <= x2 && y1 <= y2, "a box that is inside out");
+  need(empty || (x1 < x2 && y1 < y2), "a box without an inside");
+};
 const map = (most: number, keys: number, of: Kind): Kind => (value) => {
   need(value instanceof Map && value.size <= most, `no map of ${most}`);
   for (const [key, one] of value) {
@@ -143,12 +153,33 @@ const map = (most: number, keys: number, of: Kind): Kind => (value) => {
     of(one);
   }
 };
-// An int, a finite float or a text of at most 64 bytes.
-const scalar: Kind = (value) => {
-  if (typeof value === "number") need(Number.isFinite(value), "no finite number");
-  else if (typeof value === "string") text(64)(value);
-  else int(-(2n ** 63n), U64)(value);
+const scalar = (whole: Kind, most: number, bytes: number): Kind => (value) => {
+  if (typeof value === "number") float(-most, most)(value);
+  else if (typeof value === "string") text(bytes)(value);
+  else whole(value);
 };
+// No control and no change of direction; a surrogate is no UTF-8.
+const allowed = (value: string): boolean =>
+  [...value].every((one) => SCHEMA.limits.refused_characters.every(([low, high]: number[]) => one.codePointAt(0)! < low || one.codePointAt(0)! > high));
+
+function kindOf(row: any): Kind {
+  switch (row.type) {
+    case "int": return int(BigInt(row.low), BigInt(row.high));
+    case "float": return float(row.low, row.high);
+    case "bool": return bool;
+    case "str": return text(row.most_bytes);
+    case "bin": return bin(row.least_bytes, row.most_bytes);
+    case "scalar": return scalar(int(BigInt(row.low), BigInt(row.high)), row.most, row.most_bytes);
+    case "array": return row.box ? box(kindOf(row.of), row.box === "may be empty") : list(row.least, row.most, kindOf(row.of));
+    case "map": return map(row.most, row.key_bytes, kindOf(row.of));
+    case "nested": return nested(fieldsOf(SCHEMA.nested[row.of]));
+    default: throw new Error(`a type that this reader does not know: ${row.type}`);
+  }
+}
+// As MessagePack would have it.
+const valueOf = (json: any): Value => typeof json === "number" ? BigInt(json) : Array.isArray(json) ? json.map(valueOf) : json;
+const fieldsOf = (table: any): Fields =>
+  table.fields.map((row: any) => ({ name: row.name, kind: kindOf(row), missing: "default" in row ? valueOf(row.default) : undefined }));
 const nested = (fields: Fields): Kind => (value) => {
   need(Array.isArray(value), "no nested array");
   return checkFields(fields, value);
@@ -156,176 +187,50 @@ const nested = (fields: Fields): Kind => (value) => {
 // An array of an object of the backlog: these have no fields that came later.
 const row = (fields: Fields): Kind => (value) => {
   need(Array.isArray(value) && value.length === fields.length, `no array of ${fields.length}`);
-  checkFields(fields, value);
+  return checkFields(fields, value);
 };
-// Printable as docs/wire.md asks: no control, format, surrogate, private or unassigned character, no separator but the space.
-const printable = (value: string): boolean => !/[\p{C}\p{Zl}\p{Zp}]|(?! )\p{Zs}/u.test(value);
-
-const UNKNOWN_FIELDS = 16;
 
 // Skips what a later sender put behind the fields of the tables; the fields that an earlier one lacks have defaults.
 function checkFields(fields: Fields, values: Value[]): Value[] {
-  const least = fields.filter((one) => one[2] === undefined).length;
+  const least = fields.filter((one) => one.missing === undefined).length;
   need(values.length >= least, `${values.length} fields, at least ${least} are needed`);
-  need(values.length <= fields.length + UNKNOWN_FIELDS, `${values.length} fields, more than are skipped`);
-  return fields.map(([name, kind, missing], place) => {
+  need(values.length <= fields.length + SCHEMA.limits.unknown_fields, `${values.length} fields, more than are skipped`);
+  return fields.map(({ name, kind, missing }, place) => {
     if (place >= values.length) return missing!;
     try {
       return kind(values[place]) ?? values[place];
     } catch (error) {
-      throw new Refused(`${name}: ${(error as Error).message}`);
+      if (!(error instanceof Refused)) throw error;
+      throw new Refused(`${name}: ${error.message}`);
     }
   });
 }
 
-const far = 8 * 32767;
-const boxKind: Kind = (value) => {
-  exactly(4, int(-far, far))(value);
-  const [x1, y1, x2, y2] = value as bigint[];
-  need(x1 <= x2 && y1 <= y2, "a box that is inside out");
-};
-const cropKind: Kind = (value) => {
-  exactly(4, int(0, 32767))(value);
-  const [x1, y1, x2, y2] = value as bigint[];
-  need(x1 < x2 && y1 < y2, "an empty crop");
-};
-const session: [string, Kind] = ["session_id", int(0, U64)];
-const sequence: [string, Kind] = ["sequence", int(0, U32)];
-const frame: [string, Kind] = ["frame_index", int(0, U32)];
-const capture: [string, Kind] = ["capture_ns", int(0, I63)];
-const delay: [string, Kind] = ["send_delay_ns", int(-I63, I63)];
-const numbers = (names: string, kind: Kind): Fields => names.split(" ").map((name) => [name, kind]);
-
-const alsoShown: Fields = [["track_id", int(0, U32)], ["box_source_px", boxKind]];
-const trackNow: Fields = [
-  ["track_id", int(0, U32)], ["class_id", int(0, 2047)], ["confidence", int(0, 1000)], ["box_source_px", boxKind],
-];
-const health: Fields = [
-  ...numbers("frames_captured frames_encoded frames_dropped keyframes tracks", int(0, U53)),
-  ...numbers("base_queue still_queue", int(0, U32)),
-  ...numbers("encode_ms detect_ms", int(0, 600000)),
-  ["feedback_age_ms", int(-1, U32)],
-  ...numbers("frames_dropped_cpu frames_unanalyzed", int(0, U53)),
-  ...numbers("cores_needed cores_free", int(0, 409600)),
-];
-const failedPart: Fields = [
-  ["part", text(24)], ["reason", text(160)], ["failures", int(1, U32)], ["failed_ns", int(0, I63)], ["working", bool],
-];
-const stillResult: Fields = [
-  ["still_sequence", int(0, U32)], ["track_id", int(-1, U32)], ["class_name", text(64)], ["confidence", int(0, 1000)],
-  ["entropy_nats", int(0, 20000)], ["ground_track_id", int(-1, U32)], ["again", bool],
-];
-const acknowledged: Fields = [
-  session, ["kind", int(0, 2)], ["number", int(0, U32)], ["acknowledged_bytes", int(0, 4194304)],
-];
-const reasons = map(24, 32, int(0, U32));
-
-const STILL_BYTES = 2 ** 20;
-const PAYLOAD_BYTES = 4 * 2 ** 20;
-const MESSAGES: Record<string, { most: number; payload?: number; fields: Fields }> = {
-  BaseHeader: { most: 80, fields: [session, sequence, frame, capture, delay, ["flags", int(0, 255)]] },
-  RoiHeader: {
-    most: 1024,
-    payload: STILL_BYTES,
-    fields: [
-      session, sequence, frame, capture, delay, ["flags", int(0, 255)], ["track_id", int(-1, U32)],
-      ["box_source_px", boxKind], ["crop_source_px", cropKind], ["class_name", text(64)], ["confidence", int(0, 1000)],
-      ["reason", text(48)], ["codec", text(24)], ["quality_pct", int(0, 100)], ["parameters", map(8, 16, scalar)],
-      ["also", list(15, nested(alsoShown))],
-    ],
-  },
-  BacklogHeader: {
-    most: 80,
-    fields: [
-      session, ["kind", int(0, 2)], ["number", int(0, U32)], ["offset", int(0, 4194304)],
-      ["total_bytes", int(1, 4194304)], ["send_ns", int(0, I63)],
-    ],
-  },
-  Info: {
-    most: 65536,
-    fields: [
-      session, ["edge", text(32)], ["software", text(32)], ["started_ns", int(0, I63)],
-      ["source_size", exactly(2, int(1, 32767))], ["base_size", exactly(2, int(1, 32767))],
-      ["view_scale", float(0.0001, 10000)], ["view_offset_px", exactly(2, float(-32767, 32767))],
-      ["fps", float(0.01, 1000)], ["codec", text(24)], ["pace", int(0, 1)], ["method", text(48)],
-      ["budget_bps", int(0, U53)], ["base_bps", int(0, U53)], ["window_ns", int(1, 60000000000)],
-      ["class_names", list(2048, text(64))], ["received_ns", int(0, I63)], ["answered_ns", int(0, I63)],
-      ["still_codecs", list(8, text(24)), []], ["channels", list(16, text(16)), []],
-    ],
-  },
-  TrackStep: {
-    most: 16384,
-    fields: [session, sequence, frame, capture, delay, ["reference", int(-1, U32)], ["boxes", bin(16000)]],
-  },
-  PoseReport: { most: 80, fields: [["session", int(0, U32)], ["send_ns", int(0, I63)], ["coded", bin(48)]] },
-  Status: {
-    most: 6144,
-    fields: [
-      session, sequence, ["state", int(0, 1)], ["send_ns", int(0, I63)], ["media_ns", int(0, I63)],
-      ...numbers("last_base_sequence last_still_sequence", int(-1, U32)),
-      ...numbers("base_bytes roi_bytes backlog_bytes meta_bytes overhead_bytes", int(0, U53)),
-      ...numbers("base_messages roi_messages backlog_messages meta_messages", int(0, U53)),
-      ["worst_window_bps", exactly(3, int(0, U53))], ["sent", reasons], ["deferred", reasons], ["dropped", reasons],
-      ["health", nested(health)], ["failed", list(8, nested(failedPart))], ["levers", text(120)],
-      ["frames", list(32, int(0, U53)), []], ["coded_fps", int(0, 100000), 0n], ["auto_fps", bool, false],
-    ],
-  },
-  InfoRequest: { most: 1024, fields: [["requester_id", int(0, U64)], ["still_codecs", list(24, text(24))]] },
-  ControlRequest: {
-    most: 1024,
-    fields: [session, ["command", text(24)], ["arguments", map(8, 16, scalar)]],
-  },
-  ControlAnswer: {
-    most: 4096,
-    fields: [
-      session, ["accepted", bool], ["reason", text(200)], ["still_request", int(-1, U32)],
-      ["frame_index", int(-1, U32)], ["tracks", list(64, nested(trackNow))], ["note", text(200), ""],
-    ],
-  },
-  Feedback: {
-    most: 6144,
-    fields: [
-      session, ["receiver_id", int(0, U64)], sequence, ["send_ns", int(0, I63)], ["last_frame_index", int(-1, U32)],
-      ...numbers("base_messages base_bytes roi_messages roi_bytes lost corrupt", int(0, U53)),
-      ["base_sequence", int(-1, U32)], ["base_held_us", int(0, U32)], ["still_sequence", int(-1, U32)],
-      ["missing_stills", list(32, int(0, U32))], ["delay_p50_ms", int(-10, 36000000)],
-      ["clock_offset_ns", int(-I63, I63)], ["clock_error_ns", int(-1, I63)],
-      ["stills", list(32, nested(stillResult))], ["backlog", list(16, nested(acknowledged))],
-      ["objects_detected", int(-1, 65535), -1n],
-    ],
-  },
-};
-
-const VERSIONS = [3n, 4n];
-
 function read(name: string, data: Uint8Array, payload: Uint8Array): Value[] {
-  const { most, payload: mostPayload, fields } = MESSAGES[name];
-  need(data.length <= most, "it is too long");
-  need(payload.length <= (mostPayload ?? PAYLOAD_BYTES), "its payload is too long");
+  const table = SCHEMA.messages[name];
+  need(data.length <= table.most_bytes, "it is too long");
+  need(payload.length <= table.payload_bytes, "its payload is too long");
   const values = unpack(data);
   need(Array.isArray(values) && typeof values[0] === "bigint", "no array that begins with a version");
-  if (!VERSIONS.includes(values[0])) throw new Refused(`version ${values[0]}`, true);
+  if (!SCHEMA.reads.includes(Number(values[0]))) throw new Refused(`version ${values[0]}`, true);
   need(data[data.length - 5] === 0xce, "no checksum at its end");
   need(values[values.length - 1] === BigInt(crc32(payload, data.subarray(0, -5))), "another checksum");
-  return checkFields(fields, values.slice(1, -1));
+  return checkFields(fieldsOf(table), values.slice(1, -1));
 }
+
+// The place of a field among the values of a message.
+const field = (name: string, values: Value[], wanted: string): Value =>
+  values[SCHEMA.messages[name].fields.findIndex((one: any) => one.name === wanted)];
 
 // ---- Objects of the backlog -------------------------------------------------------------------------------------
 
 function readObject(kind: string, data: Uint8Array): Value {
-  need(data.length <= 4194304, "it is too long");
+  need(data.length <= SCHEMA.limits.object_bytes, "it is too long");
   const values = unpack(data);
-  if (kind === "still") {
-    need(Array.isArray(values) && values.length === 3, "no array of three");
-    bin(1024)(values[0]);
-    text(64)(values[1]);
-    need(values[2] instanceof Uint8Array && values[2].length > 0, "no still");
-    return values;
-  }
-  list(2400, row([["frame", int(0, U32)], ["capture_ns", int(0, I63)], ["keyframe", bool], ["unit", bin(4194304)]]), 1)(values);
+  if (kind === "still") return row(fieldsOf(SCHEMA.objects.BacklogStill))(values)!;
+  list(1, 2400, row(fieldsOf(SCHEMA.objects.BacklogUnit)))(values);
   let before: Value[] | undefined;
   for (const row of values as Value[][]) {
-    need((row[3] as Uint8Array).length > 0, "a frame is empty");
     need(!before || (row[0]! > before[0]! && row[1]! > before[1]!), "frames are not in order");
     before = row;
   }
@@ -430,7 +335,7 @@ function readTracks(data: Uint8Array, before: Track[], frames: number, alone: bo
   const readClass = (was: number): number => {
     if (!coder.bit(classDiffers)) return was;
     const found = coder.unsigned(classes);
-    need(found < 2048, "a class that cannot be");
+    need(found < SCHEMA.limits.classes, "a class that cannot be");
     return found;
   };
   const found: Track[] = [];
@@ -466,7 +371,7 @@ function readTracks(data: Uint8Array, before: Track[], frames: number, alone: bo
   const cy = alone ? fast(coder.signed(shared.y) * 64) : median(seen.map((track) => track.vy));
   const known = new Set(found.map((track) => track.id));
   const births = coder.unsigned(count);
-  need(seen.length + births <= 1024, "too many tracks");
+  need(seen.length + births <= SCHEMA.limits.tracks, "too many tracks");
   let p: Track = {
     id: 0, class: 0, confidence: 8, x: 0, y: 0, width: 640, height: 640, vx: 0, vy: 0, scale_x: 5, scale_y: 5, missed: 0,
   };
@@ -501,12 +406,13 @@ class TrackReader {
   // "read", "skipped" where it builds on a step that never came or is not newer, "damaged".
   take(data: Uint8Array): string {
     const values = read("TrackStep", data, new Uint8Array());
-    const [sequence, frame, reference] = [Number(values[1]), Number(values[2]), Number(values[5])];
+    const of = (name: string): Value => field("TrackStep", values, name);
+    const [sequence, frame, reference] = [of("sequence"), of("frame_index"), of("reference")].map(Number);
     if (sequence <= this.sequence || (reference !== -1 && reference !== this.sequence)) return "skipped";
     try {
       need(frame > this.frame, "it does not lie ahead");
       const before = reference === -1 ? [] : this.tracks;
-      this.tracks = readTracks(values[6] as Uint8Array, before, frame - this.frame, reference === -1);
+      this.tracks = readTracks(of("boxes") as Uint8Array, before, frame - this.frame, reference === -1);
     } catch (error) {
       if (error instanceof Refused) return "damaged";
       throw error;
@@ -569,7 +475,8 @@ class PoseReader {
   // The numbers of a report as the vectors write them, "skipped" or "damaged".
   take(data: Uint8Array): unknown {
     try {
-      return this.decode(new Bits(read("PoseReport", data, new Uint8Array())[2] as Uint8Array));
+      const values = read("PoseReport", data, new Uint8Array());
+      return this.decode(new Bits(field("PoseReport", values, "coded") as Uint8Array));
     } catch (error) {
       if (error instanceof Refused) return "damaged";
       throw error;
@@ -683,6 +590,7 @@ const shifted = (plane: Plane, by: (place: number) => number): Plane =>
 // What each pixel of an axis takes of which samples, and of how many.
 function axis(origin: number, step: number, count: number, length: number): { taps: [number, number][][]; n: number } {
   const n = Math.max(1, Math.ceil(step / 65536));
+  need(n <= 32, "a still that shrinks too much");
   const taps = Array.from({ length: count }, (_, i) => {
     const found: [number, number][] = [];
     for (let j = i * n; j < (i + 1) * n; j++) {
@@ -804,6 +712,20 @@ function checkStill(vector: any): string | undefined {
   );
 }
 
+// What becomes of a still before a decoder sees it: refused, not shown for want of its base, or the stream that it gets.
+function checkStillCase(vector: any): string | undefined {
+  const refused = refusal(() => {
+    if (vector.base_planes) {
+      if (crc32(coded(baseCrop(vector), vector.size[0], vector.size[1])) !== vector.parameters.b) throw new Refused("again");
+      return;
+    }
+    const found = hex(stream(unhex(vector.payload), vector.size[0], vector.size[1]));
+    if (vector.stream !== undefined && found !== vector.stream) throw new Refused(`another stream: ${found}`);
+  });
+  const became = refused === undefined ? "read" : refused.message === "again" ? "again" : "refused";
+  return became === vector.becomes ? undefined : `it is ${became}: ${refused?.message}`;
+}
+
 // ---- The vectors ------------------------------------------------------------------------------------------------
 
 // As the vectors write it: whole numbers beyond 2^53 as text, bytes as {"hex": …}.
@@ -833,11 +755,11 @@ function refusal(attempt: () => unknown): Refused | undefined {
 // Each gives what is wrong with a vector, nothing where it holds.
 const CHECKS: Record<string, (vector: any) => string | undefined> = {
   "messages.json": (vector) => {
-    const values = read(vector.message, unhex(vector.hex), unhex(vector.payload));
+    const values = read(vector.message, unhex(vector.hex), bytesOf(vector.payload));
     return canonical(values.map(plain)) === canonical(vector.fields) ? undefined : canonical(values.map(plain));
   },
   "refused.json": (vector) => {
-    const refused = refusal(() => read(vector.message, unhex(vector.hex), unhex(vector.payload)));
+    const refused = refusal(() => read(vector.message, unhex(vector.hex), bytesOf(vector.payload)));
     if (!refused) return "it was read";
     return refused.version === vector.version ? undefined : `it was refused for: ${refused.message}`;
   },
@@ -853,6 +775,7 @@ const CHECKS: Record<string, (vector: any) => string | undefined> = {
       const became = reader.take(unhex(step.hex));
       const expected = step.damaged ? "damaged" : step.skipped ? "skipped" : "read";
       if (became !== expected) return `step ${number} is ${became}, not ${expected}`;
+      if (step.count !== undefined && step.count !== reader.tracks.length) return `step ${number}: another number of tracks`;
       if (step.tracks && canonical(reader.tracks) !== canonical(step.tracks)) return `step ${number}: another list`;
     }
     return undefined;
@@ -867,6 +790,7 @@ const CHECKS: Record<string, (vector: any) => string | undefined> = {
     return undefined;
   },
   "stills.json": checkStill,
+  "still-cases.json": checkStillCase,
 };
 
 function main(folder: string): number {
@@ -899,4 +823,4 @@ declare class TextEncoder {
   encode(text: string): Uint8Array;
 }
 
-process.exit(main(process.argv[2]));
+process.exit(main(process.argv[3]));

@@ -16,11 +16,14 @@ from hvt_common.protocol.messages import (
     TrackStepEncoder,
     WireError,
 )
+from hvt_common.protocol.messages.exp_golomb import BitWriter
 from hvt_common.protocol.messages.track_boxes import CodedTrack, read_tracks
 from hvt_common.values import Orientation, Pose, Tracks
+from lab.conformance.scripted import Step, pose_changes, track_sessions, whole_pose, written
 
 __all__ = ["poses", "track_steps"]
 
+_LONG = 100
 _TRACK = (
     "id",
     "class",
@@ -42,6 +45,34 @@ def track_steps() -> Iterator[dict[str, Any]]:
     for name, count, steps in (("three cars", 3, 8), ("a crowd", 60, 6), ("nobody", 0, 3)):
         yield {"session": name, "steps": list(_session(count, steps))}
     yield {"session": "damaged steps", "steps": list(_damaged())}
+    for name, script in track_sessions():
+        yield {"session": name, "steps": list(_scripted(script))}
+
+
+def _scripted(script: list[Step]) -> Iterator[dict[str, Any]]:
+    """The list of a long step by its length alone."""
+    state: list[CodedTrack] = []
+    last = -1, -1
+    for sequence, (frame, builds, numbers) in enumerate(script):
+        before, frames = (state if builds else None), frame - last[1]
+        boxes = written(numbers, reference=before, frames=frames)
+        step = TrackStep(
+            session_id=1,
+            sequence=sequence,
+            frame_index=frame,
+            capture_ns=10**18,
+            send_delay_ns=0,
+            reference=last[0] if builds else -1,
+            boxes=boxes,
+        )
+        found: dict[str, Any] = {"hex": step.pack().hex()}
+        try:
+            state = read_tracks(boxes, reference=before, frames=frames)
+        except WireError:
+            yield found | {"damaged": True}
+            continue
+        last = sequence, frame
+        yield found | ({"tracks": _rows(state)} if len(state) < _LONG else {"count": len(state)})
 
 
 def _session(count: int, steps: int) -> Iterator[dict[str, Any]]:
@@ -148,6 +179,49 @@ def poses() -> Iterator[dict[str, Any]]:
     ]
     holes = [reports[1], reports[0], *damaged, reports[1], reports[1], *reports[3:]]
     yield {"session": "holes, damage, and one that stands by itself", "reports": list(_read_poses(holes))}
+    for name, scripts in _pose_scripts().items():
+        made = [PoseReport(session=9, send_ns=7, coded=one.finish()) for one in scripts]
+        yield {"session": name, "reports": list(_read_poses(made))}
+
+
+def _pose_scripts() -> dict[str, list[BitWriter]]:
+    place = (481_370_000, -1_799_999_990)
+    filled = whole_pose(0, 1000, place)
+    filled.plain(1, 3)  # in the bits that fill the last byte
+    steep = [
+        whole_pose(number, 1000 * number, place, yaw=0, pitch=pitch) for number, pitch in ((1, 900), (2, 901))
+    ]
+    return {
+        "to the left, across the antimeridian and north": [
+            whole_pose(14, 1000, place, yaw=5, pitch=-900),
+            pose_changes(15, place=(0, -30), camera=(-7, 0, -5)),
+            pose_changes(0, camera=(7, 1, 5)),
+            pose_changes(1, camera=(0, -2, 0)),
+            pose_changes(1, camera=(0, 1799, 0)),
+            pose_changes(1, camera=(0, 1799, 1), errors=27),
+            pose_changes(2, camera=(0, 0, 0), errors=1),
+            pose_changes(2, camera=(0, 0, 0), errors=-31),
+            pose_changes(3, camera=(0, 0, 0), errors=-1),
+        ],
+        "bits where zeros have to be": [filled, whole_pose(0, 1000, place)],
+        "bounds": [
+            *(whole_pose(0, 1000, (north, 5)) for north in (900_000_000, 900_000_001, -900_000_000)),
+            *(whole_pose(0, 1000, (7, east)) for east in (-1_800_000_000, 1_799_999_999, 1_800_000_000)),
+            whole_pose(0, 1000, place, yaw=3599),
+            whole_pose(0, 1000, place, yaw=3600),
+            *steep,
+        ],
+        "time goes on": [
+            whole_pose(3, 5000, place),
+            pose_changes(4, time_ms=0),
+            pose_changes(4, time_ms=-5),
+            pose_changes(4, time_ms=1),
+            whole_pose(5, 2**42 - 2, place),
+            pose_changes(6, time_ms=2),
+            pose_changes(6, time_ms=1),
+            whole_pose(7, 9, place),
+        ],
+    }
 
 
 def _read_poses(reports: list[PoseReport]) -> Iterator[dict[str, Any]]:

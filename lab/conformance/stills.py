@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from hvt_common.video.still_codecs.h264_intra import split_payload
 from hvt_common.video.still_codecs.h264_syntax import coded_slice, parameter_sets, verbatim_picture
 from hvt_common.video.still_codecs.yuv420 import Planar, padded_size, to_planar
 
-__all__ = ["FILE", "main", "vectors"]
+__all__ = ["FILE", "main", "still_cases", "vectors"]
 
 FILE = Path(__file__).resolve().parents[2] / "docs" / "conformance" / "stills.json"
 _BASE = (64, 48)
@@ -54,6 +55,47 @@ def vectors() -> Iterator[dict[str, Any]]:
         pixels = still_codec(name).decode(coded.data, size=(41, 29))
         yield _vector("a picture file", name, coded.data, (41, 29), pixels) | {
             "tolerance": {"mean": mean, "most": most}
+        }
+
+
+def still_cases() -> Iterator[dict[str, Any]]:
+    """What a reader does before a decoder sees anything: no encoder has a part in it, so that the code makes them."""
+    data = bytes.fromhex("000001 000002 0000 0003 00000004 ff000003 b70000")
+    for what, qp, size, cabac in (
+        ("QP 15 has no loop filter", 15, (16, 16), b"\x55"),
+        ("QP 16 has one", 16, (16, 16), b"\x55"),
+        ("the lowest QP", 0, (33, 17), b"\x01"),
+        ("the highest QP, data that is escaped, zeros at its end", 51, (512, 512), data),
+    ):
+        stream = parameter_sets(padded_size(size)) + coded_slice(cabac, qp=qp, intra=True)
+        yield {
+            "what": what,
+            "size": size,
+            "payload": bytes((qp, *cabac)).hex(),
+            "stream": stream.hex(),
+            "becomes": "read",
+        }
+    for what, payload in (("a QP of 52", "3401"), ("no data", "20"), ("nothing", "")):
+        yield {"what": what, "size": (16, 16), "payload": payload, "becomes": "refused"}
+    planes = _base_planes()
+    for what, side, change, becomes in (
+        ("the base that it was coded on", 64, 0, "read"),
+        ("another base", 64, 1, "again"),
+        ("32 samples a pixel", 32 * 16, 0, "read"),
+        ("33 samples a pixel", 33 * 16, 0, "refused"),
+    ):
+        crop, view = (0, 0, side, side), View((side, side), _BASE, 1.0, (0.0, 0.0))
+        base = exact_base_crop(planes, view=view, crop_source_px=crop, size=(16, 16))
+        yield {
+            "what": what,
+            "size": (16, 16),
+            "parameters": {"b": zlib.crc32(to_planar(base).tobytes()) ^ change},
+            "crop_source_px": crop,
+            "view_scale": 1.0,
+            "view_offset_px": (0.0, 0.0),
+            "base_size": _BASE,
+            "base_planes": [plane.tobytes().hex() for plane in planes],
+            "becomes": becomes,
         }
 
 

@@ -6,6 +6,8 @@ Nothing is drawn by chance: the same code gives the same files, and a test compa
 from __future__ import annotations
 
 import json
+import math
+import struct
 import sys
 import zlib
 from collections.abc import Iterator, Mapping
@@ -21,6 +23,7 @@ from hvt_common.protocol.messages import (
     BaseHeader,
     Flags,
     Message,
+    PackedMessage,
     RoiHeader,
     WireError,
     kinds,
@@ -29,12 +32,13 @@ from hvt_common.protocol.messages import (
     parse_backlog_still,
     parse_backlog_units,
 )
-from hvt_common.protocol.messages.envelope import MOST_UNKNOWN_FIELDS, READ_VERSIONS, WIRE_VERSION
-from hvt_common.protocol.messages.fields import Int
+from hvt_common.protocol.messages.envelope import DEEPEST, MOST_UNKNOWN_FIELDS, READ_VERSIONS, WIRE_VERSION
+from lab.conformance.schema import PATH, schema
 from lab.conformance.sessions import poses, track_steps
-from rigs.messages import EXAMPLES, ROI
+from lab.conformance.stills import still_cases
+from rigs.messages import BASE, EXAMPLES, INFO, REQUEST, ROI
 
-__all__ = ["FOLDER", "files", "main"]
+__all__ = ["FOLDER", "files", "main", "schema_text"]
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "conformance"
 _PAYLOADS: Mapping[type[Message], bytes] = {BaseHeader: b"an access unit", RoiHeader: b"a still"}
@@ -52,6 +56,7 @@ def files() -> dict[str, str]:
         "objects.json": list(_objects()),
         "track-steps.json": list(track_steps()),
         "poses.json": list(poses()),
+        "still-cases.json": list(still_cases()),
     }
     # A vector a line: a change shows which.
     return {
@@ -60,13 +65,128 @@ def files() -> dict[str, str]:
     }
 
 
+def schema_text() -> str:
+    """``docs/wire.json``: a field a line."""
+    content = _plain(schema())
+    lines = []
+    for part in ("messages", "nested", "objects"):
+        for name, one in content.pop(part).items():
+            rows = ",\n    ".join(json.dumps(row, ensure_ascii=True) for row in one.pop("fields"))
+            head = "".join(f'"{key}": {value}, ' for key, value in one.items())
+            lines.append((part, f'  "{name}": {{{head}"fields": [\n    {rows}\n  ]}}'))
+    parts = [f'"{key}": {json.dumps(value, ensure_ascii=True)}' for key, value in content.items()]
+    parts += [
+        f'"{part}": {{\n' + ",\n".join(text for where, text in lines if where == part) + "\n}"
+        for part in ("messages", "nested", "objects")
+    ]
+    return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
 def main() -> int:
-    """Write all of them."""
+    """Write all of them, and the schema."""
     FOLDER.mkdir(exist_ok=True)
+    PATH.write_text(schema_text(), encoding="utf-8")
     for name, text in files().items():
         (FOLDER / name).write_text(text, encoding="utf-8")
         print(f"{FOLDER / name}: {text.count(chr(10)) - 2} vectors")
     return 0
+
+
+_OF_ANY_TYPE: tuple[tuple[Any, str], ...] = (
+    (None, "is nothing"),
+    (1.5, "is a fraction"),
+    (True, "is true"),
+    (1, "is 1"),
+    ("\x07", "is a text with a control character"),
+    ([], "is an empty array"),
+    ({}, "is an empty map"),
+    (b"", "is no bytes"),
+    (2**64 - 1, "is far above all"),
+)
+
+
+def edges(kind: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:  # noqa: C901 - a case for each type
+    """Values at and beyond the bounds of a schema; MessagePack holds no more than 64 bits."""
+    match kind:
+        case {"type": "int", "low": low, "high": high}:
+            found = [(low, "at its bound"), (high, "at its upper bound")]
+            found += [
+                (low - 1, "just below its bound"),
+                (high + 1, "just above its bound"),
+                (float(low), "as a fraction"),
+            ]
+            yield from ((one, f"is {what}") for one, what in found if -(2**63) <= one < 2**64)
+        case {"type": "float", "low": low, "high": high}:
+            yield from ((low, "is at its bound"), (high, "is at its upper bound"), (math.nan, "is NaN"))
+            yield from (
+                (math.nextafter(low, -math.inf), "is below"),
+                (math.nextafter(high, math.inf), "is above"),
+            )
+            yield math.inf, "is infinite"
+            yield 1, "is a whole number"
+        case {"type": "str", "most_bytes": most}:
+            yield "ü" * (most // 2), "is as long as may be"
+            yield "ü" * (most // 2) + "x", "has a byte too many"
+            yield from _TEXTS
+        case {"type": "bin", "least_bytes": least, "most_bytes": most}:
+            yield from ((bytes(most), "are as many as may be"), (bytes(most + 1), "are too many"))
+            if least:
+                yield bytes(least - 1), "are too few"
+        case {"type": "scalar", "low": low, "high": high, "most": most}:
+            yield from edges({"type": "int", "low": low, "high": high})
+            yield from edges({"type": "float", "low": -most, "high": most})
+            yield from edges({"type": "str", "most_bytes": kind["most_bytes"]})
+        case {"type": "array", "least": least, "most": most, "of": of}:
+            one = _plain_value(of)
+            box = [0, 0, *[1] * 2] if "box" in kind else None
+            yield box or [one] * most, "is as long as may be"
+            yield [one] * (most + 1), "is longer than may be"
+            if least:
+                yield [one] * (least - 1), "is shorter than may be"
+            if box:
+                yield from (([3, 0, 2, 5], "is inside out"), ([0, 3, 5, 2], "is upside down"))
+                yield from (([3, 0, 3, 5], "has no width"), ([0, 3, 5, 3], "has no height"))
+            else:
+                yield from (
+                    ([raw] + [one] * max(0, least - 1), f"has one that {what}") for raw, what in edges(of)
+                )
+        case {"type": "map", "most": most, "key_bytes": key_bytes, "of": of}:
+            one = _plain_value(of)
+            yield {f"{number}": one for number in range(most)}, "is as large as may be"
+            yield {f"{number}": one for number in range(most + 1)}, "is larger than may be"
+            yield from (
+                ({"k" * key_bytes: one}, "has a long key"),
+                ({"k" * (key_bytes + 1): one}, "has too long a key"),
+            )
+            yield from (({"a\u202e": one}, "has a key that turns round"), ({"": one}, "has an empty key"))
+            yield from (({"a": raw}, f"has a value that {what}") for raw, what in edges(of))
+
+
+_TEXTS = (
+    ("", "is empty"),
+    ("\x7f", "has a control"),
+    ("\x85", "has a later control"),
+    ("\u2028", "begins a line"),
+    ("\u202e", "turns round"),
+    ("\u2066", "is isolated"),
+    ("\u200f", "has a mark of direction"),
+    ("\ufeffa", "begins with a mark of byte order"),
+    ("\U0001fae9\ue000\xa0", "has a new emoji, a private character and a space that does not break"),
+)
+
+
+def _plain_value(kind: Mapping[str, Any]) -> Any:
+    """The smallest value of a schema."""
+    match kind:
+        case {"type": "int", "low": low, "high": high}:
+            return min(max(0, low), high)
+        case {"type": "float", "low": low}:
+            return max(low, 0.0)
+        case {"type": "nested", "of": name}:
+            return [_plain_value(one) for one in schema()["nested"][name]["fields"]]
+        case {"type": "array", "least": least, "of": of}:
+            return [_plain_value(of)] * least
+    return {"str": "", "bin": b"", "bool": False, "scalar": 0, "map": {}}[kind["type"]]
 
 
 # Messages that are to be read
@@ -75,11 +195,11 @@ def main() -> int:
 def _messages() -> Iterator[dict[str, Any]]:
     for message in EXAMPLES:
         yield _vector(message, "an example")
-        for name, kind in kinds(type(message)):
-            if isinstance(kind, Int):
-                for bound in (kind.low, kind.high):
-                    yield _vector(replace(message, **{name: bound}), f"{name} at its bound")
+        yield from (
+            _vector(replace_at(message, place, raw), what) for place, raw, what in _edges(message, good=True)
+        )
         yield from _of_other_minors(message)
+    yield from _good_envelopes()
 
 
 def _of_other_minors(message: Message) -> Iterator[dict[str, Any]]:
@@ -121,6 +241,12 @@ def _vector(message: Message, what: str, data: bytes | None = None) -> dict[str,
     }
 
 
+def replace_at(message: Message, place: int, raw: Any) -> Message:
+    """The message with another value of a field, as MessagePack holds it."""
+    name, kind = kinds(type(message))[place - 1]
+    return replace(message, **{name: kind.decode(raw)})
+
+
 def _plain(value: Any) -> Any:
     """As JSON can hold it: bytes as ``{"hex": …}``, whole numbers beyond 2^53 as text."""
     match value:
@@ -133,6 +259,93 @@ def _plain(value: Any) -> Any:
         case dict():
             return {key: _plain(one) for key, one in value.items()}
     return [_plain(one) for one in value]
+
+
+def _good_envelopes() -> Iterator[dict[str, Any]]:
+    """The same fields in other bytes: whatever MessagePack allows is read."""
+    values = msgpack.unpackb(BASE.pack())[:-1]
+    spare_bytes = BaseHeader.MAX_BYTES - len(BASE.pack()) - 2
+    payload = _PAYLOADS[BaseHeader]
+    yield _vector(BASE, "as long as a message may be", _packed([*values, bytes(spare_bytes)], payload))
+    deepest = _nested(DEEPEST - 1)
+    yield _vector(BASE, "an unknown field as deep as may be", _packed([*values, deepest], payload))
+    maps = _nested(DEEPEST - 1, map_of=True)
+    yield _vector(BASE, "maps as deep as may be", _packed([*values, maps], payload))
+    small = replace(BASE, send_delay_ns=-5)
+    for what, coded in (
+        ("a number in a signed byte", b"\xd0\xfb"),
+        ("a number in 16 signed bits", b"\xd1\xff\xfb"),
+        ("a number in 32 signed bits", b"\xd2\xff\xff\xff\xfb"),
+        ("a number in 64 signed bits", b"\xd3\xff\xff\xff\xff\xff\xff\xff\xfb"),
+    ):
+        yield _vector(small, what, _coded(small, {"send_delay_ns": coded}))
+    yield _vector(INFO, "a float of 32 bits", _coded(INFO, {"fps": b"\xca" + struct.pack(">f", INFO.fps)}))
+    long_text = b"\xdb" + struct.pack(">I", len(INFO.edge)) + INFO.edge.encode()
+    yield _vector(INFO, "a text with a long length", _coded(INFO, {"edge": long_text}))
+    sides = b"\xdd\0\0\0\x02" + b"".join(map(msgpack.packb, INFO.base_size))
+    yield _vector(INFO, "an array with a long length", _coded(INFO, {"base_size": sides}))
+    request = replace(REQUEST, arguments={"bps": 5})
+    for what, coded in (("a map with a length of 16 bits", b"\xde\0\x01"), ("of 32 bits", b"\xdf\0\0\0\x01")):
+        yield _vector(request, what, _coded(request, {"arguments": coded + b"\xa3bps\x05"}))
+
+
+def _bad_envelopes() -> Iterator[dict[str, Any]]:
+    values = msgpack.unpackb(BASE.pack())[:-1]
+    payload = _PAYLOADS[BaseHeader]
+    spare_bytes = BaseHeader.MAX_BYTES - len(BASE.pack()) - 2
+    for what, unknown in (
+        ("a byte longer than a message may be", bytes(spare_bytes + 1)),
+        ("an unknown field too deep", _nested(DEEPEST)),
+        ("maps too deep", _nested(DEEPEST, map_of=True)),
+        ("an unknown map whose key is a number", {1: 2}),
+        ("an unknown field of a type of its own", msgpack.ExtType(5, b"x")),
+    ):
+        yield _bad(BASE, what, _packed([*values, unknown], payload), payload)
+    for what, coded in (
+        ("a key twice", b"\x82\xa1a\x01\xa1a\x02"),
+        ("a key that is a number", b"\x81\x01\x02"),
+        ("a key that is bytes", b"\x81\xc4\x01a\x02"),
+        ("a text that is no UTF-8", b"\x81\xa1a\xa2\xc3\x28"),
+        ("a text with half a surrogate", b"\x81\xa1a\xa3\xed\xa0\x80"),
+        ("a text in place of a map", b"\xa1a"),
+    ):
+        yield _bad(REQUEST, what, _coded(REQUEST, {"arguments": coded}), b"")
+    whole = BASE.pack(payload)
+    other = whole[:1] + bytes((WIRE_VERSION + 1,)) + whole[2:]
+    yield _bad(BASE, "another version whose checksum is wrong", other, payload, version=True)
+    yield _bad(BASE, "another version without a checksum", b"\x92\x07\xa1x", payload, version=True)
+    body = bytes((whole[0], *whole[1:-5], 0xCF, 0, 0, 0))
+    checksum = zlib.crc32(body, zlib.crc32(payload)).to_bytes(4, "big")
+    yield _bad(BASE, "the checksum in eight bytes", body + b"\0" + checksum, payload)
+    for message in (BASE, ROI):
+        most = type(message).MAX_PAYLOAD
+        vector = _bad(message, "a payload that is too long", message_of(message, most + 1), bytes(most + 1))
+        yield vector | {"payload": {"zeros": most + 1}}
+
+
+def message_of(message: Message, zeros: int) -> bytes:
+    """Sealed over a payload of so many zeros, however many."""
+    return _packed(msgpack.unpackb(message.pack())[:-1], bytes(zeros))
+
+
+def _nested(levels: int, *, map_of: bool = False) -> Any:
+    value: Any = {} if map_of else []
+    for _ in range(levels - 1):
+        value = {"a": value} if map_of else [value]
+    return value
+
+
+def _coded(message: Message, changed: Mapping[str, bytes]) -> bytes:
+    """With fields in other bytes."""
+    names = [name for name, _ in kinds(type(message))]
+    fields_of = PackedMessage.of(message).fields
+    rows = [changed.get(name, fields_of[name]) for name in names]
+    body = msgpack.Packer().pack_array_header(len(rows) + 2) + bytes((WIRE_VERSION,)) + b"".join(rows)
+    return (
+        bytes(body)
+        + b"\xce"
+        + zlib.crc32(body, zlib.crc32(_PAYLOADS.get(type(message), b""))).to_bytes(4, "big")
+    )
 
 
 # Messages that are not
@@ -170,32 +383,28 @@ def _refused() -> Iterator[dict[str, Any]]:
         yield _bad(
             message, "a field too few", _packed(values[: len(values) - optional - 1], payload), payload
         )
-        for place, (name, kind) in enumerate(kinds(type(message)), 1):
-            for wrong, what in _wrong(kind):
-                changed = [*values[:place], wrong, *values[place + 1 :]]
-                yield _bad(message, f"{name} {what}", _packed(changed, payload), payload)
+        yield from (
+            _bad(message, what, _packed([*values[:place], raw, *values[place + 1 :]], payload), payload)
+            for place, raw, what in _edges(message, good=False)
+        )
+    yield from _bad_envelopes()
 
 
-def _wrong(kind: Any) -> Iterator[tuple[Any, str]]:
-    """Values that a kind of field refuses, as far as MessagePack can hold them."""
-    for value, what in (
-        (None, "is nothing"),
-        (1.5, "is a fraction"),
-        ("\x07", "is a text with a control character"),
-        ([], "is an empty array"),
-        (2**64 - 1, "is far above all"),
-    ):
-        try:
-            kind.decode(value)
-        except WireError:
-            yield value, what
-    if isinstance(kind, Int):
-        for value, what in (
-            (kind.low - 1, "is just below its bound"),
-            (kind.high + 1, "is just above its bound"),
-        ):
-            if -(2**63) <= value < 2**64:
-                yield value, what
+def _edges(message: Message, *, good: bool) -> Iterator[tuple[int, Any, str]]:
+    """Values at the edges of what each field may hold, by its place: those that are read, or those refused."""
+    size = len(message.pack(_PAYLOADS.get(type(message), b"")))
+    values = msgpack.unpackb(message.pack())[:-1]
+    for place, (name, kind) in enumerate(kinds(type(message)), 1):
+        for raw, what in (*edges(kind.schema()), *_OF_ANY_TYPE):
+            try:
+                kind.decode(raw)
+            except WireError:
+                read = False
+            else:
+                read = True
+            grown = len(msgpack.packb(raw)) - len(msgpack.packb(values[place]))
+            if read is good and size + grown <= type(message).MAX_BYTES:
+                yield place, raw, f"{name} {what}"
 
 
 def _bad(
@@ -245,9 +454,20 @@ def _objects() -> Iterator[dict[str, Any]]:
         ("times are not in order", [rows[0], [9, 1_000, False, b"second"]]),
         ("a frame is empty", [[7, 1_000, True, b""]]),
         ("a flag is a number", [[7, 1_000, 1, b"first"]]),
+        ("a frame comes twice", [rows[0], [7, 1_200, False, b"second"]]),
+        ("a frame has a further field", [[*rows[0], 1]]),
+        ("a frame has a field too few", [rows[0][:3]]),
+        ("more frames than an object holds", [[frame, frame, False, b"x"] for frame in range(2401)]),
         ("an index is below zero", [[-1, 1_000, True, b"first"]]),
     ):
         yield _bad_object("base", what, msgpack.packb(changed))
+    yield _bad_object("still", "a further field", msgpack.packb([still.attachment, "image/jpeg", b"x", 1]))
+    for what, values in (
+        ("the attachment is a byte too long", [bytes(1025), "image/jpeg", b"x"]),
+        ("the encoding is a byte too long", [b"", "x" * 65, b"x"]),
+        ("the encoding has a control", [b"", "image/\n", b"x"]),
+    ):
+        yield _bad_object("still", what, msgpack.packb(values))
     yield _bad_object("still", "there is no still", msgpack.packb([still.attachment, "image/jpeg", b""]))
     yield _bad_object(
         "still", "the encoding is bytes", msgpack.packb([still.attachment, b"jpeg", b"a still"])

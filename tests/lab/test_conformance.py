@@ -16,38 +16,23 @@ from PIL import Image as Pillow
 from hvt_common.values import View
 from hvt_common.video.exact_crop import exact_base_crop
 from hvt_common.video.still_codecs import BaseMissingError, still_codec, still_codec_names
+from lab.conformance.mutants import MUTANTS, Mutant, built, survivors
+from lab.conformance.schema import PATH
 from lab.conformance.stills import FILE, vectors
-from lab.conformance.vectors import FOLDER, files
-
-READER = Path(__file__).resolve().parents[2] / "lab" / "conformance" / "reader.ts"
+from lab.conformance.vectors import FOLDER, files, schema_text
 
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """The command that runs it."""
-    compiler, node = shutil.which("tsc"), shutil.which("node")
-    if compiler is None or node is None:
+    if shutil.which("tsc") is None or shutil.which("node") is None:
         pytest.skip("no TypeScript here (Debian: node-typescript)")
-    out = tmp_path_factory.mktemp("reader")
-    settings = [
-        "--target",
-        "es2020",
-        "--lib",
-        "es2020",
-        "--module",
-        "commonjs",
-        "--strict",
-        "--outDir",
-        str(out),
-    ]
-    done = subprocess.run([compiler, *settings, str(READER)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
-    return [node, str(out / "reader.js")]
+    return ["node", str(built(tmp_path_factory.mktemp("reader")))]
 
 
 def run(reader: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
     """Over all files of a folder."""
-    return subprocess.run([*reader, str(folder)], capture_output=True, text=True, check=False)
+    return subprocess.run([*reader, str(PATH), str(folder)], capture_output=True, text=True, check=False)
 
 
 def test_the_vectors_are_those_of_the_code():
@@ -55,6 +40,7 @@ def test_the_vectors_are_those_of_the_code():
     written = {path.name: path.read_text(encoding="utf-8") for path in FOLDER.glob("*.json") if path != FILE}
     assert written.keys() == files().keys()
     stale = [name for name, text in files().items() if text != written[name]]
+    stale += [PATH.name] * (PATH.read_text(encoding="utf-8") != schema_text())
     assert stale == [], "run PYTHONPATH=.:tests/support python -m lab.conformance.vectors"
 
 
@@ -64,13 +50,14 @@ def test_an_independent_reader_reads_all_of_them(reader):
     assert done.returncode == 0, done.stdout + done.stderr
     assert [line.split(":")[0] for line in done.stdout.splitlines()] == [
         *("messages.json", "refused.json", "objects.json", "track-steps.json", "poses.json", "stills.json"),
+        "still-cases.json",
     ]
 
 
 @pytest.mark.parametrize(
     ("name", "before", "after"),
     [
-        ("messages.json", '"sequence at its bound", "hex": "98', '"sequence at its bound", "hex": "99'),
+        ("messages.json", '"sequence is at its bound", "hex": "98', '"sequence is at its bound", "hex": "99'),
         ("refused.json", '"version": true', '"version": false'),
         ("objects.json", '"values": [[7, 1000', '"values": [[8, 1000'),
         ("track-steps.json", '"width": ', '"width": 1'),
@@ -90,6 +77,20 @@ def test_a_wrong_vector_is_noticed(reader, tmp_path, name, before, after):
     done = run(reader, tmp_path / "vectors")
     assert done.returncode == 1
     assert f"{name} " in done.stdout
+
+
+def test_the_vectors_notice_a_broken_reader(reader):
+    """Somebody's reader that is wrong at a bound would pass them; `python -m lab.conformance.mutants` tries all."""
+    assert survivors(Path(reader[-1]), MUTANTS[::10]) == []
+    assert sum(bool(one.harmless) for one in MUTANTS) <= 3
+
+
+def test_a_mutant_that_is_none_is_noticed(reader):
+    """Faults that are no longer in the reader, or change nothing, would count as caught."""
+    same = Mutant("nothing", "if (at < data.length)", "if (data.length > at)")
+    assert survivors(Path(reader[-1]), [same]) == [same]
+    with pytest.raises(ValueError, match="0 times"):
+        survivors(Path(reader[-1]), [Mutant("gone", "no such text", "")])
 
 
 STILLS: list[dict[str, Any]] = [json.loads(line.rstrip(",")) for line in FILE.read_text().splitlines()[1:-1]]

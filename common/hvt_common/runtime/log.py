@@ -17,6 +17,7 @@ from typing import Any
 from hvt_common.errors import FlightError, UserError
 from hvt_common.redaction import Redaction
 from hvt_common.runtime import failures
+from hvt_common.units import shown_text
 
 __all__ = ["LOG_FORMATS", "START_LOGGER", "STATUS_LOGGER", "Log", "log_fields", "start_log"]
 
@@ -151,7 +152,7 @@ class _TextFormatter(logging.Formatter):
         self._redaction = redaction
 
     def format(self, record: logging.LogRecord) -> str:
-        return self._redaction.text(super().format(record))
+        return shown_text(self._redaction.text(super().format(record)))
 
 
 class _JsonFormatter(logging.Formatter):

@@ -19,6 +19,7 @@ from rich.text import Text
 
 from hvt_common.errors import FlightError, NotYetError, UserError, check_not_read
 from hvt_common.runtime.log import STATUS_LOGGER
+from hvt_common.units import shown_text
 
 __all__ = ["StatusLine", "check_writable", "print_table", "say", "write_json"]
 
@@ -45,7 +46,7 @@ class StatusLine:
         """Replace the line (call about once a second)."""
         with _going_on(sys.stderr):
             if self._live is not None:
-                self._live.update(Text(text, overflow="ellipsis", no_wrap=True), refresh=True)
+                self._live.update(Text(shown_text(text), overflow="ellipsis", no_wrap=True), refresh=True)
             elif not self._quiet:
                 if self._updates % _PLAIN_EVERY == 0:
                     self._print(text)
@@ -61,7 +62,7 @@ class StatusLine:
         if self._log is not None:
             self._log.info("%s", text)
         else:
-            self._console.print(text, markup=False, soft_wrap=True)
+            self._console.print(shown_text(text), markup=False, soft_wrap=True)
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -98,7 +99,7 @@ def _going_on(stream: TextIO) -> Iterator[None]:
 def say(text: str) -> None:
     """Print a line on standard output, if it can be written."""
     with _going_on(sys.stdout):
-        print(text)
+        print(shown_text(text))
 
 
 def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
@@ -107,7 +108,9 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
     table.add_column(style="cyan", no_wrap=True)
     table.add_column()
     for name, value in rows:
-        table.add_row(Text(name), Text(value))  # not markup: a path may have brackets in it
+        table.add_row(
+            Text(shown_text(name)), Text(shown_text(value))
+        )  # not markup: a path may have brackets in it
     with _going_on(sys.stdout):
         _Console(highlight=False).print(table)
 

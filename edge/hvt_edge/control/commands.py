@@ -6,7 +6,6 @@ crop. Who commands is not trusted: arguments have bounds, and requests a rate.
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -148,8 +147,11 @@ class Commands:
 
     def _tracks(self, arguments: Arguments) -> _Result:
         _Reader("tracks", arguments).end()
-        frame_index, tracks = self.on_demand.tracks()
-        return _Result(frame_index=frame_index, tracks=tracks)
+        frame_index, tracks, there = self.on_demand.tracks()
+        note = (
+            f"of {there} tracks these are the {len(tracks)} of most confidence" if there > len(tracks) else ""
+        )
+        return _Result(frame_index=frame_index, tracks=tracks, note=note)
 
     def _set_budget(self, arguments: Arguments) -> _Result:
         reader = _Reader("set-budget", arguments)
@@ -255,11 +257,11 @@ class _Reader:
         value = self._left.pop(name, None)
         if value is None:
             return None
-        if not isinstance(value, int | float) or not math.isfinite(value) or not low <= value <= high:
+        if type(value) is not int or not low <= value <= high:
             raise RefusedError(
                 f"{self._command}: {name} is a whole number from {low} to {high}, not {value!r:.24}"
             )
-        return int(value)
+        return value
 
     def needed(self, name: str, low: int, high: int) -> int:
         """As `optional`, and must be given."""

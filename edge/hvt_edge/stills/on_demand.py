@@ -158,8 +158,8 @@ class OnDemand:
                 raise RefusedError(refusal)
             return note
 
-    def tracks(self) -> tuple[int, tuple[TrackNow, ...]]:
-        """The newest frame's index, and its tracks by id; of too many, those of most confidence."""
+    def tracks(self) -> tuple[int, tuple[TrackNow, ...], int]:
+        """The newest frame's index, its tracks by id, of too many the most confident, and how many there are."""
         newest = self.ring.newest
         if newest is None:
             raise RefusedError("there is no frame yet, or none is kept (--ring)")
@@ -177,7 +177,7 @@ class OnDemand:
             )
             for row in rows
         ]
-        return newest.frame_index, tuple(listed)
+        return newest.frame_index, tuple(listed), len(tracks)
 
     def wants_tracks(self, capture_ns: int) -> bool:
         """Whether a ground has requested tracks shortly before this frame."""

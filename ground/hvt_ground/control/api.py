@@ -171,9 +171,12 @@ class RemoteEdge:
             raise UserError(self._absent())
         return self._parsed(Info.parse, answer)
 
-    def tracks(self) -> list[EdgeTrack]:
-        """What it tracks now, by its own ids: 64 tracks at most."""
+    def tracks(self, *, on_note: Callable[[str], None] = lambda _note: None) -> list[EdgeTrack]:
+        """What it tracks now, by its own ids; ``on_note`` is called with a sentence where that is not all."""
         names = self.info().class_names
+        answer = self.command(Command.TRACKS)
+        if answer.note:
+            on_note(answer.note)
         return [
             EdgeTrack(
                 one.track_id,
@@ -181,7 +184,7 @@ class RemoteEdge:
                 one.confidence,
                 one.box_source_px,
             )
-            for one in self.command(Command.TRACKS).tracks
+            for one in answer.tracks
         ]
 
     def keyframe(self) -> None:

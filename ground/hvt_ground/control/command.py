@@ -90,7 +90,7 @@ def _described(still: RequestedStill) -> str:
 
 
 def _tracks(edge: RemoteEdge) -> None:
-    tracks = edge.tracks()
+    tracks = edge.tracks(on_note=lambda note: say(f"{edge.name}: {note}"))
     say(f"{'track':>6}  {'class':<14} {'conf':>4}  x,y,w,h in source pixels")
     for one in tracks:
         x1, y1, x2, y2 = one.box_source_px

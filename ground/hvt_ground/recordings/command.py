@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hvt_common.errors import Parser, UserError
 from hvt_common.runtime.reporting import say
-from hvt_common.units import SECOND_NS, parse_limit
+from hvt_common.units import SECOND_NS, parse_limit, shown_text
 from hvt_ground.recordings.database import read_index
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.sinks.tracks_table import utc_text
@@ -90,10 +90,7 @@ def _cells(row: RecordingRow) -> tuple[str, ...]:
         " ".join([classes, *notes]).strip(),
     )
     # Names come from the wire: none may move the cursor.
-    return tuple(
-        cell if cell.isprintable() else "".join(one if one.isprintable() else "?" for one in cell)
-        for cell in cells
-    )
+    return tuple(shown_text(cell).replace("\n", "?") for cell in cells)
 
 
 def _as_json(row: RecordingRow, folder: Path) -> dict[str, object]:

@@ -110,6 +110,7 @@ def test_one_that_never_fits_comes_smaller_within_some_seconds():
 
 
 REFUSED = [
+    ({"quality": 10.0}, "quality is a whole number from 5 to 95, not 10.0"),
     ({"track": 9}, "no track 9 at frame 59: the edge's own tracks there are 5"),
     ({"track": 5, "at_ms": -9000}, "of 9 s ago is not held: frames go back 2.9 s"),
     ({"frame": 1000}, "frame 1000 is yet to come: the newest is 59"),
@@ -172,6 +173,16 @@ def test_the_tracks_are_those_of_the_newest_frame_in_source_pixels():
     assert (answer.frame_index, track.track_id, track.class_id, track.confidence) == (9, 5, 0, 0.8)
     expected = VIEW.to_source(np.array([rig.box(9)], np.float32))[0]
     assert track.box_source_px == pytest.approx(expected.tolist(), abs=0.1)
+
+
+def test_an_answer_that_leaves_tracks_out_says_so(monkeypatch):
+    """64 of 119 tracks came without a word: whoever counts them would count wrong."""
+    rig = Rig()
+    rig.run(10)
+    frame_index, tracks, there = rig.commands.on_demand.tracks()
+    assert (len(tracks), there, rig.ask("tracks").note) == (1, 1, "")
+    monkeypatch.setattr(rig.commands.on_demand, "tracks", lambda: (frame_index, tracks, 119))
+    assert rig.ask("tracks").note == "of 119 tracks these are the 1 of most confidence"
 
 
 def test_another_budget_counts_from_a_keyframe_that_comes_at_once():

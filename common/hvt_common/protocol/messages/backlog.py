@@ -11,12 +11,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import msgpack
 
-from hvt_common.protocol.messages.envelope import MAX_PAYLOAD_BYTES, Message
-from hvt_common.protocol.messages.fields import I63, U32, U64, Int, OneOf, WireError, wire_field
+from hvt_common.protocol.messages.envelope import MAX_PAYLOAD_BYTES, Message, from_values, kinds, unpacked
+from hvt_common.protocol.messages.fields import (
+    I63,
+    U32,
+    U64,
+    Blob,
+    Flag,
+    Int,
+    OneOf,
+    Text,
+    WireError,
+    wire_field,
+)
 
 __all__ = [
     "MAX_ACKNOWLEDGED_RANGES",
@@ -42,6 +53,7 @@ _MAX_ENCODING_BYTES = 64
 _SIZE = Int(1, MAX_BACKLOG_BYTES)
 
 
+_T = TypeVar("_T")
 ObjectKey = tuple[int, str, int]
 """Session, kind and number: what an object is called on the link."""
 
@@ -104,21 +116,21 @@ class AcknowledgedRange:
 class BacklogStill:
     """A stored still: what would have crossed on ``roi``."""
 
-    attachment: bytes
+    attachment: bytes = wire_field(Blob(_MAX_HEADER_BYTES))
     """A `RoiHeader` with the flag `STORED`, sealed over ``payload``."""
-    encoding: str
+    encoding: str = wire_field(Text(_MAX_ENCODING_BYTES))
     """Of Zenoh: the media type."""
-    payload: bytes
+    payload: bytes = wire_field(Blob(MAX_BACKLOG_BYTES, least=1))
 
 
 @dataclass(frozen=True, slots=True)
 class BacklogUnit:
     """One stored access unit."""
 
-    frame_index: int
-    capture_ns: int
-    keyframe: bool
-    data: bytes
+    frame_index: int = wire_field(Int(0, U32))
+    capture_ns: int = wire_field(Int(0, I63))
+    keyframe: bool = wire_field(Flag())
+    data: bytes = wire_field(Blob(MAX_BACKLOG_BYTES, least=1))
     """HEVC, Annex B."""
 
 
@@ -130,13 +142,7 @@ def pack_backlog_still(still: BacklogStill) -> bytes:
 
 def parse_backlog_still(data: bytes) -> BacklogStill:
     """Unpack; raises `WireError` and nothing else, for any bytes. The attachment is not parsed."""
-    values = _unpack(data, "a stored still")
-    if len(values) != 3 or [type(value) for value in values] != [bytes, str, bytes]:
-        raise WireError("a stored still is not an attachment, an encoding and a payload")
-    attachment, encoding, payload = values
-    if len(attachment) > _MAX_HEADER_BYTES or len(encoding) > _MAX_ENCODING_BYTES or not payload:
-        raise WireError("a stored still has an attachment or encoding that is too long, or no payload")
-    return BacklogStill(attachment, encoding, payload)
+    return _exact(BacklogStill, _unpack(data, "a stored still"))
 
 
 def pack_backlog_units(units: Sequence[BacklogUnit]) -> bytes:
@@ -152,27 +158,25 @@ def parse_backlog_units(data: bytes) -> tuple[BacklogUnit, ...]:
     rows = _unpack(data, "stored video")
     if not 1 <= len(rows) <= _MAX_UNITS:
         raise WireError(f"stored video of {len(rows)} frames: 1 to {_MAX_UNITS} are accepted")
-    units = tuple(_unit(row) for row in rows)
+    units = tuple(_exact(BacklogUnit, row) for row in rows)
     for before, unit in pairwise(units):
         if unit.frame_index <= before.frame_index or unit.capture_ns <= before.capture_ns:
             raise WireError("stored video whose frames are not in order")
     return units
 
 
-def _unit(row: Any) -> BacklogUnit:
-    if type(row) is not list or [type(value) for value in row] != [int, int, bool, bytes]:
-        raise WireError("stored video with a frame that is not an index, a time, a flag and bytes")
-    frame_index, capture_ns, keyframe, data = row
-    if not (0 <= frame_index <= U32 and 0 <= capture_ns <= I63 and data):
-        raise WireError("stored video with an index or a time out of bounds, or an empty frame")
-    return BacklogUnit(frame_index, capture_ns, keyframe, data)
+def _exact(kind: type[_T], values: Any) -> _T:
+    """Objects are as they were stored: no field came later, and none is missing."""
+    if type(values) is not list or len(values) != len(kinds(kind)):
+        raise WireError(f"a {kind.__name__} that is not an array of {len(kinds(kind))}")
+    return from_values(kind, values)
 
 
 def _unpack(data: bytes, name: str) -> list[Any]:
     if len(data) > MAX_BACKLOG_BYTES:
         raise WireError(f"{name} of {len(data)} bytes is longer than {MAX_BACKLOG_BYTES}")
     try:
-        values = msgpack.unpackb(data, raw=False, strict_map_key=True, use_list=True, max_ext_len=0)
+        values = unpacked(data)
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise WireError(
             f"{name} is not MessagePack: {str(error).strip() or type(error).__name__:.80}"

@@ -13,6 +13,7 @@ from hvt_common.protocol.messages.fields import (
     I63,
     U32,
     U64,
+    Box,
     Flag,
     Int,
     ListOf,
@@ -20,7 +21,6 @@ from hvt_common.protocol.messages.fields import (
     Scalar,
     Scaled,
     Text,
-    TupleOf,
     wire_field,
 )
 
@@ -93,7 +93,7 @@ class TrackNow:
     class_id: int = wire_field(Int(0, 2047))
     """Index into `Info.class_names`."""
     confidence: float = wire_field(Scaled(0, 1, 1000))
-    box_source_px: tuple[float, float, float, float] = wire_field(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
+    box_source_px: tuple[float, float, float, float] = wire_field(Box(Scaled(-_FAR_PX, _FAR_PX, 8)))
     """x1, y1, x2, y2 in eighths of a pixel."""
 
 

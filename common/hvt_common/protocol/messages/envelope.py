@@ -22,6 +22,7 @@ from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
 from hvt_common.protocol.messages.fields import Kind, WireError
 
 __all__ = [
+    "DEEPEST",
     "MAX_PAYLOAD_BYTES",
     "MOST_UNKNOWN_FIELDS",
     "READ_VERSIONS",
@@ -31,7 +32,9 @@ __all__ = [
     "Nested",
     "PackedMessage",
     "UnknownVersionError",
+    "from_values",
     "kinds",
+    "unpacked",
     "wire_version",
 ]
 
@@ -41,6 +44,8 @@ READ_VERSIONS = (3, 4)
 """A message of version 3 is one of version 4 without the fields that were added since; it had to be exact."""
 MOST_UNKNOWN_FIELDS = 16
 """So many fields behind the last known one are skipped, in each array; with more it is no message of ours."""
+DEEPEST = 8
+"""Levels of arrays and maps, the message's own array counted."""
 
 _CRC_BYTES = 5
 _CRC_TAG = 0xCE
@@ -104,7 +109,7 @@ class Message:
             raise WireError(f"{name} does not end with its checksum")
         if array[-1] != _checksum(data[:-_CRC_BYTES], payload):
             raise CorruptError(f"{name} or its payload is not what was sent: checksum differs")
-        return _from_values(cls, array[1:-1])
+        return from_values(cls, array[1:-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +165,10 @@ class Nested(Kind):
     def decode(self, raw: Any) -> Any:
         if type(raw) is not list:
             raise WireError(f"{type(raw).__name__} in place of a {self.of.__name__}")
-        return _from_values(self.of, raw)
+        return from_values(self.of, raw)
 
-    def describe(self) -> str:
-        return self.of.__name__
+    def schema(self) -> dict[str, Any]:
+        return {"type": "nested", "of": self.of.__name__}
 
 
 def _packed(value: Any) -> bytes:
@@ -174,13 +179,27 @@ def _packed(value: Any) -> bytes:
 def _unpack(data: bytes, name: str) -> list[Any]:
     """The array in ``data``, its version not checked. Sizes inside are bounded by the length of ``data`` itself."""
     try:
-        array = msgpack.unpackb(data, raw=False, strict_map_key=True, use_list=True, max_ext_len=0)
+        array = unpacked(data)
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         reason = str(error).strip() or type(error).__name__
         raise WireError(f"{name} is not MessagePack: {reason:.80}") from None
     if type(array) is not list or not array or type(array[0]) is not int:
         raise WireError(f"{name} is not an array that begins with a version")
     return array
+
+
+def unpacked(data: bytes) -> Any:
+    """MessagePack of one value without extensions, each key of a map once; ValueError and its like for all else."""
+    return msgpack.unpackb(data, strict_map_key=True, max_ext_len=0, object_pairs_hook=_once)
+
+
+def _once(pairs: list[tuple[str | bytes, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a map names a key twice")
+    if any(type(key) is not str for key in found):
+        raise ValueError("a map has a key that is no text")
+    return found  # type: ignore[return-value]
 
 
 def _check_version(array: list[Any], name: str) -> None:
@@ -194,7 +213,8 @@ def wire_version(data: bytes) -> int:
     return version
 
 
-def _from_values(message: type[_T], values: list[Any]) -> _T:
+def from_values(message: type[_T], values: list[Any]) -> _T:
+    """A dataclass of `wire_field` fields from the values of its array; raises `WireError`."""
     table = kinds(message)
     least, most = _required(message), len(table) + MOST_UNKNOWN_FIELDS
     if not least <= len(values) <= most:
@@ -205,10 +225,18 @@ def _from_values(message: type[_T], values: list[Any]) -> _T:
             decoded[name] = kind.decode(raw)
         except WireError as error:
             raise WireError(f"{message.__name__}.{name}: {error}") from None
-    try:
-        return message(**decoded)
-    except ValueError as error:
-        raise WireError(f"{message.__name__}: {error}") from None
+    if _too_deep(values[len(table) :], DEEPEST - 1):
+        raise WireError(f"{message.__name__} has a field that is nested too deep")
+    return message(**decoded)
+
+
+def _too_deep(value: Any, levels: int) -> bool:
+    """Whether arrays and maps in it are nested deeper than so many levels."""
+    if type(value) not in (list, dict):
+        return False
+    return levels < 0 or any(
+        _too_deep(one, levels - 1) for one in (value if type(value) is list else value.values())
+    )
 
 
 def _required(message: type) -> int:

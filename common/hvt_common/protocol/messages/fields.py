@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sized
 from dataclasses import MISSING, dataclass, field
@@ -14,9 +15,11 @@ from typing import Any
 
 __all__ = [
     "I63",
+    "REFUSED_CHARACTERS",
     "U32",
     "U64",
     "Blob",
+    "Box",
     "Flag",
     "Int",
     "Kind",
@@ -29,6 +32,7 @@ __all__ = [
     "Text",
     "TupleOf",
     "WireError",
+    "described",
     "fitted_text",
     "wire_field",
 ]
@@ -36,6 +40,14 @@ __all__ = [
 U32 = 2**32 - 1
 U64 = 2**64 - 1
 I63 = 2**63 - 1
+
+
+_MOST_REAL = 1e300
+REFUSED_CHARACTERS = ((0x00, 0x1F), (0x7F, 0x9F), (0x2028, 0x202E), (0x2066, 0x2069))
+"""First and last code points: controls, the two that begin a line or a paragraph, changes of direction."""
+_REFUSED = re.compile(
+    "[" + "".join(f"{chr(low)}-{chr(high)}" for low, high in REFUSED_CHARACTERS) + "\ud800-\udfff]"
+)
 
 
 class WireError(Exception):
@@ -61,8 +73,12 @@ class Kind(ABC):
         """The value of what MessagePack held; WireError when of another type or out of bounds."""
 
     @abstractmethod
+    def schema(self) -> dict[str, Any]:
+        """Type and bounds as docs/wire.json holds them."""
+
     def describe(self) -> str:
-        """Type and bounds in a few words, as docs/wire.md prints them."""
+        """Type and bounds in a few words, as docs/wire-messages.md prints them."""
+        return described(self.schema())
 
     def _encode(self, value: Any) -> Any:
         return value
@@ -106,11 +122,8 @@ class Int(Kind):
             raise WireError(f"{raw} is outside {self.low}…{self.high}")
         return raw
 
-    def describe(self) -> str:
-        return f"int {_power(self.low)}…{_power(self.high)}"
-
-
-_PARTS = {8: "eighths", 10: "tenths", 100: "hundredths", 1000: "thousandths"}
+    def schema(self) -> dict[str, Any]:
+        return {"type": "int", "low": self.low, "high": self.high}
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,9 +144,9 @@ class Scaled(Kind):
             raise WireError(f"{raw}/{self.per} is outside {self.low:g}…{self.high:g}")
         return raw / self.per
 
-    def describe(self) -> str:
+    def schema(self) -> dict[str, Any]:
         low, high = (round(bound * self.per) for bound in (self.low, self.high))
-        return f"int {low}…{high}, {_PARTS[self.per]}"
+        return {"type": "int", "low": low, "high": high, "per": self.per}
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +166,8 @@ class Real(Kind):
             raise WireError(f"{raw:g} is outside {self.low:g}…{self.high:g}")
         return raw
 
-    def describe(self) -> str:
-        return f"float {self.low:g}…{self.high:g}"
+    def schema(self) -> dict[str, Any]:
+        return {"type": "float", "low": self.low, "high": self.high}
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,13 +179,17 @@ class Flag(Kind):
             raise WireError(f"{type(raw).__name__} in place of a boolean")
         return raw
 
-    def describe(self) -> str:
-        return "bool"
+    def schema(self) -> dict[str, Any]:
+        return {"type": "bool"}
 
 
 @dataclass(frozen=True, slots=True)
 class Text(Kind):
-    """Printable UTF-8 of at most ``max_bytes``: received text ends up on terminals and in file names."""
+    """UTF-8 of at most ``max_bytes`` without controls and changes of direction, which could rewrite a terminal.
+
+    The rule is the same under every version of Unicode; who shows text replaces what does not print
+    (`units.shown_text`).
+    """
 
     max_bytes: int
 
@@ -184,34 +201,35 @@ class Text(Kind):
             raise WireError(f"{type(raw).__name__} in place of text")
         if len(raw) > self.max_bytes or len(raw.encode("utf-8", "surrogatepass")) > self.max_bytes:
             raise WireError(f"text of {len(raw)} characters is longer than {self.max_bytes} bytes")
-        if not raw.isprintable():
-            raise WireError(f"text {raw!r:.40} has characters that do not print")
+        if _REFUSED.search(raw) is not None:
+            raise WireError(f"text {raw!r:.40} has a control or a change of direction")
         return raw
 
-    def describe(self) -> str:
-        return f"str ≤ {self.max_bytes} B"
+    def schema(self) -> dict[str, Any]:
+        return {"type": "str", "most_bytes": self.max_bytes}
 
 
 @dataclass(frozen=True, slots=True)
 class Blob(Kind):
-    """At most ``max_bytes`` bytes with a coding of their own."""
+    """``least`` to ``max_bytes`` bytes with a coding of their own."""
 
     max_bytes: int
+    least: int = 0
 
     def decode(self, raw: Any) -> Any:
         if type(raw) is not bytes:
             raise WireError(f"{type(raw).__name__} in place of bytes")
-        if len(raw) > self.max_bytes:
-            raise WireError(f"{len(raw)} bytes where at most {self.max_bytes} are allowed")
+        if not self.least <= len(raw) <= self.max_bytes:
+            raise WireError(f"{len(raw)} bytes where {self.least} to {self.max_bytes} are allowed")
         return raw
 
-    def describe(self) -> str:
-        return f"bin ≤ {self.max_bytes} B"
+    def schema(self) -> dict[str, Any]:
+        return {"type": "bin", "least_bytes": self.least, "most_bytes": self.max_bytes}
 
 
 def fitted_text(text: str, max_bytes: int) -> str:
-    """Text of any origin, such as a model's class name, as `Text` takes it: cut between characters, printable."""
-    plain = "".join(one if one.isprintable() else "?" for one in text)
+    """Text of any origin, such as a model's class name, as `Text` takes it: cut between characters, no controls."""
+    plain = _REFUSED.sub("?", text)
     return plain.encode("utf-8", "replace")[:max_bytes].decode("utf-8", "ignore")
 
 
@@ -227,8 +245,13 @@ class OneOf(Kind):
     def decode(self, raw: Any) -> Any:
         return self.words[Int(0, len(self.words) - 1).decode(raw)]
 
-    def describe(self) -> str:
-        return "int: " + ", ".join(f"{number} {word}" for number, word in enumerate(self.words))
+    def schema(self) -> dict[str, Any]:
+        return {
+            "type": "int",
+            "low": 0,
+            "high": len(self.words) - 1,
+            "words": [str(one) for one in self.words],
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,11 +264,11 @@ class Scalar(Kind):
         if type(raw) is str:
             return Text(self.max_bytes).decode(raw)
         if type(raw) is float:
-            return Real(-1e300, 1e300).decode(raw)
+            return Real(-_MOST_REAL, _MOST_REAL).decode(raw)
         return Int(-I63, I63).decode(raw)
 
-    def describe(self) -> str:
-        return f"int, finite float or str ≤ {self.max_bytes} B"
+    def schema(self) -> dict[str, Any]:
+        return {"type": "scalar", "low": -I63, "high": I63, "most": _MOST_REAL, "most_bytes": self.max_bytes}
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,8 +280,8 @@ class ListOf(_Sequence):
     def decode(self, raw: Any) -> Any:
         return self._items(raw, self.max_items)
 
-    def describe(self) -> str:
-        return f"array ≤ {self.max_items} of {self.inner.describe()}"
+    def schema(self) -> dict[str, Any]:
+        return {"type": "array", "least": 0, "most": self.max_items, "of": self.inner.schema()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,8 +296,37 @@ class TupleOf(_Sequence):
             raise WireError(f"{len(items)} numbers in place of {self.length}")
         return items
 
-    def describe(self) -> str:
-        return f"array of {self.length}: {self.inner.describe()}"
+    def schema(self) -> dict[str, Any]:
+        return {"type": "array", "least": self.length, "most": self.length, "of": self.inner.schema()}
+
+
+@dataclass(frozen=True, slots=True)
+class Box(TupleOf):
+    """x1, y1, x2, y2 of one kind, x2 and y2 exclusive: never inside out; ``empty``: it may have no inside."""
+
+    length: int = 4
+    empty: bool = True
+
+    def decode(self, raw: Any) -> Any:
+        items = self._items(raw, self.length)
+        if len(items) != self.length:
+            raise WireError(f"{len(items)} numbers in place of {self.length}")
+        x1, y1, x2, y2 = items
+        if x2 < x1 or y2 < y1:
+            raise WireError(f"box {items} is inside out")
+        if not self.empty and (x2 == x1 or y2 == y1):
+            raise WireError(f"box {items} is empty")
+        return items
+
+    def schema(self) -> dict[str, Any]:
+        of = self.inner.schema()
+        return {
+            "type": "array",
+            "least": 4,
+            "most": 4,
+            "of": of,
+            "box": "may be empty" if self.empty else "never empty",
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,8 +345,9 @@ class MapOf(Kind):
         name = Text(self.key_bytes)
         return {name.decode(key): self.inner.decode(item) for key, item in raw.items()}
 
-    def describe(self) -> str:
-        return f"map ≤ {self.max_items}: str ≤ {self.key_bytes} B to {self.inner.describe()}"
+    def schema(self) -> dict[str, Any]:
+        of = self.inner.schema()
+        return {"type": "map", "most": self.max_items, "key_bytes": self.key_bytes, "of": of}
 
 
 def _check_size(raw: Any, wanted: type[Sized], name: str, most: int) -> None:
@@ -302,6 +355,35 @@ def _check_size(raw: Any, wanted: type[Sized], name: str, most: int) -> None:
         raise WireError(f"{type(raw).__name__} in place of a {name}")
     if len(raw) > most:
         raise WireError(f"{name} of {len(raw)} where at most {most} are allowed")
+
+
+_PARTS = {8: "eighths", 10: "tenths", 100: "hundredths", 1000: "thousandths"}
+
+
+def described(kind: dict[str, Any]) -> str:  # noqa: PLR0911 - one return for each kind
+    """A schema in a few words."""
+    match kind:
+        case {"type": "int", "words": words}:
+            return "int: " + ", ".join(f"{number} {word}" for number, word in enumerate(words))
+        case {"type": "int", "low": low, "high": high, "per": per}:
+            return f"int {low}…{high}, {_PARTS[per]}"
+        case {"type": "int", "low": low, "high": high}:
+            return f"int {_power(low)}…{_power(high)}"
+        case {"type": "float", "low": low, "high": high}:
+            return f"float {low:g}…{high:g}"
+        case {"type": "str" | "bin" as name, "most_bytes": most}:
+            return f"{name} ≤ {most} B"
+        case {"type": "scalar", "most_bytes": most}:
+            return f"int, finite float or str ≤ {most} B"
+        case {"type": "array", "least": least, "most": most, "of": of}:
+            return (
+                f"array of {most}: {described(of)}" if least == most else f"array ≤ {most} of {described(of)}"
+            )
+        case {"type": "map", "most": most, "key_bytes": key_bytes, "of": of}:
+            return f"map ≤ {most}: str ≤ {key_bytes} B to {described(of)}"
+        case {"type": "nested", "of": name}:
+            return str(name)
+    return str(kind["type"])
 
 
 def _power(number: int) -> str:

@@ -12,13 +12,13 @@ from hvt_common.protocol.messages.fields import (
     I63,
     U32,
     U64,
+    Box,
     Int,
     ListOf,
     MapOf,
     Scalar,
     Scaled,
     Text,
-    TupleOf,
     wire_field,
 )
 
@@ -80,13 +80,8 @@ class AlsoShown:
 
     track_id: int = wire_field(Int(0, U32))
     """The edge's."""
-    box_source_px: tuple[float, float, float, float] = wire_field(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
+    box_source_px: tuple[float, float, float, float] = wire_field(Box(Scaled(-_FAR_PX, _FAR_PX, 8)))
     """x1, y1, x2, y2 in eighths of a pixel."""
-
-    def __post_init__(self) -> None:
-        x1, y1, x2, y2 = self.box_source_px
-        if x2 < x1 or y2 < y1:
-            raise ValueError(f"box {self.box_source_px} is inside out")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,9 +101,9 @@ class RoiHeader(Message):
     flags: int = wire_field(Int(0, 255))
     track_id: int = wire_field(Int(-1, U32))
     """The edge's track; -1 where the still belongs to none."""
-    box_source_px: tuple[float, float, float, float] = wire_field(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
+    box_source_px: tuple[float, float, float, float] = wire_field(Box(Scaled(-_FAR_PX, _FAR_PX, 8)))
     """The track's box at that frame, in eighths of a pixel; may reach beyond the frame."""
-    crop_source_px: tuple[int, int, int, int] = wire_field(TupleOf(Int(0, _FAR_PX), 4))
+    crop_source_px: tuple[int, int, int, int] = wire_field(Box(Int(0, _FAR_PX), empty=False))
     """What the still shows."""
     class_name: str = wire_field(Text(64))
     confidence: float = wire_field(Scaled(0, 1, 1000))
@@ -121,14 +116,6 @@ class RoiHeader(Message):
     the size of the crop."""
     also: tuple[AlsoShown, ...] = wire_field(ListOf(Nested(AlsoShown), MAX_ALSO))
     """Further tracks that the same crop shows."""
-
-    def __post_init__(self) -> None:
-        x1, y1, x2, y2 = self.crop_source_px
-        if x2 <= x1 or y2 <= y1:
-            raise ValueError(f"crop {self.crop_source_px} is empty")
-        x1_, y1_, x2_, y2_ = self.box_source_px
-        if x2_ < x1_ or y2_ < y1_:
-            raise ValueError(f"box {self.box_source_px} is inside out")
 
     @property
     def send_ns(self) -> int:
