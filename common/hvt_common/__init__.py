@@ -1,4 +1,4 @@
-"""What edge and ground share: values, settings, wire protocol, transport, video, inference and tracking."""
+"""Shared by edge and ground: values, settings, wire protocol, transport, video, inference and tracking."""
 
 import os
 

@@ -190,7 +190,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """What the command line asked for."""
+    """The settings and choices of the command line."""
 
     values: Mapping[str, Any]
     """Field name → value, only for those that the file or the flags set."""

@@ -19,12 +19,12 @@ HIDDEN = "…"
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{0,15}):[/\\]+", re.ASCII)
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]*(?:%\w{1,16})?\]|[\w*-]+(?:\.[\w*-]+)*)(?::(\d{1,5}))?", re.ASCII)
 _FILE = re.compile(r"[^@?&=#:\\]+|[^@?&=#\\]*\d:\d[^@?&=#\\]*")
-"""What may be the name of a file: a colon stands between the digits of a time alone."""
+"""Text that may be the name of a file: a colon stands between the digits of a time alone."""
 _SCHEMELESS = re.compile(
     r"\s*(?:(?:rtsps?|rtmps?|https?|srt|udp|tcp|rtp)\b[:/\\]|\w*//|[^/]*:\d+/|(?:\d{1,3}\.){3}\d)|.*:[/\\]",
     re.IGNORECASE | re.DOTALL,
 )
-"""What looks like an address with a typing error, and like no file."""
+"""Text that looks like an address with a typing error, and like no file."""
 _WORD = re.compile(
     r"(?:[A-Za-z]{0,12}[0-9]{0,4}|h26[45][A-Za-z]{0,12})(?:[._-](?:[A-Za-z]{0,12}[0-9]{0,4}|mp4))*", re.ASCII
 )
@@ -74,7 +74,7 @@ def redacted(address: str) -> str:
 
 
 def _path(rest: str, *, hidden: bool) -> str:
-    """What of a path may be shown: words as cameras name their streams. RTMP has a stream key there."""
+    """The part of a path that may be shown: words as cameras name their streams. RTMP has a stream key there."""
     path = re.split(r"[?#\\]", rest, maxsplit=1)[0]
     parts = (part if not hidden and _WORD.fullmatch(part) else part and HIDDEN for part in path.split("/"))
     return "/".join(parts) + (f"?{HIDDEN}" if path != rest else "")
@@ -113,7 +113,7 @@ class Redaction:
 
 
 def _secrets(word: str) -> Iterable[str]:
-    """What of a word, an address or ``--source=`` and one, nobody may read; of a typing error rather too much."""
+    """The secret parts of a word, an address or ``--source=`` and one; of a typing error rather too much."""
     found = _BEGIN.search(word)
     if found is None and not _LIKELY.search(word) and not _PAIR.search(word):
         return

@@ -1,4 +1,4 @@
-"""What the edge reports of itself: `Info` on request, `Status` once a second, and a line on the terminal."""
+"""The edge's own reports: `Info` on request, `Status` once a second, and a line on the terminal."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class InfoReporter:
     clock: Callable[[], int]
 
     def info(self, received_ns: int | None = None) -> bytes:
-        """What a ground needs to know of the session; times are of the clock that the headers go by."""
+        """The session's facts for a ground; times are of the clock of the headers."""
         config, view, now = self.config, self.view, self.operating.now
         answered_ns = self.clock()
         info = Info(
@@ -93,7 +93,7 @@ class StatusReporter:
     def __post_init__(self) -> None:
         self._sequence = 0
         self._pending: tuple[EdgeState, str] | None = None
-        """What was not sent yet: the newest second's."""
+        """The report of the newest second, not sent yet."""
         self._due_ns: int | None = None
         """Since when a report waits."""
         self._reported: Levers | None = None

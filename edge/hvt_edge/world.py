@@ -34,7 +34,7 @@ class World:
         self.failures = Failures(self.clock)
         """Which parts have failed in flight."""
         self.inbox = FeedbackInbox()
-        """What grounds have answered."""
+        """Answers of grounds."""
         self.executor: Executor | None = None
         """Runs perception in lockstep; None: a thread of its own."""
 

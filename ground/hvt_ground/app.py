@@ -81,13 +81,13 @@ class Ground:
         self._clock = SteadyClock()
         self._edges: dict[str, EdgeThread] = {}
         self._leaving: list[EdgeThread] = []
-        """Of edges that are served no more: they finish."""
+        """Threads of edges that are served no more: they finish."""
         self._moved: dict[str, EdgeSessions] = {}
-        """What was received of edges that another member of the group serves now."""
+        """Sessions of edges that another member of the group serves now."""
         self._ended: defaultdict[str, deque[tuple[dict[str, Any], Sequence[Sink[Event]]]]] = defaultdict(
             partial(deque, maxlen=_MOST_SUMMARIES)
         )
-        """By edge, the summaries of sessions and what they were written to."""
+        """By edge, the summaries of sessions and the sinks that wrote them."""
         self._began_s = time.monotonic()
         self._state: GroundState | None = None
 

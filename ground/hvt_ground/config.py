@@ -1,4 +1,4 @@
-"""Every setting of ``hvt-ground``, its default and what is accepted."""
+"""Every setting of ``hvt-ground``, its default and the accepted values."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _LINK_RARE, _MODELS_RARE, _FILES_RARE = (replace(group, rare=True) for group in 
 
 @dataclass(frozen=True, slots=True)
 class GroundConfig:
-    """What ``hvt-ground`` runs with. See ``--help-all`` for each."""
+    """The settings of ``hvt-ground``. See ``--help-all`` for each."""
 
     listen: tuple[str, ...] = _LINK.option(
         TEXT, (), "Zenoh endpoint to listen on", many=True, shown_default=DEFAULT_ENDPOINT

@@ -206,5 +206,5 @@ class StillsRead:
 
 
 FrameEvent = VideoSample | Overlay | Refinement | Traffic | Notice | PoseUpdate
-"""What a recording shows, at the frame and capture time that it carries."""
+"""Everything that a recording shows at the frame and capture time that it carries."""
 Event = FrameEvent | MessageTiming | StillsRead

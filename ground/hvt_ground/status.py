@@ -1,4 +1,4 @@
-"""What a ground says of its sessions: the JSON for programs, the table and the status line for people."""
+"""A ground's report of its sessions: the JSON for programs, the table and the status line for people."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["completed", "status_text", "summary", "table"]
 
 
 def status_text(state: GroundState) -> str:
-    """The status line: what comes of each edge now, and what does not work; empty without any."""
+    """The status line: the traffic of each edge now, and the failed parts; empty without any."""
     elsewhere = [f"{edge}: at {one.member}" for edge, one in state.elsewhere.items()]
     return " | ".join([*map(_edge_text, state.edges), *elsewhere, *map(failed_text, state.failed)])
 
@@ -206,7 +206,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def failed_text(one: FailedPart) -> str:
-    """What does not work, since when."""
+    """The failed parts, and since when."""
     return f"{one.part} FAILED at {utc_text(one.since_ns)[11:19] or '?'} UTC"
 
 

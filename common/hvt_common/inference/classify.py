@@ -52,7 +52,7 @@ class Classifier(Protocol):
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """What ``probabilities`` run over."""
+        """The classes of ``probabilities``, in order."""
 
     def classify(self, crops_bgr: Sequence[Image]) -> list[Posterior]:
         """One posterior a crop, in order."""
@@ -197,7 +197,7 @@ def _not_a_classifier(model: OnnxModel, why: str) -> str:
 
 
 def _preparation(model: OnnxModel, classes: int) -> tuple[Preparation, str]:
-    """How pixels are prepared, and what says so."""
+    """How pixels are prepared, and the source of that."""
     said = model.metadata
     if said.get("author") == "Ultralytics" or said.get("task") == "classify":
         usual, why = _ULTRALYTICS, "its metadata say Ultralytics' classify"

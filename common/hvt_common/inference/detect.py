@@ -72,7 +72,7 @@ class Detector(Protocol):
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """What ``class_ids`` index."""
+        """The names that ``class_ids`` index."""
 
     def detect(self, image_bgr: Image) -> Detections:
         """Detections in (height, width, 3) uint8, which must not be written to: in its pixels, inside it, best first.
@@ -296,7 +296,7 @@ def _is_finite(output: npt.NDArray[Any]) -> bool:
 
 
 def _cells(model: OnnxModel) -> tuple[int, ...]:
-    """Of what the sides of a free input may be multiples, likeliest first: ``stride`` of the metadata, if it says."""
+    """Multiples that the sides of a free input may have, likeliest first: ``stride`` of the metadata, if it says."""
     text = model.metadata.get("stride", "")
     if text.isascii() and text.isdigit() and int(text) in (8, 16, *_CELLS):
         return (max(_CELL, int(text)),)

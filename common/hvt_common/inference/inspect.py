@@ -1,4 +1,4 @@
-"""What a model file is: its ports, the adapter that fits it, its classes, and its speed on this machine."""
+"""Describes a model file: its ports, the adapter that fits it, its classes, and its speed on this machine."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FREE_SIZE = (640, 384)
 
 @dataclass(frozen=True, slots=True)
 class ModelReport:
-    """What `inspect_model` found."""
+    """The result of `inspect_model`."""
 
     path: Path
     size_bytes: int
@@ -43,7 +43,7 @@ class ModelReport:
     class_names: tuple[str, ...]
     provider: str
     timing: str
-    """What was timed; empty where nothing was."""
+    """The timed operation; empty if nothing was timed."""
     median_ms: float | None
 
 

@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 KNOWN_LABELS: Mapping[str, tuple[str, ...]] = {"coco": COCO_NAMES, "visdrone": VISDRONE_NAMES}
-"""What may be said in place of a file. A number of classes alone never means one of these."""
+"""Names that stand for a file. A number of classes alone never means one of these."""
 
 MAX_LABELS = 100_000
 MAX_LABEL_CHARS = 200

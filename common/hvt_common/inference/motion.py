@@ -45,7 +45,7 @@ _STILL_PX = 0.1  # a camera that moved the corners less than this is not worth a
 
 @dataclass(frozen=True, slots=True)
 class MotionSettings:
-    """What counts as a moving object; lengths are pixels of the working image (`max_side_px`)."""
+    """The limits of a moving object; lengths are pixels of the working image (`max_side_px`)."""
 
     memory_calls: int = 6
     """So many earlier images are compared with."""

@@ -1,4 +1,4 @@
-"""What a network sees of a pixel, as its file says or as its kind is trained."""
+"""How pixels become a network's input, as its file says or as its kind is trained."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a model's metadata say, which opens no network: its classes, and what its scores mean."""
+"""Reads the classes and the calibration of a model from its metadata, without opening a network."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _metadata(spec: str, *, role: str) -> dict[str, str]:
 
 
 def uncalibrated(role: str, spec: str) -> str:
-    """What is said, once, of a model whose scores are not calibrated."""
+    """The sentence, logged once, for a model whose scores are not calibrated."""
     plug_in = role == "detector" and plug_in_of(spec) is not None
     return (
         f"{role} {spec if plug_in else Path(spec).name} has no calibration ({_CALIBRATION} in its metadata):"

@@ -94,7 +94,7 @@ class FrameAccount:
 
     @classmethod
     def of_counts(cls, counts: Sequence[int], *, coded_fps: float, auto_fps: bool) -> Self:
-        """What `as_counts` gave; groups of a later version that has more are not known here."""
+        """Read the result of `as_counts`; further groups of a later version are ignored."""
         groups = {name: count for name, count in zip(FRAME_GROUPS, counts, strict=False) if count}
         return cls(groups, coded_fps, auto_fps)
 

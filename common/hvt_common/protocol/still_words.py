@@ -1,4 +1,4 @@
-"""What is said of the reasons and outcomes of stills; `Status`, JSON and metrics have the words of the code."""
+"""Texts for the reasons and outcomes of stills; `Status`, JSON and metrics have the words of the code."""
 
 from __future__ import annotations
 

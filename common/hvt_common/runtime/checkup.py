@@ -36,7 +36,7 @@ _TIMEX_BYTES = 512
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What a check found, for people; ``todo`` is one line where something is to be done."""
+    """The result of a check, for people; ``todo`` is one line with the remedy, if there is one."""
 
     state: State
     found: str
@@ -147,7 +147,7 @@ def _bounded(check: Callable[[], Finding], patience_s: float) -> Finding:
 
 
 class _Said(logging.Handler):
-    """What is logged in one thread."""
+    """The log records of one thread."""
 
     def __init__(self, thread: int) -> None:
         super().__init__(logging.INFO)

@@ -21,18 +21,18 @@ _Part = TypeVar("_Part")
 _Answer = TypeVar("_Answer")
 _REDACTION = Redaction()
 _STEADY_NS = 60 * SECOND_NS
-"""What fails again after it worked for so long is news, and begins with a short pause."""
+"""A failure after it worked for so long is news, and begins with a short pause."""
 
 
 def reason_of(error: BaseException) -> str:
-    """What an error says, in one line: a sentence as it is, anything else after its kind."""
+    """An error in one line: a sentence as it is, anything else after its kind."""
     text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     return " ".join(text.split())[:300]
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """What became of one part."""
+    """The state of one failed part."""
 
     part: str
     reason: str

@@ -35,7 +35,7 @@ _PATIENCE_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What one path answers."""
+    """The answer of one path."""
 
     body: bytes
     media_type: str = "text/plain; charset=utf-8"
@@ -43,7 +43,7 @@ class Answer:
 
 
 class State(Protocol):
-    """What a program knows of itself at one moment."""
+    """A program's own state at one moment."""
 
     @property
     def at_ns(self) -> int:

@@ -42,7 +42,7 @@ def the_one(group: str, name: str, *, what: str, built_in: bool) -> EntryPoint |
 
 
 def loaded(entry: EntryPoint, make: Callable[[Any], Any], *, what: str) -> Any:
-    """What ``make`` gives of the entry's object; `UserError` for whatever foreign code raises."""
+    """The result of ``make`` for the entry's object; `UserError` for whatever foreign code raises."""
     try:
         return make(entry.load())
     except Exception as error:  # foreign code may raise anything

@@ -38,7 +38,7 @@ _UNCONFIRMED_COST_LIMIT: Final = 0.7
 _DUPLICATE_COST_LIMIT: Final = 0.15
 
 _LONGEST_S: Final = 10.0
-"""What no detection was run for so long tells nothing of the picture now."""
+"""After so long without a detection the last one tells nothing of the picture now."""
 _LEAST_DETECTIONS: Final = 3
 """Detections that a lost track is remembered for, where they are further apart than the buffer is long."""
 
@@ -70,13 +70,13 @@ class TrackerSettings:
     this many of their own lengths for a second without (0.75 at most). Where every frame is searched nothing
     changes; 0 is off."""
     class_decay: float = 0.9
-    """What a class vote is still worth one matched detection later: 1 never forgets."""
+    """The remaining weight of a class vote one matched detection later: 1 never forgets."""
     camera_motion: Literal["off", "flow"] = "off"
     """How to estimate the camera's motion, which then moves all tracks before they are matched."""
 
     @classmethod
     def starting_at(cls, confidence: float, *, camera_motion: Literal["off", "flow"]) -> TrackerSettings:
-        """What both sides run with: detections from ``confidence`` start tracks, weaker ones carry them on."""
+        """The settings of both sides: detections from ``confidence`` start tracks, weaker ones carry them on."""
         return cls(
             track_confidence=confidence,
             low_confidence=weak_confidence(confidence),

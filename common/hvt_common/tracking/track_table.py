@@ -1,4 +1,4 @@
-"""What the tracker remembers: the detections it may use of a frame, and all living tracks as parallel arrays."""
+"""The tracker's memory: the usable detections of a frame, and all living tracks as parallel arrays."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from typing import Protocol
 __all__ = ["CAPACITY_BYTES", "Inbox", "Received", "ReceivedQueue"]
 
 CAPACITY_BYTES = 64 * 2**20
-"""What one inbox holds at most: minutes of a base stream, and sixteen of the largest messages there are."""
+"""The size limit of one inbox: minutes of a base stream, and sixteen of the largest messages there are."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,7 +47,7 @@ _MAY_COME = re.compile(
     "Cannot assign requested address|Address already in use|No such device|Network is (unreachable|down)"
     "|failed to lookup address"
 )
-"""What Zenoh says of an address that is not there yet, or not free."""
+"""Zenoh's messages for an address that is not there yet, or not free."""
 
 
 @contextmanager

@@ -8,7 +8,7 @@ __all__ = ["LONG_START", "PARAMETER_SETS", "is_keyframe", "nal_kind", "nal_units
 
 _START_CODE = re.compile(rb"\x00\x00\x01")
 LONG_START = b"\0\0\0\1"
-"""What a parameter set, and the first unit of a picture, begins with."""
+"""The start code of a parameter set, and of the first unit of a picture."""
 _IRAP = frozenset(range(16, 22))
 """BLA, IDR and CRA pictures of H.265, table 7-1."""
 PARAMETER_SETS = frozenset({32, 33, 34})

@@ -77,26 +77,26 @@ class Backfill:
         self._requested: set[int] = set()
         """Sessions whose facts it requested."""
         self._refused: set[ObjectKey] = set()
-        """What the present ground does not take; another is offered it again, and so is any after the next start."""
+        """Objects that the present ground refuses; another ground, and the next start, offer them again."""
         self._acknowledged: dict[ObjectKey, int] = {}
-        """What the present ground has said it has of objects that are not done."""
+        """Bytes that the present ground reports of unfinished objects."""
         self._receiver_id: int | None = None
         self._reported_ns = 0
         self.video_first = False
         """A ground requested the video."""
         self.acknowledged_bytes = 0
-        """That grounds have said they have."""
+        """Bytes that grounds have acknowledged."""
         self.given_up = 0
         """Objects that were put aside because a ground did not take them."""
 
     @property
     def in_flight(self) -> int:
-        """Objects of which something is on its way."""
+        """Objects with bytes under way."""
         return len(self._line)
 
     @property
     def unacknowledged_bytes(self) -> int:
-        """Of what is on its way; for any thread."""
+        """Bytes under way; for any thread."""
         return sum(one.sent_bytes - one.acknowledged_bytes for one in tuple(self._line.values()))
 
     @property

@@ -197,7 +197,7 @@ class Store:
             self._measure()
 
     def end_segment(self) -> None:
-        """What was appended is an object now."""
+        """Make the appended units an object."""
         if self._open is None or self._db is None:
             return
         try:
@@ -380,7 +380,7 @@ class Store:
         return db
 
     def _take_over(self, db: sqlite3.Connection) -> None:
-        """What earlier runs have stored, but for what is too old. A full disk refuses that, and can still be read."""
+        """Take over the unexpired objects of earlier runs. A full disk refuses that, and can still be read."""
         with contextlib.suppress(sqlite3.OperationalError):
             db.executescript(_ADOPT)
             self._move_times(db)
@@ -403,7 +403,7 @@ class Store:
         self._evict_for(0, db)
 
     def _move_times(self, db: sqlite3.Connection) -> None:
-        """Of what earlier runs have stored: to the present clock."""
+        """Move the times of earlier runs' objects to the present clock."""
         found = db.execute("SELECT capture_ns, boot, steady_ns FROM stored").fetchone()
         if found is None:  # a version that did not note it, if any
             (newest_ns,) = db.execute("SELECT max(capture_ns) FROM object WHERE kind <> 'info'").fetchone()
@@ -428,7 +428,7 @@ class Store:
                 db.close()
 
     def _lose(self) -> None:
-        """What is stored counts no more, until it is found again."""
+        """Forget all stored objects until they are found again."""
         self._disconnect()
         self._still_bytes = self._span_ns = self.disk_bytes = self.stills = self.segments = 0
 

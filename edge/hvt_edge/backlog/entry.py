@@ -1,4 +1,4 @@
-"""One object of the store: what it is called on the link, what it is worth, and the segment that is being written."""
+"""One object of the store: its key, its rank, and the segment that is being written."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Entry:
     kind: BacklogKind
     number: int
     rank: float
-    """What has to go first where the store is full has the least: worth of a still, age of a segment."""
+    """The least rank is deleted first if the store is full: worth of a still, age of a segment."""
     span_ns: int
     """Of video: from its first frame to its last."""
 
     @property
     def key(self) -> ObjectKey:
-        """What it is called on the link."""
+        """Its key on the link."""
         return self.session_id, self.kind, self.number
 
     def __str__(self) -> str:
@@ -47,7 +47,7 @@ class Entry:
 
 
 def entry_of(values: tuple[Any, ...]) -> Entry:
-    """What one row of the file says, in the order of `Entry`; `ValueError` for one that no edge has written."""
+    """Read a row of the file, in the order of `Entry`; `ValueError` for one that no edge has written."""
     row, session, kind, number, rank, span_ns = values
     kinds = [type(one) for one in (session, kind, number, rank, span_ns)]
     if kinds != [str, str, int, float, int] or not (0 <= number < 2**32 and span_ns >= 0):
@@ -99,5 +99,5 @@ def worth(utility: float, capture_ns: int) -> float:
 
 
 def moved_rank(kind: BacklogKind, moved_ns: int) -> float:
-    """What is added to the rank of an object whose time moves by so much."""
+    """The change of an object's rank if its time moves by so much."""
     return moved_ns / _HALF_LIFE_NS if kind is BacklogKind.STILL else float(moved_ns)

@@ -40,7 +40,7 @@ Item = AccessUnit | IntakeStill | EndSegment
 
 @dataclass(slots=True)
 class News:
-    """What has happened since the last `take`."""
+    """The events since the last `take`."""
 
     woken: bool = False
     interrupted: bool = False
@@ -48,7 +48,7 @@ class News:
     video_first: bool = False
     """A ground requested the video."""
     acknowledged: dict[tuple[int, ObjectKey], AcknowledgedRange] = field(default_factory=dict)
-    """What grounds say they have, by receiver id and object."""
+    """Acknowledged bytes, by receiver id and object."""
 
 
 class Intake:
@@ -125,7 +125,7 @@ class Intake:
     # In the thread that takes
 
     def take(self, timeout_s: float) -> tuple[News, Item | None]:
-        """What has happened, and the next item; None where there is none within that time, or something happened."""
+        """The events, and the next item; None if there is none within that time, or something happened."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._news.woken, timeout=timeout_s)
             news, self._news = self._news, News()

@@ -49,7 +49,7 @@ class State(Enum):
 
 @dataclass(frozen=True, slots=True)
 class BacklogLink:
-    """What the backlog needs of the link and of the outbox, as functions given when it is built."""
+    """The link and the outbox, as functions, as far as the backlog needs them."""
 
     has_subscriber: Callable[[], bool]
     """Whether a ground subscribes to ``backlog``."""
@@ -167,7 +167,7 @@ class BacklogStage:
         return self.offline and self._linked and now_ns - self._probed_ns >= _PROBE_NS
 
     def resume(self) -> None:
-        """The keyframe to go on with has been made: it and what follows is sent."""
+        """Send the keyframe that was made for the restart, and all later frames."""
         self._lose_in_flight()  # stills that went out while the link was going, or coming
         self._worker.intake.end_segment()
         self.state = State.LIVE
@@ -180,7 +180,7 @@ class BacklogStage:
         self.state = State.OFFLINE
 
     def _lose_in_flight(self) -> None:
-        """What no report has named is taken for lost."""
+        """Count everything as lost that no report has named."""
         units = self._in_flight.take()
         self.breaks += 1
         if (
@@ -256,7 +256,7 @@ class BacklogStage:
 
     @property
     def numbers(self) -> StoreNumbers:
-        """What is kept and what was done."""
+        """The store's numbers, for status and summary."""
         return self._worker.numbers
 
     def send_no_more(self) -> None:
@@ -296,7 +296,7 @@ class BacklogStage:
     # How chunks leave
 
     def chunk_allowance(self, now_ns: int) -> ChunkAllowance | None:
-        """What a chunk may have now. None: the link is not steady, no ground reports, or a keyframe is to come."""
+        """Bytes that a chunk may take now. None: the link is not steady, no ground reports, or a keyframe is due."""
         if self.state is not State.LIVE or not self._linked or now_ns - self._back_ns < _STEADY_NS:
             return None
         if not self._outage.reports_now(now_ns):

@@ -35,14 +35,14 @@ _BUSY_S = 0.02
 _IDLE_S = 0.25
 _CLOSE_S = 5.0
 _LAST_CHUNK_S = 1.0
-"""What is being sent when no more is to be sent has so long to go."""
+"""The last chunk has so long to go out."""
 _TRICKLE_SHARE = 1 / 40
 """Of the total, where live stills always wait: they must not hold up for ever what was admitted before."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkAllowance:
-    """What a chunk may have now."""
+    """The limits of a chunk now."""
 
     limit_bytes: int
     trickle: bool = False
@@ -51,7 +51,7 @@ class ChunkAllowance:
 
 @dataclass(frozen=True, slots=True)
 class StoreNumbers:
-    """What the store holds and has done."""
+    """The contents and the counts of the store."""
 
     stills: int = 0
     segments: int = 0
@@ -147,7 +147,7 @@ class StoreWorker:
 
     @property
     def numbers(self) -> StoreNumbers:
-        """What is stored and what was done."""
+        """The contents and the counts of the store."""
         store = self._store
         return StoreNumbers(
             stills=store.stills,
@@ -228,7 +228,7 @@ class StoreWorker:
         self._failures.failed(_PART, reason)
 
     def _attempt_sending(self, do: Callable[[], None]) -> None:
-        """Where it cannot be done, the disk apart, what was in hand is put aside, and nothing sent for a while."""
+        """If sending fails for another reason than the disk, the object in hand is set aside, and sending pauses."""
         try:
             do()
         except OSError as error:

@@ -1,1 +1,1 @@
-"""What a ground may ask for (`commands`), and what the state of the link decides (`link_control`)."""
+"""Requests of a ground (`commands`), and decisions by the state of the link (`link_control`)."""

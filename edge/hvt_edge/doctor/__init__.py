@@ -1,1 +1,1 @@
-"""``hvt-edge doctor``: whether a flight with these settings could start, and what it would lack. See `command`."""
+"""``hvt-edge doctor``: whether a flight with these settings could start, and why not. See `command`."""

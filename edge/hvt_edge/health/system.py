@@ -1,4 +1,4 @@
-"""What the machine tells of itself: how hot it is, and how well its wireless link is."""
+"""The machine's temperature and the quality of its wireless link."""
 
 from __future__ import annotations
 

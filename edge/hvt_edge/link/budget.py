@@ -75,7 +75,7 @@ class BudgetSettings:
 
     @property
     def still_bps(self) -> int:
-        """What stills earn."""
+        """The rate of the stills' allowance."""
         return max(0, self.total_bps - self.base_bps - self.metadata_bps)
 
 
@@ -148,7 +148,7 @@ class RollingBudget:
 
     @property
     def base_step_bytes(self) -> float:
-        """What one base frame takes on average at B_v, in line bytes."""
+        """The mean of one base frame at B_v, in line bytes."""
         return self._settings.base_bps / 8 / self._settings.fps
 
     @property
@@ -357,7 +357,7 @@ class RollingBudget:
         return max(old_peak, self._base_peak) if at_ns < until_ns else self._base_peak
 
     def _borrowable(self, now_ns: int) -> float:
-        """What of B_v neither the base nor a still has taken in the window that ends now."""
+        """The part of B_v that neither the base nor a still has taken in the window that ends now."""
         settings = self._settings
         if not settings.borrow_unused or self._last_base_ns is None:
             return 0.0

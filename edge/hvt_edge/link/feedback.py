@@ -1,4 +1,4 @@
-"""What grounds report back, in the order and at the pace in which the edge takes it in."""
+"""Reports of grounds, in the order and at the pace in which the edge processes them."""
 
 from __future__ import annotations
 

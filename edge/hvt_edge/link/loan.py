@@ -14,7 +14,7 @@ from collections import deque
 __all__ = ["MOST_SHARE", "VideoLoan"]
 
 MOST_SHARE = 0.8
-"""Of a window, for requested stills; the rest is for status, tracks, pose and what is left of the video."""
+"""Share of a window for requested stills; the rest is for status, tracks, pose and the remaining video."""
 _PATIENCE = 2
 """Windows for which frames are left out for a still that waits."""
 
@@ -46,7 +46,7 @@ class VideoLoan:
         self._taken.append((now_ns, line_bytes))
 
     def left_bytes(self, window_bytes: float, *, now_ns: int) -> float:
-        """What requested stills may still take of the window that ends now."""
+        """Bytes that requested stills may still take of the window that ends now."""
         return MOST_SHARE * window_bytes - self._taken_bytes(now_ns)
 
     def waits(self, window_bytes: float, *, now_ns: int) -> bool:

@@ -1,4 +1,4 @@
-"""What goes beside the base stream's payload: headers, framing and ``status``."""
+"""Bytes beside the base stream's payload: headers, framing and ``status``."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from hvt_common.protocol.ledger import overhead_bytes
 __all__ = ["BASE_ATTACHMENT_BYTES", "STATUS_BYTES", "base_overhead_bps"]
 
 BASE_ATTACHMENT_BYTES = 48
-"""What a `BaseHeader` takes at most."""
+"""The largest `BaseHeader`."""
 STATUS_BYTES = 320
-"""What a `Status` takes."""
+"""The size of a `Status`."""
 
 
 def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
-    """What headers, framing and ``status`` take of ``base_bps``: the encoder gets the rest."""
+    """The share of headers, framing and ``status`` in ``base_bps``: the encoder gets the rest."""
     payload = round(base_bps / 8 / fps)
     key = EdgeKeys(edge_id).key(Channel.BASE)
     encoding = DELIVERIES[Channel.BASE].encoding

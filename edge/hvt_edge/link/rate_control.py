@@ -78,7 +78,7 @@ class RateSettings:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """What one report says of the newest base message that has arrived, in the edge's own accounts."""
+    """One report of the newest base message that has arrived, in the edge's own accounts."""
 
     now_ns: int
     """When the report came, the edge's clock."""
@@ -87,7 +87,7 @@ class Progress:
     arrived_ns: int
     """The ground's clock."""
     serialization_ns: int
-    """What it would have taken on a link of the rate of that time, behind the edge's own messages."""
+    """Its delay on a link of the rate of that time, behind the edge's own messages."""
     arrived_bytes: int
     """Line bytes sent up to and with it: they have all arrived, or are lost."""
     messages: int = 0
@@ -157,7 +157,7 @@ class LossCount:
         self._marked = self._counts[-1]
 
     def clear(self) -> None:
-        """What was lost before is no property of the link from now on."""
+        """Forget earlier losses: from now on they are no property of the link."""
         self._counts.clear()
         self._marked = None
 
@@ -218,13 +218,13 @@ class RateController:
 
     @property
     def rate_bps(self) -> int:
-        """What may be sent now, line bits a second."""
+        """The rate that may be sent now, line bits a second."""
         settings = self._settings
         return round(min(settings.ceiling_bps, max(settings.floor_bps, self._rate)))
 
     @property
     def steady_bps(self) -> int:
-        """What is likely to last, for what cannot follow each step: near where it broke down, a little below that."""
+        """The rate that is likely to last, for slow followers: near where it broke down, a little below that."""
         if self._rate >= self._settings.ceiling_bps or self._rate > 1.15 * self._cubic_max:
             return self.rate_bps
         return min(self.rate_bps, max(self._settings.floor_bps, round(0.9 * self._cubic_max)))
@@ -331,7 +331,7 @@ class RateController:
         return chosen[-1].excess_ns >= chosen[0].excess_ns - limit_ns // 4  # it empties: wait
 
     def _arriving_bps(self) -> float:
-        """What arrived while the queue stood: what the link carries."""
+        """The arrival rate while the queue stood: the link's capacity."""
         chosen = self._verdict() or list(self._recent)
         return _arrival_bps(chosen[0].progress, chosen[-1].progress) or self._rate
 
@@ -371,7 +371,7 @@ class RateController:
         return self._cubic_max * (1 + self._settings.beyond_per_s3 * beyond_s**3)
 
     def _lately_bps(self) -> float:
-        """What arrived in about the last second; half the rate where that is not known yet."""
+        """The arrival rate of about the last second; half the rate if that is not known yet."""
         last = first = self._recent[-1].progress
         for one in reversed(self._recent):
             first = one.progress

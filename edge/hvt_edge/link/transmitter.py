@@ -48,7 +48,7 @@ STILL_ATTACHMENT_BYTES = 100
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
 `Transmitter.still_allowance_bytes` of one that is counts its own header."""
 BACKLOG_ATTACHMENT_BYTES = 48
-"""What a `BacklogHeader` takes at most."""
+"""The largest `BacklogHeader`."""
 _LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
 _CHUNK_S = 0.05
 """So long the link is busy with a chunk at most, so that a frame or a live still need not wait for it."""
@@ -441,7 +441,7 @@ class Transmitter:
         return self.budget.earliest_ns(line_bytes + _GROWTH_BYTES, now_ns=now_ns)
 
     def _payload_bytes(self, line_bytes: int, attachment_bytes: int, media_type: str) -> int:
-        """What of so many line bytes is left for a still's payload."""
+        """The payload that so many line bytes leave for a still."""
         around = attachment_bytes + overhead_bytes(
             line_bytes, attachment_bytes, key=self._keys.key(Channel.ROI), encoding=media_type
         )
@@ -470,7 +470,7 @@ class Transmitter:
     def _line_bytes(
         self, channel: Channel, payload: bytes, attachment_bytes: int, *, encoding: str = ""
     ) -> int:
-        """Payload, attachment and what the transport adds."""
+        """Payload, attachment and transport overhead."""
         overhead = overhead_bytes(
             len(payload),
             attachment_bytes,

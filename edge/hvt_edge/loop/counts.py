@@ -1,4 +1,4 @@
-"""What the frame loop counts."""
+"""The counters of the frame loop."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class FrameCounts:
     """Frames of one run."""
 
     groups: Counter[FrameGroup] = field(default_factory=Counter)
-    """What became of the frames that came to the loop, each in one."""
+    """The outcome of each frame that came to the loop, each in one group."""
     source_groups: Counter[FrameGroup] = field(default_factory=Counter)
     """Frames that did not come to it: damaged, or more than the base rate takes."""
     encoded: int = 0
@@ -50,7 +50,7 @@ class FrameCounts:
         return self.groups["processor"]
 
     def account(self, *, coded_fps: float, auto_fps: bool) -> FrameAccount:
-        """What became of each source frame so far."""
+        """The outcome of each source frame so far."""
         return FrameAccount(dict(self.groups + self.source_groups), coded_fps, auto_fps)
 
     def drop(self, group: FrameGroup, count: int = 1) -> None:

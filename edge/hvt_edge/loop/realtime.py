@@ -63,7 +63,7 @@ class RealtimePace:
         self._sent_ns = self._link_late_ns = 0
         """When the last frame was sent; how late a clip is because the link took its time, not yet made up."""
         self._bound: FrameGroup = "processor"
-        """What took longest with the last frame: coding it, the budget's window, or the link."""
+        """The slowest step of the last frame: coding it, the budget's window, or the link."""
         self._worker = StillWorker(
             self.stills,
             results=self.inbox.take,

@@ -42,7 +42,7 @@ class KeyframeSettings:
 
 @dataclass(frozen=True, slots=True)
 class KeyframeState:
-    """What the plan publishes."""
+    """The published state of the plan."""
 
     interval_ns: int
     last_ns: int | None = None
@@ -72,7 +72,7 @@ class KeyframeRequests:
         self._paid_ns = -(2**63)
         """Requests are paid for up to this time: `_cost_ns` each."""
         self._keyframe_ns = 0
-        """What a keyframe takes of the budget, as time."""
+        """The cost of a keyframe, as time of the budget."""
         self._losses: dict[int, int] = {}
         """By receiver, as its last report counted them."""
         self._lossy = False

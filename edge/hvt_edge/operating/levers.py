@@ -27,7 +27,7 @@ __all__ = ["LeverControl", "LeverSettings", "Measured"]
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What the shadow ground says of tracks (see `hvt_edge.perception`); nothing at first. Gains are of F1, 0…1."""
+    """The shadow ground's gains of tracks (see `hvt_edge.perception`); zero at first. Gains are of F1, 0…1."""
 
     comparisons: float = 0.0
     """How many comparisons it comes of."""
@@ -49,14 +49,14 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class LeverSettings:
-    """What is worth its bits. Gains are of F1, 0…1."""
+    """The thresholds at which tracks and stills are worth their bits. Gains are of F1, 0…1."""
 
     tracks_bps: int
     """Line bits a second that tracks take of the budget."""
     least_gain: float = 0.005
     """From so much net gain on that is sure tracks are sent, until the net gain, sure or not, falls below it."""
     gain_per_doubling: float = 0.07
-    """What twice the bits give video: .05 to .11 between 100 and 400 kbps (docs/design-notes/study-results.md)."""
+    """Gain of video by twice the bits: .05 to .11 between 100 and 400 kbps (docs/design-notes/study-results.md)."""
     least_comparisons: float = 1.5
     """Before so many comparisons no tracks are sent, for a single picture may be an exception, unless …"""
     plain_gain: float = 0.2
@@ -108,7 +108,7 @@ class LeverControl:
         self._loads: deque[tuple[int, int]] = deque(maxlen=settings.load_samples)
 
     def take_shadow(self, measured: Measured) -> None:
-        """What the shadow ground measured."""
+        """Take a measurement of the shadow ground."""
         self._measured = measured
 
     def take_answer(self, *, changed: bool) -> None:

@@ -29,7 +29,7 @@ _SHARPNESS_SIDE_PX = 64
 
 @dataclass(frozen=True, slots=True)
 class ClassPosterior:
-    """What the ground's classifier said of a track, as it came back by ``feedback``."""
+    """The answer of the ground's classifier for a track, from ``feedback``."""
 
     class_name: str
     confidence: float

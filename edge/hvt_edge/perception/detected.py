@@ -22,7 +22,7 @@ _LEAST_WORTH = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Detected:
-    """What a ground reports of its own detector."""
+    """A ground's report of its own detector."""
 
     receiver_id: int
     """Which ground."""

@@ -69,7 +69,7 @@ class ShadowSettings:
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """What was measured, means a picture, the newest most; see the module for ``p``."""
+    """The measured gains, means a picture, the newest most; see the module for ``p``."""
 
     comparisons: float = 0.0
     """How many comparisons the means are worth."""
@@ -139,7 +139,7 @@ class Shadow:
 
     @property
     def measured(self) -> Measured:
-        """What decides on tracks."""
+        """The measured gains of tracks."""
         return Measured(
             comparisons=self.comparisons,
             gain=self.gain,
@@ -204,7 +204,7 @@ class ShadowGround:
 
     @property
     def measured(self) -> Measured:
-        """What decides on tracks, for the ground as it reports."""
+        """The measured gains of tracks, corrected by the ground's reports."""
         more = self._difference.mean
         if more is None:
             return self.now.measured
@@ -213,7 +213,7 @@ class ShadowGround:
         return replace(plain.measured, sure_gain=sure.sure_gain, reported=reported)
 
     def take_detected(self, report: Detected) -> None:
-        """What a ground says of its own detector."""
+        """Take a ground's report of its own detector."""
         self._difference.take(report)
 
     def compare(self, seen: AnalyzedFrame) -> bool:

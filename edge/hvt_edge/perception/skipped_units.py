@@ -1,4 +1,4 @@
-"""What the edge has coded and not decoded: a decoder that is to go on needs it first."""
+"""Coded units that the edge has not decoded: a decoder that goes on needs them first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What gives poses."""
+"""The contract of a source of poses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class PoseSource(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was guessed when it was opened, and why: a sentence each."""
+        """The guesses made at its opening, and their reasons: a sentence each."""
         ...
 
     def close(self) -> None:

@@ -36,7 +36,7 @@ _MESSAGES = (
     "GPS2_RAW",
 )
 _OF_AUTOPILOT = frozenset({"GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT", "GPS2_RAW"})
-"""What a gimbal or a companion may say of itself, which is not the aircraft's."""
+"""Messages that a gimbal or a companion may send of itself, not of the aircraft."""
 _FIXES = ("GPS_RAW_INT", "GPS2_RAW")
 _AUTOPILOT = 1
 """``MAV_COMP_ID_AUTOPILOT1``."""
@@ -206,7 +206,7 @@ class MavlinkPose:
         return whose == (self._vehicle[0], _AUTOPILOT)
 
     def _of(self, whose: tuple[int, int], now_ns: int) -> dict[str, Any]:
-        """What one component has said lately."""
+        """The latest messages of one component."""
         return {
             name: message
             for (system, component, name), (at_ns, message) in self._newest.items()

@@ -24,7 +24,7 @@ class FrameParser:
 
     @property
     def buffered_bytes(self) -> int:
-        """What waits for the rest of its frame."""
+        """Bytes that wait for the rest of their frame."""
         return len(self._rest)
 
     def messages(self, data: bytes) -> list[Any]:

@@ -44,7 +44,7 @@ class Link(Protocol):
     """Whose the newest bytes are; of a stream always the same."""
 
     def read(self) -> bytes:
-        """What has come, of one datagram at most; nothing after `_POLL_S`. Raises `OSError` once it is gone."""
+        """The bytes of one datagram at most; nothing after `_POLL_S`. Raises `OSError` once it is gone."""
         ...
 
     def close(self) -> None:
@@ -132,7 +132,7 @@ class Connection:
             _log.warning("%s; all else goes on without a pose, and it is tried again", said)
 
     def read(self) -> bytes:
-        """What has come in a fraction of a second; nothing while it is not open."""
+        """The bytes of a fraction of a second; nothing while it is not open."""
         try:
             if self._link is None:
                 pause_s = _PAUSES_S[min(self._failed, len(_PAUSES_S)) - 1]

@@ -82,7 +82,7 @@ class CameraDecoder:
         self._whole = False
         """Whether all since a keyframe was decoded."""
         self.trouble = ""
-        """What was wrong with the newest unit that was left out, in a few words."""
+        """The fault of the newest unit that was left out, in a few words."""
 
     def expect(self, size: tuple[int, int]) -> None:
         """From now on a picture of another size (width, height) is not taken."""

@@ -148,7 +148,7 @@ class CodedVideoSource(Source):
 
 
 def _seen(packets: Iterator[tuple[float, bytes]], units: CameraUnits) -> list[SeenUnit]:
-    """What the clip takes, without decoding it."""
+    """Measure the bytes of the clip, without decoding it."""
     seen: list[SeenUnit] = []
     surveyed_s = before_s = 0.0
     for at_s, packet in packets:

@@ -33,7 +33,7 @@ class SeenUnit:
 
 @dataclass(frozen=True, slots=True)
 class CameraStream:
-    """What was seen of the stream before the flight: of a file its first minutes, of a camera some seconds."""
+    """The stream as measured before the flight: of a file its first minutes, of a camera some seconds."""
 
     units: tuple[SeenUnit, ...]
     """The first is a keyframe."""
@@ -74,9 +74,9 @@ class Source(ABC):
     """The camera's own HEVC, where each frame comes with its unit of it (`Frame.camera_unit`). An index that is left
     out is a unit that was lost."""
     notes: tuple[str, ...] = ()
-    """What was decided about it before the flight and why, a sentence each; what is guessed is here."""
+    """The decisions and guesses about it before the flight and their reasons, a sentence each."""
     warning: str = ""
-    """What the camera's own stream does to what is shown, in a sentence; empty for nothing."""
+    """The effect of the camera's own stream on the picture, in a sentence; empty for none."""
 
     @abstractmethod
     def frames(self, *, start_ns: int) -> Iterator[Frame]:

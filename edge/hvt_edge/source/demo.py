@@ -39,7 +39,7 @@ __all__ = [
 _END_S = 5.0
 _POSES_PER_S = 5
 SCENE_WORDS: Mapping[str, tuple[str, Any]] = {"codes": ("codes", True), "4k": ("size", (3840, 2160))}
-"""What may follow ``demo:``, and the argument of the scene that it is."""
+"""Words that may follow ``demo:``, each with its argument of the scene."""
 
 
 def is_demo(spec: str) -> bool:
@@ -48,7 +48,7 @@ def is_demo(spec: str) -> bool:
 
 
 def demo_scene(spec: str) -> dict[str, Any]:
-    """What the scene's maker is given beside the seed, for ``demo`` or ``demo:WORD,…``; `UserError` for others."""
+    """The arguments of the scene's maker beside the seed, for ``demo`` or ``demo:WORD,…``; `UserError` for others."""
     _, colon, text = spec.partition(":")
     words = [word.strip() for word in text.split(",")] if colon else []
     for word in words:
@@ -59,7 +59,7 @@ def demo_scene(spec: str) -> dict[str, Any]:
 
 
 class DrawnScene(Protocol):
-    """What a drawn scene is to the edge; made by ``scene(seed)``, or with what `demo_scene` gives beside it."""
+    """The edge's view of a drawn scene; made by ``scene(seed)``, or with the arguments of `demo_scene` beside it."""
 
     size: tuple[int, int]
     """(width, height) of its pictures in pixels."""
@@ -168,7 +168,7 @@ def _end(drawing: subprocess.Popen[bytes]) -> None:
 
 
 def _draw(seed: int, spec: str) -> None:
-    """What the other process does, until nobody asks any more."""
+    """The loop of the drawing process."""
     (entry,) = entry_points(group="hvt.scenes", name="demo")
     scene: DrawnScene = entry.load()(seed, **demo_scene(spec))
     requests, answers = sys.stdin.buffer, sys.stdout.buffer

@@ -1,4 +1,4 @@
-"""What cannot be paused: a reader thread that keeps only the latest frame of a camera or a network stream."""
+"""Sources that cannot be paused: a reader thread holds only the latest frame of a camera or a network stream."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS
 _JOIN_S = 1.5
 _IDLE_S = 1.0
 SOURCE_PART = "source"
-"""What it is called where it fails."""
+"""Its name as a failed part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class Grabber(Protocol):
 
     @property
     def notes(self) -> Notes | None:
-        """What was decided about it."""
+        """The decisions about it."""
         ...
 
     def open(self) -> None:

@@ -98,7 +98,7 @@ def _check_there(spec: str, scheme: str) -> None:
 
 
 def shown(spec: str) -> str:
-    """What ``--source`` names as it may be printed: a file, a device and the demo as they are."""
+    """``--source`` as it may be printed: a file, a device and the demo as they are."""
     return spec if is_demo(spec) or _is_there(spec) else redacted(spec)
 
 

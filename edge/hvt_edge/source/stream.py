@@ -108,7 +108,7 @@ class StreamGrabber:
         self._container, self._shots = container, shots
 
     def _read(self, container: Any, stream: Any) -> Iterator[Shot]:
-        """What comes from now on; raises UserError where the stream is not taken."""
+        """Read from now on; raises UserError if the stream is refused."""
         stream.thread_type = "SLICE"
         self._pictures.begin(stream)
         return _decoded(container, stream, self._pictures)

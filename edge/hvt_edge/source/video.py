@@ -117,7 +117,7 @@ class VideoSource(Source):
             yield times.popleft(), whole
 
     def _about_times(self, stream: Any) -> Iterator[str]:
-        """What was decided about them, and why."""
+        """The decisions about its times, and their reasons."""
         fps = float(1 / self._stamps.period_s)
         if self._override is not None:
             return

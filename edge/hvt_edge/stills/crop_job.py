@@ -90,7 +90,7 @@ class CropJob:
     crop_bgr: Image
     """Of the source, at the size at which it is coded."""
     base_crop_bgr: Image | None
-    """What the decoded base frame of the same source frame shows of it, at that size; None where there is none."""
+    """The same place in the decoded base frame of the same source frame, at that size; None without one."""
     alternative: Alternative | None
     """None where the base was not at hand."""
 
@@ -115,7 +115,7 @@ class CropJob:
 def union_crop(
     request: Request, *, padding: float, source_size: tuple[int, int]
 ) -> tuple[int, int, int, int]:
-    """What a still of it shows: the smallest box around the padded crops of all its tracks, source pixels."""
+    """The area of a still of it: the smallest box around the padded crops of all its tracks, source pixels."""
     crops = [
         crop_box(one.box_source_px, padding=padding, source_size=source_size)
         for one in (request.candidate, *request.also)
@@ -144,7 +144,7 @@ def crop_of(source_bgr: Image, crop_px: Crop, size: tuple[int, int]) -> Image:
 
 
 def size_parameters(crop_px: Crop, size: tuple[int, int]) -> dict[str, int | float | str]:
-    """What the header says of the coded size; nothing where it is the size of the crop."""
+    """The coded size for the header; nothing if it is the size of the crop."""
     if size == (crop_px[2] - crop_px[0], crop_px[3] - crop_px[1]):
         return {}
     return {"w": size[0], "h": size[1]}

@@ -61,7 +61,7 @@ class _Fitted:
     parameters: Parameters
     quality_pct: int
     shown_bgr: Image
-    """What the ground will see."""
+    """The picture that the ground will decode."""
 
 
 @dataclass(frozen=True, slots=True)

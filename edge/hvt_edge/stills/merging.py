@@ -21,7 +21,7 @@ from hvt_edge.stills.policy.cost import CostEstimate
 __all__ = ["ALSO_BYTES", "MOST_ALSO", "group"]
 
 ALSO_BYTES = 17.0
-"""What the header takes for each further track: its id and its box in eighths of a pixel."""
+"""Bytes of the header for each further track: its id and its box in eighths of a pixel."""
 MOST_ALSO = 15
 _MOST_COMPARED = 96
 """Of more requests than that only the most useful are compared with each other: the time it takes stays bounded."""

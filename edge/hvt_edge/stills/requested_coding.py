@@ -33,17 +33,17 @@ _FLOOR_PCT = 20
 _SHRINKS = (0.7, 0.5, 0.35, 0.25)
 _TRIES = 4
 _FILLED = 0.85
-"""Of what is allowed: no more tries to get nearer to it."""
+"""Share of the allowance from which no further try is made."""
 _FALLS_PER_PCT = 0.03
 """Of the logarithm of a still's bytes, for each percent of quality less: where a search begins."""
 
 
 @dataclass(frozen=True, slots=True)
 class Capacity:
-    """What one message may take, payload."""
+    """The payload limits of one message."""
 
     prompt_bytes: int
-    """What comes within a second."""
+    """The bytes that go out within a second."""
     most_bytes: int
     """All that the video yields."""
     total_bps: int
@@ -55,7 +55,7 @@ class Capacity:
 
 @dataclass(frozen=True, slots=True)
 class CodedRequest:
-    """A coded still, and what its requester is told before it comes; nothing where it comes as requested."""
+    """A coded still, and the note for its requester; empty if it comes as requested."""
 
     still: Still
     note: str

@@ -44,7 +44,7 @@ class ChooserSettings:
     share: bool = False
     """Neighbours share one still where that is cheaper."""
     overhead_bytes: float = STILL_OVERHEAD_BYTES
-    """What a still takes on the line beside its payload."""
+    """Line bytes of a still beside its payload."""
     from_source: bool = False
     """Whether candidates were found on the source, and may be unknown to the ground."""
 
@@ -313,7 +313,7 @@ class Chooser:
         self._most_bytes = most_bytes
 
     def close(self) -> None:
-        """What is pending will not be sent any more."""
+        """End: pending stills will not be sent any more."""
         if self.on_demand is not None:
             self.on_demand.close()
         self._count_left(self.outbox.clear(), now_ns=0)

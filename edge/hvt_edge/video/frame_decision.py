@@ -12,7 +12,7 @@ __all__ = ["Action", "FrameDecision", "FrameInputs", "decide"]
 
 
 class Action(Enum):
-    """What happens to a source frame."""
+    """The action for a source frame."""
 
     SKIP = "not coded: frame decimation leaves it out"
     HOLD = "due, and not coded: there is no room for it"
@@ -41,7 +41,7 @@ class FrameInputs:
 
 @dataclass(frozen=True, slots=True)
 class FrameDecision:
-    """What to do with one source frame."""
+    """The decision for one source frame."""
 
     action: Action
     keyframe: bool = False

@@ -26,7 +26,7 @@ __all__ = ["PassthroughStage", "UnitInputs", "VideoStage", "decide_unit"]
 
 _PART = "passthrough"
 _PATIENCE_NS = SECOND_NS // 2
-"""A unit waits so long for its room: a large keyframe leaves none for a moment, and what waits is not lost."""
+"""A unit waits so long for its room: a large keyframe leaves none for a moment, and a waiting unit is not lost."""
 _POLL_NS = SECOND_NS // 100
 
 
@@ -217,4 +217,4 @@ class PassthroughStage:
 
 
 VideoStage = BaseStage | PassthroughStage
-"""What the frame loop takes a frame through."""
+"""The video stage of the frame loop: one that codes, or one that passes a camera's units through."""

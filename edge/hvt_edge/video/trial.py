@@ -1,4 +1,4 @@
-"""What a scene needs: its first second is coded once before the flight."""
+"""Measures a scene: its first second is coded once before the flight."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def make_levers(config: EdgeConfig, operating: Operating, view: View) -> LeverCo
 
 
 def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:
-    """What tracks and stills must give."""
+    """The thresholds of tracks and stills."""
     return LeverSettings(tracks_bps=config.metadata_bps, finer=shows_details(config, view))
 
 
@@ -126,7 +126,7 @@ def make_camera_rates(
     operating: Operating,
     pacer: Pacer | None,
 ) -> CameraRates:
-    """What runs at the keyframes of a camera that is passed through."""
+    """Make the rates that change at the keyframes of a passed-through camera."""
 
     def needed(window_bytes: int) -> int:
         return _camera_needs_bps(config, window_bytes, operating.now.video_share or config.share)
@@ -144,7 +144,7 @@ def make_camera_rates(
 
 
 def make_least_link(config: EdgeConfig, *, pacer: Pacer | None, in_flight: BaseInFlight) -> LeastLink | None:
-    """What keeps a camera's units from a queue; None where nothing tracks the link."""
+    """Make the bound on a camera's queued units; None if nothing measures the link."""
     if pacer is None:
         return None
 

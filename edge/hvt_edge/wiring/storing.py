@@ -1,4 +1,4 @@
-"""What is written on the edge, from the settings."""
+"""Makes the files of the edge, from the settings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def check_files(config: EdgeConfig) -> None:
 
 
 def store_folder(config: EdgeConfig) -> Path:
-    """Where what is captured while the link is down is kept."""
+    """The folder of the backlog."""
     return config.store_folder or default_folder(config.edge_id)
 
 

@@ -59,7 +59,7 @@ _SEND_S: Final = 10.0
 _END_S: Final = 1.0
 _MOST_EVENTS: Final = 2048
 _SOCKET_BYTES: Final = 64 * 1024
-"""What the kernel may hold back: what lies there is not replaced by what is newer."""
+"""The kernel's buffer: events in it cannot be replaced by newer ones."""
 _BUFFER_BYTES: Final = 4096
 """As above, in Python. Not 0: at that asyncio's TLS pauses and does not go on."""
 _READ_BYTES: Final = 64 * 1024
@@ -140,7 +140,7 @@ def _check_key(settings: Mapping[str, str]) -> None:
 
 
 def _settings(url: str, environment: Mapping[str, str]) -> dict[str, str]:
-    """What pytak is to be told, of ``environment``."""
+    """The settings for pytak, from ``environment``."""
     parts = urlsplit(url)
     # It reads values through a `ConfigParser`, to which a percent sign is a beginning.
     settings = {name: environment[name].replace("%", "%%") for name in VARIABLES if environment.get(name)}
@@ -294,7 +294,7 @@ async def _close(writer: Any) -> None:
 
 
 def _reason(error: BaseException) -> str:
-    """What went wrong, in a few words; pytak wraps what OpenSSL says into advice not to verify."""
+    """The cause in a few words; pytak wraps OpenSSL's message into advice not to verify."""
     root = error.__cause__ if isinstance(error, SyntaxError) and error.__cause__ is not None else error
     if isinstance(root, ssl.SSLCertVerificationError):
         return f"the server's certificate is not accepted ({root.verify_message}); {_CAFILE} names its CA"

@@ -17,7 +17,7 @@ from hvt_ground.sinks.tracks_table import utc_text
 __all__ = ["UNKNOWN_M", "CotEvent", "CotMessage", "Motion", "Parent", "Point", "Sensor", "plain"]
 
 UNKNOWN_M: Final = 9_999_999.0
-"""What the schema says for a height or an error that is not known."""
+"""The schema's value for an unknown height or error."""
 _DECLARATION: Final = b'<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'
 _MOST_CALLSIGN: Final = 64
 _MOST_REMARKS: Final = 400
@@ -57,7 +57,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """What a camera looks at."""
+    """The view of a camera."""
 
     azimuth_deg: float
     """Clockwise from true north."""

@@ -108,7 +108,7 @@ class SessionReporter:
                     _put(self._stills, track_id, address)
 
     def skipped(self, count: int) -> None:
-        """What follows says it again."""
+        """Nothing to do: later events repeat it."""
 
     def close(self, hurry: threading.Event | None = None) -> None:
         """Nothing is held back."""

@@ -48,7 +48,7 @@ class PlacedTrack:
 
 @dataclass(frozen=True, slots=True)
 class Reported:
-    """What was last said of a track."""
+    """The last report of a track."""
 
     at_ns: int
     place: Place

@@ -37,7 +37,7 @@ from hvt_ground.sinks.rerun.stills.pairs import event_text, still_picture
 __all__ = ["McapFile"]
 
 _CHUNK_BYTES = 256 * 1024
-"""What a kill loses at the most: a chunk is written once it is full."""
+"""The most that a kill loses: a chunk is written once it is full."""
 _LATEST_NS = (1 << 63) - 1
 _THIN_PX, _THICK_PX = 1.0, 3.0
 _FONT_PX = 12.0

@@ -61,7 +61,7 @@ class Address:
 
 
 def destination(text: str) -> Address | Path:
-    """What ``--ts`` names, a path where it is no URL. `UserError` where it can be neither."""
+    """The destination in ``--ts``, a path if it is no URL. `UserError` if it can be neither."""
     if "://" not in text:
         path = Path(text)
         if path.suffix != ".ts" and not path.is_dir():

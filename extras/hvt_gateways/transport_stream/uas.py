@@ -1,4 +1,4 @@
-"""What is known at one moment as a UAS Datalink local set (MISB ST 0601.16). What is not known is left out."""
+"""One moment as a UAS Datalink local set (MISB ST 0601.16). Unknown values are left out."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ _PATIENCE = 3
 
 
 BacklogContent = Info | ReceivedStill | tuple[BacklogUnit, ...]
-"""What an object holds: the facts of its session, a still, or a stretch of the base stream."""
+"""The content of an object: the facts of its session, a still, or a stretch of the base stream."""
 
 
 @dataclass(slots=True)
@@ -52,7 +52,7 @@ class _Open:
 
     @property
     def size_bytes(self) -> int:
-        """What it takes, here or where it was handed to."""
+        """Its bytes, here or in the stage that it was handed to."""
         return self.total_bytes if self.handed else len(self.data)
 
 
@@ -78,7 +78,7 @@ class BacklogAssembly:
 
     @property
     def size_bytes(self) -> int:
-        """What the objects in progress and those handed out have."""
+        """The bytes of the objects in progress and of those handed out."""
         return sum(entry.size_bytes for entry in self._open.values())
 
     @property
@@ -202,7 +202,7 @@ class BacklogAssembly:
 
 
 def backlog_content(key: ObjectKey, data: bytes, *, edge: str) -> BacklogContent:
-    """What the bytes of a whole object hold; raises `WireError` and nothing else, for any bytes whatever."""
+    """Read the bytes of a whole object; raises `WireError` and nothing else, for any bytes whatever."""
     session_id, kind, number = key
     if kind == BacklogKind.INFO:
         return _info(session_id, data, edge=edge)

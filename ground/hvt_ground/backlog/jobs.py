@@ -63,7 +63,7 @@ class StillJob(Job):
         self._done(True if written else None)
 
     def fail(self, error: Exception) -> None:
-        """What the machine may mend, such as a full disk, comes again."""
+        """End with an error: the object comes again if the machine may mend it, such as a full disk."""
         self._done(_usable(error))
 
 

@@ -1,4 +1,4 @@
-"""What is stored of one session becomes the same events as live messages do: video in its holes, stills, boxes."""
+"""Turns a session's stored objects into the events of live messages: video in its holes, stills, boxes."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class BacklogTotals:
         self._note(frame_index, capture_ns)
 
     def take_back(self, *, stills: int, frames: int, video_s: float) -> None:
-        """What was counted is lost after all: it is to come again."""
+        """Take back the counts of lost objects: they are sent again."""
         self.stills -= stills
         self.frames -= frames
         self.video_s -= video_s
@@ -125,7 +125,7 @@ class SessionBacklog:
                 totals.add_still(header.frame_index, header.capture_ns)
 
     def receipt(self) -> Receipt:
-        """Of what is logged from now on: only what is written is to be acknowledged."""
+        """The receipt of everything logged from now on: only written objects are acknowledged."""
         return Receipt(self._outputs)
 
     def lose_still(self, sequence: int) -> None:

@@ -1,1 +1,1 @@
-"""``hvt-ground doctor``: whether a ground with these settings could start, and what it would lack. See `command`."""
+"""``hvt-ground doctor``: whether a ground with these settings could start, and why not. See `command`."""

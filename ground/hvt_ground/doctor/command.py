@@ -74,7 +74,7 @@ def _models(config: GroundConfig) -> Finding:
 
 
 def _recordings(config: GroundConfig) -> Finding:
-    """What is written, and whether there is room."""
+    """The files that will be written, and whether there is room."""
     named = {"--summary": config.summary, "--timing": config.timing}
     if config.tracks is not None and config.tracks.suffix == ".csv" and not config.tracks.is_dir():
         named["--tracks"] = config.tracks

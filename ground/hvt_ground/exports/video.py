@@ -49,7 +49,7 @@ def write_video(recorded: Recorded, path: Path, *, container: str, burn_in: bool
 
 
 def pictures(recorded: Recorded) -> Iterator[tuple[VideoSample, Image, Overlay]]:
-    """Each sample that can be decoded, its picture (uint8 (H, W, 3) BGR, base pixels) and what was drawn on it."""
+    """Each decodable sample, its picture (uint8 (H, W, 3) BGR, base pixels) and the boxes on it."""
     decoder = BaseDecoder()
     overlays = recorded.overlays()  # at every sample, and at some frames between
     for sample in from_keyframe(recorded):

@@ -60,7 +60,7 @@ class _Area:
         return _Area(self.west_deg + degrees, self.south_deg, self.east_deg + degrees, self.north_deg)
 
     def common(self, other: _Area) -> _Area | None:
-        """What lies in both."""
+        """The intersection of both."""
         west, east = max(self.west_deg, other.west_deg), min(self.east_deg, other.east_deg)
         south, north = max(self.south_deg, other.south_deg), min(self.north_deg, other.north_deg)
         return _Area(west, south, east, north) if west < east and south < north else None
@@ -68,7 +68,7 @@ class _Area:
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """What is in memory: (H, W) float32 metres, NaN where the model has none, row 0 in the north."""
+    """The part of the model in memory: (H, W) float32 metres, NaN for holes, row 0 in the north."""
 
     metres: npt.NDArray[np.float32]
     area: _Area

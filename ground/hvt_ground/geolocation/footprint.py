@@ -1,4 +1,4 @@
-"""What of the ground a picture shows: where its middle and its corners lie, and how far away."""
+"""The footprint of a picture on the ground: its middle and its corners, and how far away they are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What rays meet: flat ground, or another surface such as `terrain`."""
+"""The surface that rays meet: flat ground, or another one such as `terrain`."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class StreamCounters:
     keyframe_requests: int = 0
 
     def since(self, before: StreamCounters) -> StreamCounters:
-        """What was counted after ``before`` was copied."""
+        """The counts since ``before`` was copied."""
         return StreamCounters(
             **{
                 one.name: getattr(self, one.name) - getattr(before, one.name)

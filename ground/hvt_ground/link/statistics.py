@@ -34,7 +34,7 @@ __all__ = ["REPORT_LINE_BYTES", "LinkMeasurement", "ReceptionStatistics", "Sessi
 
 _MS = 1_000_000
 REPORT_LINE_BYTES = 180
-"""What a report without results takes on the line."""
+"""Line bytes of a report without results."""
 _SHARE = 0.03
 _LEAST_NS, _MOST_NS = 100 * _MS, 500 * _MS
 _RATE_OVER_NS = 2 * SECOND_NS
@@ -46,7 +46,7 @@ _MISSED_NS = 6 * SECOND_NS
 
 @dataclass(frozen=True, slots=True)
 class LinkMeasurement:
-    """What a report says of the link."""
+    """A report's view of the link."""
 
     base_sequence: int
     base_held_us: int
@@ -127,7 +127,7 @@ class ReceptionStatistics:
         return min(_MOST_NS, max(_LEAST_NS, round(REPORT_LINE_BYTES / (_SHARE * arriving))))
 
     def take(self, now_ns: int) -> LinkMeasurement:
-        """What to report now; delays begin anew."""
+        """The report of now; delays begin anew."""
         with self._lock:
             delays = list(self._delays_ms)
             self._delays_ms.clear()
@@ -199,7 +199,7 @@ class Uptime:
 
 
 class SessionAccount:
-    """What crossed the line in one session, and when. For the receiving thread; ``emit`` takes the events."""
+    """The traffic of one session and its times. For the receiving thread; ``emit`` takes the events."""
 
     def __init__(
         self,

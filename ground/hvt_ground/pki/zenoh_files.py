@@ -96,7 +96,7 @@ def router_file(router: RouterMember, roster: Roster, *, folder: str = KEYS_FOLD
 
 
 def _toward_edge(edge: str, *, command: bool) -> list[_Rule]:
-    """What passes where an edge is at the other end."""
+    """The messages to and from an edge."""
     keys = EdgeKeys(edge)
     requested = [keys.key(Channel.INFO), *([keys.key(Channel.CONTROL)] if command else [])]
     return [
@@ -112,7 +112,7 @@ def _toward_edge(edge: str, *, command: bool) -> list[_Rule]:
 
 
 def _toward_ground(edges: Sequence[str], *, command: bool, label: str) -> list[_Rule]:
-    """What passes where a ground is at the other end that may watch these edges."""
+    """The messages to and from a ground that may watch these edges."""
     keys = [EdgeKeys(edge) for edge in edges]
     requested = [Channel.INFO, *([Channel.CONTROL] if command else [])]
     named = f"{label}-{'commands' if command else 'watches'}"
@@ -131,7 +131,7 @@ def _toward_ground(edges: Sequence[str], *, command: bool, label: str) -> list[_
 
 
 def _written(edges: Sequence[str]) -> list[str]:
-    """What edges publish."""
+    """The keys that edges publish."""
     rows = [row for row in Channel if DELIVERIES[row].direction is Direction.EDGE_TO_GROUND]
     return [EdgeKeys(edge).key(row) for edge in edges for row in rows]
 
@@ -168,7 +168,7 @@ _AMONG_GROUNDS: list[_Rule] = [
     )
     for flow in ("ingress", "egress")
 ]
-"""What grounds of a group tell each other, by way of routers too; no edge hears of it, or takes part."""
+"""Messages between grounds of a group, by way of routers too; no edge receives or sends them."""
 
 
 def _access(grants: dict[str, list[_Rule]]) -> dict[str, Any]:

@@ -65,7 +65,7 @@ class DrawnLayer:
         return {frame: capture_ns for rows in self._rows.values() for frame, capture_ns, _ in rows}
 
     def at(self, frame: int, *, reported: bool) -> Iterator[DrawnBox]:
-        """What is drawn at a frame."""
+        """The boxes drawn at a frame."""
         ids = self._latest("track_id", frame)
         before, after = self._latest("class_before", frame), self._latest("class_ids", frame)
         percents = self._latest("confidence_pct", frame) or [0] * len(ids)

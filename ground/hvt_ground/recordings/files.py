@@ -1,4 +1,4 @@
-"""Files of recordings on disk: whether one is written to, what is in one, how one loses its video."""
+"""Files of recordings on disk: whether one is open, its contents, and the removal of its video."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def is_claimed(path: Path) -> bool:
 
 
 def described(path: Path) -> RecordingRow | None:
-    """What a file says of itself; None where it is no recording of ours."""
+    """Read a file's description of itself; None if it is no recording of ours."""
     content = _Content()
     try:
         with warnings.catch_warnings():
@@ -91,7 +91,7 @@ def described(path: Path) -> RecordingRow | None:
 
 
 class _Content:
-    """What the chunks of a recording have, for the index."""
+    """The content of a recording's chunks, for the index."""
 
     def __init__(self) -> None:
         self.frames = 0

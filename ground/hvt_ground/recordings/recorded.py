@@ -52,7 +52,7 @@ _LAYERS = {TRACKS: "Boxes2D", REPORTED: "Ellipses2D", REFINED: "Boxes2D", DOUBTE
 _LEVELS: Mapping[str, str] = {"INFO": "info", "WARN": "warning", "ERROR": "error"}
 _POSE, _INFO, _MESSAGE = "pose", "info", "message"
 _ONE_COMPONENT = {MAP_CAMERA: _POSE, SESSION: _INFO, STILL_MESSAGES: _MESSAGE}
-"""What is used of these entities."""
+"""The components that are read of these entities."""
 _SAMPLE, _PICTURE, _CAPTION = "VideoStream:sample", "EncodedImage:blob", "Boxes2D:labels"
 
 _Timed = tuple[int, int, Any]
@@ -68,11 +68,11 @@ class RecordedStill:
     capture_ns: int
     jpeg: bytes
     base_jpeg: bytes
-    """What the base showed of it; empty where the recording does not say."""
+    """The base crop of it; empty if the recording has none."""
     caption: str
     """``17  car → van .93``; empty where it was never on the screen."""
     header: RoiHeader | None = None
-    """What goes with ``jpeg`` on the wire; None where the recording does not say."""
+    """The `RoiHeader` of ``jpeg``; None if the recording has none."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +82,14 @@ class Recorded:
     edge: str
     session: str
     info: Info | None
-    """What the edge said of the session; None in a recording of an earlier HVT."""
+    """The edge's facts of the session; None in a recording of an earlier HVT."""
     video: Sequence[VideoSample]
     """In order of frames."""
     stills: Sequence[RecordedStill]
     notices: Sequence[Notice]
     poses: Sequence[PoseUpdate]
     surface: Surface
-    """What tracks stand on."""
+    """The surface that tracks stand on."""
     _layers: Mapping[str, DrawnLayer] = field(repr=False)
 
     @cached_property
@@ -101,7 +101,7 @@ class Recorded:
         return trail
 
     def overlays(self) -> Iterator[Overlay]:
-        """What was drawn at each frame that has a picture or at which boxes changed, in order of frames."""
+        """The boxes at each frame that has a picture or at which boxes changed, in order of frames."""
         times: dict[int, int] = {}
         for layer in self._layers.values():
             times |= layer.times()
@@ -318,7 +318,7 @@ def _video(rows: Iterable[_Timed]) -> list[VideoSample]:
 
 
 def _stills(rows: Mapping[tuple[str, str], list[_Timed]]) -> list[RecordedStill]:
-    """Pairs of the gallery, what was never on the screen, and what was on the enhanced picture alone."""
+    """Pairs of the gallery, stills that were never on the screen, and those on the enhanced picture alone."""
     headers = _Headers(rows.get((STILL_MESSAGES, _MESSAGE), []))
     found = []
     for (entity, component), pictures in rows.items():

@@ -1,4 +1,4 @@
-"""What the index knows of one file of a recording."""
+"""The index's row of one file of a recording."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class RecordingRow:
     classes: Mapping[str, int] = field(default_factory=dict)
     """Tracks that had the class, as refined."""
     backlog: bool = False
-    """What came after an outage, of the time of another file or of a session that was over."""
+    """Objects of an outage, of the time of another file or of a session that was over."""
     video: bool = True
     """False once the video was removed."""
     whole: bool = False

@@ -129,7 +129,7 @@ class _ReplayPort:
         return None
 
     def request_keyframe(self) -> None:
-        """What came has come."""
+        """Nothing to request: a replay has only the messages that came."""
 
     def report(self, feedback: Feedback) -> None:
         """Nobody listens."""
@@ -203,7 +203,7 @@ class _Replay:
 
 
 def messages_in(files: Sequence[Path]) -> _Messages:
-    """What was received: of logs that follow each other, or of the recordings of one session."""
+    """The received messages: of logs that follow each other, or of the recordings of one session."""
     if any(one.suffix == ".rrd" for one in files):
         return partial(iter, messages_of(read_recordings(files)))
     ordered = sorted(files, key=_first_ns)
@@ -217,7 +217,7 @@ def _first_ns(log: Path) -> int:
 
 
 def _infos(messages: Iterator[Received]) -> dict[str, dict[int, Info]]:
-    """What each edge said of its sessions, by session; all are played in lockstep."""
+    """Each edge's facts of its sessions, by session; all are played in lockstep."""
     found: dict[str, dict[int, Info]] = {}
     for item in messages:
         parsed = parse_key(item.key)

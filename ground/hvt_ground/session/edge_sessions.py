@@ -83,9 +83,9 @@ class EdgeSessions:
         self._clock = clock or SteadyClock()
         self._pause = pause or RetryPause()
         self.failures = Failures(self._clock)
-        """What failed of this edge's reception."""
+        """The failures of this edge's reception."""
         self.backlog = EdgeBacklog(port.edge, recordings=recordings)
-        """What was stored while the link was down."""
+        """The backlog of the edge."""
         self._clock_offset = ClockOffset()
         self._reports = ReceiverReports(
             port.report, clock=self._clock, clock_offset=self._clock_offset, backlog=self.backlog
@@ -353,7 +353,7 @@ class EdgeThread:
         self.sessions = sessions
         self._drain_ns = round(drain_s * SECOND_NS)
         self.error: BaseException | None = None
-        """What ended the thread."""
+        """The error that ended the thread."""
         self._inbox = sessions.port.inbox
         self._stop = threading.Event()
         self._stop_ns = 0

@@ -53,7 +53,7 @@ class Receiver:
 
     @property
     def counters(self) -> StreamCounters:
-        """What the reassembly has counted, over all sessions; a copy."""
+        """The counts of the reassembly, over all sessions; a copy."""
         return replace(self._reassembler.counters)
 
     @property
@@ -62,7 +62,7 @@ class Receiver:
         return time.monotonic_ns() - self._last_message_ns
 
     def receive(self, item: Received) -> Sequence[BasePacket | Packet]:
-        """What one message brings: no packet where it is unusable or waits, several where it fills a hole."""
+        """The packets of one message: none if it is unusable or waits, several if it fills a hole."""
         self._last_message_ns = time.monotonic_ns()
         at_ns = self._uptime.handle(arrived_ns=item.received_ns, now_ns=self._clock())
         parsed = parse_key(item.key)
@@ -88,7 +88,7 @@ class Receiver:
         return True
 
     def wait_for_keyframe(self) -> None:
-        """What came last could not be decoded, or its session is not open: go on with the next keyframe."""
+        """The last unit could not be decoded, or its session is not open: go on with the next keyframe."""
         self._reassembler.decoder_failed()
 
     def disown(self) -> None:
@@ -96,7 +96,7 @@ class Receiver:
         self._reassembler.disown()
 
     def duplicate_notice(self, session_id: int, *, shown: int) -> str | None:
-        """What to say of a second edge of this id; None where it was said lately."""
+        """The notice of a second edge of this id; None if it was given lately."""
         text = self._duplicates.note(session_id, shown=shown, now_ns=time.monotonic_ns())
         if text is not None:
             _log.warning("%s", text)

@@ -1,4 +1,4 @@
-"""Reports to one edge: what came of its messages, how the link is, what the stills were. For any thread."""
+"""Reports to one edge: its received messages, the link, the readings of its stills. For any thread."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class LineFile:
         self._size_bytes += len(item.encode())
 
     def skipped(self, count: int) -> None:
-        """What is missing is missing."""
+        """Nothing to do: skipped lines are lost."""
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
         """Close the file; a second call does nothing."""

@@ -54,7 +54,7 @@ class QueuedSink(Generic[T]):
         self._taken = 0
         """Items that ever were queued."""
         self._receipts: deque[tuple[int, Callable[[bool], None]]] = deque()
-        """What is to be called when so many of them are written."""
+        """The functions to call when so many of them are written."""
         self._queued_bytes = 0
         self._skipped = 0
         self._in_hand = False
@@ -231,7 +231,7 @@ class QueuedSink(Generic[T]):
             done(True)
 
     def _fail(self, error: BaseException) -> None:
-        """What is queued is lost."""
+        """Count the queue as lost."""
         self._pause.failed(time.monotonic_ns())
         with self._changed:
             self._open, self._failing = False, True
@@ -250,7 +250,7 @@ class QueuedSink(Generic[T]):
 
 
 class Receipt:
-    """Of what is stored and logged between its making and `then` to each of ``sinks``: whether it is written."""
+    """Whether all events stored and logged between its making and `then` are written by each of ``sinks``."""
 
     def __init__(self, sinks: Sequence[QueuedSink[Any]]) -> None:
         self._sinks = [(sink, sink.stored_losses) for sink in sinks]

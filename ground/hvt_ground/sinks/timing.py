@@ -75,7 +75,7 @@ class SessionTiming:
                     self._write(self._unread.pop(next(iter(self._unread))), handled_ns=0)
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """What was not read, never will be."""
+        """Write the stills that were never read."""
         with self._lock:
             for still in self._unread.values():
                 self._write(still, handled_ns=0)

@@ -51,7 +51,7 @@ class Access:
     proxy: str | None = None
 
     def role(self, headers: Mapping[str, str], *, token: str | None = None) -> Role | None:
-        """What a request may do; None is nothing. ``token`` is that of a link, else the cookie counts."""
+        """The role of a request; None for none. ``token`` is that of a link, else the cookie counts."""
         if not self.tokens:
             # Another site's name may be made to lead here: only our own names are answered.
             host = requested_host(headers.get("host", ""))
@@ -68,7 +68,7 @@ class Access:
 
     @property
     def refusal(self) -> tuple[str, int]:
-        """What somebody without a role is told, and the status."""
+        """The answer to a request without a role, and its status."""
         if self.tokens:
             return "give the link that hvt-ground showed at its start", 401
         if self.proxy is not None:

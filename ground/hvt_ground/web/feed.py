@@ -230,7 +230,7 @@ def _words(session: SessionState, *, calibrated: bool) -> list[str]:
 
 
 def _short(one: EdgeState) -> str:
-    """What of the link stands on the picture."""
+    """The state of the link on the picture."""
     session = one.session
     if session is None or session.total_bps is None:
         return ""
@@ -239,7 +239,7 @@ def _short(one: EdgeState) -> str:
 
 
 def _why(session: SessionState) -> list[str]:
-    """What became of frames and stills, and what decides on tracks and stills, in sentences."""
+    """The outcomes of frames and stills, and the decisions on tracks and stills, in sentences."""
     why = [] if session.edge_frames is None else [f"At the edge {session.edge_frames}."]
     if session.stills_not_sent:
         why.append(f"Not sent as stills: {counts_text(session.stills_not_sent)}.")

@@ -34,7 +34,7 @@ _RECENT = 8
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What a player needs before the fragments."""
+    """The header that a player needs before the fragments."""
 
     codec: str
     """RFC 6381, such as ``avc1.42c01f``."""
@@ -152,7 +152,7 @@ class Muxer:
 
 
 def codec_string(codec: Codec, sets: tuple[bytes, ...]) -> str:
-    """What `MediaSource.isTypeSupported` takes (RFC 6381; ISO/IEC 14496-15, annex E)."""
+    """The argument of `MediaSource.isTypeSupported` (RFC 6381; ISO/IEC 14496-15, annex E)."""
     if codec == "h264":
         return f"avc1.{sets[0][1:4].hex()}"
     profile = _profile(sets[1])

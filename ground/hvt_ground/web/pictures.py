@@ -53,7 +53,7 @@ _X264 = {
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What to send to those on a rung: a start, a fragment or a JPEG."""
+    """A message to the viewers on a rung: a start, a fragment or a JPEG."""
 
     rung: Rung
     item: Start | Fragment | bytes

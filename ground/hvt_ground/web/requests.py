@@ -1,4 +1,4 @@
-"""What an operator may ask of an edge from the page: a closer look, a keyframe, another budget or method."""
+"""An operator's requests from the page: a closer look, a keyframe, another budget or method."""
 
 from __future__ import annotations
 

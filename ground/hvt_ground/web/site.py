@@ -1,4 +1,4 @@
-"""The addresses of the page: its files, the WebSocket of each viewer, pictures of stills, and what may be asked."""
+"""The addresses of the page: its files, the WebSocket of each viewer, pictures of stills, and requests."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _FILES = {
 
 
 class Site:
-    """What the addresses do."""
+    """The handlers of the addresses."""
 
     def __init__(
         self, access: Access, hub: Hub, edge_requests: EdgeRequests, clock: Callable[[], int]
@@ -170,7 +170,7 @@ class Site:
 
 
 async def _send(socket: WebSocket, viewer: Viewer) -> None:
-    """What is queued, as fast as it is taken; one that takes nothing is closed for want of an answer to a ping."""
+    """Send the queue as fast as it is taken; one that takes nothing is closed for want of an answer to a ping."""
     with suppress(WebSocketDisconnect, RuntimeError, ConnectionError):
         while True:
             message = await viewer.take()

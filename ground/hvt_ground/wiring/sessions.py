@@ -1,4 +1,4 @@
-"""What is made for each session of an edge, and for recordings of former ones, as one tree."""
+"""Makes the parts of each session of an edge, and of recordings of former ones, as one tree."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ __all__ = ["OpenSink", "SessionFactory"]
 S = TypeVar("S", bound=SinkWriter[Any])
 
 OpenSink = Callable[[Info], Callable[[], SinkWriter[Event]]]
-"""What opens a sink for a session."""
+"""Opens a sink for a session."""
 
 _LOCKSTEP_WAIT_S = 10.0
 

@@ -10,7 +10,7 @@ from hvt_common.inference.heads.trial import Trial
 __all__ = ["HEAD_NAMES", "check_head_name", "choose_head"]
 
 HEAD_NAMES = tuple(KINDS)
-"""What ``--head`` takes."""
+"""The values of ``--head``."""
 _RT_DETR = ("rt-detr-rows", "rt-detr")
 _RAW_AXES = 5
 """(1, 3, H, W, 5+C): what YOLOv5's levels say, beside all of them decoded."""

@@ -1,4 +1,4 @@
-"""What a head is: which outputs it reads, how it wants its pixels, and boxes."""
+"""The contract of a head: which outputs it reads, how it wants its pixels, and boxes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Head:
     """The boxes still need non-maximum suppression."""
     decoder: Decoder
     why: str
-    """What told it, half a sentence."""
+    """The evidence for it, half a sentence."""
 
     def decode(
         self, outputs: Sequence[npt.NDArray[Any]], *, confidence: float, input_size: tuple[int, int]

@@ -50,7 +50,7 @@ class Match:
     classes: int | None
     decoder: Decoder
     proof: str | None
-    """What leaves no other head; None where the shape alone fits."""
+    """The evidence that excludes all other heads; None if the shape alone fits."""
     possible: bool = True
     """False where the values speak against it, and only the user can know better."""
 

@@ -1,4 +1,4 @@
-"""What a network answered to a few pictures, and what its file says of itself: all that tells its head."""
+"""A network's answers to a few pictures, and its file's metadata: all evidence for its head."""
 
 from __future__ import annotations
 

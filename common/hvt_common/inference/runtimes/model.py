@@ -362,7 +362,7 @@ def _port(value: Any) -> Port:
 
 
 def _cause(path: Path, error: Exception) -> str:
-    """Why onnxruntime does not open a file: what was found, what is supported here, and what to do."""
+    """Why onnxruntime does not open a file: the version found, the version supported here, and the remedy."""
     text = " ".join(str(error).split())
     try:
         (version, producer), opset = onnx_version(path), opset_versions(path).get("", 0)
@@ -402,7 +402,7 @@ _CAUSES: Mapping[str, str] = {
         "{here} has no {0} (opset {1}) for its type of numbers: export the model in float32"
     ),
 }
-"""What onnxruntime says, and what is said instead."""
+"""Messages of onnxruntime, and our sentences in their place."""
 
 
 def _reason(error: Exception) -> str:

@@ -94,7 +94,7 @@ def onnx_version(path: Path) -> tuple[int, str]:
 
 
 def onnx_metadata(path: Path) -> dict[str, str]:
-    """What the exporter wrote into a model. Raises `UserError` as `check_onnx_file` does."""
+    """The metadata that the exporter wrote into a model. Raises `UserError` as `check_onnx_file` does."""
     check_onnx_file(path)
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         return dict(

@@ -65,7 +65,7 @@ class PlugInDetector:
             ) from error
 
     def detect(self, image_bgr: Image) -> Detections:
-        """What it finds from the confidence of use on: inside the image, best first, `MAX_DETECTIONS` at most."""
+        """Detections from the confidence of use on: inside the image, best first, `MAX_DETECTIONS` at most."""
         image = as_bgr(image_bgr)
         found = self._part.detect(image)
         boxes, sure, kinds = _checked(found, classes=len(self.class_names))

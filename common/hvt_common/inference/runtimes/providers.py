@@ -43,7 +43,7 @@ _HOW_TO_GET: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class OpenVinoCpu:
-    """The OpenVINO that is installed, and what it can do on this processor."""
+    """The installed OpenVINO and its abilities on this processor."""
 
     version: str
     bf16: bool

@@ -85,7 +85,7 @@ _HEIGHT, _ALTITUDE = _Number(-10_000, 1_000_000, 2), _Number(-10_000, 1_000_000,
 _FIELD: Final = _Number(1, 1799, 0)
 _ERRORS: Final = (_Number(0, 31, 0),) * 3
 _PARTS: Final = ((_HEIGHT,), (_ALTITUDE,), _ANGLES, _ANGLES, (_FIELD,))
-"""What may be missing: height, altitude, the camera's angles, the platform's, the field of view."""
+"""The optional parts: height, altitude, the camera's angles, the platform's, the field of view."""
 _GROUPS: Final = (_PLACE, *_PARTS, _ERRORS)
 _LEAST_ERROR, _ERROR_RATIO = 0.1, 2**0.5
 
@@ -232,7 +232,7 @@ def _read_whole(bits: BitReader) -> _Sample:
 def _changes(
     sample: _Sample, number: int, *, last: _Sample, step: tuple[int, ...]
 ) -> tuple[bytes, tuple[int, ...]]:
-    """What changed, as bytes; and the place's step, which the next report builds on."""
+    """The changes, as bytes; and the place's step, which the next report builds on."""
     out = BitWriter()
     out.plain(0, 1)
     out.plain(number, 4)

@@ -166,7 +166,7 @@ class _Walk:
     def _shared_motion(
         self, reference: Sequence[CodedTrack], goals: Sequence[CodedTrack | None]
     ) -> tuple[int, int]:
-        """What the camera did beyond what was predicted: the median over all tracks."""
+        """The camera's motion beyond the prediction: the median over all tracks."""
         off = [(0, 0)]
         pairs = [(track, goal) for track, goal in zip(reference, goals, strict=True) if goal is not None]
         if pairs:

@@ -33,7 +33,7 @@ _SECURED = ("tls/", "quic/")
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What stands in a certificate."""
+    """The fields of a certificate."""
 
     name: str
     """Its common name: who the machine is for the other side's access control. Empty where it has none."""
@@ -66,7 +66,7 @@ class KeyPair:
     key: Path
 
     def read(self, *, as_server: bool) -> Certificate:
-        """What the other side would see; UserError for files that cannot be used. Says nothing of time or CA."""
+        """Read the certificate as the other side would; UserError for unusable files. Checks neither time nor CA."""
         try:
             said = _shown(self, as_server=as_server)
         except ssl.SSLError as error:

@@ -203,7 +203,7 @@ def _no_tls(place: _Place) -> str:
 
 
 def _alert(error: ssl.SSLError, files: TlsFiles) -> str:
-    """What the other side's alert says; empty where it is none."""
+    """The other side's TLS alert as text; empty for none."""
     alert = (error.reason or "").partition("ALERT_")[2]
     if not alert:
         return ""

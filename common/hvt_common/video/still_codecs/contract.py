@@ -52,14 +52,14 @@ class BaseMissingError(StillError):
 
 @dataclass(frozen=True, slots=True)
 class CodedCrop:
-    """A crop as bytes, and what the other side has to know beside them."""
+    """A crop as bytes, and the facts beside them that the other side needs."""
 
     data: bytes
     parameters: Parameters = field(default_factory=dict)
 
 
 class StillCodec(Protocol):
-    """What the edge and the ground need of a codec."""
+    """The contract of a still codec."""
 
     @property
     def name(self) -> str:

@@ -50,7 +50,7 @@ _REMOVED = ("jpeg-lite", "avif-lite", "hevc-intra")
 
 
 def still_codec_names() -> tuple[str, ...]:
-    """What `still_codec` takes on this machine: HVT's own first, then the plug-ins of others by name, none loaded."""
+    """The names that `still_codec` takes on this machine: HVT's own, then plug-ins by name; loads none."""
     own = [*_BUILT_IN, *(name for name, target in _PLUGINS.items() if _loaded(target).lacking() is None)]
     return (*own, *sorted(installed(GROUP).keys() - _BUILT_IN.keys() - _PLUGINS.keys()))
 
@@ -96,7 +96,7 @@ def _foreign(entry: EntryPoint) -> StillCodec:
 
 
 def _faults(name: str, codec: object) -> str | None:
-    """What keeps it from being a `StillCodec` of that name, as far as can be seen without coding anything."""
+    """Reasons why it is no `StillCodec` of that name, as far as can be told without coding anything."""
     said = getattr(codec, "name", None)
     if said != name or not _NAME.fullmatch(name):
         return f"its name is {said!r}, and has to be the entry point's: [a-z0-9-], at most 24 characters"

@@ -24,7 +24,7 @@ class PictureCondition:
         self._said: set[str] = set()
 
     def note(self, picture_bgr: Image, *, at_ns: int) -> str:
-        """What is to be said now, once for each stretch of it; else empty. ``at_ns`` is when it was taken."""
+        """The warning, once for each stretch; else empty. ``at_ns`` is the capture time."""
         sample = picture_bgr[::_EACH, ::_EACH].copy()
         before, self._before = self._before, sample
         is_black = int(sample.max()) <= _BLACK

@@ -153,7 +153,7 @@ def said_rate(stream: Any) -> Fraction | None:
 
 
 def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
-    """What the stream's first packets say of its times, and its first frame; None where none decodes there."""
+    """The times in the stream's first packets, and its first frame; None if none decodes there."""
     times: list[tuple[Fraction | None, Fraction | None]] = []
     first: av.VideoFrame | None = None
     for packet in _packets(container, stream):
@@ -219,7 +219,7 @@ class _Reading:
             yield from frames
 
     def faults(self) -> Iterator[str]:
-        """What is to be said at the end."""
+        """The faults, for the end of the flight."""
         if self._damaged:
             yield f"has {self._damaged} damaged packets, which were skipped"
         why = self._ended or self._unfinished()
@@ -275,7 +275,7 @@ def _decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
 
 
 def _lacks_index(path: Path) -> str:
-    """What is wrong with an MP4 whose index is missing; empty for anything else (ISO/IEC 14496-12, 4.2)."""
+    """The fault of an MP4 whose index is missing; empty for anything else (ISO/IEC 14496-12, 4.2)."""
     kinds: list[bytes] = []
     with suppress(OSError), path.open("rb") as file:
         end = path.stat().st_size

@@ -1,4 +1,4 @@
-"""What was decided about a source and why: before the flight for who opens it, in flight for the log."""
+"""Decisions about a source and their reasons: before the flight for its opener, in flight for the log."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _SAME = Fraction(2, 100)
 
 @dataclass(frozen=True, slots=True)
 class Stamps:
-    """What the first packets of a stream say, in decoding order."""
+    """The time stamps of a stream's first packets, in decoding order."""
 
     period_s: Fraction
     """The usual step from one frame to the next."""
@@ -78,7 +78,7 @@ class Timeline:
 
     @property
     def says(self) -> str:
-        """What was mended, in a sentence; empty for nothing."""
+        """The repairs, in a sentence; empty for none."""
         if not self.jumps:
             return ""
         at_s, step_s = self.jumps[0]

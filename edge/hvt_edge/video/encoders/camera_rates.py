@@ -69,7 +69,7 @@ class LeastLink:
         self._least_bps = least_bps
         self._unreported_bytes = unreported_bytes
         self._queued_bytes = 0.0
-        """What such a link would still hold."""
+        """The bytes that such a link would still hold."""
         self._drained_ns = 0
 
     def sent(self, size_bytes: int, *, now_ns: int) -> None:

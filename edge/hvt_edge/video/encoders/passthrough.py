@@ -49,7 +49,7 @@ def measure_camera(stream: CameraStream, *, window_s: float, edge_id: str) -> Me
 
 
 def check_camera(name: str, stream: CameraStream, limit: Allowed, *, budget_bps: int, edge_id: str) -> str:
-    """What was measured, as a sentence. Raises `UserError` with the figure where it does not fit the budget."""
+    """The measurement as a sentence. Raises `UserError` with the figure if it does not fit the budget."""
     found = measure_camera(stream, window_s=limit.window_s, edge_id=edge_id)
     rate = bitrate_text(round(8 * found.window_bytes / limit.window_s))
     takes = (
@@ -65,7 +65,7 @@ def check_camera(name: str, stream: CameraStream, limit: Allowed, *, budget_bps:
 
 
 def about_keyframes(name: str, stream: CameraStream) -> str:
-    """What a camera that makes few keyframes costs, as a sentence; empty for one that makes enough."""
+    """The cost of a camera's rare keyframes, as a sentence; empty if there are enough."""
     if stream.keyframe_s <= _LONG_KEYFRAMES_S:
         return ""
     return (

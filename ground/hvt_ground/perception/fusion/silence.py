@@ -16,7 +16,7 @@ __all__ = ["EdgeSilence"]
 NEAR_IOU = 0.1
 """A box of the edge that overlaps ours by so much is no silence: of a small object two boxes overlap little."""
 LET_GO_STEPS = 6
-"""Of what the edge has listed once, so many steps in a row must be silent: a detection may fail now and then."""
+"""An object once listed by the edge must be missed in so many steps in a row: a detection may fail."""
 SURER = 0.1
 """By so much surer than what was never doubted must be what was, or it would come and go."""
 

@@ -1,4 +1,4 @@
-"""What a still shows: a classifier on the crop, or the detector again on the picture with the stills pasted in."""
+"""Names the objects of a still: a classifier on the crop, or the detector on the picture with stills pasted in."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _PADDING = 0.15
 
 @dataclass(frozen=True, slots=True)
 class ObjectReading:
-    """What is said of one object in a still."""
+    """The reading of one object in a still."""
 
     posterior: Posterior | None = None
     """None is no opinion."""
@@ -51,7 +51,7 @@ class ObjectReading:
 
 @dataclass(frozen=True, slots=True)
 class FrameReadings:
-    """What is said of all stills of one frame."""
+    """The readings of all stills of one frame."""
 
     objects: tuple[tuple[ObjectReading, ...], ...]
     """For each still, in order: the lead object's reading, then one for each ``also`` box."""
@@ -165,7 +165,7 @@ class Redetection:
         return max(1.0, min(width / base_size[0], height / base_size[1], 1 / self._view.scale))
 
     def _readings(self, found: Detections, overlaps: npt.NDArray[np.float64]) -> list[ObjectReading]:
-        """For each row of ``overlaps`` (an object), what the detections (columns) at its place say."""
+        """For each row of ``overlaps`` (an object), the reading of the detections (columns) at its place."""
         if not len(found):
             return [ObjectReading()] * len(overlaps)
         owners = overlaps.argmax(axis=0)

@@ -51,7 +51,7 @@ class StillToMatch:
 
 @dataclass(frozen=True, slots=True)
 class TrackMatch:
-    """What was found for a still: row ``row`` of ``tracks``, or nothing (``tracks`` is None)."""
+    """The match of a still: row ``row`` of ``tracks``, or none (``tracks`` is None)."""
 
     tracks: Tracks | None = None
     row: int = -1
@@ -169,7 +169,7 @@ class Matcher:
         return evidence + CLASS_BONUS * (same_class & (evidence > 0))
 
     def _known(self, edge_id: int, ground_id: int, frame_index: int) -> float:
-        """What earlier stills add to, or take from, the overlap of this pair."""
+        """The bonus or penalty of earlier stills for the overlap of this pair."""
         if edge_id >= 0 and self._ground_of.get(edge_id, (None, 0))[0] == ground_id:
             return KNOWN_BONUS
         owner, since = self._edge_of.get(ground_id, (edge_id, frame_index))

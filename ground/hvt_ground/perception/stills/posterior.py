@@ -60,7 +60,7 @@ class ClassEstimate:
 
 
 class TrackPosterior:
-    """What is known of one track of the ground."""
+    """The class posterior of one track of the ground."""
 
     __slots__ = ("_clear", "_log_sum", "_newest", "_order", "last_frame")
 
@@ -86,7 +86,7 @@ class TrackPosterior:
         return True
 
     def newest(self, vocabulary: Vocabulary, *, class_id: int) -> ClassEstimate:
-        """What the still of the newest frame said; the class on the base, where it means that one as well."""
+        """The class in the still of the newest frame; the class on the base, if that means the same."""
         said = self._said()
         best = vocabulary.names.index(said.class_name)
         if said.probabilities[class_id] >= said.probabilities[best]:

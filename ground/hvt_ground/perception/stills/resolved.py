@@ -1,4 +1,4 @@
-"""What a still says, and what it did: the values that refinement takes and gives."""
+"""A still's reading and its effect: the values that refinement takes and gives."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ended
 
 @dataclass(frozen=True, slots=True)
 class StillContext:
-    """What a still brings along while it waits for its track, for one of the objects that it shows."""
+    """The context of a still that waits for its track, for one of the objects in it."""
 
     received: ReceivedStill
     decoded: DecodedStill
@@ -61,9 +61,9 @@ class StillSeen:
     box_base_px: tuple[float, float, float, float]
     """x1 y1 x2 y2, base pixels, without padding."""
     class_name: str
-    """What the edge's detector called it."""
+    """The class name of the edge's detector."""
     posterior: Posterior
-    """What it says of the object, over `Vocabulary.names`."""
+    """Its class posterior, over `Vocabulary.names`."""
     context: StillContext
     side_px: float
     """The shorter side of the object, source pixels."""
@@ -83,7 +83,7 @@ class StillSeen:
 
 @dataclass(frozen=True, slots=True)
 class ResolvedStill:
-    """A still and what it did."""
+    """A still and its effect."""
 
     still: StillSeen
     outcome: Outcome

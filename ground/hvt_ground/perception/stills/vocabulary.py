@@ -34,13 +34,13 @@ _SOME = 6
 
 @dataclass(frozen=True, slots=True)
 class Vote:
-    """What a still says of an object."""
+    """A still's vote on an object."""
 
     posterior: Posterior | None
     """Over `Vocabulary.names`; its probabilities need not sum to 1, as several classes may mean one thing. None is no
     vote."""
     note: str = ""
-    """What the classifier called it, where that means no class: ``waffle iron .31``."""
+    """The classifier's name for it, if that means no class: ``waffle iron .31``."""
 
 
 class Vocabulary:

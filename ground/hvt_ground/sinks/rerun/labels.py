@@ -25,7 +25,7 @@ _Boxes = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """What is to be said of a track."""
+    """The label of a track."""
 
     row: int
     """Of the boxes."""

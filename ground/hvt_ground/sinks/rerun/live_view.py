@@ -59,7 +59,7 @@ class LiveView:
         self.page = (
             f"http://{_HOST}:{web_port}/?url=rerun%2Bhttp://{_HOST}:{port}/proxy" if kind == "serve" else ""
         )
-        """What to open in a browser; empty for the native viewer."""
+        """The address for a browser; empty for the native viewer."""
         if kind == "spawn" and sys.platform == "linux" and not _display():
             raise UserError("--view needs a display and DISPLAY is not set: use --serve and a browser")
         self._port, self._web_port = port, web_port

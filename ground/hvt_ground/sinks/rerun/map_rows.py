@@ -70,7 +70,7 @@ def pose_numbers(update: PoseUpdate) -> npt.NDArray[np.float64]:
 
 
 def pose_of(numbers: Sequence[float], *, frame_index: int, capture_ns: int) -> PoseUpdate:
-    """What `pose_numbers` made these of. ValueError for another count of them."""
+    """The pose that `pose_numbers` made these of. ValueError for another count of them."""
     values = [None if np.isnan(one) else float(one) for one in numbers]
     count, turned = len(_PLAIN), len(_TURNED)
     if len(values) != count + 2 * turned + _VIEW_NUMBERS:

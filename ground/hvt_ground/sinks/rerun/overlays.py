@@ -65,7 +65,7 @@ _CONTINUES_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What the boxes of one layer are; N entries in the order of the boxes."""
+    """Identity of the boxes of one layer; N entries in the order of the boxes."""
 
     track_ids: tuple[int, ...] = ()
     classes_before: tuple[str, ...] = ()
@@ -76,7 +76,7 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class LayerUpdate:
-    """What to write for one layer at one frame. A component that is not there is as before."""
+    """The changes of one layer at one frame. A missing component is as before."""
 
     layer: Layer
     components: Mapping[str, Any]
@@ -225,7 +225,7 @@ class BacklogOverlays:
         self._credit_bytes += received_bytes
 
     def encode(self, overlay: Overlay) -> list[tuple[int, int, LayerUpdate]]:
-        """What to write for an overlay of stored video, with frame and capture time; nothing outside a hole."""
+        """The changes of an overlay of stored video, with frame and capture time; nothing outside a hole."""
         frame = overlay.frame_index
         holes = (
             one for one in self._holes if one.before < frame and (one.after is None or frame < one.after)

@@ -172,7 +172,7 @@ def _chunks(path: Path) -> Iterator[Chunk]:
 
 
 def _messages(stream: bytes) -> bytes:
-    """What the SDK encoded, without the stream's header and footer."""
+    """The SDK's encoded messages, without the stream's header and footer."""
     end = at = _STREAM_HEADER_BYTES
     while at < len(stream):
         kind, length = _MESSAGE_HEADER.unpack_from(stream, at)

@@ -1,4 +1,4 @@
-"""What a recording says once, for all times: codec, line colours, box styles, gallery frames, session facts."""
+"""The static data of a recording: codec, line colours, box styles, gallery frames, session facts."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ class TableRow:
     """A name of `COLUMNS`."""
     value: Any
     size_bytes: int = 64
-    """What it costs once compacted, about."""
+    """Its bytes once compacted, about."""
     at: tuple[int, int] | None = None
     """Frame index and capture time, where they are not the event's."""
 
@@ -285,4 +285,4 @@ COLUMNS: dict[str, Callable[[Sequence[Any]], Columns]] = {
     "text": _texts,
     "lines": _lines,
 }
-"""What the values of a row become, by name. ``patch``: a placed JPEG, or None, which takes it off."""
+"""Component of each value of a row, by name. ``patch``: a placed JPEG, or None, which takes it off."""

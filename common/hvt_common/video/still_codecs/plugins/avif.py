@@ -46,7 +46,7 @@ class AvifCodec(IntraCodec):
 
 
 def av1_data(file: bytes) -> bytes:
-    """What is in the one ``mdat`` box of an AVIF file, without a temporal delimiter; else `StillError`."""
+    """The content of the one ``mdat`` box of an AVIF file, without a temporal delimiter; else `StillError`."""
     found, position = [], 0
     while position < len(file):
         length, kind = int.from_bytes(file[position : position + 4], "big"), file[position + 4 : position + 8]

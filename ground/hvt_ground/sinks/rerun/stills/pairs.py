@@ -1,4 +1,4 @@
-"""What is shown of a still: its words, and the two pictures of a pair."""
+"""The display of a still: its words, and the two pictures of a pair."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def still_picture(refinement: Refinement) -> Coded | None:
 
 
 def _decoded(data: bytes) -> Image | None:
-    """What OpenCV makes of a coded picture; None where it does not know the format."""
+    """The picture that OpenCV decodes; None if it does not know the format."""
     if not data:
         return None
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)

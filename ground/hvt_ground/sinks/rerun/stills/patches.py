@@ -81,7 +81,7 @@ class Patches:
         return Moved(slot, patch.place())
 
     def move(self, overlay: Overlay) -> list[Moved]:
-        """What changes with this overlay: patches that move with their tracks, and those that go."""
+        """The changes by this overlay: patches that move with their tracks, and those that go."""
         boxes = overlay.boxes_base_px.astype(np.float64)
         centres = (boxes[:, :2] + boxes[:, 2:]) / 2
         self._centres = dict(zip(overlay.track_ids.tolist(), centres, strict=True))

@@ -1,4 +1,4 @@
-"""What a recording shows of stills: pairs in the gallery, patches on the enhanced picture, lines of the event log."""
+"""Rows of stills in a recording: pairs in the gallery, patches on the enhanced picture, lines of the event log."""
 
 from __future__ import annotations
 
