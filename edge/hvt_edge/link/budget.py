@@ -185,7 +185,7 @@ class RollingBudget:
         self._last_ns = max(self._last_ns, now_ns)
 
     def record_backlog(self, line_bytes: int, *, now_ns: int) -> None:
-        """Count a piece of what was kept, that `backlog_allowance` admitted at this very time."""
+        """Count a chunk of the backlog that `backlog_allowance` admitted at this very time."""
         self._record(line_bytes, now_ns)
 
     def record_still(self, line_bytes: int, *, now_ns: int) -> None:

@@ -210,14 +210,14 @@ def backlog_content(key: ObjectKey, data: bytes, *, edge: str) -> BacklogContent
         return _still(session_id, number, data)
     units = parse_backlog_units(data)
     if units[0].frame_index != number:
-        raise WireError(f"past video {number} begins with frame {units[0].frame_index}")
+        raise WireError(f"stored video {number} begins with frame {units[0].frame_index}")
     return units
 
 
 def _info(session_id: int, data: bytes, *, edge: str) -> Info:
     info = Info.parse(data)
     if info.session_id != session_id or info.edge != edge:
-        raise WireError("the facts of a past session are those of another")
+        raise WireError("the facts of a stored session are those of another")
     return info
 
 
@@ -225,17 +225,17 @@ def _still(session_id: int, number: int, data: bytes) -> ReceivedStill:
     stored = parse_backlog_still(data)
     header = RoiHeader.parse(stored.attachment, stored.payload)
     if header.session_id != session_id or header.sequence != number:
-        raise WireError(f"past still {number} is another one inside")
+        raise WireError(f"stored still {number} has another number inside")
     return ReceivedStill(replace(header, flags=header.flags | Flags.STORED), stored.payload)
 
 
 def _check(header: BacklogHeader, payload: bytes) -> None:
     if not payload or header.offset + len(payload) > header.total_bytes:
         raise WireError(
-            f"a piece of {len(payload)} bytes at {header.offset} is none of an object of {header.total_bytes}"
+            f"a chunk of {len(payload)} bytes at {header.offset} is none of an object of {header.total_bytes}"
         )
     if header.kind == BacklogKind.INFO and (header.number or header.total_bytes > Info.MAX_BYTES):
-        raise WireError("a piece of a session's facts has a number, or is of too many")
+        raise WireError("a chunk of a session's facts has a number, or is too long")
 
 
 def _trim(ring: OrderedDict[ObjectKey, int], most: int) -> None:
