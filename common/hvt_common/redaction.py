@@ -35,7 +35,7 @@ _BEGIN = re.compile(
     re.IGNORECASE,
 )
 _LIKELY = re.compile(rf":.*@|[#?]|@{_HOSTLIKE}|(?:^|=){_HOSTLIKE}[^/]*/")
-"""Of an address without a scheme; ``clip@2x.mp4`` is none."""
+"""Signs of an address without a scheme; ``clip@2x.mp4`` is none."""
 _MOST_PORT = 65535
 
 _KEY = r"[\w.-]{0,32}(?:pass|pwd|pw|key|token|auth|secret|sig|user|cred|streamid|session|code)[\w.-]{0,32}"

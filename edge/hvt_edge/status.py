@@ -95,7 +95,7 @@ class StatusReporter:
         self._pending: tuple[EdgeState, str] | None = None
         """The report of the newest second, not sent yet."""
         self._due_ns: int | None = None
-        """Since when a report waits."""
+        """The time since which a report waits."""
         self._reported: Levers | None = None
         self._reported_sequence = 0
 

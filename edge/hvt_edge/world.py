@@ -1,4 +1,4 @@
-"""Where an edge meets the world: camera or clip, detector, link and clock. A study passes its own in their place."""
+"""The edge's world: camera or clip, detector, link and clock. A study passes its own in their place."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class World:
         self.session_id = secrets.randbits(64)
         self.clock: Callable[[], int] = SteadyClock()
         self.failures = Failures(self.clock)
-        """Which parts have failed in flight."""
+        """Parts that have failed in flight."""
         self.inbox = FeedbackInbox()
         """Answers of grounds."""
         self.executor: Executor | None = None

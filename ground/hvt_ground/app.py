@@ -56,7 +56,7 @@ _STATUS_EVERY_POLLS = 10
 _STUCK_S = 5.0
 """A ground that has made no state for so long does not serve its edges either."""
 _MOST_SUMMARIES = 256
-"""Of an edge; one that is started again and again for weeks is not to fill the memory."""
+"""Limit for an edge: one that restarts for weeks must not fill the memory."""
 
 
 class Ground:
@@ -251,7 +251,7 @@ class Ground:
         )
 
     def _note_ended(self, session: GroundSession) -> None:
-        """In the thread of its edge: a session is not remembered, its numbers are, of the last ones."""
+        """In the thread of its edge: forget the session and remember the numbers of the last ones."""
         self._ended[session.info.edge].append((summary(session), session.sinks))
 
     def _leave_edges(self, ports: list[EdgePort], link: GroundLink) -> None:

@@ -187,7 +187,7 @@ class GroundConfig:
 
     @property
     def patience_s(self) -> float:
-        """After so long an edge that is away has ended."""
+        """The absence after which an edge has ended."""
         if self.patience is not None:
             return self.patience
         return 5.0 if self.once else 600.0

@@ -48,7 +48,7 @@ class VideoSample:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where on the ground N objects are; NaN where that is not known."""
+    """The places of N objects on the ground; NaN if unknown."""
 
     places_deg: npt.NDArray[np.float64]
     """(N, 2) latitude and longitude, WGS 84."""
@@ -59,7 +59,7 @@ class Places:
 
 @dataclass(frozen=True, slots=True)
 class PoseUpdate:
-    """Where the camera was."""
+    """The pose of the camera."""
 
     frame_index: int
     """The newest frame when it came."""
@@ -93,13 +93,13 @@ class Overlay:
     origins: tuple[Origin, ...] = ()
     """N words; empty says ``base`` for all."""
     stored: bool = False
-    """Of a `VideoSample` that was."""
+    """Whether the `VideoSample` was stored."""
     doubted: npt.NDArray[np.bool_] | None = None
     """(N,) True where stills say that it is nothing of mine; None is nowhere."""
     sure: npt.NDArray[np.bool_] | None = None
     """(N,) True where stills agree on the class with a calibrated probability above .9; None is nowhere."""
     places: Places | None = None
-    """Where on the ground they are; None where no pose tells."""
+    """Their places on the ground; None without a pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ class Refinement:
     unread: bool = False
     """Nothing could read it: both classes are the edge's word."""
     note: str = ""
-    """Of an unread still: what the classifier called it, though tracks have no such class."""
+    """Of an unread still: the classifier's name for it, which no track can have."""
     doubted: bool = False
     """The still says that the object is nothing of mine."""
     sure: bool = False

@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 _RUNS = 45
 """Detections on pictures: 15 s at the defaults (15 fps, every fifth frame)."""
 _LEAST_SHARE = 0.1
-"""Of the runs that found something at the confidence of use, or in which something moved."""
+"""Share of the runs that found something at the confidence of use, or in which something moved."""
 _OTHER = "yolox-s"
 _MOTION = "motion"
 

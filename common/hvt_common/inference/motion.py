@@ -48,7 +48,7 @@ class MotionSettings:
     """The limits of a moving object; lengths are pixels of the working image (`max_side_px`)."""
 
     memory_calls: int = 6
-    """So many earlier images are compared with."""
+    """The number of earlier images to compare with."""
     least_calls: int = 2
     """Silent until so many images are stored."""
     max_side_px: int = 1280

@@ -24,7 +24,7 @@ class Preparation:
 
     @classmethod
     def torchvision(cls) -> Preparation:
-        """As torchvision and the ONNX model zoo train on ImageNet."""
+        """The preparation of torchvision and the ONNX model zoo for ImageNet."""
         return cls(mean=(123.675, 116.28, 103.53), scale=(1 / 58.395, 1 / 57.12, 1 / 57.375))
 
     def __str__(self) -> str:

@@ -69,7 +69,7 @@ class FrameAccount:
         )
 
     def __str__(self) -> str:
-        """As ``220 frames came: 71 sent, 50 left out by auto's 7.5 a second, 81 had no room in the budget``."""
+        """Such as ``220 frames came: 71 sent, 50 left out by auto's 7.5 a second, 81 had no room in the budget``."""
         frames = "1 frame" if self.came == 1 else f"{self.came} frames"
         said = [
             f"{self.groups[name]} {text.format(frame_rate=self._frame_rate)}"

@@ -63,13 +63,13 @@ class Moment:
 
     unix_ns: int
     boot: str
-    """Which boot ``steady_ns`` counts from."""
+    """The boot that ``steady_ns`` counts from."""
     steady_ns: int
 
 
 @cache
 def boot_id() -> str:
-    """Of this boot of the machine; where the system has none, of this process."""
+    """The id of this boot of the machine; if the system has none, of this process."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:

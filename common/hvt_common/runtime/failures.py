@@ -36,7 +36,7 @@ class Failure:
 
     part: str
     reason: str
-    """Of the newest failure, a sentence."""
+    """The newest failure, a sentence."""
     count: int
     failed_ns: int
     """The newest failure, Unix time."""
@@ -64,11 +64,11 @@ class Failures:
         self._lock = threading.Lock()
         self._parts: dict[str, Failure] = {}
         self._said: set[str] = set()
-        """Of which the log says that they do not work."""
+        """Parts that the log has reported as failed."""
 
     @property
     def parts(self) -> tuple[Failure, ...]:
-        """In the order of their first failure."""
+        """The parts in the order of their first failure."""
         return tuple(self._parts.values())
 
     @property

@@ -26,11 +26,11 @@ from hvt_common.units import SECOND_NS
 __all__ = ["Answer", "HealthServer", "State", "state_answers"]
 
 _METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-"""Of Prometheus' text format."""
+"""The media type of Prometheus' text format."""
 
 _MOST_AT_ONCE = 16
 _PATIENCE_S = 2.0
-"""So long a client may take to say what it wants, and to take its answer."""
+"""The time that a client has for its request and for reading the answer."""
 
 
 @dataclass(frozen=True, slots=True)

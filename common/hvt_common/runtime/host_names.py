@@ -43,7 +43,7 @@ def requested_host(header: str) -> str:
 
 
 def host_and_port(address: str, *, name: str, example: str) -> tuple[str, int]:
-    """Of ``HOST:PORT``. Raises `UserError`, which names the option, where it is none."""
+    """Split ``HOST:PORT``. Raises `UserError`, which names the option, for anything else."""
     try:
         parts = urlsplit(f"//{address}")
         host, port = parts.hostname or "", parts.port or 0

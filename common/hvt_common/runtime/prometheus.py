@@ -15,7 +15,7 @@ Gauge, Counter = GaugeMetricFamily, CounterMetricFamily
 
 _State = TypeVar("_State")
 Table = Mapping[str, tuple[str, Callable[[_State], float | None]]]
-"""By name: what it says, and how it follows from a state; None is left out."""
+"""Metrics by name: the help text, and the value as a function of a state; None is left out."""
 
 
 def exposition(metrics: Iterable[Metric]) -> bytes:
@@ -42,7 +42,7 @@ def of_table(
 
 
 def seconds(ms: float | None) -> float | None:
-    """Of milliseconds."""
+    """Convert milliseconds."""
     return None if ms is None else ms / 1000
 
 

@@ -32,7 +32,7 @@ class StatusCommand:
     what: str
     """The kind of program, for people."""
     address: str
-    """Where it answers, if nothing else is said."""
+    """The default address."""
     table: Callable[[dict[str, Any]], Table]
 
     def run(self, argv: Sequence[str]) -> int:

@@ -30,7 +30,7 @@ _STILL_SHARE: Final = 0.4
 _MOST_SHARE: Final = 0.9
 """What is surely there is easy to see; of what is not, nobody reports more."""
 _CAUTION: Final = 2
-"""So many objects not reported are added: after the first that both see nothing is known yet."""
+"""Unreported objects that are assumed at the start: after the first that both detect, nothing is known yet."""
 _OTHERS: Final = 20
 """What is known of all classes counts as so many objects of each: few are enough to learn that an observer does not
 know one of them."""
@@ -45,14 +45,14 @@ class Recall:
 
     def __init__(self) -> None:
         self._counts: dict[int, npt.NDArray[np.float64]] = {}
-        """By class, (2,) how many were there, and how many of them were reported."""
+        """By class, (2,) the number of objects, and how many of them were reported."""
         self._shares: dict[int, float] = {}
         self._share_of_others = 0.0
-        """Of classes of which nothing is known."""
+        """The same for classes without any count."""
         self._at_s: float | None = None
 
     def take(self, class_ids: npt.NDArray[Any], *, reported: npt.NDArray[np.bool_], at_s: float) -> None:
-        """Of one picture: the classes (N,) of what was surely there, and whether it was ``reported`` (N,)."""
+        """Count one picture: the classes (N,) of the sure objects, and whether each was ``reported`` (N,)."""
         fade = 0.0 if self._at_s is None else math.exp(-max(0.0, at_s - self._at_s) / _MEMORY_S)
         self._at_s = at_s
         self._counts = {class_id: fade * counts for class_id, counts in self._counts.items()}

@@ -349,7 +349,7 @@ class ByteTracker:
         self._table.append(born)
 
     def _duplicates(self, living: _Mask) -> _Mask:
-        """Of a tracked and a lost track at the same place, the younger one."""
+        """The younger one of each pair of a tracked and a lost track at the same place."""
         table = self._table
         duplicate = np.zeros(len(table), bool)
         present = (living & (table.phase != LOST)).nonzero()[0]

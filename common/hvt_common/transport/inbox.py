@@ -31,7 +31,7 @@ class Received:
 
 
 class ReceivedQueue(Protocol):
-    """Where Zenoh's callbacks put what came; must never block."""
+    """Takes messages from Zenoh's callbacks; must never block."""
 
     def put(self, item: Received) -> None:
         """Take one message."""

@@ -22,9 +22,9 @@ class Rights:
     enabled: bool = False
     default_allow: bool = True
     rules: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """By id."""
+    """The rules by id."""
     granted: tuple[tuple[frozenset[str] | None, tuple[str, ...]], ...] = ()
-    """Of each policy: the names that it is for (None: anybody), and the ids of its rules."""
+    """For each policy: the names that it is for (None: anybody), and the ids of its rules."""
 
     @classmethod
     def of(cls, config: zenoh.Config) -> Rights:

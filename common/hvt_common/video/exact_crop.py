@@ -20,7 +20,7 @@ _PHASES = 32
 _WEIGHT_BITS = 17
 """The four weights of a phase add up to 2^17."""
 _LEVEL_BITS = 6
-"""Of a resampled level behind the point."""
+"""Fractional bits of a resampled level."""
 _MATRIX = np.array([[76309, 138438, 0], [76309, -13975, -34925], [76309, 0, 117489]], np.float64)
 """2^16 times rows B, G, R of BT.709, columns Y, Cb, Cr, limited range."""
 _OFFSETS = np.array([16, 128, 128], np.float64) * 2**_LEVEL_BITS

@@ -44,12 +44,12 @@ class YuvPicture:
 
     @property
     def frame(self) -> av.VideoFrame:
-        """As libavcodec gives it, for who codes it again."""
+        """The frame of libavcodec, for coding it again."""
         return self._picture
 
     @property
     def nbytes(self) -> int:
-        """Of its pixels."""
+        """The bytes of its pixels."""
         return sum(plane.buffer_size for plane in self._picture.planes)
 
     @property

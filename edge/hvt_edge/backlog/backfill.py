@@ -30,7 +30,7 @@ _MOST_ANSWERS = 300
 _MOST_OBJECTS = 12
 """On their way at a time; one report of the ground names 16."""
 _MOST_AHEAD_BYTES = 256 * 1024
-"""Of one object, beyond what the ground has said it has."""
+"""Limit of one object's bytes beyond the acknowledged ones."""
 _LEAST_CHUNK_BYTES = 600
 """A smaller one is mostly headers, unless it is the last."""
 _OTHER_RECEIVER_NS = 5 * SECOND_NS
@@ -51,12 +51,12 @@ class _Transfer:
     entry: Entry
     total_bytes: int
     since_ns: int
-    """Of the last chunk sent or acknowledged."""
+    """Time of the last chunk sent or acknowledged."""
     sent_bytes: int = 0
     acknowledged_bytes: int = 0
     tries: int = 0
     answers: int = 0
-    """In which the ground had got no further: it is busy."""
+    """Answers without progress of the ground: it is busy."""
 
 
 class Backfill:
@@ -71,7 +71,7 @@ class Backfill:
         self._line: OrderedDict[ObjectKey, _Transfer] = OrderedDict()
         self._data: tuple[ObjectKey, bytes] | None = None
         self._in_hand: ObjectKey | None = None
-        """Of which chunks were being made last."""
+        """The object whose chunks were made last."""
         self._informed: set[int] = set()
         """Sessions whose facts the ground has."""
         self._requested: set[int] = set()
@@ -101,7 +101,7 @@ class Backfill:
 
     @property
     def cached_bytes(self) -> int:
-        """Of the object in memory."""
+        """The bytes of the object in memory."""
         return 0 if self._data is None else len(self._data[1])
 
     # What comes back
@@ -217,7 +217,7 @@ class Backfill:
             transfer.sent_bytes = min(transfer.sent_bytes, chunk.offset)
 
     def _begin_again(self, before_ns: int, now_ns: int) -> None:
-        """Where the ground has not got on for too long."""
+        """Send again the objects on which the ground has made no progress for too long."""
         for key, transfer in list(self._line.items()):
             if self._store.find(key) is None:  # evicted meanwhile
                 self._leave(key)

@@ -28,14 +28,14 @@ class Entry:
     """One object that is stored."""
 
     row: int
-    """In the database."""
+    """Its row in the database."""
     session_id: int
     kind: BacklogKind
     number: int
     rank: float
     """The least rank is deleted first if the store is full: worth of a still, age of a segment."""
     span_ns: int
-    """Of video: from its first frame to its last."""
+    """The length of video: from its first frame to its last."""
 
     @property
     def key(self) -> ObjectKey:
@@ -90,7 +90,7 @@ class OpenSegment:
 
 
 def worth(utility: float, capture_ns: int) -> float:
-    """Of a still: the binary logarithm of its utility, plus its time in half-lives. So the order never changes."""
+    """A still's binary logarithm of utility, plus its time in half-lives: so the order never changes."""
     if utility > 0:
         strength = max(_LEAST_STRENGTH, math.log2(min(utility, 1e12)))
     else:

@@ -17,7 +17,7 @@ from hvt_common.values import AccessUnit
 __all__ = ["EndSegment", "Intake", "IntakeStill", "News"]
 
 _MOST_ACKNOWLEDGED_RANGES = 64
-"""Of all grounds together, the newest of each object; one report names 16."""
+"""Limit for all grounds together, the newest of each object; one report names 16."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,7 +76,7 @@ class BaseInFlight:
 
     @property
     def size_bytes(self) -> int:
-        """Of the access units."""
+        """The bytes of the access units."""
         return self._size_bytes
 
     def sent(self, sequence: int, unit: AccessUnit, *, now_ns: int) -> None:

@@ -29,12 +29,12 @@ from hvt_edge.operating.keyframes import KeyframeRequests
 __all__ = ["BacklogLink", "BacklogStage", "State"]
 
 _STEADY_NS = 2 * SECOND_NS
-"""So long the link is back before anything stored is sent: the picture comes first."""
+"""The link is back for so long before stored objects are sent: the picture comes first."""
 _PROBE_NS = SECOND_NS
 _RESERVE = 1 / 3
-"""Of the stills' share of a window, left for a live one that may come."""
+"""Share of the stills' part of a window that stays free for a live one."""
 _TRICKLE_BYTES = 1_400
-"""Of a chunk that goes while live stills are pending: one packet."""
+"""Size of a chunk while live stills are pending: one packet."""
 _FINISH_NS, _STUCK_NS, _POLL_S = 60 * SECOND_NS, 6 * SECOND_NS, 0.05
 """How long sending goes on after the end of a clip: in all, and without getting on."""
 

@@ -37,7 +37,7 @@ _CLOSE_S = 5.0
 _LAST_CHUNK_S = 1.0
 """The last chunk has so long to go out."""
 _TRICKLE_SHARE = 1 / 40
-"""Of the total, where live stills always wait: they must not hold up for ever what was admitted before."""
+"""Share of the total while live stills are always pending: an admitted chunk must not wait for ever."""
 
 
 @dataclass(frozen=True, slots=True)

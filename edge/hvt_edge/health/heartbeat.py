@@ -16,7 +16,7 @@ __all__ = ["Heartbeat"]
 
 
 class Heartbeat:
-    """In the frame loop; ``clock`` is wall time, in lockstep too."""
+    """Beats in the frame loop; ``clock`` is wall time, in lockstep too."""
 
     def __init__(self, maker: StateMaker, *, clock: Callable[[], int]) -> None:
         self._maker = maker

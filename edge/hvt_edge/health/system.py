@@ -18,9 +18,9 @@ class SystemReading:
     """None where the system does not tell."""
 
     temperature_c: float | None = None
-    """Of the hottest zone."""
+    """The temperature of the hottest zone."""
     wireless_quality: float | None = None
-    """As the driver counts it, of 70 with most."""
+    """The driver's count, of 70 with most."""
     wireless_dbm: float | None = None
 
 

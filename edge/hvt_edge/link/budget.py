@@ -46,10 +46,10 @@ _MEMORY_WINDOWS = 5
 _FORECASTS = 30
 """At how many moments of the coming window the forecast is made, at most: what it costs stays bounded."""
 _ROUNDING = 0.01
-"""Of a frame: rates and times are rounded to whole nanoseconds."""
+"""Rounding error of a frame: rates and times are whole nanoseconds."""
 
 _SPARE_SHARE = 0.05
-"""Of a window: what a requested still leaves for ``status``."""
+"""Share of a window that a requested still leaves for ``status``."""
 BASE_PEAK = 1.15
 """The fullest window of the base stream over B_v: what the VBV allows, kept also where frames bunch up."""
 

@@ -10,7 +10,7 @@ from hvt_common.values import Still
 __all__ = ["StillEnvelope"]
 
 _PLAIN_ENCODING = "application/octet-stream"
-"""Of formats that only HVT reads; one byte on the wire."""
+"""The encoding of formats that only HVT reads; one byte on the wire."""
 _OWN_TYPES = "application/vnd.hvt."
 
 

@@ -30,7 +30,7 @@ class FeedbackInbox:
         self._known: dict[tuple[int, int, bool], None] = {}
         self._done_sequence = -1
         self._detected: dict[int, Detected] = {}
-        """By frame, in the order in which they came."""
+        """Reports by frame, in the order in which they came."""
         self._base_messages = 0
         self._roi_messages = 0
         self.received_ns: int | None = None

@@ -29,7 +29,7 @@ class VideoLoan:
         self._taken: deque[tuple[int, int]] = deque()
         """(time, line bytes) of the requested stills of the last window."""
         self._due = 0.0
-        """Of a frame: what has come together to be left out since the last that was."""
+        """Part of a frame that is due to be left out since the last one was."""
 
     def want(self, line_bytes: int, *, now_ns: int) -> None:
         """A requested still of about so many line bytes waits for room; said again, only its size is new."""

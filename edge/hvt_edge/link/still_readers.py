@@ -35,7 +35,7 @@ class StillReaders:
         self._clock = clock
         self._lock = threading.Lock()
         self._readers: dict[int, _Reader] = {}
-        """By the number of who asked, in the order of the last request; a stranger's numbers cost a place each."""
+        """Codecs by requester, in the order of the last request; a stranger's numbers cost a place each."""
         self._said: set[str] = set()
 
     def on_request(self, request: InfoRequest) -> None:

@@ -31,11 +31,11 @@ class TrackReportSettings:
     fresh_frames: int = 5
     """A track whose last detection is older than so many source frames is left out."""
     refresh_ns: int = SECOND_NS
-    """So often, in capture time, a step stands by itself: a lost one hurts no longer."""
+    """Capture time after which a step stands by itself: a lost one hurts no longer."""
 
 
 class TrackSender(Protocol):
-    """Where steps go: `hvt_edge.link.transmitter.Transmitter`."""
+    """Sends steps: `hvt_edge.link.transmitter.Transmitter`."""
 
     def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> bool:
         """Send ``make(now_ns)``; False where the budget has no room for it beside the next frame."""

@@ -51,13 +51,13 @@ BACKLOG_ATTACHMENT_BYTES = 48
 """The largest `BacklogHeader`."""
 _LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
 _CHUNK_S = 0.05
-"""So long the link is busy with a chunk at most, so that a frame or a live still need not wait for it."""
+"""A chunk occupies the link so long at most, so a frame or a live still need not wait for it."""
 _GROWTH_BYTES = 16
-"""By how much a message may grow when it is made for a later moment: its two times."""
+"""Growth of a message that is made for a later moment: its two times."""
 
 
 class Outlet(Protocol):
-    """Where bytes go: the link, or in the study nowhere."""
+    """Takes the bytes: the link, or in the study nothing."""
 
     def put(
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
@@ -90,7 +90,7 @@ class Transmitter:
         self._flags = Flags.LOCKSTEP if self.lockstep else Flags(0)
         self._lock = threading.Lock()
         self.base_sequence = -1
-        """Of the last access unit sent; -1 before the first."""
+        """Index of the last access unit sent; -1 before the first."""
         self.still_sequence = -1
         self.base_waited_ns = 0
         """How long base messages have waited for the budget's window, all together."""
@@ -158,7 +158,7 @@ class Transmitter:
         return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
 
     def requested_allowance_bytes(self, now_ns: int, *, still: Still) -> int:
-        """As `still_allowance_bytes`, not paced, of one that a ground requested: the video yields to it."""
+        """Like `still_allowance_bytes`, not paced, for a requested still: the video yields to it."""
         with self._lock:
             line_bytes = self.budget.requested_allowance(now_ns)
         envelope = self.envelope(still)
@@ -253,7 +253,7 @@ class Transmitter:
 
     @property
     def round_trip_ns(self) -> int:
-        """Of the link; half a second where it is not measured."""
+        """The round trip of the link; half a second if it is not measured."""
         return SECOND_NS // 2 if self.pacer is None else self.pacer.round_trip_ns
 
     @property

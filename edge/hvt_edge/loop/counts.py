@@ -54,7 +54,7 @@ class FrameCounts:
         return FrameAccount(dict(self.groups + self.source_groups), coded_fps, auto_fps)
 
     def drop(self, group: FrameGroup, count: int = 1) -> None:
-        """So many frames were given up before anything was decided on them."""
+        """Count frames that were dropped before anything was decided on them."""
         if count:
             self.groups[group] += count
 

@@ -10,7 +10,7 @@ __all__ = ["PerceptionRest"]
 
 _FIRST_NS: Final = SECOND_NS // 8
 _LONGEST_NS: Final = SECOND_NS // 2
-"""Where video goes on losing frames whatever perception does, boxes are still made twice a second."""
+"""If video goes on losing frames whatever perception does, boxes are still made twice a second."""
 _STEADY_NS: Final = 5 * SECOND_NS
 
 

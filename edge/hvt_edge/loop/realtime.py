@@ -28,7 +28,7 @@ _MOST_LATE_NS = SECOND_NS
 _MOST_LINK_LATE_NS = 10 * SECOND_NS
 _LINK_BOUND_NS = SECOND_NS // 100
 _BEHIND_SHARE = 0.5
-"""Of the time between two frames: later than that the loop is late."""
+"""Share of the time between two frames: beyond it the loop is late."""
 
 
 @dataclass(eq=False)

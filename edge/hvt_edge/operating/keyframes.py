@@ -30,12 +30,12 @@ class KeyframeSettings:
     """After a keyframe, requests are taken as answered by it for so long: they crossed it on the way. With the
     second request of a ground (0.3 s after the first) and the patience it stays under a second."""
     burst: int = 6
-    """So many may be requested in a row: losses come in bursts."""
+    """Requests in a row: losses come in bursts."""
     refill_ns: int = 7 * SECOND_NS // 10
     """After that one in so long at the most, where losses were reported too; 0 for no limit. On a link that loses one
     frame in twenty, two seconds would show half of what 0.7 s shows."""
     request_share: float = 0.35
-    """Of the budget, for keyframes that nobody needs as far as the edge can tell."""
+    """Share of the budget for keyframes that nobody needs as far as the edge can tell."""
     camera_every_s: float | None = None
     """The camera makes its own keyframes, about so far apart, and none on request; None: the edge makes them."""
 
@@ -48,7 +48,7 @@ class KeyframeState:
     last_ns: int | None = None
     """When the newest keyframe was encoded; None before the first."""
     due_ns: int | None = None
-    """Since when one is due; None where none is."""
+    """The time since which one is due; None if none is."""
     sent: int = 0
     requested: bool = False
     """Whether the one that is due was requested, and is no mere one of the schedule."""
@@ -74,7 +74,7 @@ class KeyframeRequests:
         self._keyframe_ns = 0
         """The cost of a keyframe, as time of the budget."""
         self._losses: dict[int, int] = {}
-        """By receiver, as its last report counted them."""
+        """Losses by receiver, as of its last report."""
         self._lossy = False
         """Whether somebody has lost more since the last keyframe."""
         self.served = 0

@@ -32,7 +32,7 @@ class Measured:
     comparisons: float = 0.0
     """How many comparisons it comes of."""
     gain: float = 0.0
-    """Of sending tracks."""
+    """The gain of sending tracks."""
     sure_gain: float = 0.0
     """The same where of few objects hardly any count."""
     hidden: float = 0.0
@@ -42,7 +42,7 @@ class Measured:
     misnamed: float = 0.0
     """Objects a picture that the base shows under another class."""
     misnamed_share: float = 0.0
-    """Of those that it shows, those that bear another class there."""
+    """Share of the shown objects that bear another class there."""
     reported: bool = False
     """The ground's own detector shows even fewer: ``hidden`` are those that it does not see."""
 
@@ -54,17 +54,17 @@ class LeverSettings:
     tracks_bps: int
     """Line bits a second that tracks take of the budget."""
     least_gain: float = 0.005
-    """From so much net gain on that is sure tracks are sent, until the net gain, sure or not, falls below it."""
+    """Tracks are sent from this sure net gain on, until the net gain, sure or not, falls below it."""
     gain_per_doubling: float = 0.07
     """Gain of video by twice the bits: .05 to .11 between 100 and 400 kbps (docs/design-notes/study-results.md)."""
     least_comparisons: float = 1.5
-    """Before so many comparisons no tracks are sent, for a single picture may be an exception, unless …"""
+    """Comparisons before tracks are sent, because a single picture may be an exception, unless …"""
     plain_gain: float = 0.2
     """… the net gain is as plain as this; so too where hardly any of it is sure, of the only object there is."""
     least_answers: int = 12
-    """So many stills must have been answered before they may pause."""
+    """Answered stills before stills may pause."""
     most_answers: int = 40
-    """So many of the newest count."""
+    """The newest answers that count."""
     least_changed: float = 0.1
     """The share of stills that must change something."""
     finer: bool = False
@@ -78,7 +78,7 @@ class LeverSettings:
     """The share of frames that perception must have time for: two pictures in five seconds."""
 
     def net_gain(self, gain: float, *, total_bps: int) -> float:
-        """Of tracks, less what the video would gain by their bits."""
+        """The gain of tracks, less what the video would gain by their bits."""
         share = min(0.9, self.tracks_bps / total_bps)
         return gain - self.gain_per_doubling * math.log2(1 / (1 - share))
 

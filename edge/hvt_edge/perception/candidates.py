@@ -48,7 +48,7 @@ class Candidate:
     class_id: int
     class_name: str
     confidence: float
-    """Of the detection matched last, 0…1."""
+    """Confidence of the detection matched last, 0…1."""
     area_share: float
     """Box area over base frame area."""
     crop_area_px: float

@@ -17,7 +17,7 @@ __all__ = ["Detected", "GroundDifference"]
 _MOST_OPEN = 32
 """Comparisons that wait for a report: half a minute of them."""
 _LEAST_WORTH = 0.5
-"""Of comparisons: with less nothing is known; the last one counts for some twenty seconds."""
+"""Least weight of comparisons: with less nothing is known; the last one counts for some twenty seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Detected:
     """A ground's report of its own detector."""
 
     receiver_id: int
-    """Which ground."""
+    """The ground's number."""
     frame_index: int
     """The last frame that it was done with."""
     objects: int
@@ -45,7 +45,7 @@ class GroundDifference:
     def __init__(self, *, memory_s: float, grace_ns: int) -> None:
         self._memory_s = memory_s
         self._grace_ns = grace_ns
-        """So long a beginning, of a ground or a scene, does not count: the first picture is coarser than others."""
+        """The start of a ground or a scene does not count: the first picture is coarser than others."""
         self._receiver_id: int | None = None
         self.forget()
 
@@ -62,7 +62,7 @@ class GroundDifference:
         return self._mean if self._worth >= _LEAST_WORTH else None
 
     def expect(self, frame_index: int, objects: float, *, capture_ns: int) -> None:
-        """So many were found here on the base picture of this frame."""
+        """Note the number found here on the base picture of this frame."""
         self._fade(capture_ns)
         self._open.append(_Comparison(frame_index, capture_ns, objects))
 

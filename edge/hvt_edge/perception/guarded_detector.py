@@ -22,7 +22,7 @@ class OpenedOnUse:
         self.class_names = class_names
 
     def detect(self, image_bgr: Image) -> Detections:
-        """As the detector does. Raises what opening it raises."""
+        """Like the detector's. Raises what opening it raises."""
         self._opened = self._opened or self._open()
         return self._opened.detect(image_bgr)
 
@@ -48,12 +48,12 @@ class GuardedDetector(Retried[Detector]):
         self.class_names = opened.class_names
 
     def detect(self, image_bgr: Image) -> Detections | None:
-        """As `Detector.detect`; None while it does not work."""
+        """Like `Detector.detect`; None while it does not work."""
         found = self.run(lambda model: model.detect(image_bgr))
         if found is not None and self._hint is not None:
             self._hint.take(found, image_bgr, lambda other: self.run(lambda model: model.detect(other)))
         return found
 
     def detect_whole(self, image_bgr: Image) -> Detections | None:
-        """As `hvt_common.inference.tiles.detect_whole`; None while it does not work."""
+        """Like `hvt_common.inference.tiles.detect_whole`; None while it does not work."""
         return self.run(lambda model: detect_whole(model, image_bgr))

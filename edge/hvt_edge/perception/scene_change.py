@@ -27,12 +27,12 @@ _LEAST_ALIKE: Final = 0.3
 _LEAST_DIFFERENCE: Final = 0.15
 """Levels, mean over the thumbnail: what the rounding of 8 bits makes of a picture without noise, and some more."""
 _USUAL_TIMES: Final = 1.3
-"""So many times the usual difference is more than noise, waves and steady motion vary by."""
+"""Multiple of the usual difference beyond noise, waves and steady motion."""
 _EXPOSURE: Final = 16.0
 """Levels. By so much the whole picture may become brighter or darker from one step to the next."""
 _NEWEST_WEIGHT: Final = 0.5
 _LONGEST_NS: Final = SECOND_NS
-"""So much later a moving camera may show other ground."""
+"""After this time a moving camera may show other ground."""
 
 
 class SceneChange:
@@ -67,6 +67,6 @@ def _alike(here: _Thumbnail, there: _Thumbnail) -> float:
 
 
 def _thumbnail(image_bgr: Image) -> _Thumbnail:
-    """In fractions of a level: means of thousands of pixels, rounded, would be a flat scene's only contrast."""
+    """Fractions of a level: rounded means of thousands of pixels would be a flat scene's only contrast."""
     halfway = cv2.resize(image_bgr, _HALFWAY_PX, interpolation=cv2.INTER_AREA).astype(np.float32)
     return np.asarray(cv2.resize(halfway, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA), np.float32).ravel()

@@ -43,9 +43,9 @@ from hvt_edge.perception.scene_change import SceneChange
 __all__ = ["UNMEASURED", "Shadow", "ShadowGround", "ShadowSettings"]
 
 _LEAST_MORE = 0.5
-"""Of objects that the ground shows more or fewer than were found here."""
+"""Least difference between the ground's number of objects and the edge's."""
 _BASE_NAMES = 1 / 3
-"""Where base and source name an object differently, how often the base's name is right."""
+"""How often the base's name is right if base and source name an object differently."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,11 +60,11 @@ class ShadowSettings:
     quick_comparisons: float = 2.5
     """At first so few comparisons are made in quick order, because nothing is known."""
     most_share: float = 0.15
-    """Of a processor core, for comparisons; in lockstep, where no clock may decide, only ``rest_ns`` counts."""
+    """Share of a processor core for comparisons; in lockstep, where no clock may decide, only ``rest_ns`` counts."""
     memory_s: float = 8.0
     """Time constant with which former comparisons fade."""
     match_iou: float = 0.3
-    """As little as the ground takes for one object: boxes of 15 pixels from two pictures seldom reach more."""
+    """The ground's own limit for one object: boxes of 15 pixels from two pictures seldom overlap more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class Shadow:
     """Those that the base does not show and the ground would list."""
     hidden_p: float = 0.0
     misnamed: float = 0.0
-    """Of the shown, those that bear another class on the base."""
+    """Shown objects that bear another class on the base."""
     misnamed_p: float = 0.0
     false: float = 0.0
     """Boxes of the base where the source has none."""
@@ -93,7 +93,7 @@ class Shadow:
 
     @property
     def misnamed_share(self) -> float:
-        """Of the objects that the base shows, those that it shows under another class."""
+        """Share of the shown objects that bear another class on the base."""
         return self.misnamed / self.shown if self.shown else 0.0
 
     @property
@@ -151,7 +151,7 @@ class Shadow:
         )
 
     def _gain(self, share: float) -> float:
-        """Of F1, if only this share of what tracks change is true."""
+        """The gain of F1 if only this share of the tracks' changes is true."""
         true = self.source_p + self.false_p
         if not true:
             return 0.0

@@ -111,7 +111,7 @@ def _good(rows: Iterable[_Values | UserError], path: Path) -> list[Pose]:
 
 
 def _in_order(poses: list[Pose], path: Path) -> list[Pose]:
-    """By time; of two of one time the first. `UserError` where no time rises."""
+    """Sort by time; of two of one time keep the first. `UserError` if no time rises."""
     ordered = sorted(poses, key=lambda one: one.capture_ns)
     if ordered != poses:
         _log.warning("pose file %s is not in order of time: sorted", path)

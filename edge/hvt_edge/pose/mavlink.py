@@ -71,9 +71,9 @@ class MavlinkPose:
         self._vehicle: tuple[int, int] | None = None
         """System and component whose place counts."""
         self._newest: dict[tuple[int, int, str], tuple[int, Any]] = {}
-        """By system, component and name, when it came and the message."""
+        """Arrival and message by system, component and name."""
         self._placed_ns: int | None = None
-        """Since when there is a place and no direction of the camera; 0 once that was told of."""
+        """The time since which there is a place and no direction of the camera; 0 once that was reported."""
         self._lock = threading.Lock()
         self._stop = threading.Event()
         where = Address.parse(address)
@@ -141,7 +141,7 @@ class MavlinkPose:
         return f" ({trouble})" if trouble else ""
 
     def _known(self, *, fresh: bool) -> dict[str, tuple[int, Any]]:
-        """By name, when it came and the newest message of the vehicle that is, if ``fresh``, not too old."""
+        """Arrival and newest message by name of the present vehicle; with ``fresh`` only recent ones."""
         now_ns = self._clock()
         with self._lock:
             vehicle, newest = self._vehicle, dict(self._newest)

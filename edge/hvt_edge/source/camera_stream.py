@@ -35,7 +35,7 @@ _FORMATS = frozenset({"yuv420p", "yuvj420p"})
 LONG_STEP_S, _LONG_STEPS = 1.0, 3
 """From one frame to the next: more than both, in seconds and in usual steps, is a jump of the time stamps."""
 _OTHER_MATRICES = frozenset({4, 5, 6, 7, 9})
-"""Of ITU-T H.273, table 4: BT.601 in its variants, SMPTE 240M and BT.2020."""
+"""Other matrices of ITU-T H.273, table 4: BT.601 in its variants, SMPTE 240M and BT.2020."""
 
 
 def without_jumps(units: Sequence[SeenUnit]) -> tuple[SeenUnit, ...]:

@@ -26,7 +26,7 @@ class CameraUnits:
 
     def __init__(self, header: bytes) -> None:
         self._length_bytes = 0
-        """Of the lengths that stand in place of start codes; 0 where there are none."""
+        """Size of the lengths in place of start codes; 0 without any."""
         sets = nal_units(header)
         if header[:1] == b"\1":
             self._length_bytes, sets = _hvcc(header)

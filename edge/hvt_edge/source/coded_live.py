@@ -31,7 +31,7 @@ from hvt_edge.source.stream import StreamGrabber, camera_time_ns
 __all__ = ["CodedLiveSource", "CodedStreamGrabber"]
 
 _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
-"""So long a camera is looked at before the flight: until its second keyframe, within these."""
+"""A camera is surveyed before the flight until its second keyframe, within these."""
 _QUEUE_S, _LEAST_QUEUED, _MOST_QUEUED_BYTES = 1.0, 8, 8 * 2**20
 _IDLE_S = 1.0
 
@@ -68,7 +68,7 @@ def _picture(packet: CameraPacket) -> Image:
 @dataclass(frozen=True, slots=True)
 class _Queued:
     number: int
-    """Of the camera's packets; one that is missing was lost here."""
+    """Counts the camera's packets; a missing one was lost here."""
     capture_ns: int
     packet: CameraPacket
 

@@ -34,7 +34,7 @@ __all__ = ["CodedVideoSource"]
 _log = logging.getLogger(__name__)
 
 _MOST_SURVEY_S, _MOST_SURVEYED = 600.0, 40_000
-"""So much of a clip is looked at before the flight."""
+"""The part of a clip that is surveyed before the flight."""
 
 
 class CodedVideoSource(Source):

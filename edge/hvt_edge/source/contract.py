@@ -25,7 +25,7 @@ class SeenUnit:
     """One access unit that was looked at before the flight."""
 
     at_s: float
-    """By the camera's time stamps, from its first unit on."""
+    """The camera's time stamp, from its first unit on."""
     size_bytes: int
     """With the parameter sets that a keyframe is given."""
     keyframe: bool
@@ -38,7 +38,7 @@ class CameraStream:
     units: tuple[SeenUnit, ...]
     """The first is a keyframe."""
     fps: float
-    """As its time stamps say."""
+    """The frame rate by its time stamps."""
 
     @property
     def keyframe_s(self) -> float:

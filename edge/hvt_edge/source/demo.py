@@ -71,7 +71,7 @@ class DrawnScene(Protocol):
         ...
 
     def pose(self, t_s: float) -> Pose:
-        """Where the camera is at a moment; ``capture_ns`` counts from the scene's beginning."""
+        """The camera's pose at a moment; ``capture_ns`` counts from the scene's beginning."""
         ...
 
     def write_truth(self, path: Path, *, fps: float, view: View) -> int:
@@ -129,7 +129,7 @@ class DemoSource(Source):
         self._answer()
 
     def poses(self) -> list[Pose]:
-        """Where the camera is from the scene's beginning to its end; before the first frame."""
+        """The camera's poses from the scene's beginning to its end; before the first frame."""
         self._request("poses")
         poses: list[Pose] = self._answer()
         return poses

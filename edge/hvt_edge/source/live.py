@@ -37,7 +37,7 @@ class CameraPacket:
 
     data: bytes
     at_s: float | None
-    """By the stream's own time stamps; None where it has none."""
+    """The stream's own time stamps; None without any."""
     decoder: CameraDecoder
 
 

@@ -47,7 +47,7 @@ class Alternative:
     limits: tuple[float, ...]
     """Sums of squared differences that a still must stay below."""
     psnr_y_db: float
-    """Of the base crop, luma, over the whole crop."""
+    """Quality of the base crop, luma, over the whole crop."""
     error_share: float
     """Its squared luma error over the variance of the crop's luma: 1 is no better than one flat grey."""
 
@@ -88,7 +88,7 @@ class CropJob:
     header: Still
     """The still as it will be, but for sequence, quality and data."""
     crop_bgr: Image
-    """Of the source, at the size at which it is coded."""
+    """The crop of the source, at the size at which it is coded."""
     base_crop_bgr: Image | None
     """The same place in the decoded base frame of the same source frame, at that size; None without one."""
     alternative: Alternative | None

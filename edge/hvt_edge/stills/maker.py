@@ -38,7 +38,7 @@ Allowance = Callable[[Still], int]
 """How many payload bytes a still with this header may take now; what it holds as data does not count."""
 
 _TRIES = 3
-"""Of fitting payload and parameters into one admission: parameters hardly change in size."""
+"""Tries to fit payload and parameters into one admission: parameters hardly change in size."""
 _QUALITY_STEP_PCT = 5
 _LEAST_PCT, _MOST_PCT = 1, 95
 _READ_BY_ALL = JpegCodec()
@@ -81,7 +81,7 @@ class StillMaker:
     ceiling_pct: int = 90
     """The most that is spent on being better than the base."""
     min_gain_db: float = 0.1
-    """By how much the still must be closer than the base; covers how others round when they count."""
+    """The still must be closer than the base by this; it covers the rounding of others."""
     least_bytes: int = 0
     """A smaller still is mostly header and changes nothing at the ground: it gets more bytes, or waits for them."""
     readable: Callable[[str], bool] = lambda _codec: True
@@ -109,7 +109,7 @@ class StillMaker:
 
     @property
     def codec_names(self) -> tuple[str, ...]:
-        """Of the codecs in use, without repetition."""
+        """The codecs in use, without repetition."""
         return tuple(dict.fromkeys((self.preferred.name, self.without_base.name)))
 
     def crop(
@@ -170,7 +170,7 @@ class StillMaker:
     def _fitted(
         self, codec: StillCodec, job: CropJob, header: Still, allowance: Allowance
     ) -> tuple[Still, _Fitted] | NoStill:
-        """As requested, with this codec, or the best below that is allowed."""
+        """Code as requested, with this codec, or the best below that is allowed."""
         header = _of_codec(header, codec)
         limit_bytes = allowance(header)
         for _ in range(_TRIES):

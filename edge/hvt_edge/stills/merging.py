@@ -24,7 +24,7 @@ ALSO_BYTES = 17.0
 """Bytes of the header for each further track: its id and its box in eighths of a pixel."""
 MOST_ALSO = 15
 _MOST_COMPARED = 96
-"""Of more requests than that only the most useful are compared with each other: the time it takes stays bounded."""
+"""Of more requests only the most useful are compared with each other, which bounds the time."""
 _LEAST_SAVING_BYTES = 1.0
 
 Crop = tuple[int, int, int, int]

@@ -38,7 +38,7 @@ class OutboxSettings:
     """Bounds, and when a still is overdue."""
 
     max_pending: int = 8
-    """Of the method; those that grounds request have their own bound."""
+    """Limit for the method; requested stills have their own bound."""
     max_pending_ns: int = SECOND_NS
     """A crop that has waited longer shows a past the operator no longer needs."""
     max_on_demand_ns: int = 10 * SECOND_NS
@@ -58,11 +58,11 @@ class OutboxStill:
     job: CropJob | None
     """The crop to be coded; of a sent still the crop to be coded again, None where that cannot be."""
     request: Request | None
-    """Of the method; None where a ground requested it."""
+    """The method's request; None if a ground requested it."""
     utility: float
-    """As the method scored it; infinite where a ground requested it."""
+    """The method's score; infinite if a ground requested it."""
     since_ns: int | None
-    """Since when it is pending; None until the thread that sends it has met it."""
+    """The time since which it is pending; None until the sending thread has met it."""
     again: bool = False
     """The ground could not decode the first still of this crop."""
     state: StillState = StillState.PENDING
@@ -86,12 +86,12 @@ class OutboxStill:
 
     @property
     def track_id(self) -> int:
-        """Of the candidate that leads it."""
+        """The track of the candidate that leads it."""
         return (self.coded or self.crop.header).track_id
 
     @property
     def track_ids(self) -> set[int]:
-        """Of all that it shows."""
+        """All its tracks."""
         return {self.track_id, *(track_id for track_id, _ in self.crop.header.also)}
 
 
@@ -128,13 +128,13 @@ class Outbox:
         self.turn = threading.RLock()
         """Held from when a still gets its number until it has gone out: two threads send, and numbers go up."""
         self._pending: dict[int, OutboxStill] = {}
-        """By the track that leads."""
+        """The stills by the track that leads."""
         self._on_demand: deque[OutboxStill] = deque()
         self._sent: dict[int, OutboxStill] = {}
-        """By sequence, in the order of sending: not acknowledged, or with a crop to be coded again."""
+        """The stills by sequence, in the order of sending: not acknowledged, or with a crop to be coded again."""
         self._undecodable: set[int] = set()
         self._next_sequences = {False: 0, True: FIRST_STORED}
-        """Of the next still: for the link, and for the backlog."""
+        """Number of the next still: for the link, and for the backlog."""
         self._reported_ns = 0
         self._round_trip_ns = 0
 
@@ -150,7 +150,7 @@ class Outbox:
 
     @property
     def pending(self) -> tuple[OutboxStill, ...]:
-        """Of the method."""
+        """The pending stills of the method."""
         with self._lock:
             return tuple(self._pending.values())
 
@@ -274,12 +274,12 @@ class Outbox:
 
     @property
     def sent_bytes(self) -> int:
-        """Of coded stills that are not acknowledged."""
+        """The bytes of coded stills that are not acknowledged."""
         return sum(len(one.still.data) for one in self._unnamed())
 
     @property
     def crop_bytes(self) -> int:
-        """Of the pixels of sent stills."""
+        """The bytes of the pixels of sent stills."""
         return sum(one.job.size_bytes for one in self._sent.values() if one.job is not None)
 
     def on_report(

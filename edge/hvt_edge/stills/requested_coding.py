@@ -35,7 +35,7 @@ _TRIES = 4
 _FILLED = 0.85
 """Share of the allowance from which no further try is made."""
 _FALLS_PER_PCT = 0.03
-"""Of the logarithm of a still's bytes, for each percent of quality less: where a search begins."""
+"""Fall of the logarithm of a still's bytes for each percent of quality less: the start of a search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ class _Tries:
         return self.done[quality_pct]
 
     def gain_db(self, one: _Tried) -> float:
-        """By how much it is closer to the source than the base, at the crop's own size."""
+        """The gain in closeness to the source over the base, at the crop's own size."""
         alternative, crop = self.job.alternative, self.job.crop_bgr
         if alternative is None:
             return math.inf

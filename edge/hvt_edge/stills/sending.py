@@ -1,4 +1,4 @@
-"""Where a coded still goes: to the link, or to the backlog while the link is away."""
+"""Sends a coded still to the link, or to the backlog while the link is down."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class StillSender:
 
     def __post_init__(self) -> None:
         self._breaks = 0
-        """Of the link, as far as this has noticed them."""
+        """Breaks of the link that were noticed here."""
 
     @property
     def offline(self) -> bool:

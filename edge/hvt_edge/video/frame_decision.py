@@ -52,7 +52,7 @@ class FrameDecision:
     resumes: bool = False
     """With it the link has the stream again."""
     held_by: FrameGroup = "budget"
-    """Of HOLD: what had no room for it."""
+    """For HOLD: the owner without room."""
 
     @property
     def codes(self) -> bool:

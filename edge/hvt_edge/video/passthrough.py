@@ -104,7 +104,7 @@ class PassthroughStage:
 
     def __post_init__(self) -> None:
         self._sent_index = self._stored_index = self._copied_index = -2
-        """Of the frame that was sent last, stored last, copied last."""
+        """The frames sent last, stored last, copied last."""
         self._keyframes = 0
         self._paused_ns = 0
         self._held_by: FrameGroup = "unreadable"
@@ -166,7 +166,7 @@ class PassthroughStage:
 
     @property
     def budget_waited_ns(self) -> int:
-        """As of `BaseStage`."""
+        """See `BaseStage`."""
         return self._paused_ns + self.transmitter.base_waited_ns
 
     def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> bool:

@@ -11,7 +11,7 @@ from hvt_edge.video.encoders.contract import Encoder
 __all__ = ["trial_frames", "trial_quantiser"]
 
 _TRIAL_S = 0.85
-"""As long as two comparisons of the shadow ground take."""
+"""The time of two comparisons of the shadow ground."""
 _LAST = 3
 """The last so many count: those before still pay for the keyframe."""
 

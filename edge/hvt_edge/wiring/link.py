@@ -25,7 +25,7 @@ from hvt_edge.wiring.stills import shows_details
 from hvt_edge.wiring.video import least_rate_bps
 
 _AUTO_STILL_SHARE = 0.15
-"""Of the budget, at most, for stills that are not known to pay: what the base loses by it is .015 of F1."""
+"""Share of the budget, at most, for stills that are not known to pay: the base loses .015 of F1 by it."""
 SPARSE_SHARE = 0.9
 """Of the budget, at most, for a base of which not all frames are coded. Each has more bits then; at 7.5 a second it
 still arrives within 1.5 times the delay of 15 a second with the whole budget."""

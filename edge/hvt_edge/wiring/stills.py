@@ -25,9 +25,9 @@ _TRIAL_PX = 48
 _LEAST_STILL_BYTES = 400
 _DETAIL = "detail_weight"
 _FINER = 0.5
-"""Of `_hidden_pixels`."""
+"""Limit of `_hidden_pixels`."""
 _DETAIL_WEIGHT = 5.0
-"""Where the base has none of the source's pixels: then details count for more than a class (docs/legibility.md)."""
+"""If the base has none of the source's pixels, details count for more than a class (docs/legibility.md)."""
 
 
 def check_codecs(config: EdgeConfig) -> None:
@@ -72,7 +72,7 @@ def _hidden_pixels(view: View) -> float:
 
 
 def make_suppression(config: EdgeConfig) -> Suppression:
-    """Which tracks pause, and for how long."""
+    """Make the rule that says which tracks pause, and for how long."""
     return Suppression.for_cooldown(config.cooldown, min_gain=config.min_gain)
 
 

@@ -61,7 +61,7 @@ _MOST_EVENTS: Final = 2048
 _SOCKET_BYTES: Final = 64 * 1024
 """The kernel's buffer: events in it cannot be replaced by newer ones."""
 _BUFFER_BYTES: Final = 4096
-"""As above, in Python. Not 0: at that asyncio's TLS pauses and does not go on."""
+"""The same in Python. Not 0: at that asyncio's TLS pauses and does not go on."""
 _READ_BYTES: Final = 64 * 1024
 
 
@@ -171,7 +171,7 @@ class CotConnection:
         self._settings = _settings(url, environment)
         self._lock = threading.Lock()
         self._unsent: dict[str, bytes] = {}
-        """By uid, in the order in which they came first."""
+        """Events by uid, in the order in which they came first."""
         self._ending = False
         self._error: UserError | None = None
         self._opened: Future[None] = Future()

@@ -34,7 +34,7 @@ class CotMessage:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Where it is, WGS 84."""
+    """A place, WGS 84."""
 
     latitude_deg: float
     longitude_deg: float
@@ -48,7 +48,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Where it goes."""
+    """Course and speed."""
 
     course_deg: float
     """Clockwise from true north, 0 up to 360."""
@@ -67,7 +67,7 @@ class Sensor:
     hfov_deg: float
     vfov_deg: float
     range_m: float | None
-    """As far as it sees the ground."""
+    """How far it sees the ground."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +98,10 @@ class CotEvent:
     sensor: Sensor | None = None
     parent: Parent | None = None
     url: str = ""
-    """Of a picture."""
+    """Address of a picture."""
 
     def message(self) -> CotMessage:
-        """As UTF-8 with a declaration, in one line."""
+        """The event in UTF-8 with a declaration, in one line."""
         event = Element(
             "event",
             version="2.0",
@@ -152,7 +152,7 @@ class CotEvent:
 
 
 def plain(text: str, *, most: int) -> str:
-    """In one line and at most so long; without control, invisible, direction and unassigned characters."""
+    """One line of limited length; without control, invisible, direction and unassigned characters."""
     visible = "".join(one for one in text[: 4 * most] if one.isspace() or unicodedata.category(one)[0] != "C")
     words = " ".join(visible.split())
     return words if len(words) <= most else f"{words[: most - 1]}…"

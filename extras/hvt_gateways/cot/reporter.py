@@ -29,14 +29,14 @@ _log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 StillAddress = Callable[[Refinement], str]
-"""Where the picture of a still is: a URL, or a file of this machine; empty where it is nowhere."""
+"""The address of a still's picture: a URL, or a file of this machine; empty without one."""
 
 _CIRCLE_95: Final = 2.448
 """Radius that holds 95 % of a circular normal distribution, in standard deviations along an axis."""
 _PLATFORM_NS: Final = SECOND_NS * 9 // 10
 """Poses come once a second, a little early or late."""
 _PLATFORM_STALE_NS: Final = 15 * SECOND_NS
-"""Behind the 10 s after which a pose is stale, because a report may be lost."""
+"""More than the 10 s after which a pose is stale, because a report may be lost."""
 _NOTICE_NS: Final = 10 * SECOND_NS
 _MOST_RANGE_M: Final = 5000.0
 _LEAST_DEPRESSION_DEG: Final = 1.0
@@ -82,7 +82,7 @@ class SessionReporter:
         self._schedule = TrackSchedule()
         self._motions: dict[int, MotionTrail] = {}
         self._stills: dict[int, str] = {}
-        """Of the newest still by track, its address."""
+        """The address of the newest still by track."""
         self._platform_trail = MotionTrail()
         self._platform_ns: int | None = None
         """When it was reported."""
@@ -114,7 +114,7 @@ class SessionReporter:
         """Nothing is held back."""
 
     def _age_ns(self, capture_ns: int) -> int:
-        """Since it was captured. In lockstep capture is media time: there everything is from now."""
+        """The age since capture. In lockstep capture is media time: there everything is from now."""
         if self._info.pace == "lockstep":
             return 0
         return max(0, self._clock() - (capture_ns - self._offset_ns))

@@ -26,7 +26,7 @@ STALE_NS: Final = 5 * SECOND_NS
 _MOVED_NS: Final = SECOND_NS
 _UNMOVED_NS: Final = 3 * SECOND_NS
 _LEAST_MOVE: Final = 0.25
-"""Of the error: boxes tremble by less."""
+"""Share of the error: boxes tremble by less."""
 _MOST_A_SECOND: Final = 50
 _FORGOTTEN_NS: Final = 60 * SECOND_NS
 _MOST_TRACKS: Final = 4096

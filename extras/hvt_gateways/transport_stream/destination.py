@@ -1,4 +1,4 @@
-"""Where a transport stream goes: a file, UDP, or SRT where PyAV is built with it."""
+"""Destinations of a transport stream: a file, UDP, or SRT if PyAV is built with it."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _log = logging.getLogger(__name__)
 _ACCEPTED: Final = "give FILE.ts, a folder that is there, udp://HOST:PORT or srt://HOST:PORT"
 _PACKET_BYTES: Final = 188
 _DATAGRAM_BYTES: Final = 7 * _PACKET_BYTES
-"""As all senders of MPEG-TS have it: seven packets fit an Ethernet frame."""
+"""The size of all senders of MPEG-TS: seven packets fit an Ethernet frame."""
 _SRT_WAITS: Final = {"connect_timeout": "3000", "listen_timeout": "5000000", "timeout": "3000000"}
 """Milliseconds, microseconds, microseconds, as libavformat has them: by default it waits for ever."""
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Of a receiver; ``{edge}`` in it stands for the edge's id."""
+    """The address of a receiver; ``{edge}`` in it stands for the edge's id."""
 
     url: str
 
@@ -181,7 +181,7 @@ class StreamFile:
             raise UserError(f"MPEG-TS file {path} cannot be created: {error.strerror}") from None
 
     def write(self, data: bytes) -> int:
-        """As `Output.write`."""
+        """See `Output.write`."""
         left = memoryview(data)
         try:
             check_there(self._file, self._path)
@@ -194,7 +194,7 @@ class StreamFile:
         return len(data)
 
     def close(self) -> None:
-        """As `Output.close`."""
+        """See `Output.close`."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
@@ -228,7 +228,7 @@ class Datagrams:
         self._where = where
 
     def write(self, data: bytes) -> int:
-        """As `Output.write`."""
+        """See `Output.write`."""
         for begin in range(0, len(data), _DATAGRAM_BYTES):
             try:
                 self._socket.sendto(data[begin : begin + _DATAGRAM_BYTES], self._where)
@@ -241,5 +241,5 @@ class Datagrams:
         return len(data)
 
     def close(self) -> None:
-        """As `Output.close`."""
+        """See `Output.close`."""
         self._socket.close()

@@ -25,7 +25,7 @@ class Moment:
     frame_index: int
     capture_ns: int
     at: int
-    """In the time of the stream."""
+    """Time of the stream."""
     pictured: bool
     """It has a picture in the stream."""
     overlay: Overlay | None = None

@@ -32,9 +32,9 @@ from hvt_ground.sinks.decodable import DecodableRun
 __all__ = ["TransportStream", "live_stream", "stream_file", "write_recorded"]
 
 _BUFFER_BYTES: Final = 24 * 7 * 188
-"""Of whole datagrams of whole packets."""
+"""A buffer of whole datagrams of whole packets."""
 _DELAY_US: Final = "200000"
-"""By so much a receiver's clock is behind the times in the stream: what metadata may come later than its picture."""
+"""Delay of a receiver's clock behind the times in the stream: metadata may come so much later than its picture."""
 _USUAL_FPS: Final = 15.0
 """A recording does not say it; it counts where a clock was set."""
 
@@ -88,7 +88,7 @@ class TransportStream:
                 self._trail.add(item.pose)
 
     def skipped(self, count: int) -> None:
-        """So many events are missing: it goes on at the next keyframe."""
+        """Count missing events: it goes on at the next keyframe."""
         del count
         self._run.interrupt()
         self._moments.forget()

@@ -14,12 +14,12 @@ TIME_BASE: Final = Fraction(1, 90_000)
 _LONGEST_S: Final = 3600
 """A longer pause is a clock that was set. The 33 bits of a time hold a day."""
 _AHEAD_S: Final = 10
-"""By so much may be known what was at a moment before its picture comes."""
+"""Lead at which the facts of a moment may be known before its picture comes."""
 _PER_SECOND: Final = TIME_BASE.denominator
 
 
 class Timeline:
-    """Of one stream, which begins with its first picture; ``fps`` says how long one stands where times do not."""
+    """The times of one stream, which begins with its first picture; ``fps`` is its rate if times do not say."""
 
     def __init__(self, *, fps: float) -> None:
         self._frame = max(1, round(_PER_SECOND / fps))

@@ -18,7 +18,7 @@ from hvt_ground.events import Overlay
 __all__ = ["MOST_BYTES", "vmti_local_set"]
 
 MOST_BYTES: Final = 48 * 1024
-"""Of all targets: what a PES packet holds is bounded at 64 kB."""
+"""Limit of all targets: a PES packet holds 64 kB."""
 _SYSTEM: Final = b"HVT"
 _VERSION: Final = 5
 _MOST_COUNT: Final = 0xFFFFFF

@@ -193,7 +193,7 @@ class BacklogAssembly:
         self._report(key, total_bytes)
 
     def _report_busy(self, key: ObjectKey, entry: _Open, total_bytes: int) -> None:
-        """Of another object of the same name nothing is here."""
+        """Report the object as busy: nothing is here of another object of the same name."""
         self._report(key, entry.total_bytes - 1 if entry.total_bytes == total_bytes else 0)
 
     def _report(self, key: ObjectKey, acknowledged_bytes: int) -> None:

@@ -51,7 +51,7 @@ class EdgeBacklog:
         self._infos: OrderedDict[int, Info] = OrderedDict()
         self._working = 0
         self._sessions = 0
-        """That have ended: what is still at work for one of them has no say any more."""
+        """Sessions that have ended: jobs still at work for one of them are ignored."""
 
     @property
     def paths(self) -> Sequence[Path]:

@@ -118,7 +118,7 @@ class VideoJob(Job):
         return True
 
     def fail(self, error: Exception) -> None:
-        """As of a `StillJob`."""
+        """See `StillJob`."""
         if self._target is None:
             self._done(_usable(error))
         else:
@@ -152,7 +152,7 @@ class _BoxesJob(Job):
         self._target = destination.acquire()
         self._pictures: _Pictures = iter(())
         self._checkout = ExitStack()
-        """Of the models, from the first step on."""
+        """Its checkout from the model pool, from the first step on."""
         self._tracker: StretchTracker | None = None
         self._last: BacklogUnit | None = None
 

@@ -18,13 +18,13 @@ _MOST = 512
 
 
 class LateStills:
-    """Of one session; for one thread. Stills come before the boxes of their frame, which wait for all else."""
+    """The late stills of one session; for one thread. Stills come before the boxes of their frame."""
 
     def __init__(self) -> None:
         self._stills: OrderedDict[int, list[Refinement]] = OrderedDict()
         """Those of no track yet, by frame."""
         self._named: OrderedDict[int, Refinement] = OrderedDict()
-        """By track."""
+        """Stills by track."""
 
     def take(self, still: Refinement) -> None:
         """Note a stored still that was read; others pass by."""

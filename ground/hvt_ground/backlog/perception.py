@@ -29,7 +29,7 @@ from hvt_ground.perception.stills.vocabulary import Vocabulary
 __all__ = ["FIRST_TRACK_ID", "BacklogPerception", "StretchTracker"]
 
 FIRST_TRACK_ID = 1_000_001
-"""Of the first track in stored video: these tracks are others than those of the live stream."""
+"""Id of the first track in stored video: these tracks are others than those of the live stream."""
 
 Emit = Callable[[Event], None]
 

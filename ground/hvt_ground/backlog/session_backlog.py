@@ -31,9 +31,9 @@ class BacklogTotals:
 
     stills: int = 0
     frames: int = 0
-    """That can be shown and were missing."""
+    """Missing frames that can be shown."""
     left_out: int = 0
-    """That are missing still, for no decoder can use them."""
+    """Frames that are missing still, because no decoder can use them."""
     video_s: float = 0.0
     first: tuple[int, int] | None = None
     """Frame index and capture time of the oldest of it."""
@@ -99,7 +99,7 @@ class SessionBacklog:
         self._frames = SequenceWindow()
         self._late = LateStills()
         self.totals = BacklogTotals()
-        """Since the start."""
+        """Totals since the start."""
         self._news = BacklogTotals()
 
     def live(self, frame_index: int, data: bytes, *, keyframe: bool, after_gap: bool) -> None:

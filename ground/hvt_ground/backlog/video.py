@@ -21,7 +21,7 @@ _GAPS = 4
 
 
 class BacklogVideo:
-    """Of one session. `live` and `pictures` may be called by two threads. Pictures have ``base_size``."""
+    """A session's stored video. `live` and `pictures` may be called by two threads. Pictures have ``base_size``."""
 
     def __init__(self, *, base_size: tuple[int, int]) -> None:
         self._base_size = base_size

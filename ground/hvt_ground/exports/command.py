@@ -25,7 +25,7 @@ __all__ = ["run"]
 
 _FOLDERS: dict[str, Callable[[Recorded, Path], None]] = {"coco": write_coco, "stills": write_stills}
 _SUFFIXES = {"mot": ".txt"}
-"""Where it is not the kind's own name."""
+"""The suffixes other than the kind's own name."""
 
 
 _FILES: dict[str, Callable[[Recorded, Path], None]] = {

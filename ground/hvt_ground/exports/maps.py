@@ -45,7 +45,7 @@ class _Spot:
 
     @property
     def fix(self) -> Fix:
-        """Where and when."""
+        """Place and time."""
         return Fix(self.capture_ns, self.longitude_deg, self.latitude_deg)
 
 
@@ -148,7 +148,7 @@ def _poses(recorded: Recorded) -> Sequence[Any]:
 
 
 def _tracks(recorded: Recorded) -> dict[int, _Track]:
-    """By id, of those whose place was ever known; tracks that stills doubt are left out."""
+    """The tracks by id, of those whose place was ever known; doubted tracks are left out."""
     _poses(recorded)
     tracks: defaultdict[int, _Track] = defaultdict(_Track)
     for overlay in recorded.overlays():

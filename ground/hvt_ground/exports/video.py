@@ -25,7 +25,7 @@ from hvt_ground.sinks.palette import class_colour
 __all__ = ["CONTAINERS", "from_keyframe", "pictures", "write_video"]
 
 CONTAINERS = {"mp4": "mp4", "mkv": "matroska", "ts": "mpegts"}
-"""By name, libavformat's."""
+"""libavformat's names of the containers."""
 _TIME_BASE = Fraction(1, 1000)
 """MP4 has 32 bits for the time between two pictures: 24 days."""
 _CRF = "20"

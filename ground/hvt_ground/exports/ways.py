@@ -13,7 +13,7 @@ from hvt_common.geodesy import turned_deg
 __all__ = ["Fix", "line", "parts_of"]
 
 _DIGITS: Final = 7
-"""Of degrees: a centimetre."""
+"""Digits of degrees: a centimetre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Fix:
 
     @property
     def position(self) -> list[float]:
-        """As GeoJSON has it."""
+        """A position for GeoJSON."""
         return [round(self.longitude_deg, _DIGITS), round(self.latitude_deg, _DIGITS)]
 
 

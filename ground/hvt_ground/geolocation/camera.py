@@ -19,7 +19,7 @@ from hvt_ground.geolocation.surface import FLAT_GROUND, Points, Rays, Surface
 __all__ = ["ground_points", "places_of_boxes"]
 
 _CHI2_95: Final = 5.991
-"""Of two degrees of freedom: the ellipse that holds 95 % (Abramowitz and Stegun, 26.4.9)."""
+"""Chi-square of two degrees of freedom: the ellipse that holds 95 % (Abramowitz and Stegun, 26.4.9)."""
 _FIELD_ERROR: Final = 0.02
 """Standard deviation of a field of view, of itself: what data sheets and stabilisation leave."""
 _BOX_ERROR: Final = (0.15, 0.25)

@@ -149,7 +149,7 @@ def _errors() -> Iterator[None]:
 
 
 def _bounds(file: Any) -> _Area:
-    """Of the whole file; longitudes as it says them where it has any."""
+    """The bounds of the whole file; longitudes in its own form."""
     if file.crs.is_geographic:
         return _Area(*file.bounds)
     if not file.crs.is_projected:

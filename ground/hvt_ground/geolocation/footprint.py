@@ -20,7 +20,7 @@ Place = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """Of the base picture, black edges included. What lies at or above the horizon is None."""
+    """The footprint of the base picture, black edges included. Corners at or above the horizon are None."""
 
     centre: Place
     below_m: float
@@ -32,7 +32,7 @@ class Footprint:
 
 
 def fields_of_view(pose: Pose, view: View) -> tuple[float, float] | None:
-    """Of the base picture, degrees: across and up; None where the pose does not say that of the source."""
+    """The fields of view of the base picture, degrees: across and up; None if the pose lacks that of the source."""
     if pose.hfov_deg is None:
         return None
     half = math.tan(math.radians(pose.hfov_deg) / 2) / (view.source_size[0] / 2)

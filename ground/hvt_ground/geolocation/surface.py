@@ -45,7 +45,7 @@ class FlatGround:
         return pose.height_m is not None and pose.height_m > 0
 
     def meet(self, pose: Pose, rays: Rays) -> Points:
-        """As `Surface.meet`."""
+        """See `Surface.meet`."""
         assert pose.height_m is not None, "else it is not usable"
         falls = rays[:, 2] > np.linalg.norm(rays, axis=1) * math.sin(math.radians(LEAST_DEPRESSION_DEG))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -53,7 +53,7 @@ class FlatGround:
         return np.where(falls[:, None], metres, np.nan)
 
     def below_m(self, pose: Pose, metres: Points) -> npt.NDArray[np.float64]:
-        """As `Surface.below_m`."""
+        """See `Surface.below_m`."""
         assert pose.height_m is not None, "else it is not usable"
         return np.full(len(metres), pose.height_m)
 

@@ -20,7 +20,7 @@ __all__ = ["Terrain"]
 _log = logging.getLogger(__name__)
 
 _REACH_M: Final = 10_000.0
-"""As far as a ray is followed."""
+"""The length to which a ray is followed."""
 _STEPS: Final = 160
 _FIRST_M: Final = 1.0
 
@@ -80,7 +80,7 @@ class Terrain:
         return np.where(known[:, None], units[:, :2] * reach[:, None], np.nan)
 
     def below_m(self, pose: Pose, metres: Points) -> npt.NDArray[np.float64]:
-        """As `Surface.below_m`."""
+        """See `Surface.below_m`."""
         (altitude_m, _), tile = self._levels_m(pose), self._tile_around(pose)
         if altitude_m is None:
             return np.full(len(metres), np.nan)

@@ -30,7 +30,7 @@ __all__ = ["Elsewhere", "GroundGroup", "member_name", "owner_of"]
 _log = logging.getLogger(__name__)
 
 _JOIN_S = 1.5
-"""So long after its start a member claims nothing: it learns who is there."""
+"""After its start a member claims nothing for so long: it learns who is there."""
 _SETTLE_S = 0.3
 """Between a claim and serving: another claim of the same moment is seen by then."""
 _MOST_PAGE_BYTES = 512
@@ -45,7 +45,7 @@ def owner_of(edge: str, members: Iterable[str]) -> str:
 
 
 def member_name() -> str:
-    """Of this machine and process, such as ``base-3fa2``."""
+    """The name of this machine and process, such as ``base-3fa2``."""
     host = re.sub(r"[^a-z0-9-]+", "-", socket.gethostname().lower()).strip("-")[:24]
     return f"{host or 'ground'}-{secrets.token_hex(2)}"
 
@@ -56,7 +56,7 @@ def _weight(edge: str, member: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Elsewhere:
-    """Where an edge is served by another member."""
+    """The member that serves an edge instead of this one."""
 
     member: str
     page: str
@@ -88,12 +88,12 @@ class GroundGroup:
         self._claims: defaultdict[str, set[str]] = defaultdict(set)
         """By edge, the other members that claim it."""
         self._mine: dict[str, bool] = {}
-        """By edge, whether it is this member's; until members or claims change."""
+        """Whether each edge is this member's; until members or claims change."""
         self._own: dict[str, tuple[float, zenoh.LivelinessToken]] = {}
-        """By edge, since when it is claimed here."""
+        """The time since which each edge is claimed here."""
         self._serving: set[str] = set()
         self._pages: dict[str, str] = {}
-        """By member that has answered; empty where it has none."""
+        """The answers by member; empty for none."""
         self._requested: set[str] = set()
         """Members that are asked for theirs."""
         key, data = self._keys.member(self.member), page.encode()
@@ -111,7 +111,7 @@ class GroundGroup:
 
     @property
     def elsewhere(self) -> Mapping[str, Elsewhere]:
-        """By edge, the other member that serves it."""
+        """The other member that serves each edge."""
         with self._lock:
             found = {edge: min(members) for edge, members in sorted(self._claims.items()) if members}
             pages = dict(self._pages)
@@ -198,7 +198,7 @@ class GroundGroup:
             claim[1].undeclare()  # type: ignore[no-untyped-call]
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        """In Zenoh's thread."""
+        """Handles a token in Zenoh's thread."""
         parsed = self._keys.parse(str(sample.key_expr))
         if parsed is None or parsed[0] == self.member:
             return

@@ -1,4 +1,4 @@
-"""Which numbers have been, in any order and in bounded memory: frames in a recording, stills that came."""
+"""Remembers received numbers, in any order and in bounded memory: frames in a recording, stills that came."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class SequenceWindow:
 
 
 class StillSequenceWindow:
-    """Which stills have come: each is shown once, and counted as often as it crossed. Safe for threads."""
+    """The received stills: each is shown once, and counted as often as it crossed. Safe for threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -54,7 +54,7 @@ class LinkMeasurement:
     missing_stills: tuple[int, ...]
     """Below it, in their order."""
     delay_p50_ms: float | None
-    """Of the base messages since the last report."""
+    """The median over the base messages since the last report."""
 
 
 class ReceptionStatistics:
@@ -220,7 +220,7 @@ class SessionAccount:
         self._next_traffic_ns = 0
         self.last_traffic: Traffic | None = None
         self.budget_bps = info.budget_bps
-        """As it is now."""
+        """The present measurement."""
 
     def count(self, row: Channel, account: Account, item: Received, *, at_ns: int) -> None:
         """Take the bytes of a message on the line."""

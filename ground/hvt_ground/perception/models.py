@@ -23,7 +23,7 @@ __all__ = ["ModelSet", "Models", "stills_calibrated", "track_confidence"]
 _log = logging.getLogger(__name__)
 
 _USUAL_SIZE = (1280, 720)
-"""Of base streams; what an edge really sends is known only when its first picture comes."""
+"""The usual size of base streams; an edge's own is known with its first picture."""
 
 ModelSet = tuple[Detector, Classifier | None]
 

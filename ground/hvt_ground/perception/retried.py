@@ -34,7 +34,7 @@ class RetriedDetector(Retried[Detector]):
         return self.part.class_names
 
     def detect(self, image_bgr: Image) -> Detections:
-        """As the model does."""
+        """Like the model's."""
         found = self.run(lambda model: model.detect(image_bgr))
         if found is None:
             return Detections.none()
@@ -52,5 +52,5 @@ class RetriedClassifier(Retried[Classifier]):
         return self.part.class_names
 
     def classify(self, crops_bgr: Sequence[Image]) -> list[Posterior]:
-        """As the model does; empty while it fails."""
+        """Like the model's; empty while it fails."""
         return self.run(lambda model: model.classify(crops_bgr)) or []

@@ -19,7 +19,7 @@ from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
 __all__ = ["KEYS_FOLDER", "edge_file", "ground_file", "router_file"]
 
 KEYS_FOLDER = "/etc/hvt/tls"
-"""Where the files lie on the machines, unless said otherwise."""
+"""The default folder of the files on the machines."""
 
 _EVERYBODY = f"{ROOT}/**"
 _GROUPS = f"{GROUP_ROOT}/**"
@@ -41,7 +41,7 @@ _ROUTER_SETTINGS: dict[str, Any] = {
         },
     },
 }
-"""As deploy/zenoh/router.json5, open to the network."""
+"""Like deploy/zenoh/router.json5, open to the network."""
 
 
 def edge_file(name: str, roster: Roster, *, folder: str = KEYS_FOLDER) -> str:

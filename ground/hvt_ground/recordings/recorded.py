@@ -84,7 +84,7 @@ class Recorded:
     info: Info | None
     """The edge's facts of the session; None in a recording of an earlier HVT."""
     video: Sequence[VideoSample]
-    """In order of frames."""
+    """The video in order of frames."""
     stills: Sequence[RecordedStill]
     notices: Sequence[Notice]
     poses: Sequence[PoseUpdate]
@@ -217,7 +217,7 @@ class _File:
 
     @property
     def _begins(self) -> tuple[int, int]:
-        """That frame, and its capture time; zeros without video."""
+        """The first frame, and its capture time; zeros without video."""
         samples = self.rows.get((VIDEO, _SAMPLE))
         return samples[0][:2] if samples else (0, 0)
 
@@ -303,7 +303,7 @@ def _is_used(entity: str, component: str) -> bool:
 
 
 def _bytes(value: Any) -> bytes | None:
-    """Of a list with one list of bytes, eight times as large as Python's own; None where it is empty."""
+    """The bytes of a list with one list of bytes, eight times as large as Python's own; None if it is empty."""
     if not value.is_valid or not len(value.values):
         return None
     return bytes(memoryview(value.values[0].values.to_numpy()))

@@ -32,7 +32,7 @@ class RecordingRow:
     begin_ns: int | None
     """Capture time of the first picture, report or still, by the edge's clock; None before there is one."""
     end_ns: int | None
-    """Of the last."""
+    """Capture time of the last frame."""
     written_ns: int
     """When it was written to last: its age counts from there. `IndexWriter` says it, and moves it with the clock."""
     size_bytes: int

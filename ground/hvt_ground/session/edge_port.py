@@ -34,13 +34,13 @@ _log = logging.getLogger(__name__)
 
 _INBOX_MESSAGES = 1024
 _INBOX_SHARE = 0.75
-"""Of the inbox for one row: reports by the thousand do not keep pictures out."""
+"""Share of the inbox for one channel: reports by the thousand do not keep pictures out."""
 _MOST_PER_S = 2000
 """Messages of one row from one edge. A camera has 240 pictures a second at the very most."""
 _ANSWER_S = 1.0
 _MOST_ANSWERS, _MOST_ERRORS = 4, 16
 _UNANSWERED = 3
-"""So many questions on control in a row without an answer are no accident."""
+"""So many queries on control in a row without an answer are no accident."""
 
 InfoAnswer = tuple[Info, int, int]
 """A session's facts with the times of asking and hearing, ns."""
@@ -93,7 +93,7 @@ class EdgePort:
         return found[0] if found else None
 
     def request_info(self, session_id: int) -> None:
-        """As `query_info`, without waiting: `take_info` has the answer, if one comes."""
+        """Like `query_info`, without waiting: `take_info` has the answer, if one comes."""
         self._query_info(session_id, self._answers, on_end=lambda: None)
 
     def take_info(self) -> InfoAnswer | None:

@@ -42,7 +42,7 @@ _INFO_TRIES = 3
 _BACKLOG_PAUSE_NS = 3 * SECOND_NS
 """After so long without another chunk the recording says how much of the backlog came."""
 _CLOCK_EVERY_NS = 20 * SECOND_NS
-"""So often the edge is asked for its time."""
+"""Time between two queries of the edge's clock."""
 
 
 class EdgeSessions:

@@ -33,7 +33,7 @@ _SILENT_NS = 2_000_000_000
 
 
 class Receiver:
-    """Of one edge, over all its sessions; ``clock`` is Unix nanoseconds without steps."""
+    """Receives one edge, over all its sessions; ``clock`` is Unix nanoseconds without steps."""
 
     def __init__(self, edge: str, *, clock: Callable[[], int]) -> None:
         self._edge = edge
@@ -129,7 +129,7 @@ def _base_packet(arrival: Arrival, item: Received) -> BasePacket:
 
 
 def _packets(row: Channel | None, item: Received) -> list[Packet]:
-    """Of any channel but ``base``; none for one that the ground does not read."""
+    """The packets of any channel but ``base``; none for one that the ground does not read."""
     match row:
         case Channel.ROI:
             return [Packet(RoiHeader.parse(item.attachment, item.payload), item)]

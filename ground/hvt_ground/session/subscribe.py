@@ -59,7 +59,7 @@ class GroundLink:
         self._alive: set[str] = set()
         """Edges that show their token, also those that others serve; with a group."""
         self._subscribers: dict[str, list[zenoh.Subscriber[None]]] = {}
-        """By edge, with a group."""
+        """Subscriptions by edge, with a group."""
         self._leaving: set[str] = set()
         """Edges whose last session here is being closed; with a group."""
         self._clock = clock or SteadyClock()

@@ -29,7 +29,7 @@ __all__ = ["MessageLog", "read_log"]
 _MAGIC = b"HVTLOG\x00\x01"
 _HEAD = struct.Struct("<II")
 _MOST_BYTES = MAX_PAYLOAD_BYTES + 2**17
-"""Of a record: the largest payload, the largest message beside it, and the names."""
+"""Limit of a record: the largest payload, the largest message beside it, and the names."""
 _MOST_EDGES = 256
 """Whose answers are remembered; beyond, the oldest is forgotten."""
 _TYPES = [int, str, str, bytes, bytes]
@@ -45,7 +45,7 @@ class MessageLog:
         self.path = path
         self._most_bytes = most_bytes
         self._answers: OrderedDict[str, bytes] = OrderedDict()
-        """By key, the record of the last answer to ``info``."""
+        """The record of the last answer to ``info``, by key."""
         self._file = _created(path)
         try:
             self.before.unlink(missing_ok=True)  # of another flight
@@ -57,7 +57,7 @@ class MessageLog:
 
     @property
     def before(self) -> Path:
-        """Where the older half of the messages is."""
+        """The file of the older half of the messages."""
         return self.path.with_stem(f"{self.path.stem}-before")
 
     def log(self, item: Received) -> None:

@@ -63,7 +63,7 @@ class QueuedSink(Generic[T]):
         self._failures = failures
         self._pause = RetryPause()
         self.files: list[Path] = []
-        """In the order of opening."""
+        """The sinks in the order of opening."""
         self._open = self._failing = self._resumed = False
         self.missing = 0
         """Items that came while the sink was failing, or for which the queue had no room."""

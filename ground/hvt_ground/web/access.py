@@ -28,7 +28,7 @@ __all__ = ["HEADERS", "ROLE_HEADER", "Access", "Role", "cookie_name", "own_token
 Role = Literal["viewer", "operator"]
 
 ROLE_HEADER = "X-HVT-Role"
-"""In it a reverse proxy names the role; once, and only under the proxy's own host, it counts."""
+"""A reverse proxy names the role in it; once, and only under the proxy's own host, it counts."""
 HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; media-src blob:; "
@@ -93,7 +93,7 @@ class Access:
 
 
 def cookie_name(headers: Mapping[str, str]) -> str:
-    """By the port that the browser sees: cookies know no port, and another ground of this host has its own."""
+    """A name by the port that the browser sees: cookies know no port, and another ground of this host has its own."""
     port = _place(f"http://{headers.get('host', '')}")[1:]
     return f"hvt-{port[0]}" if port else "hvt"
 

@@ -23,9 +23,9 @@ from hvt_ground.web.viewers import EdgePage, Hub, text
 __all__ = ["SessionFeed", "state_loads", "state_message", "still_name"]
 
 _LATE_NS = 300_000_000
-"""Behind the link by so much, pictures are decoded and not coded again until it has caught up."""
+"""So far behind the link, pictures are decoded and not coded again until it has caught up."""
 _TOO_LATE_NS = 3_000_000_000
-"""By so much, those up to the next keyframe are passed over."""
+"""So far behind, pictures up to the next keyframe are skipped."""
 _SHOWN_BY_BROWSERS = ("image/jpeg", "image/png", "image/webp")
 _MILLION = 1_000_000
 
@@ -97,7 +97,7 @@ class SessionFeed:
             self._hub.post(partial(give, frame_index=sample.frame_index, captured_ms=captured_ms))
 
     def _captured_ms(self, capture_ns: int) -> float:
-        """By the ground's clock. In lockstep capture is media time: there the picture is from now."""
+        """Capture time by the ground's clock. In lockstep capture is media time: there the picture is from now."""
         if self._info.pace == "lockstep":
             return self._clock() / _MILLION
         return (capture_ns - self._offset_ns) / _MILLION
@@ -195,7 +195,7 @@ def state_message(state: GroundState, *, recorded: bool | None = None) -> str:
 
 
 def state_loads(state: GroundState) -> dict[str, tuple[float, float, float, float]]:
-    """By edge, where it is known: Unix milliseconds, and bits a second: all, the base stream, the budget."""
+    """By edge, if known: Unix milliseconds, and bits a second: all, the base stream, the budget."""
     return {
         one.edge: (
             state.at_ns // _MILLION,

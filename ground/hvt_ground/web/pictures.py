@@ -32,7 +32,7 @@ THUMBNAIL: Rung = "thumbnail"
 
 _MOST_GOP_BYTES = 16 * 2**20
 _MOST_GOP_UNITS = 1800
-"""Of the pictures since the last keyframe, which who comes in between needs."""
+"""Limit of the pictures since the last keyframe, which a new viewer needs."""
 _JPEG_EVERY_NS = 500_000_000
 _THUMBNAIL_EVERY_NS = 1_000_000_000
 _THUMBNAIL_WIDTH_PX = 320

@@ -133,7 +133,7 @@ class Site:
                 await socket.close(1008)
 
     async def _receive(self, socket: WebSocket, viewer: Viewer) -> None:
-        """Until it leaves, or says what no page of ours would."""
+        """Read until it leaves, or sends a message that no page of ours would."""
         times: deque[float] = deque(maxlen=_MOST_MESSAGES_A_S)
         while True:
             try:
@@ -165,7 +165,7 @@ class Site:
                 raise ValueError("no message")
 
     def _now_ms(self) -> float:
-        """By the clock of all other times on the page."""
+        """Milliseconds of the clock of all other times on the page."""
         return round(self._clock() / 1e6, 1)
 
 

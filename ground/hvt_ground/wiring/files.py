@@ -1,4 +1,4 @@
-"""Where files go, and whether they can: each session gets names of its own."""
+"""Names the files of each session, and checks whether they can be written."""
 
 from __future__ import annotations
 

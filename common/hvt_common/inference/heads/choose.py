@@ -60,7 +60,7 @@ def _named(trial: Trial, name: str, by: str) -> Head:
 
 
 def _says_rt_detr(trial: Trial) -> bool:
-    """As Ultralytics writes it into ``head``, earlier into ``description``."""
+    """Whether ``head``, or in older files ``description``, says RT-DETR, as Ultralytics writes it."""
     said = trial.metadata.get("head", "") + trial.metadata.get("description", "")
     return "rtdetr" in said.lower().replace("-", "")
 

@@ -43,7 +43,7 @@ class Head:
     """How one family of networks wants its input and writes its output."""
 
     name: str
-    """As of ``--head``."""
+    """The name for ``--head``."""
     classes: int | None
     """Number of classes; None where the outputs do not tell."""
     outputs: tuple[int, ...]

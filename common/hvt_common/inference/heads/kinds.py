@@ -34,7 +34,7 @@ __all__ = ["KINDS", "Kind", "Match"]
 _STRIDES: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32), (16, 32))
 _YOLOX_STRIDES: tuple[tuple[int, ...], ...] = (*_STRIDES[:2], (8, 16, 32, 12, 24, 48))
 _ANCHORS_A_CELL = 3
-"""Of YOLOv5 and YOLOv7."""
+"""Anchors a cell of YOLOv5 and YOLOv7."""
 _LEAST_COLUMNS, _BOX = 5, 4
 
 _BGR_255 = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=False)
@@ -506,4 +506,4 @@ KINDS: Mapping[str, Kind] = {
         suppresses=False,
     ),
 }
-"""By the name of ``--head``."""
+"""The heads by the name of ``--head``."""

@@ -27,9 +27,9 @@ class Trial:
     ports: Sequence[Port]
     """Its outputs."""
     runs: Sequence[Sequence[npt.NDArray[Any]]]
-    """Of each picture, the outputs in the order of ``ports``."""
+    """For each picture, the outputs in the order of ``ports``."""
     tops: Sequence[int]
-    """Of each picture, its greatest value: 1 or 255; 0 where that says nothing."""
+    """For each picture, its greatest value: 1 or 255; 0 if that says nothing."""
     size: tuple[int, int]
     """(width, height) of the network's input in the trial."""
     metadata: Mapping[str, str]
@@ -42,7 +42,7 @@ class Trial:
         return replace(self, runs=[self.runs[i] for i in these], tops=[self.tops[i] for i in these])
 
     def shape(self, index: int) -> tuple[int, ...]:
-        """Of an output of the first picture."""
+        """The shape of an output for the first picture."""
         return tuple(self.runs[0][index].shape)
 
     def table(self, index: int) -> Array:

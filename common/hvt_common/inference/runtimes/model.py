@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 _MOST_PORTS = 64
 _MOST_AXES = 8
 _MOST_ELEMENTS = 1 << 26
-"""Of one input or output with its free sizes taken as 1: 256 MiB of float32, a picture of 4096x4096 and more."""
+"""Limit of one input or output with its free sizes taken as 1: 256 MiB of float32, a picture of 4096x4096."""
 
 _MOST_CHARS = 300
 _TRIAL_SIDE = 256

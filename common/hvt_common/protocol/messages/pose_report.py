@@ -43,7 +43,7 @@ class PoseReport(Message):
 
     @property
     def number(self) -> int:
-        """Of the report, modulo 16; 0 where it is empty, which `PoseDecoder.decode` refuses."""
+        """The number of the report, modulo 16; 0 if it is empty, which `PoseDecoder.decode` refuses."""
         return self.coded[0] >> 3 & 15 if self.coded else 0
 
 
@@ -98,9 +98,9 @@ class _Sample:
     place: tuple[int, ...]
     """Latitude and longitude, 1e-7 degrees."""
     parts: tuple[tuple[int, ...] | None, ...]
-    """Of `_PARTS`: 0.1 m and 0.1 degrees."""
+    """The values of `_PARTS`: 0.1 m and 0.1 degrees."""
     errors: tuple[int, ...]
-    """Of place, height and angles: 0.1 m or degrees times the square root of 2 to this power."""
+    """The errors of place, height and angles: 0.1 m or degrees times the square root of 2 to this power."""
 
     @classmethod
     def of(cls, pose: Pose) -> _Sample:

@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 MOST_BOXES: Final = 1024
-"""In one step."""
+"""Limit of one step."""
 MOST_CLASSES: Final = 2048
 PER_PX: Final = 16
 """Positions and sizes count so many to a base pixel."""
@@ -70,7 +70,7 @@ class CodedTrack:
     """Steps since it was last listed; 0 for listed now."""
 
     def moved(self, frames: int) -> tuple[int, int]:
-        """Where its centre is so many frames later, at constant velocity."""
+        """The box so many frames later, at constant velocity."""
         half = 1 << _VELOCITY_BITS - 1
         return (
             self.x + (self.velocity_x * frames + half >> _VELOCITY_BITS),
@@ -227,7 +227,7 @@ class _Walk:
     # Tracks that the reference does not have
 
     def _first_velocity(self, new: Sequence[CodedTrack] | None) -> tuple[int, int]:
-        """Of a step without a reference the median velocity is sent, in 1/64 of a pixel a frame."""
+        """The median velocity, which a step without a reference sends in 1/64 of a pixel a frame."""
         x, y = _common_velocity(new or ())
         step = 1 << _VELOCITY_BITS - 2
         return (

@@ -44,7 +44,7 @@ class TrackStep(Message):
 
     session_id: int = wire_field(Int(0, U64))
     sequence: int = wire_field(Int(0, U32))
-    """Of track steps: 0, 1, 2 …; a hole means that messages were lost."""
+    """Counts track steps: 0, 1, 2 …; a hole means that messages were lost."""
     frame_index: int = wire_field(Int(0, U32))
     """The frame whose tracks these are."""
     capture_ns: int = wire_field(Int(0, I63))

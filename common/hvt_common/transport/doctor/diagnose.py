@@ -87,7 +87,7 @@ class LinkWatch:
         """Places that are called twice."""
         self._had_two: set[str] = set()
         self._halved_s: float | None = None
-        """Since when one link of two has been missing; infinite once that is said."""
+        """The time since which one link of two has been missing; infinite once that is reported."""
         self._first_seen_s: dict[str, float] = {}
         self._named: set[str] = set()
         self._stop = threading.Event()

@@ -217,7 +217,7 @@ def _alert(error: ssl.SSLError, files: TlsFiles) -> str:
 
 
 def _context(files: TlsFiles) -> ssl.SSLContext:
-    """As Zenoh would connect; UserError for files that have become unusable since the start."""
+    """A TLS context like Zenoh's; UserError for files that have become unusable since the start."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = files.verify_name
     try:

@@ -86,7 +86,7 @@ class Strangers:
 
 
 def listening_ports(endpoints: Iterable[str]) -> set[int]:
-    """Of the TCP and TLS endpoints, such as ``tls/0.0.0.0:7447``."""
+    """The ports of the TCP and TLS endpoints, such as ``tls/0.0.0.0:7447``."""
     found = (re.match(r"(?:tcp|tls)/.*:(\d+)(?:[?#]|$)", one) for one in endpoints)
     return {int(one[1]) for one in found if one is not None}
 

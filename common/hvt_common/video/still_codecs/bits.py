@@ -57,7 +57,7 @@ class BitReader:
         return self.u(zeros + 1) - 1
 
     def ues(self, number: int) -> list[int]:
-        """So many of them."""
+        """Read so many of them."""
         return [self.ue() for _ in range(number)]
 
     def se(self) -> int:

@@ -46,7 +46,7 @@ _QUIET_S, _POLL_S = 10.0, 0.1
 """A file that has not grown for so long has ended."""
 _MOST_BOXES = 64
 _TS_BYTES = (188, 192, 204)
-"""Of a packet: plain, with a time before it as in Blu-ray's, with a checksum behind it as in DVB's."""
+"""Size of a packet: plain, with a time before it as in Blu-ray's, with a checksum behind it as in DVB's."""
 
 
 def is_local(spec: str) -> bool:
@@ -57,7 +57,7 @@ def is_local(spec: str) -> bool:
 
 
 def name_of(spec: str) -> str:
-    """As it may be printed; `is_local` ones are known to be there."""
+    """The name as it may be printed; `is_local` ones are known to be there."""
     return spec if is_local(spec) else redacted(spec)
 
 
@@ -204,7 +204,7 @@ class _Reading:
         self._end_s: Fraction | None = None
 
     def frames(self) -> Iterator[av.VideoFrame]:
-        """As they are decoded."""
+        """The frames as they are decoded."""
         for packet in _packets(self._container, self._stream):
             if isinstance(packet, Exception):
                 self._ended = f"it breaks off ({cause_of(packet)})"
@@ -268,7 +268,7 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
 
 
 def _decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
-    """Of a packet; of an error what the decoder has held back until then."""
+    """Decode a packet; after an error, the pictures that the decoder has held back."""
     if isinstance(packet, Exception):
         return list(stream.codec_context.decode(None))
     return list(packet.decode())
@@ -310,7 +310,7 @@ def _size_of(container: Any) -> int | None:
 
 
 def cause_of(error: Exception) -> str:
-    """Of FFmpeg's or the system's error, without the address that it may hold."""
+    """The cause in FFmpeg's or the system's error, without the address that it may hold."""
     if isinstance(error, av.error.ExitError):
         return "no answer in time"
     return redacted(str(getattr(error, "strerror", None) or error))

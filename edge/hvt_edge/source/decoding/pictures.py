@@ -43,7 +43,7 @@ _TURNS = {
 
 
 class Pictures:
-    """Of one stream, for as long as it is read; ``notes`` has what was decided, and why."""
+    """The pictures of one stream, for as long as it is read; ``notes`` has the decisions and their reasons."""
 
     def __init__(self, notes: Notes) -> None:
         self._say = notes
@@ -167,7 +167,7 @@ def turn_of(frame: av.VideoFrame) -> str:
 
 
 def _turn_of(frame: av.VideoFrame) -> _Turn:
-    """By the display matrix (ISO/IEC 14496-12, 8.3.2)."""
+    """The turn by the display matrix (ISO/IEC 14496-12, 8.3.2)."""
     said: Any = frame.side_data.get("DISPLAYMATRIX")
     if said is None:
         return False, False, False

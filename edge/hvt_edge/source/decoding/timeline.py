@@ -15,7 +15,7 @@ LONG_STEP_S = Fraction(10)
 """A step of more than this, and than three usual ones, is a jump (``max_frame_duration`` of ffplay)."""
 _LONG_STEPS = 3
 _FEW = 8
-"""So many stamps that do not rise say that there are none."""
+"""After so many stamps that do not rise, the stream has none."""
 _SAME = Fraction(2, 100)
 
 
@@ -74,7 +74,7 @@ class Timeline:
         self._at_s: Fraction | None = None
         self._offset_s = Fraction(0)
         self.jumps: list[tuple[Fraction, Fraction]] = []
-        """Where in the presentation one was mended, and how far the stamp went; seconds."""
+        """Place of each repair in the presentation, and the size of the step; seconds."""
 
     @property
     def says(self) -> str:

@@ -26,7 +26,7 @@ __all__ = ["CameraRates", "FullestWindow", "LeastLink", "needed_bps"]
 _MARGIN = 1.1
 """The flight has a fuller window than was seen, and ``status`` goes beside."""
 _MEMORY_NS = 30 * SECOND_NS
-"""So long a fuller window is remembered, to twice that long: one that stalled once may have bunched its units."""
+"""Time for which a fuller window is remembered, at most twice: a camera that stalled may have bunched its units."""
 
 
 class FullestWindow:
@@ -37,7 +37,7 @@ class FullestWindow:
         self._inside: deque[tuple[int, int]] = deque()
         self._held = 0
         self.most_bytes = 0
-        """Of all windows so far."""
+        """Bytes of the fullest window so far."""
 
     def add(self, size_bytes: int, *, at_ns: int) -> int:
         """Take in one unit; return what the window that ends with it holds."""
@@ -73,7 +73,7 @@ class LeastLink:
         self._drained_ns = 0
 
     def sent(self, size_bytes: int, *, now_ns: int) -> None:
-        """So many line bytes go out."""
+        """Count line bytes that go out."""
         self._drain(now_ns)
         self._queued_bytes += size_bytes
 

@@ -27,7 +27,7 @@ class CameraPath:
         self._ahead_frames = ahead_frames
         self._steps: deque[tuple[int, int, _Floats]] = deque(maxlen=frames)
         self._cached: dict[tuple[int, int], Affine] = {}
-        """Since the last picture: a hundred boxes ask for the same two frames."""
+        """Results since the last picture: a hundred boxes need the same two frames."""
 
     def add(self, affine: Affine, *, start: int, end: int) -> None:
         """Take the (2, 3) map from the picture of frame ``start`` to that of ``end``, base pixels, end > start."""

@@ -19,7 +19,7 @@ _NEW_VELOCITY = 0.6
 """Weight of the newest velocity against those before: two boxes of a small object give a rough one."""
 _NEW_CONFIDENCE = 0.2
 MISSED_STEPS = 2
-"""So many steps in a row that do not list a track end the edge's knowledge of it."""
+"""Steps in a row without a track that end the edge's knowledge of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class Entity:
     is_doubted: bool = False
     """Whether that speaks against it: only we see it, and are not sure enough."""
     still_frame: int = -1
-    """Of the newest still that showed it."""
+    """Frame of the newest still that showed it."""
     apart: int = 0
     """Steps in a row at which its two witnesses lay apart."""
     own_then: tuple[_Floats, int] | None = None

@@ -58,7 +58,7 @@ PAIR_IOU = 0.3
 """Lower than the usual half: boxes of 15 pixels from two detectors, some frames apart, seldom reach that."""
 APART_IOU = 0.1
 CLASS_BONUS = 0.05
-"""Of two partners that fit equally well, the one of the same class."""
+"""Bonus for the same class, to choose between two partners that fit equally well."""
 PATIENCE_S = 2.0
 REACH_S = 1.0
 """For how long the motion of an object is extrapolated."""

@@ -56,7 +56,7 @@ class _Line:
     entity: Entity
     origin: Origin
     row: int | None
-    """Of our own list."""
+    """Row of our own list."""
 
     @property
     def far(self) -> Witness | None:

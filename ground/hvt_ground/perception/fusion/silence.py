@@ -18,7 +18,7 @@ NEAR_IOU = 0.1
 LET_GO_STEPS = 6
 """An object once listed by the edge must be missed in so many steps in a row: a detection may fail."""
 SURER = 0.1
-"""By so much surer than what was never doubted must be what was, or it would come and go."""
+"""An object that was suppressed must be surer by this than one that never was, or it would come and go."""
 
 
 class EdgeSilence:

@@ -36,7 +36,7 @@ _INSIDE_SHARE = 0.9
 """How much of a new object's box must lie inside a still: elsewhere the picture is the old one."""
 
 _PADDING = 0.15
-"""Of an object's width and height on each side, as the edge pads a crop."""
+"""Share of an object's width and height on each side, as the edge pads a crop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class ObjectReading:
     posterior: Posterior | None = None
     """None is no opinion."""
     box_base_px: Box | None = None
-    """Where the object was found at the still's frame; None where the reader finds no boxes."""
+    """The object's box at the still's frame; None if the reader finds no boxes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class StillReader(Protocol):
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Of the posteriors, and of ``found``."""
+        """The classes of the posteriors, and of ``found``."""
         ...
 
     def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:

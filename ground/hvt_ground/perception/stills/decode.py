@@ -15,7 +15,7 @@ from hvt_common.video.still_codecs import BaseMissingError, StillError, still_co
 __all__ = ["Box", "DecodedStill", "ReceivedStill", "decode_still", "needs_base", "readable_codecs"]
 
 _MOST_BASE_PX = 32
-"""Of a side, for one pixel of a still: a stranger's `Info` may say any scale, and each of them costs memory."""
+"""Limit of a side for one pixel of a still: a stranger's `Info` may say any scale, and each of them costs memory."""
 
 Box = tuple[float, float, float, float]
 """x1 y1 x2 y2."""
@@ -38,7 +38,7 @@ class DecodedStill:
     box_base_px: Box
     frame_index: int
     also_boxes_base_px: tuple[Box, ...] = ()
-    """Of the further objects that it shows, in the order of the header's ``also``."""
+    """The boxes of its further objects, in the order of the header's ``also``."""
 
     @property
     def boxes_base_px(self) -> tuple[Box, ...]:

@@ -36,7 +36,7 @@ __all__ = ["BASE_WEIGHT", "MARGIN", "PROBABILITY_FLOOR", "SURE", "ClassEstimate"
 PROBABILITY_FLOOR = 1e-4
 BASE_WEIGHT = 1.0
 MARGIN = 0.2
-"""By so much another class must be more probable than that on the base: a toss-up leaves the class as it is."""
+"""Lead that another class needs over that of the base: a toss-up leaves the class as it is."""
 SURE = 0.9
 """Above it, a class that stills agree on is certain."""
 LEAST_SURE_PX = 12
@@ -52,7 +52,7 @@ class ClassEstimate:
     """A class with its probability."""
 
     class_id: int
-    """Of `Vocabulary.names`."""
+    """Index of `Vocabulary.names`."""
     confidence: float
     sure: bool = False
     """The newest still alone and all of them together give the class more than `SURE`: many stills of one object err

@@ -50,7 +50,7 @@ _REMEMBERED_STILLS = 4096
 
 
 def _unknown(_edge_track_id: int) -> None:
-    """Where the edge tells nothing of its tracks."""
+    """No track: the edge reports none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,7 +45,7 @@ class StillContext:
     """The edge's."""
     box_base_px: Box
     found_base_px: Box | None
-    """Where the reader found the object."""
+    """The reader's box of the object."""
     base_crop_bgr: Image | None
 
 
@@ -70,7 +70,7 @@ class StillSeen:
     news: float = 1.0
     """How much the still shows that the base did not, 0…1; see `news`."""
     part: int = 0
-    """Which of the objects that the still shows: each is offered by itself, under the still's sequence number."""
+    """Number of the object in the still: each is matched by itself, under the still's sequence number."""
     stored: bool = False
     """It was stored while the link was down. Where nothing is known of its frame it may refine the track that its
     edge track is known as now: the object is the same, and so is its class."""
@@ -94,7 +94,7 @@ class ResolvedStill:
     class_after: str
     """The class that is shown from now on; without a track what the still alone says."""
     confidence: float
-    """Of ``class_after``, 0…1."""
+    """Confidence of ``class_after``, 0…1."""
     doubted: bool = False
     """``class_after`` is nothing of mine."""
     sure: bool = False

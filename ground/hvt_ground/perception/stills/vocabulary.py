@@ -57,7 +57,7 @@ class Vocabulary:
         words = [_group_word(name) if self.coarse else name for name in reader]
         nothing = next((name for name in reader if is_nothing(name)), None) if not self.coarse else None
         self.names = _names(detectors, words, nothing)
-        """Of the classes of tracks; those of ``detectors`` come first, under their own ids."""
+        """The classes of tracks; those of ``detectors`` come first, under their own ids."""
         self.nothing: int | None = None
         """The class that is nothing of mine; None where the reader cannot say it."""
         if nothing is not None:

@@ -28,7 +28,7 @@ class Word:
     """The label of a track."""
 
     row: int
-    """Of the boxes."""
+    """Row of the boxes."""
     text: str
 
 
@@ -41,7 +41,7 @@ class Label:
     at_px: tuple[float, float]
     """The point that the text is centred below, base pixels."""
     side: int
-    """Of its box; to be tried first next time."""
+    """Side of its box; tried first next time."""
 
 
 def points(count: float, width_px: int) -> float:

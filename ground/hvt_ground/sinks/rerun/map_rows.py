@@ -28,7 +28,7 @@ _TURNED: Final = tuple(one.name for one in fields(Orientation))
 
 
 class MapRows:
-    """Of one recording."""
+    """The map rows of one recording."""
 
     def __init__(self) -> None:
         self._next_ns = 0

@@ -43,7 +43,7 @@ HALF_SIZE_STEP_PX = 1.0
 CONFIDENCE_STEP_PCT = 5
 
 BRIGHTNESS = (0.45, 0.75, 1.0)
-"""By level: a probability below one half; above; a still said it, and its calibrated probability is above .9."""
+"""By level: probability below one half; above; refined by a still with a calibrated probability above .9."""
 _FAINT, _LIKELY, _SURE = range(3)
 _FAINT_BELOW_PCT, _LIKELY_FROM_PCT = 45, 55
 _MOST_CHOSEN = 8
@@ -71,7 +71,7 @@ class Identity:
     classes_before: tuple[str, ...] = ()
     classes_after: tuple[str, ...] = ()
     levels: tuple[int, ...] = ()
-    """Of `BRIGHTNESS`."""
+    """Levels of `BRIGHTNESS`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class _Screen:
     levels: npt.NDArray[np.int64]
     """(N,) of `BRIGHTNESS`."""
     sides: Mapping[int, int]
-    """Where labels are, by track."""
+    """Sides of the labels, by track."""
 
 
 class OverlayEncoder:
@@ -184,7 +184,7 @@ class _Hole:
     after: int | None
     """Frame of the first overlay after it; None where there has been none."""
     capture_ns: int = 0
-    """Of that."""
+    """Capture time of that frame."""
     screen: tuple[LayerUpdate, ...] = ()
     """All that is on the screen there."""
     written: bool = False
@@ -319,7 +319,7 @@ def _doubted(overlay: Overlay) -> npt.NDArray[np.bool_]:
 
 
 def _labels(overlay: Overlay, screen: _Screen, size: tuple[int, int], chosen: Container[int]) -> list[Label]:
-    """Of the tracks that a still renamed or doubts, or that were chosen, as far as there is room."""
+    """Labels of the tracks that a still renamed or doubts, or that were chosen, as far as there is room."""
     doubted, reported = _doubted(overlay), _reported(overlay)
     words = []
     for row, track_id in enumerate(screen.ids.tolist()):

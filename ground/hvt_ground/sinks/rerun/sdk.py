@@ -44,7 +44,7 @@ _list_of_recordings = threading.RLock()
 
 @dataclass(frozen=True, slots=True)
 class RecordingId:
-    """Which edge and session a recording is of: files with the same are shown as one."""
+    """The edge and session of a recording: files with the same are shown as one."""
 
     edge: str
     session: str
@@ -107,7 +107,7 @@ def send_blueprint(recording: rr.RecordingStream, one: RecordingId, blueprint: r
 
 @contextmanager
 def releasing_recordings() -> Iterator[None]:
-    """In it, disconnect recordings and ``del`` the last that refers to them: they are freed at its end."""
+    """Disconnect recordings in it and ``del`` the last reference to them: they are freed at its end."""
     with _list_of_recordings:
         yield
         # It flushes all recordings first, and raises where the viewer of any is gone: that is not this one's fault.

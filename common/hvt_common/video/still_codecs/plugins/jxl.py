@@ -20,7 +20,7 @@ _EFFORT = 3
 _SIDE_BITS = (9, 13, 18, 30)
 _RATIOS = ((1, 1), (6, 5), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))
 _MAX_UPSAMPLING = 1
-"""As a power of two; below quality 10 libjxl codes at half the size."""
+"""A power of two; below quality 10 libjxl codes at half the size."""
 
 
 class JxlCodec(IntraCodec):

@@ -25,7 +25,7 @@ CANVAS = (COLUMNS * (_PAIR[0] + 2 * _MARGIN), ROWS * (_PAIR[1] + _MARGIN) + _MAR
 """(width, height) of everything."""
 
 _MOST_TIMES = 512
-"""That are remembered of a slot: twenty minutes at three stills a second."""
+"""Remembered times of a slot: twenty minutes at three stills a second."""
 _NEVER_NS = 2**63
 
 Rect = tuple[float, float, float, float]

@@ -41,13 +41,13 @@ class _Patch:
     track_id: int
     since_ns: int
     centre_px: npt.NDArray[np.float64]
-    """Of the object's box at the still's frame."""
+    """Centre of the object's box at the still's frame."""
     side_px: float
     """The shorter side of that box."""
     origin: Placement
-    """Where the picture lies when the object is at ``centre_px``."""
+    """Origin of the picture when the object is at ``centre_px``."""
     shift_px: npt.NDArray[np.float64]
-    """As it is drawn."""
+    """The drawn shift."""
 
     def place(self) -> Placement:
         x, y = self.shift_px.tolist()

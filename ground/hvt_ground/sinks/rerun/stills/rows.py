@@ -42,7 +42,7 @@ class StillRows:
         self._gallery = Gallery()
         self._patches = Patches()
         self._pair_bytes = 0
-        """Of pairs that cost more than came over the link."""
+        """Bytes of pairs beyond those that came over the link."""
         self._pictured: OrderedDict[int, None] = OrderedDict()
 
     def refinement(self, refinement: Refinement) -> list[TableRow]:
