@@ -37,7 +37,7 @@ set_log_tick_enabled set_xticks set_yticks tick_params timeout_keep_alive xticks
 _LIBRARIES_SAY = frozenset(_OF_LIBRARIES.split())
 _OPTIONS = frozenset({"follow", "keep", "keep_video"})
 """As `tail` and FFmpeg call it, and restic what retention leaves: a setting's name is its flag's."""
-_FORMER_OPTION = re.compile(r'^\s+"[a-z-]+": (_REFRESH_GONE|"give --)')
+_FORMER_OPTION = re.compile(r'^\s+"[a-z-]+": (_REFRESH_GONE|"(is no longer accepted: )?give --)')
 """A line of the table that answers an option of an earlier version with what takes its place."""
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z0-9]+")
 

@@ -131,14 +131,14 @@ class _Events(queue.Queue[Received]):
 
     def _put(self, item: Received) -> None:
         super()._put(item)
-        self._weigh(item, by=1)
+        self._count_bytes(item, by=1)
 
     def _get(self) -> Received:
         item = super()._get()
-        self._weigh(item, by=-1)
+        self._count_bytes(item, by=-1)
         return item
 
-    def _weigh(self, item: Received, *, by: int) -> None:
+    def _count_bytes(self, item: Received, *, by: int) -> None:
         self._bytes += by * item.event.image_bgr.nbytes if isinstance(item.event, Picture) else 0
         self.maxsize = _MOST_QUEUED if self._bytes < _MOST_QUEUED_BYTES else max(1, len(self.queue))
 
