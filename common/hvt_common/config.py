@@ -257,7 +257,7 @@ def _gone(config_class: type) -> Mapping[str, str]:
 
 
 def _refuse_gone(config_class: type, words: Sequence[str]) -> None:
-    """Raise `UserError` for a flag of an earlier version, with what takes its place."""
+    """Raise `UserError` for a flag of an earlier version, with its successor."""
     for word in words:
         name = word.partition("=")[0].removeprefix("--").removeprefix("no-")
         if word.startswith("--") and name in _gone(config_class):

@@ -64,7 +64,7 @@ def may_come(error: OSError) -> bool:
 
 
 def listening_trouble(error: OSError) -> str:
-    """Why an address and its port cannot be listened on, and what to do about it: the end of a sentence."""
+    """Why an address and its port cannot be listened on, and the remedy: the end of a sentence."""
     if error.errno == errno.EADDRNOTAVAIL:
         return "this machine has no such address"
     if isinstance(error, socket.gaierror):
@@ -83,7 +83,7 @@ class FlightError(Exception):
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one sentence, without the usage above it."""
+    """Explains wrong arguments in one sentence, without the usage above it."""
 
     def error(self, message: str) -> NoReturn:
         """Raise `UserError`."""
@@ -141,7 +141,7 @@ def _traceback_without(
 
 
 def _reader_left() -> bool:
-    """Standard output has no reader; what is still to be written then goes nowhere, also at exit."""
+    """Standard output has no reader: discard all further output, also at exit."""
     output = select.poll()
     output.register(sys.stdout.fileno(), 0)
     if not output.poll(0):
@@ -152,7 +152,7 @@ def _reader_left() -> bool:
 
 @contextmanager
 def needs_extra(install: str) -> Iterator[None]:
-    """Within it a missing package is a `UserError` that names what to ``pip install``, such as ``'hvt[study]'``."""
+    """Within it a missing package is a `UserError` that names it for ``pip install``, such as ``'hvt[study]'``."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -81,7 +81,7 @@ def _path(rest: str, *, hidden: bool) -> str:
 
 
 class Redaction:
-    """Hides in any text what the ``addresses`` of a process hold, however a library has quoted it."""
+    """Hides the secrets of a process's ``addresses`` in any text, however a library has quoted them."""
 
     def __init__(self, addresses: Iterable[str] = ()) -> None:
         words = list(addresses)

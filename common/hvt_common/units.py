@@ -137,7 +137,7 @@ def exact_rate(fps: float) -> Fraction:
 
 
 def shown_text(text: str) -> str:
-    """Text of any origin for a terminal: what this Python does not know as printable is ``?``; lines stay."""
+    """Text of any origin for a terminal: characters that are not printable for this Python are ``?``; lines stay."""
     if text.isprintable():
         return text
     return "".join(one if one.isprintable() or one == "\n" else "?" for one in text)

@@ -1,4 +1,4 @@
-"""Every setting of ``hvt-edge``, its default and what is accepted."""
+"""Every setting of ``hvt-edge``, its default and the accepted values."""
 
 from __future__ import annotations
 
@@ -69,9 +69,9 @@ LEAST_FPS = 2.0
 _AUTO_FIRST_SHARE = 0.95
 """With ``--profile auto`` stills begin with the least."""
 POSE_BPS = 1_200
-"""What ``--pose`` takes of the budget: a message a second."""
+"""The share of ``--pose`` in the budget: a message a second."""
 TRACKS_BPS = 8_000
-"""What ``--send-tracks`` takes of the budget: about that for 45 boxes three times a second."""
+"""The share of ``--send-tracks`` in the budget: about that for 45 boxes three times a second."""
 
 
 _REFRESH_GONE = (
@@ -86,7 +86,7 @@ _SOURCE_RARE, _LINK_RARE, _SENT_RARE, _MODELS_RARE, _FILES_RARE = (
 
 @dataclass(frozen=True, slots=True)
 class EdgeConfig:
-    """What ``hvt-edge`` runs with. See ``--help-all`` for each."""
+    """The settings of ``hvt-edge``. See ``--help-all`` for each."""
 
     GONE: ClassVar[Mapping[str, str]] = MappingProxyType(
         {
@@ -328,7 +328,7 @@ class EdgeConfig:
 
     @property
     def floor_bps(self) -> int:
-        """What ``--adapt`` never goes below, in bits a second."""
+        """The floor of ``--adapt``, in bits a second."""
         return min(self.budget_bps, self.min_budget_bps)
 
     @property
@@ -381,7 +381,7 @@ class EdgeConfig:
 
     @property
     def metadata_bps(self) -> int:
-        """What is kept for messages beside base and stills, in bits a second."""
+        """The rate reserved for messages beside base and stills, in bits a second."""
         return (TRACKS_BPS if self.send_tracks else 0) + (POSE_BPS if self.pose else 0)
 
     @property
@@ -470,7 +470,7 @@ def check(config: EdgeConfig) -> EdgeConfig:
 
 
 def note_on_share(config: EdgeConfig, *, given: Mapping[str, Any]) -> str:
-    """What is to be said where the share that the user has ``given`` is not that of the checked ``config``."""
+    """The sentence for a share that the user has ``given`` and the checked ``config`` does not have."""
     share = given.get("video_share", config.video_share)
     if share == config.video_share:
         return ""
@@ -511,7 +511,7 @@ def least_budget_bps(config: EdgeConfig, size: tuple[int, int], *, share: float)
 
 
 def stream_text(config: EdgeConfig, size: tuple[int, int]) -> str:
-    """Such as ``1280x720 at 15 fps``: what the least budget is for."""
+    """Such as ``1280x720 at 15 fps``: the stream that the least budget is for."""
     fps = LEAST_FPS if config.auto_fps else config.nominal_fps
     what = f"{size[0]}x{size[1]} at {fps:g} fps"
     return what if config.window == 1 else f"{what} with --window {config.window:g}s"
@@ -530,7 +530,7 @@ def _with_rates(config: EdgeConfig) -> EdgeConfig:
 
 
 def _check_passthrough(config: EdgeConfig) -> None:
-    """What the camera decides cannot be set."""
+    """Refuse settings that the camera decides."""
     if config.size == AUTO:
         raise UserError(
             "--size auto is not accepted with --encoder passthrough, which sends the camera's own size: leave it out"

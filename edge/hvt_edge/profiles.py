@@ -1,4 +1,4 @@
-"""Settings in one word: what ``--profile`` and ``--regime`` stand for. A flag or a file that says otherwise wins."""
+"""Settings in one word: the values of ``--profile`` and ``--regime``. A flag or a file that says otherwise wins."""
 
 from __future__ import annotations
 

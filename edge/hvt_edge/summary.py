@@ -1,4 +1,4 @@
-"""What an edge says of a run: the JSON for programs, the table for people."""
+"""An edge's report of a run: the JSON for programs, the table for people."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def title(content: dict[str, Any]) -> str:
 
 
 def table(content: dict[str, Any]) -> list[tuple[str, str]]:
-    """The same as rows of name and value; of what nobody received only what it would have been."""
+    """The same as rows of name and value; a flight that nobody received has fewer rows."""
     stills, worst = content["stills"], content["worst_window_bps"]
     total = content["total_bps"]
     share = f"{total / content['budget_bps']:.0%} of {bitrate_text(content['budget_bps'])}"
@@ -130,7 +130,7 @@ def _failure(one: dict[str, Any]) -> str:
 
 
 def _too_slow(content: dict[str, Any]) -> list[tuple[str, str]]:
-    """What the machine had no time for, and what it would have needed."""
+    """The frames that the machine had no time for, and the cores that they would have needed."""
     rows = []
     if skipped := content["frames_unanalyzed"]:
         rows.append(("", f"{skipped} of {content['frames_captured']} frames not analyzed"))
@@ -143,7 +143,7 @@ def _too_slow(content: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _store_rows(store: dict[str, Any] | None) -> list[tuple[str, str]]:
-    """What the store did, where it did anything."""
+    """The store's counts, if there are any."""
     if store is None or not any(store.values()):
         return []
     sent = f"{store['sent_stills']} stills and {store['sent_video_s']:.0f} s of video sent afterwards"

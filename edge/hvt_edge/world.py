@@ -47,7 +47,7 @@ class World:
         warm_up_for(config, detector, source.view)
 
     def open_source(self, config: EdgeConfig) -> Source:
-        """Open what ``--source`` names. Raises `UserError` where nothing usable is there."""
+        """Open ``--source``. Raises `UserError` if nothing usable is there."""
         assert config.source is not None, "check() refuses a missing source"
         return open_source(
             config.source,
@@ -64,7 +64,7 @@ class World:
         )
 
     def open_pose(self, config: EdgeConfig, source: Source) -> PoseSource | None:
-        """Open what ``--pose`` names; None without. Raises `UserError` where nothing usable is there."""
+        """Open ``--pose``; None without. Raises `UserError` if nothing usable is there."""
         if config.pose is None:
             return None
         if config.pose == "demo":

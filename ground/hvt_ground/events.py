@@ -83,7 +83,7 @@ class Overlay:
     boxes_base_px: Boxes
     """(N, 4) x1 y1 x2 y2."""
     base_classes: tuple[str, ...]
-    """N names: what the detector says of the base stream."""
+    """N names: the detector's classes on the base stream."""
     classes: tuple[str, ...]
     """N names: the same after refinement; equal to the base class where no still has refined it."""
     confidences: npt.NDArray[np.float32]
@@ -151,7 +151,7 @@ class Refinement:
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """The link over the last second, and how old what we show is."""
+    """The link over the last second, and the age of the shown picture."""
 
     frame_index: int
     capture_ns: int
@@ -183,7 +183,7 @@ class MessageTiming:
     """When a message was captured, sent, received and handled; Unix nanoseconds, 0 where there is none."""
 
     kind: str
-    """The channel; of a backlog chunk with what it is of, as ``backlog-still``."""
+    """The channel; of a backlog chunk with its kind, as ``backlog-still``."""
     sequence: int
     frame_index: int
     """-1 where it is about no frame."""

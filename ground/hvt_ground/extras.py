@@ -25,7 +25,7 @@ __all__ = ["Extra", "Flight", "NewFile", "OpenSinks", "Opening", "all_extras", "
 
 _GROUP = "hvt.ground"
 _BROUGHT_BY = {"cot": "cot", "cot-types": "cot", "mcap": "mcap", "ts": "ground"}
-"""Settings of the extras that come with HVT, and what to install for each."""
+"""Settings of the extras that come with HVT, and the package to install for each."""
 
 NewFile = Callable[[Path, str, Callable[[Path], SinkWriter[Event]]], Callable[[], SinkWriter[Event]]]
 """Opens a file, or one of the suffix in a folder, by a name that no other session of this ground has."""
@@ -37,7 +37,7 @@ class Flight:
 
     info: Info
     surface: Surface
-    """What its tracks stand on."""
+    """The surface under its tracks."""
     clock: Callable[[], int]
     """The ground's steady clock, nanoseconds."""
     new_file: NewFile
@@ -59,12 +59,12 @@ OpenSinks = Callable[[Flight], Iterable[Opening]]
 
 
 class Extra:
-    """What an extra may bring; each method gets the whole configuration, which is an instance of ``options`` too."""
+    """The parts that an extra may bring; each method gets the whole configuration, an instance of ``options`` too."""
 
     options: ClassVar[type]
     """A frozen dataclass without slots whose fields are declared by `hvt_common.config.Group`."""
     exports: ClassVar[Mapping[str, Callable[[Recorded, Path], None]]] = {}
-    """Kinds of ``hvt-ground export``, with what writes one: a file that ends in the kind's name."""
+    """Kinds of ``hvt-ground export``, each with its writer: a file that ends in the kind's name."""
 
     def check(self, config: GroundConfig) -> None:
         """Raise `UserError` where its settings contradict each other or the ground's."""
@@ -78,14 +78,14 @@ class Extra:
         return ()
 
     def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
-        """Raise `UserError` where it could not write, or send, what is asked for."""
+        """Raise `UserError` if it could not write, or send, as requested."""
 
     def checks(self, config: GroundConfig) -> Mapping[str, Callable[[], Finding]]:  # noqa: ARG002
-        """What ``hvt-ground doctor`` looks at for it, by name."""
+        """Its checks in ``hvt-ground doctor``, by name."""
         return {}
 
     def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:
-        """Open what all sessions share; return what opens the sinks of one."""
+        """Open the parts that all sessions share; return the function that opens the sinks of one."""
         raise NotImplementedError
 
 
@@ -100,7 +100,7 @@ def all_extras() -> tuple[Extra, ...]:
 
 @cache
 def config_class(extras: tuple[Extra, ...] | None = None) -> type[GroundConfig]:
-    """`GroundConfig` with the settings of ``extras``, by default all; what an absent one brings is refused."""
+    """`GroundConfig` with the settings of ``extras``, by default all; settings of absent ones are refused."""
     options = [extra.options for extra in (all_extras() if extras is None else extras)]
     whole = make_dataclass("GroundConfig", (), bases=(*options, GroundConfig), frozen=True)
     known = {field.name.replace("_", "-") for field in fields(whole)}

@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 MOVING = "moving"
-"""The class of what moves, whatever it is."""
+"""The class of any moving object."""
 
 
 def _text(name: str) -> str:
@@ -71,7 +71,7 @@ def group_of(name: str) -> str | None:
 
 
 def is_nothing(name: str) -> bool:
-    """Whether a class stands for what is none of the others: ``other``, ``background`` or ``nothing``."""
+    """Whether a class stands for none of the others: ``other``, ``background`` or ``nothing``."""
     return _plain(name) in _NOTHING
 
 
@@ -88,6 +88,6 @@ _IMAGENET = frozenset(map(_plain, IMAGENET_NAMES))
 
 
 def same_kind(name: str, wanted: str) -> bool:
-    """Whether both words mean the same kind; what moves may be anything."""
+    """Whether both words mean the same kind; ``moving`` may be anything."""
     kinds = kind_of(name), kind_of(wanted)
     return kinds[0] == kinds[1] or MOVING in kinds

@@ -1,4 +1,4 @@
-"""Detectors: an ONNX network with one of the known heads, plain motion, or what another package brings."""
+"""Detectors: an ONNX network with one of the known heads, plain motion, or another package's."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def first_synonym(label: str) -> str:
 
 
 def decoded(content: bytes) -> str:
-    """Text in UTF-8, or in what its byte order mark says. Raises `UnicodeDecodeError` for anything else."""
+    """Text in UTF-8, or as its byte order mark says. Raises `UnicodeDecodeError` for anything else."""
     wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     return content.decode("utf-16" if wide else "utf-8-sig")
 

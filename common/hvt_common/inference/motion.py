@@ -66,7 +66,7 @@ class MotionSettings:
     least_area_px: int = 24
     """Smaller specks are noise, and so is …"""
     least_side_px: int = 4
-    """… what is thinner than this, or …"""
+    """… a region thinner than this, or …"""
     largest_aspect: float = 8.0
     """… longer than so many times its width: the border of a letterboxed picture, for one."""
     largest_share: float = 0.25
@@ -76,7 +76,7 @@ class MotionSettings:
 
 
 class MotionDetector:
-    """Finds what moves; stateful: one instance for one stream of images in order."""
+    """Finds moving objects; stateful: one instance for one stream of images in order."""
 
     class_names: tuple[str, ...] = (MOVING,)
 

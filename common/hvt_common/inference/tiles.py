@@ -44,7 +44,7 @@ _MOST_TILES: Final = 64
 _SMALL_PX: Final = 12
 """The side of an object, source pixels, for which ``auto`` chooses the grid …"""
 _SEEN_PX: Final = 10
-"""… and what it should have on the network's input: below, recall falls off steeply."""
+"""… and the size it should have on the network's input: below, recall falls off steeply."""
 _BORDER_SHARE: Final = 0.004
 """A box that ends so near a tile's border, as a share of the tile, may go on beyond."""
 _SAME_IOU: Final = 0.45
@@ -132,7 +132,7 @@ def tile_boxes(
 
 
 def detect_whole(detector: Detector, image_bgr: Image) -> Detections:
-    """What the detector finds in the whole picture, without the tiles that `tiled` may have given it."""
+    """Detect in the whole picture, without the tiles that `tiled` may have given it."""
     return (
         detector.detect_whole(image_bgr)
         if isinstance(detector, TiledDetector)

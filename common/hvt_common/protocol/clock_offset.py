@@ -10,7 +10,7 @@ __all__ = ["ClockOffset"]
 
 
 _DRIFT_PPM = 500
-"""How fast two clocks may part at most (RFC 5905: 500 ppm is what NTP corrects)."""
+"""The most that two clocks drift apart (RFC 5905: NTP corrects 500 ppm)."""
 _ROUNDING_NS = 1_000_000
 
 

@@ -41,7 +41,7 @@ FRAME_GROUPS: Mapping[FrameGroup, str] = MappingProxyType(
         "encoder": "the encoder failed on",
     }
 )
-"""Group → what is said behind its number."""
+"""Group → the text behind its number."""
 
 assert tuple(FRAME_GROUPS) == get_args(FrameGroup), "one order"
 

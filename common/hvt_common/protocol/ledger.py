@@ -28,12 +28,12 @@ StillOutcome = Literal["sent", "deferred", "dropped", "received"]
 
 
 class Account(Enum):
-    """What a message belongs to."""
+    """The stream that a message belongs to."""
 
     BASE = "base"
     ROI = "roi"
     BACKLOG = "backlog"
-    """What was stored while the link was down, and sent afterwards."""
+    """Objects stored while the link was down, and sent afterwards."""
     META = "meta"
     """Status, info, feedback and tracks."""
 
@@ -265,7 +265,7 @@ class Ledger:
             self._windows.restart()
 
     def _release(self, *, before_ns: int) -> None:
-        """Hand on, in order of time, what no late message can come before any more."""
+        """Pass on, in order of time, messages that no late one can precede any more."""
         ready = 0
         while ready < len(self._pending) and self._pending[ready][0] < before_ns:
             self._windows.add(*self._pending[ready])

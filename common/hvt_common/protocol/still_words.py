@@ -43,7 +43,7 @@ STILL_WORDS: Mapping[str, str] = MappingProxyType(
         "base_missing": "of a frame that the ground does not have",
     }
 )
-"""Word of the code → what is said behind a number of stills."""
+"""Word of the code → the text behind a number of stills."""
 
 
 def still_words(reason: str) -> str:

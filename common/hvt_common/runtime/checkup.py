@@ -54,7 +54,7 @@ def run_checks(
 
 
 def print_findings(title: str, findings: Mapping[str, Finding], *, as_json: bool) -> int:
-    """Show them, and at the end what to do. Returns the exit code: 2 where something is wrong."""
+    """Show them, and the remedies at the end. Returns the exit code: 2 if something is wrong."""
     if as_json:
         say(json.dumps([{"check": name, **asdict(one)} for name, one in findings.items()]))
     else:

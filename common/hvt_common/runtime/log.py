@@ -26,13 +26,13 @@ STATUS_LOGGER = "hvt.status"
 """Of the lines that are a status line else; in JSON only."""
 
 START_LOGGER = "hvt.start"
-"""Of what was found at the start and is no warning; not with ``quiet``."""
+"""Findings at the start that are no warning; not with ``quiet``."""
 
 _fields: ContextVar[Mapping[str, str]] = ContextVar("hvt_log_fields", default=MappingProxyType({}))
 
 
 def log_fields(**fields: str) -> None:
-    """Name what all further lines of this thread are about, such as ``edge``; empty for nothing."""
+    """Name the subject of all further lines of this thread, such as ``edge``; empty for nothing."""
     _fields.set({name: value for name, value in {**_fields.get(), **fields}.items() if value})
 
 
@@ -67,7 +67,7 @@ def start_log(
 
 
 class Log:
-    """What `start_log` began."""
+    """The log that `start_log` began."""
 
     def __init__(self, program: str, held: _HeldLog, *, as_json: bool, redaction: Redaction) -> None:
         self._logger = logging.getLogger(program)
@@ -77,16 +77,16 @@ class Log:
         """One JSON object a line."""
 
     def release(self) -> None:
-        """Write what is buffered, and from now on each line at once."""
+        """Write the buffer, and from now on each line at once."""
         self._held.say_on()
 
     def result(self, content: Any) -> None:
-        """What a run came to, as one JSON line."""
+        """The result of a run, as one JSON line."""
         self._write(logging.INFO, "ended", hvt_content={"summary": content})
 
     @contextmanager
     def ending(self) -> Iterator[None]:
-        """Within it what ends the program with a sentence is one JSON line; what is buffered then is discarded."""
+        """Within it a sentence that ends the program is one JSON line; the buffer is then discarded."""
         try:
             yield
         except (UserError, FlightError) as error:
@@ -102,7 +102,7 @@ class Log:
         self._logger.critical("%s: %s", kind.__name__, error, exc_info=(kind, error, trace))
 
     def _write(self, level: int, message: str, **extra: Any) -> None:
-        """Past what is buffered."""
+        """Write past the buffer."""
         record = self._logger.makeRecord(
             self._logger.name, level, __file__, 0, message, (), None, extra=extra
         )
@@ -124,7 +124,7 @@ class _HeldLog(logging.handlers.MemoryHandler):
         self.flush()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """What a start waits for is said at once: it may take hours."""
+        """A wait at the start is logged at once: it may take hours."""
         if self._free or record.name != failures.__name__:
             super().emit(record)
         else:
@@ -135,7 +135,7 @@ class _HeldLog(logging.handlers.MemoryHandler):
         return self._free
 
     def flush(self) -> None:
-        """Discard at exit what is still buffered: logging itself would write it."""
+        """Discard the buffer at exit: logging itself would write it."""
         if self._free:
             super().flush()
 
@@ -156,7 +156,7 @@ class _TextFormatter(logging.Formatter):
 
 
 class _JsonFormatter(logging.Formatter):
-    """``time`` (ISO 8601, UTC), ``level``, ``program``, ``logger``, ``message``, what it is about, ``traceback``."""
+    """``time`` (ISO 8601, UTC), ``level``, ``program``, ``logger``, ``message``, the subject, ``traceback``."""
 
     def __init__(self, program: str, fields: Mapping[str, str], redaction: Redaction) -> None:
         super().__init__()

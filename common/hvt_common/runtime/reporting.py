@@ -1,4 +1,4 @@
-"""What a run reports: a status line, and at its end a table and a JSON file."""
+"""The report of a run: a status line, and at its end a table and a JSON file."""
 
 from __future__ import annotations
 

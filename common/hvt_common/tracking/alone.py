@@ -28,7 +28,7 @@ _LEAST_SHARE: Final = 0.5
 _STILL_SHARE: Final = 0.4
 """Once it says something it does so down to here, or a list would come and go."""
 _MOST_SHARE: Final = 0.9
-"""What is surely there is easy to see; of what is not, nobody reports more."""
+"""Limit of the reported share: sure objects are easy to detect, and no more of the others are reported."""
 _CAUTION: Final = 2
 """Unreported objects that are assumed at the start: after the first that both detect, nothing is known yet."""
 _OTHERS: Final = 20
@@ -72,7 +72,7 @@ class Recall:
         return self._shares.get(class_id, self._share_of_others)
 
     def least_confidence(self, class_id: int) -> float:
-        """From where what is not reported is listed all the same; 0 where silence says nothing."""
+        """From this confidence an unreported object is listed all the same; 0 if a missed detection says nothing."""
         share = self.share(class_id)
         return _LEAST_REAL / (_LEAST_REAL + (1 - _LEAST_REAL) * (1 - share)) if share else 0.0
 

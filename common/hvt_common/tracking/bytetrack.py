@@ -296,7 +296,7 @@ class ByteTracker:
         return match, free.nonzero()[0]
 
     def _held(self, frame_index: int) -> _Floats:
-        """The boxes as they were last seen, moved with the camera alone: meanwhile what drove may have stopped."""
+        """The last boxes, moved with the camera alone: meanwhile a vehicle may have stopped."""
         states = self._table.states.copy()
         elapsed = (frame_index - self._table.seen)[:, None]
         states[:, kalman.POSITION] -= elapsed * states[:, kalman.VELOCITY]
@@ -325,7 +325,7 @@ class ByteTracker:
         table.votes[rows] = votes
 
     def _retire(self, match: _Indices, frame_index: int) -> _Mask:
-        """Mark as lost what was not found; the answer says which tracks live on."""
+        """Mark unmatched tracks as lost; return which tracks live on."""
         table = self._table
         missed = match < 0
         over = (table.phase == LOST) & (frame_index - table.seen > self._lost_frames + 1)

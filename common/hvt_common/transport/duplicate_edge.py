@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 _ANSWER_S = 1.0
 _ATTEMPT_S = 2.5
-"""For one attempt: a link that drops what is sent must not keep an edge from starting."""
+"""Limit of one attempt: a link that drops everything must not keep an edge from starting."""
 _LEAVING_S = 5.0
 """An edge that is shutting down still answers for so long; its successor is not refused because of it."""
 _PAUSE_S = 0.5

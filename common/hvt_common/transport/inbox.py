@@ -76,7 +76,7 @@ class Inbox:
             return self._take() if self._items else None
 
     def close(self) -> None:
-        """Wake the waiting thread; what is queued can still be taken."""
+        """Wake the waiting thread; queued messages can still be taken."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

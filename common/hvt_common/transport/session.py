@@ -101,7 +101,7 @@ def _open_listening_later(
 
 
 def _listening_ports() -> set[int]:
-    """Ports that this process listens on, by what Linux says: Zenoh does not say when its listener has come."""
+    """Ports that this process listens on, from Linux: Zenoh does not say when its listener has come."""
     sockets = set()
     for one in Path("/proc/self/fd").iterdir():
         with suppress(OSError):  # closed meanwhile

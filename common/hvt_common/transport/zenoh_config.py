@@ -78,7 +78,7 @@ class LinkSettings:
 
     role: Literal["edge", "ground", "client"]
     listen: tuple[str, ...] = ()
-    """Such as ``tcp/127.0.0.1:7447``; what is given here replaces what the file says."""
+    """Such as ``tcp/127.0.0.1:7447``; these replace the file's."""
     connect: tuple[str, ...] = ()
     zenoh_config: Path | None = None
     """A JSON5 file of Zenoh's own settings, which go before our defaults."""
@@ -92,7 +92,7 @@ class LinkSettings:
 
 
 def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
-    """Zenoh's configuration and the endpoints it will listen on; UserError for what cannot be used."""
+    """Zenoh's configuration and the endpoints it will listen on; UserError if it is unusable."""
     config, said = _read_config(settings.zenoh_config)
     for path, value in {**_DEFAULTS, **(_CLIENT if settings.role == "client" else {})}.items():
         if not _mentions(said, path):
@@ -176,7 +176,7 @@ def _mentions(said: dict[str, Any], path: str) -> bool:
 
 
 def _value(said: dict[str, Any], path: str) -> Any:
-    """What the user's file says at this path; None for nothing."""
+    """The value in the user's file at this path; None for nothing."""
     value: Any = said
     for part in path.split("/"):
         value = value.get(part) if isinstance(value, dict) else None

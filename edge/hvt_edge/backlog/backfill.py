@@ -109,7 +109,7 @@ class Backfill:
     def on_acknowledged(
         self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int, now_ns: int
     ) -> None:
-        """Take in what a ground says it has. One ground counts, until it says nothing of it for a while."""
+        """Take in a ground's acknowledgements. One ground counts, until it reports none for a while."""
         if receiver_id != self._receiver_id:
             if self._receiver_id is not None and now_ns - self._reported_ns < _OTHER_RECEIVER_NS:
                 return
@@ -138,7 +138,7 @@ class Backfill:
             self._on_done(entry)
 
     def interrupt(self) -> None:
-        """The link is away: what was on its way is begun again later, where the ground left off."""
+        """The link is down: objects under way are begun again later, from the acknowledged bytes on."""
         self._line.clear()
         self._data = None
         self._forget()

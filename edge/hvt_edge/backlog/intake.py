@@ -44,7 +44,7 @@ class News:
 
     woken: bool = False
     interrupted: bool = False
-    """The link went: what was on its way is not."""
+    """The link went: nothing is under way."""
     video_first: bool = False
     """A ground requested the video."""
     acknowledged: dict[tuple[int, ObjectKey], AcknowledgedRange] = field(default_factory=dict)
@@ -107,7 +107,7 @@ class Intake:
             self._wake()
 
     def on_acknowledged(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
-        """A ground acknowledges what it has; the newest counts, and one that is lost comes again."""
+        """A ground acknowledges bytes; the newest report counts, and a lost one comes again."""
         with self._changed:
             known = self._news.acknowledged
             for one in acknowledged_ranges:

@@ -31,7 +31,7 @@ class Outage:
         self._linked = False
         self._reported_ns: int | None = None
         self.reports = False
-        """Whether a ground ever reported on this session: of who never does nobody knows what has arrived."""
+        """Whether a ground ever reported on this session: without reports nobody knows what has arrived."""
 
     def reported(self, now_ns: int) -> None:
         """A ground has reported on this session (any thread)."""

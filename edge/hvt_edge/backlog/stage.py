@@ -103,7 +103,7 @@ class BacklogStage:
         """Stored, to be sent later; those included that went out too, to find out whether the link is back."""
         self.folder, self.max_bytes = store.path, store.max_bytes
         self.breaks = 0
-        """How often what was in flight has been taken for lost."""
+        """How often the messages in flight have been taken for lost."""
         self._worker = StoreWorker(
             store,
             session_id=session_id,
@@ -129,7 +129,7 @@ class BacklogStage:
         return self._worker.failed
 
     def before_frame(self, now_ns: int, *, linked: bool) -> bool:
-        """Before each frame: whether the link is away. Raises what has ended the store's thread."""
+        """Before each frame: whether the link is down. Raises the error that has ended the store's thread."""
         self._worker.check()
         self._linked = linked
         offline = self._outage.offline(now_ns, linked=linked) and not self.failed
@@ -147,7 +147,7 @@ class BacklogStage:
 
     @property
     def segment_open(self) -> bool:
-        """Whether what is stored goes on from a keyframe without a hole."""
+        """Whether the open segment goes on from a keyframe without a hole."""
         return self._segment_ns is not None
 
     def base(self, unit: AccessUnit, *, now_ns: int, sent: bool = False) -> bool:
@@ -173,7 +173,7 @@ class BacklogStage:
         self.state = State.LIVE
 
     def _leave(self) -> None:
-        """The link has gone: what was in flight is stored first."""
+        """The link has gone: messages in flight are stored first."""
         self._worker.intake.signal(interrupted=True)
         self._lose_in_flight()
         self._segment_ns = None
@@ -230,7 +230,7 @@ class BacklogStage:
         return self._outage.reports and bool(len(self._in_flight) or self._link.stills_in_flight())
 
     def end_in_flight(self) -> None:
-        """The run ends: what no report has named by now is stored, and sent as what was stored."""
+        """The run ends: messages that no report has named are stored, and sent as stored ones."""
         if self._unnamed:
             self._lose_in_flight()
             self._worker.intake.end_segment()
@@ -273,7 +273,7 @@ class BacklogStage:
         return True
 
     def close(self) -> None:
-        """Store what no ground has acknowledged, and leave the store in order; after the last report."""
+        """Store unacknowledged messages, and leave the store in order; after the last report."""
         try:
             self.end_in_flight()
         finally:

@@ -105,7 +105,7 @@ class StoreWorker:
         self._close_s = close_s
         self._backfill = Backfill(store, session_id=session_id, on_done=self._note_done)
         self.intake = Intake(_QUEUE)
-        """For signals, see there; what is to be stored comes by `offer`."""
+        """For signals, see there; objects to store come by `offer`."""
         self._sending = ChunkThread(send, on_done=self.intake.signal)
         self._sent_stills = self._sent_ns = self._trickle_ns = 0
         self._slow = False
@@ -120,7 +120,7 @@ class StoreWorker:
     # From other threads
 
     def check(self) -> None:
-        """Raise what has ended the thread, once."""
+        """Raise the error that has ended the thread, once."""
         if self._error is not None:
             error, self._error = self._error, None
             raise error
@@ -165,11 +165,11 @@ class StoreWorker:
         )
 
     def send_no_more(self) -> None:
-        """Let nothing go out from now on, so that an account can be closed; what comes is stored all the same."""
+        """Send nothing from now on, so that an account can be closed; new objects are still stored."""
         self._sending.close(_LAST_CHUNK_S)
 
     def close(self) -> None:
-        """Write what waits, end the file, join the thread. A disk that hangs costs what waits, and a warning."""
+        """Write the queue, end the file, join the thread. A disk that hangs costs the queue, and a warning."""
         self.intake.signal(closed=True)
         self._thread.join(timeout=self._close_s)
         if self._thread.is_alive():
@@ -315,7 +315,7 @@ class ChunkThread:
         return chunk, sent
 
     def close(self, timeout_s: float) -> None:
-        """Send no more, and say of what waits that it was not sent; what is being sent has so long to go."""
+        """Send no more, and count the queue as not sent; the chunk under way has so long to go."""
         self._closed = True
         self._chunks.put(None)
         self._thread.join(timeout=timeout_s)

@@ -47,7 +47,7 @@ Arguments = Mapping[str, int | float | str]
 
 @dataclass(frozen=True, slots=True)
 class _Result:
-    """What an accepted command answers beside yes."""
+    """The answer to an accepted command beside yes."""
 
     still_request: int = -1
     frame_index: int = -1
@@ -92,7 +92,7 @@ class Commands:
         }
 
     def answer(self, request: ControlRequest) -> ControlAnswer:
-        """Do it or say why not; never raises for what a ground may send."""
+        """Do it or say why not; never raises, whatever a ground sends."""
         try:
             with self._lock:
                 result = self._obey(request)
@@ -201,7 +201,7 @@ class Commands:
             self.keyframes.require(self.loop_clock())
 
     def _share_for(self, video_only: bool) -> float | None:  # noqa: FBT001 - one caller
-        """The base's share for a method of that kind: with no stills it is all, else what the edge began with."""
+        """The base's share for a method of that kind: all without stills, else the share at the edge's start."""
         if video_only:
             return 1.0
         began = self.config
@@ -246,7 +246,7 @@ def _on_demand_request(arguments: Arguments) -> OnDemandRequest:
 
 
 class _Reader:
-    """Takes a command's arguments one by one; what is left at the end is one too many."""
+    """Takes a command's arguments one by one; a remaining one is one too many."""
 
     def __init__(self, command: str, arguments: Arguments) -> None:
         self._command = command
@@ -278,6 +278,6 @@ class _Reader:
         return value
 
     def end(self) -> None:
-        """Refuse what was not taken."""
+        """Refuse remaining arguments."""
         if self._left:
             raise RefusedError(f"{self._command} takes no {next(iter(self._left))!r:.24}")

@@ -1,4 +1,4 @@
-"""``hvt-edge doctor``: checks what a flight with these settings needs; sends nothing and changes nothing."""
+"""``hvt-edge doctor``: checks the needs of a flight with these settings; sends nothing and changes nothing."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 class _Checks:
-    """In the order of the flight; the later ones use what the earlier have opened."""
+    """The checks in the order of the flight; later ones use what earlier ones have opened."""
 
     def __init__(self, config: EdgeConfig) -> None:
         self._config = config
@@ -178,7 +178,7 @@ class _Checks:
         return Finding("ok", f"{config.encoder} and {config.still_codec} code and decode")
 
     def processor(self) -> Finding:
-        """What every frame would take, against what others leave."""
+        """Compare the cost of every frame with the free processor time."""
         if self._source is None or not self._frames:
             return Finding("unknown", "not tried without a source")
         config, meter = self._config, CpuMeter()
@@ -208,7 +208,7 @@ class _Checks:
         return Finding("ok", found)
 
     def files(self) -> Finding:
-        """What is written, and whether there is room."""
+        """The files that will be written, and whether there is room."""
         config = self._config
         check_files(config)
         live = self._source is not None and self._source.live

@@ -1,4 +1,4 @@
-"""An edge's state as Prometheus reads it. What a ground tells too has the same name and the same value."""
+"""An edge's state for Prometheus. A metric that a ground has too has the same name and value."""
 
 from __future__ import annotations
 

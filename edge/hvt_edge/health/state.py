@@ -68,7 +68,7 @@ class OperatingState:
     budget_bps: int
     """As set or commanded."""
     allowed_bps: int
-    """What may be sent now: less than the budget where the link carries less."""
+    """The rate that may be sent now: less than the budget if the link carries less."""
     base_budget_bps: int
     """The base stream's share."""
 
@@ -78,7 +78,7 @@ class Frames:
     """Since the start."""
 
     account: FrameAccount
-    """What became of each."""
+    """The outcome of each."""
     encoded: int
     unanalyzed: int
     """Skipped by perception for want of time."""
@@ -86,7 +86,7 @@ class Frames:
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """What the edge knows of its link."""
+    """The edge's view of its link."""
 
     ground: bool
     """Whether a ground listens."""
@@ -100,14 +100,14 @@ class LinkState:
     """Since a ground reported last."""
     round_trip_ms: float | None
     rate_bps: int | None
-    """What the link was found to carry; None where nobody measures it."""
+    """The measured rate of the link; None if nobody measures it."""
     unusable_messages: int
     """Of grounds: damaged, foreign, or of another version."""
 
 
 @dataclass(frozen=True, slots=True)
 class BacklogState:
-    """What is stored while the link is away, and sent afterwards."""
+    """Objects stored while the link is down, and sent afterwards."""
 
     offline: bool
     """Frames and stills go into the store now."""
@@ -154,7 +154,7 @@ class EdgeState:
     backlog_bps: float | None
     meta_bps: float | None
     budget_share: float | None
-    """What is used of what may be sent."""
+    """The used share of the allowed rate."""
     frames: Frames
     source_silent_s: float | None
     """Since the source gave its last frame; None before the first."""
@@ -193,7 +193,7 @@ class EdgeState:
 
 
 def lacks(state: EdgeState, *, patience_s: float) -> str:
-    """What keeps an edge whose loop turns from sending pictures; empty for nothing."""
+    """Why an edge whose loop turns sends no pictures; empty for no reason."""
     if state.state == "waiting":
         return "it waits for a ground"
     silent_s = state.source_silent_s

@@ -88,7 +88,7 @@ class PushedEdge:
         self._grabber.put(frame_bgr.copy(), taken_ns)
 
     def close(self) -> None:
-        """Send what is left, say goodbye, and wait for the end; raises what ended the edge before."""
+        """Send the rest, say goodbye, and wait for the end; raises the error that ended the edge before."""
         self._stop_and_join()
         atexit.unregister(self._stop_and_join)
         if self._error is not None:

@@ -23,7 +23,7 @@ _MISSED = 3
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A ground's report with what was decided on it. Pacer, outbox, store and inbox are all handed the same."""
+    """A ground's report with the decisions on it. Pacer, outbox, store and inbox all get the same."""
 
     feedback: Feedback
     now_ns: int
@@ -31,7 +31,7 @@ class Report:
     primary: bool
     """It is new and of the ground that steers."""
     first: bool = False
-    """Another ground steers from now on, or this one began anew: what was measured of its path no longer holds."""
+    """Another ground steers from now on, or this one began anew: measurements of its path no longer hold."""
 
 
 class PrimaryReceiver:

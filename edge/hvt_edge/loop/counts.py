@@ -69,11 +69,11 @@ class FrameCounts:
         self.groups[_group(decision, coded=coded, taken=taken, has_viewer=has_viewer)] += 1
 
     def begin(self, source: Source) -> None:
-        """The flight begins: what the source left out before is none of it."""
+        """The flight begins: frames that the source left out before do not count."""
         self._source_before = (source.unreadable, source.passed_over)
 
     def note_source(self, source: Source) -> None:
-        """Take over what the source left out by itself."""
+        """Take over the frames that the source left out by itself."""
         unreadable, passed_over = self._source_before
         self.source_groups["unreadable"] = source.unreadable - unreadable
         self.source_groups["frame_rate"] = source.passed_over - passed_over
@@ -92,7 +92,7 @@ class FrameCounts:
         self.encode_ns += encode_ns
 
     def measure_cpu(self, *, perception_ns: int) -> None:
-        """About once a second: what all frames would have taken, from what those did that were not left out."""
+        """About once a second: the cost of all frames, estimated from those that were not left out."""
         here = (self.captured, self.dropped_cpu, self.unanalyzed, self.encode_ns, perception_ns)
         captured, dropped, unanalyzed, encode_ns, spent_ns = (
             new - old for new, old in zip(here, self._measured, strict=True)

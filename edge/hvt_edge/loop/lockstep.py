@@ -28,7 +28,7 @@ from hvt_edge.video.passthrough import VideoStage
 __all__ = ["LockstepPace"]
 
 _AHEAD_S = 1.0
-"""How far the edge runs ahead of the ground, in media time: what a ground reports counts so much later."""
+"""The edge's lead over the ground, in media time: reports of the ground count so much later."""
 _GROUND_GONE_S = 20.0
 """A ground that has not answered for so long is not waited for again."""
 _UNSUBSCRIBED_S = 2.0
@@ -65,7 +65,7 @@ class LockstepPace:
         self._executor = self.executor or ThreadPoolExecutor(1, thread_name_prefix="hvt-perception")
         self._analysis: tuple[Frame, int, bool, Future[AnalyzedFrame]] | None = None
         self._in_flight: deque[tuple[int, int, set[int]]] = deque()
-        """(frame index, newest coded index by then, stills sent with it): what the ground is to answer."""
+        """(frame index, newest coded index by then, stills sent with it): the expected answers of the ground."""
         self._coded_index = -1
         self._newest_answered = self._newest_analyzed = -1
 
@@ -121,7 +121,7 @@ class LockstepPace:
             self._in_flight.append((frame.index, coded_index, sent))
 
     def _wait_for_answers(self, *, before: int) -> None:
-        """Wait until the ground has done with the frames before this one, and take in what it made of them."""
+        """Wait until the ground is done with the frames before this one, and take in its answers."""
         while self._in_flight and self._in_flight[0][0] < before:
             _, coded_index, sent = self._in_flight.popleft()
             if self._waits:

@@ -78,12 +78,12 @@ class LeverSettings:
     """The share of frames that perception must have time for: two pictures in five seconds."""
 
     def net_gain(self, gain: float, *, total_bps: int) -> float:
-        """The gain of tracks, less what the video would gain by their bits."""
+        """The gain of tracks, less the gain of video by the same bits."""
         share = min(0.9, self.tracks_bps / total_bps)
         return gain - self.gain_per_doubling * math.log2(1 / (1 - share))
 
     def tracks_pay(self, measured: Measured, *, total_bps: int, sent: bool = False) -> bool:
-        """Whether tracks are to be sent, by what was measured; ``sent``: they are being sent."""
+        """Whether to send tracks, by the measurements; ``sent``: they are being sent."""
         if measured.comparisons and self.net_gain(measured.gain, total_bps=total_bps) >= self.plain_gain:
             return True
         # Of a ground that sees more than the edge found, what is sure may be more: else they would come and go.
@@ -132,13 +132,13 @@ class LeverControl:
             self.decide(now_ns)
 
     def forget(self) -> None:
-        """Another scene: what was measured says nothing of it."""
+        """Another scene: measurements of the last one say nothing of it."""
         self._measured = Measured()
         self._changed.clear()
         self._paused_until_ns, self._pauses = None, 1
 
     def decide(self, now_ns: int) -> Levers:
-        """Set the levers for what is known now; ``now_ns`` is the time that windows go by."""
+        """Decide by the present measurements; ``now_ns`` is the time that windows go by."""
         with self._lock:
             return self._decide(now_ns)
 

@@ -17,7 +17,7 @@ __all__ = ["Levers", "LoopClock", "Operating", "OperatingPoint", "base_rate_bps"
 
 @dataclass(frozen=True, slots=True)
 class Levers:
-    """What is sent beside the video, where the settings allow it."""
+    """Which parts are sent beside the video, as far as the settings allow it."""
 
     tracks: bool = True
     stills: bool = True
@@ -28,7 +28,7 @@ class Levers:
 
 @dataclass(frozen=True, slots=True)
 class OperatingPoint:
-    """What holds at one moment. Rates in line bits a second."""
+    """The rates of one moment, in line bits a second."""
 
     budget_bps: int
     """B_tot as set or commanded; `total_bps` never exceeds it."""
@@ -36,9 +36,9 @@ class OperatingPoint:
     """The base stream's share of it, as set or commanded; None: it follows the scene."""
     method: str
     total_bps: int
-    """What may be sent now: the budget, or less where the link carries less."""
+    """The rate that may be sent now: the budget, or less if the link carries less."""
     base_bps: int
-    """B_v: what x265 was opened for."""
+    """B_v: the rate for which x265 was opened."""
     decimation: int
     """Each n-th source frame is coded."""
     highest_budget_bps: int
@@ -89,26 +89,26 @@ class Operating:
         self._set(started_ns=now_ns)
 
     def command(self, *, budget_bps: int, video_share: float | None, method: str) -> None:
-        """What a ground commanded; the rates take effect with the next keyframe."""
+        """Note a ground's command; the rates take effect with the next keyframe."""
         highest_bps = max(self._point.highest_budget_bps, budget_bps)
         self._set(
             budget_bps=budget_bps, video_share=video_share, method=method, highest_budget_bps=highest_bps
         )
 
     def allow(self, total_bps: int) -> None:
-        """What may be sent from now on."""
+        """Allow this rate from now on."""
         self._set(total_bps=total_bps)
 
     def open(self, *, total_bps: int, base_bps: int, decimation: int) -> None:
-        """What x265 is opened for, and the total that goes with it."""
+        """Note the rate for which x265 is opened, and the total that goes with it."""
         self._set(total_bps=total_bps, base_bps=base_bps, decimation=decimation)
 
     def encode_with(self, preset: str, says: str) -> None:
-        """What x265 is opened with, from the next keyframe on."""
+        """Use this preset from the next keyframe on; ``says`` is the sentence about it."""
         self._set(preset=preset, preset_says=says)
 
     def pull(self, levers: Levers) -> None:
-        """What was measured decides anew what is sent beside the video."""
+        """Decide anew, by the measurements, which parts are sent beside the video."""
         self._set(levers=levers)
 
     def _set(self, **changes: object) -> None:
@@ -134,5 +134,5 @@ class LoopClock:
 
 
 def base_rate_bps(total_bps: int, share: float, *, metadata_bps: int) -> int:
-    """B_v of so much in all, with what tracks take left free."""
+    """B_v of so much in all, less the rate of tracks."""
     return round(min(total_bps * share, total_bps - metadata_bps))

@@ -65,7 +65,7 @@ class Candidate:
     leaving: bool = False
     """Touches the border, and less of it shows than before."""
     covered_share: float = 0.0
-    """The largest share of the box that another track in front of it covers; in front is what reaches lower down."""
+    """The largest share of the box that one track in front covers; the one that reaches lower down is in front."""
     sent_count: int = 0
     last_sent_frame: int | None = None
     last_sent_ns: int | None = None
@@ -186,7 +186,7 @@ class TrackMemory:
     def record_feedback(
         self, track_id: int, *, class_name: str, confidence: float, entropy_nats: float
     ) -> None:
-        """Note what the ground's classifier made of the track; unknown tracks are ignored."""
+        """Note the answer of the ground's classifier for the track; unknown tracks are ignored."""
         history = self._histories.get(track_id)
         if history is not None:
             history.class_posterior = ClassPosterior(class_name, confidence, entropy_nats)
@@ -343,7 +343,7 @@ def _sharpness_of(source_bgr: Image, crop_source_px: tuple[int, int, int, int]) 
 def _loss_of(
     source_bgr: Image, base_bgr: Image, *, crop_source_px: tuple[int, int, int, int], view: View
 ) -> Callable[[], BaseLoss]:
-    """Measures what coding lost, not what the size of the base loses: detectors there see its grid and no finer."""
+    """Measures the loss by coding, not by the size of the base: detectors there see its grid and no finer."""
     x1, y1, x2, y2 = crop_source_px
     shrink = max(1.0, 1 / view.scale, max(x2 - x1, y2 - y1) / MAX_SIDE_PX)
     size = (max(1, round((x2 - x1) / shrink)), max(1, round((y2 - y1) / shrink)))

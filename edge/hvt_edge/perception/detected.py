@@ -67,7 +67,7 @@ class GroundDifference:
         self._open.append(_Comparison(frame_index, capture_ns, objects))
 
     def take(self, report: Detected) -> None:
-        """Compare a report with what was found here on the newest picture that it covers."""
+        """Compare a report with the number found here on the newest picture that it covers."""
         if report.receiver_id != self._receiver_id:  # another model, perhaps
             self._receiver_id = report.receiver_id
             self._mean, self._worth, self._first_ns = 0.0, 0.0, None

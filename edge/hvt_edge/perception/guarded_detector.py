@@ -22,7 +22,7 @@ class OpenedOnUse:
         self.class_names = class_names
 
     def detect(self, image_bgr: Image) -> Detections:
-        """Like the detector's. Raises what opening it raises."""
+        """Like the detector's. Raises the error of opening it."""
         self._opened = self._opened or self._open()
         return self._opened.detect(image_bgr)
 

@@ -25,7 +25,7 @@ _THUMBNAIL_PX: Final = (32, 18)
 _LEAST_ALIKE: Final = 0.3
 """Two pictures a third of a second apart that are less alike may be of two scenes. See `_alike`."""
 _LEAST_DIFFERENCE: Final = 0.15
-"""Levels, mean over the thumbnail: what the rounding of 8 bits makes of a picture without noise, and some more."""
+"""Levels, mean over the thumbnail: the rounding of 8 bits in a picture without noise, and some more."""
 _USUAL_TIMES: Final = 1.3
 """Multiple of the usual difference beyond noise, waves and steady motion."""
 _EXPOSURE: Final = 16.0

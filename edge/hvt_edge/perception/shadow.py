@@ -197,7 +197,7 @@ class ShadowGround:
         self.scene_changes = 0
         """How often another scene began."""
         self._recall = Recall()
-        """How much of what the base surely shows the source shows too."""
+        """The share of the base's sure objects that the source shows too."""
         self.now = before
         """For a ground with the edge's detector."""
         self._difference = GroundDifference(memory_s=settings.memory_s, grace_ns=settings.rest_ns)
@@ -245,7 +245,7 @@ class ShadowGround:
         return True
 
     def _forget(self) -> None:
-        """Another scene: what was measured says nothing of it."""
+        """Another scene: measurements of the last one say nothing of it."""
         self.scene_changes += 1
         self.now, self._last_ns, self._next_ns = UNMEASURED, None, 0
         self._difference.forget()

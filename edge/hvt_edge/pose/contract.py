@@ -30,5 +30,5 @@ class PoseSource(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of what is open."""
+        """Close open files and connections."""
         ...

@@ -133,7 +133,7 @@ def _in_order(poses: list[Pose], path: Path) -> list[Pose]:
 
 
 def _check(row: _Values, path: Path, number: int) -> None:
-    """Raise `UserError` for what no place on earth has."""
+    """Raise `UserError` for a place that does not exist on earth."""
     for name, value in row.items():
         low, high = _BOUNDS.get(name, _ANY_TIME if name == "utc_s" else (-_FAR, _FAR))
         if not low <= value <= high:

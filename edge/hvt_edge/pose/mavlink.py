@@ -46,7 +46,7 @@ _NOWHERE = 10_000
 """1e-7 degrees around 0, 0: a hundred metres in the Gulf of Guinea."""
 _MOST_SENDERS = 8
 _MOST_KNOWN = 200
-"""Messages of all that speak here, by name: what strangers send is bounded."""
+"""Limit of the messages of all senders, by name: strangers may send any number."""
 _OF_GIMBAL = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS")
 _NO_DIRECTION_NS = 10 * SECOND_NS
 _YAW_LOCK, _YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME = 16, 32, 64

@@ -28,7 +28,7 @@ class FrameParser:
         return len(self._rest)
 
     def messages(self, data: bytes) -> list[Any]:
-        """All messages that end in ``data``; what is none is left out."""
+        """All messages that end in ``data``; other bytes are left out."""
         found, rest = _parsed(self._rest + data)
         if not self._is_stream and self._rest:
             alone, rest_alone = _parsed(data)

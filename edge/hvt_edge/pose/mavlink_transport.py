@@ -65,7 +65,7 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Raises `UserError` for what is none."""
+        """Raises `UserError` for any other text."""
         said = f"--pose mavlink:{text:.200}"
         kind, _, rest = text.partition(":")
         if kind in _KINDS:

@@ -40,7 +40,7 @@ _MOST_SATELLITES = 60
 
 
 def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[str, float]]:
-    """Rows of values as `hvt_edge.pose.files.COLUMNS` names them; ``note`` is told what was guessed, and why."""
+    """Rows of values as `hvt_edge.pose.files.COLUMNS` names them; ``note`` gets the guesses and their reasons."""
     blocks = [
         (time, block[time.end() :])
         for block in re.split(r"\r?\n\s*\r?\n", text)

@@ -17,7 +17,7 @@ from hvt_edge.source.live import Shot, SignalLost
 __all__ = ["CameraGrabber"]
 
 _REQUESTED_SIZE = (1920, 1080)
-"""Requested of the camera, which takes the nearest it has. Stills live on what exceeds the base size."""
+"""Requested of the camera, which takes the nearest it has. Stills live on the pixels beyond the base size."""
 
 _READ_MS = 2000
 

@@ -129,7 +129,7 @@ def open_units(name: str, stream: Any) -> CameraUnits:
 
 
 def check_stream(name: str, stream: Any) -> None:
-    """Raise `UserError` where an open stream cannot be the base stream, with what is accepted."""
+    """Raise `UserError` if an open stream cannot be the base stream, with the accepted ones."""
     codec = stream.codec_context
     if codec is None or codec.name != "hevc":
         said = "no codec that is known" if codec is None else codec.name

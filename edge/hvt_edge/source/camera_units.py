@@ -22,7 +22,7 @@ _DELIMITER, _SLICES_END = 35, 32
 
 
 class CameraUnits:
-    """One stream; ``header`` is what the container or the stream's description says before the first packet."""
+    """One stream; ``header`` is the container's or the stream's description before the first packet."""
 
     def __init__(self, header: bytes) -> None:
         self._length_bytes = 0
@@ -34,7 +34,7 @@ class CameraUnits:
         self._note(sets)
 
     def unit(self, packet: bytes) -> CameraUnit:
-        """The access unit of one picture. `ValueError` with what is wrong for anything else."""
+        """The access unit of one picture. `ValueError` with the fault for anything else."""
         data = packet
         if self._length_bytes:
             data = b"".join(LONG_START + one for one in _split(packet, self._length_bytes))

@@ -55,7 +55,7 @@ class Source(ABC):
     view: View
     """The map from source to base pixels; fixed once the source is open."""
     live: bool
-    """True for what cannot be paused (camera, network stream); a file, a folder and the demo wait for the reader."""
+    """It cannot be paused (camera, network stream); a file, a folder and the demo wait for the reader."""
     fps: float
     """Base rate, frames a second. A live camera that is slower delivers fewer."""
     frame_count: int | None
@@ -112,7 +112,7 @@ def size_within(source_size: tuple[int, int], box: tuple[int, int]) -> tuple[int
 
 
 def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) -> None:
-    """Raise `UserError` for a size or rate that no base stream can have, with what is accepted."""
+    """Raise `UserError` for a size or rate that no base stream can have, with the accepted ones."""
     wide, high = (_LEAST_SIDE_PX, _LEAST_SIDE_PX) if callable(size) else size
     # HEVC codes 4:2:0 pictures in even sizes only.
     if wide % 2 or high % 2 or not all(_LEAST_SIDE_PX <= side <= _MOST_SIDE_PX for side in (wide, high)):

@@ -157,7 +157,7 @@ class DemoSource(Source):
         return picture
 
     def _drop_pictures(self) -> None:
-        """Take what an earlier reader asked for and left."""
+        """Take the pictures that an earlier reader requested and left."""
         while self._pictures_due:
             self._picture()
 
@@ -191,7 +191,7 @@ def _draw(seed: int, spec: str) -> None:
 
 
 def check_truth(path: Path | None, source: Source) -> None:
-    """Refuse ``--truth`` for a source that does not know what it shows; `UserError`."""
+    """Refuse ``--truth`` for a source without ground truth; `UserError`."""
     if path is not None and not isinstance(source, DemoSource):
         raise UserError(f"--truth {path} is for --source demo: no other source knows its truth")
 

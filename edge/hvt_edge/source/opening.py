@@ -110,7 +110,7 @@ def _is_there(spec: str) -> bool:
 
 
 def _check_coded(spec: str) -> None:
-    """Raise `UserError` for what is no coded video; that it is HEVC is seen when it is open."""
+    """Raise `UserError` for anything but coded video; whether it is HEVC is checked when it is open."""
     kinds = (
         ("the drawn demo", is_demo(spec)),
         ("a device", spec.startswith("/dev/")),

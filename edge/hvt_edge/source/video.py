@@ -25,7 +25,7 @@ __all__ = ["VideoSource"]
 
 
 class VideoSource(Source):
-    """A clip by presentation time; the first frame that decodes is its zero. What can be decoded is played."""
+    """A clip by presentation time; the first frame that decodes is its zero. Every decodable frame is played."""
 
     live = False
 

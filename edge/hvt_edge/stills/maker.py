@@ -35,7 +35,7 @@ from hvt_edge.stills.policy.base import Request
 __all__ = ["Allowance", "NoStill", "StillMaker"]
 
 Allowance = Callable[[Still], int]
-"""How many payload bytes a still with this header may take now; what it holds as data does not count."""
+"""How many payload bytes a still with this header may take now; the header's own data does not count."""
 
 _TRIES = 3
 """Tries to fit payload and parameters into one admission: parameters hardly change in size."""

@@ -207,7 +207,7 @@ class Outbox:
             return max(self._pending.values(), key=_order, default=None)
 
     def expire(self, now_ns: int) -> list[tuple[OutboxStill, str]]:
-        """Give up what of the method has been pending for too long."""
+        """Expire stills of the method that have been pending for too long."""
         with self._lock:
             old = [one for one in self.pending if now_ns - _since_ns(one) > self.settings.max_pending_ns]
             return [self._expire(one, "stale") for one in old]
@@ -302,7 +302,7 @@ class Outbox:
         return bool(named)
 
     def on_undecodable(self, sequence: int) -> None:
-        """A ground does not have the base frame that this still builds on. Of what is not here nothing comes."""
+        """A ground lacks the base frame of this still: code it again. Unknown numbers are ignored."""
         with self._lock:
             if sequence in self._sent and self._sent[sequence].job is not None:
                 self._undecodable.add(sequence)
@@ -349,7 +349,7 @@ class Outbox:
         return sorted(overdue, key=lambda one: -one.utility)
 
     def lose(self) -> list[OutboxStill]:
-        """The link is away: take what no report has named for lost; most useful first."""
+        """The link is down: take stills that no report has named for lost; most useful first."""
         with self._lock:
             lost = self._unnamed()
             for one in lost:

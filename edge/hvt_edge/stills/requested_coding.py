@@ -82,7 +82,7 @@ class _Tried:
 def code_requested(
     job: CropJob, *, codec: StillCodec, quality_pct: int, capacity: Capacity
 ) -> CodedRequest | NothingCloser:
-    """Code the crop of ``job``; its ``alternative`` is what the base shows, None where that is not known."""
+    """Code the crop of ``job``; its ``alternative`` is the base's crop, None if that is not known."""
     tries = _Tries(job, codec)
     wanted = tries.at(quality_pct)
     best = None
@@ -159,7 +159,7 @@ class _Tries:
         return best
 
     def _guess(self, limit_bytes: int, low: int, high: int) -> int:
-        """The quality at which a line through what was tried crosses the limit, aimed a little below it."""
+        """The quality at which a line through the tries so far crosses the limit, aimed a little below it."""
         wanted = math.log(max(1, 0.95 * limit_bytes))
         known = sorted((abs(math.log(one.size_bytes) - wanted), pct) for pct, one in self.done.items())
         if not known:

@@ -305,7 +305,7 @@ class Chooser:
         )
 
     def set_method(self, method: Method) -> None:
-        """From the next decision step on; what is pending already stays."""
+        """Use it from the next decision step on; pending stills stay."""
         self.method = method
 
     def set_most_bytes(self, most_bytes: int) -> None:
@@ -331,5 +331,5 @@ class Chooser:
         self.on_outcome("dropped", reason)
 
     def _cost_of(self, codec: str) -> CostModel:
-        """Learnt for each codec apart: a residual takes a fraction of what an intra still takes."""
+        """Learnt for each codec apart: a residual takes a fraction of the bytes of an intra still."""
         return self._costs.setdefault(codec, CostModel.of_codec(codec))

@@ -51,7 +51,7 @@ class StillSender:
         self.transmitter.still(coded.envelope, now_ns=now_ns, copy=copy, requested=requested)
 
     def store_lost(self, now_ns: int) -> None:
-        """Store what was sent before the link went away, or came back, and no report has named."""
+        """Store stills that were sent before the link went, or came back, and that no report has named."""
         if self.backlog is None or self.backlog.breaks == self._breaks:
             return
         self._breaks = self.backlog.breaks
@@ -60,7 +60,7 @@ class StillSender:
             self._store(lost, now_ns=now_ns, counted=False)
 
     def close(self, now_ns: int) -> None:
-        """The run ends: what no report has named by now is stored."""
+        """The run ends: stills that no report has named are stored."""
         if self.backlog is not None:
             self.backlog.end_in_flight()
         self.store_lost(now_ns)

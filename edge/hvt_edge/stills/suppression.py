@@ -105,7 +105,7 @@ class Gate:
         return self.psnr_y_db > 0
 
     def good_enough(self, loss: BaseLoss) -> bool:
-        """Whether a still of what the base shows so well is not worth its bits."""
+        """Whether the base shows it so well that a still is not worth its bits."""
         return self.on and loss.psnr_y_db >= self.psnr_y_db and loss.detail_lost <= self.most_detail_lost
 
 

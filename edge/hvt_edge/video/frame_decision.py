@@ -1,4 +1,4 @@
-"""May this source frame be coded, as what, and where does it go? One pure decision."""
+"""Decides whether a source frame is coded, as a keyframe or not, and where it goes. One pure decision."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class LocalCopy:
             self._failures.failed(_PART, f"{self._path} takes no more than {_MOST_QUEUED} frames late")
 
     def close(self) -> None:
-        """Write what is queued, the index, and end the thread; a card that hangs is left behind."""
+        """Write the queue and the index, and end the thread; a card that hangs is left behind."""
         with contextlib.suppress(queue.Full):
             self._queue.put(None, timeout=_CLOSE_S)
         self._thread.join(_CLOSE_S)

@@ -1,4 +1,4 @@
-"""What changes with a keyframe: frame rate, the base's share, the total, the preset. x265 is opened anew for each."""
+"""Changes at a keyframe: frame rate, the base's share, the total, the preset. x265 is opened anew for each."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _WORTH = 0.04
 
 @dataclass(frozen=True, slots=True)
 class ReconfigurationSettings:
-    """What of the settings bounds the rates."""
+    """The settings that bound the rates."""
 
     size: tuple[int, int]
     nominal_fps: float
@@ -35,9 +35,9 @@ class ReconfigurationSettings:
     """The lowest rate of coded frames."""
     edge_id: str
     metadata_bps: int
-    """What tracks take of the budget."""
+    """The rate of tracks, part of the budget."""
     min_budget_bps: int
-    """What the link's rate is never taken below, where the budget is not lower itself."""
+    """The floor of the link's rate, unless the budget is lower itself."""
 
 
 class OpenEncoder(Protocol):
@@ -72,7 +72,7 @@ class EncoderReconfiguration:
         self._lock = threading.Lock()
         now = self.operating.now
         self._opened = {"total_bps": now.budget_bps, "base_bps": now.base_bps, "decimation": now.decimation}
-        """What x265 was last opened for."""
+        """The rate for which x265 was last opened."""
         self._commanded = (now.budget_bps, now.video_share)
         """Budget and share that x265 was last opened under."""
         self.count = 0
@@ -142,7 +142,7 @@ class EncoderReconfiguration:
             return self.split.wants_keyframe(now_ns)
 
     def open_again(self) -> Encoder:
-        """Return another encoder for what the last was opened for."""
+        """Return another encoder with the last settings."""
         return self.open_encoder(**self._opened)
 
     def __call__(self, decimation: int, now_ns: int) -> Encoder | None:
@@ -210,7 +210,7 @@ class EncoderReconfiguration:
 
     @property
     def _metadata_bps(self) -> int:
-        """What is kept for tracks, while they are sent."""
+        """The rate reserved for tracks, while they are sent."""
         return self.settings.metadata_bps if self.operating.now.levers.tracks else 0
 
     @property

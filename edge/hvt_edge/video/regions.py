@@ -105,7 +105,7 @@ class TrackRegions:
     free_share: float = 0.25
 
     def regions(self, tracks: Tracks | None) -> list[Region]:
-        """Return what the next frame gets, keyframe or not; ``tracks`` (base pixels) may be some frames old."""
+        """Return the regions of the next frame, keyframe or not; ``tracks`` (base pixels) may be some frames old."""
         if tracks is None or not len(tracks):
             return []
         best = np.argsort(-tracks.confidences, kind="stable")[:MOST_REGIONS]

@@ -33,7 +33,7 @@ class SplitSettings:
     least_base_bps: int
     """The lowest B_v at which x265 follows its target (`rate.least_base_bps`)."""
     metadata_bps: int = 0
-    """What the ``tracks`` channel takes: neither the base's nor the stills'."""
+    """The rate of the ``tracks`` channel: neither the base's nor the stills'."""
     visible_base_bps: int = 160_000
     """Below it the base loses objects that it would else show, more than stills give back (1280x720 at 15 fps)."""
     least_still_share: float = 0.05
@@ -68,13 +68,13 @@ class Split:
         self._settings = settings
         self._gain = gain or ExpectedGain()
         self.share = first_share
-        """Of the budget, for the base: the first, then what was last proposed."""
+        """The base's share of the budget: the first, then the one last proposed."""
         self._stills, self._sparse = True, False
         self._need_bytes = 0.0
         self._shown = 1.0
         self._observed_ns: int | None = None
         self._changed_ns = 0
-        """Since when the share is what it is."""
+        """The time of the last change of the share."""
 
     def observe(self, candidates: Sequence[Candidate], step: Step) -> None:
         """Take in all tracks of a decision step, those that rest included."""
@@ -133,7 +133,7 @@ class Split:
         return part * (step.cost.of(candidate) + step.still_overhead_bytes)
 
     def _still_share(self) -> float:
-        """What stills want, within what they may have, within what the base can spare."""
+        """The stills' need, within their limits and within the base's reserve."""
         settings = self._settings
         if not self._stills:
             return 0.0

@@ -112,7 +112,7 @@ def yuv_picture(
 
 
 def mean_qp_of(packet: av.Packet[Any]) -> float:
-    """What the encoder says of it, or NaN: a little-endian 32-bit number in units of 1/118 (``FF_QP2LAMBDA``)."""
+    """The encoder's own value, or NaN: a little-endian 32-bit number in units of 1/118 (``FF_QP2LAMBDA``)."""
     if not packet.has_sidedata("quality_stats"):
         return math.nan
     stats = bytes(packet.get_sidedata("quality_stats"))

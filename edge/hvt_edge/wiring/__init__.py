@@ -1,4 +1,4 @@
-"""Builds every part of an edge once, each from the settings and from what it needs."""
+"""Builds every part of an edge once, each from the settings and from the parts it needs."""
 
 from hvt_edge.wiring.link import make_link_settings
 from hvt_edge.wiring.perception import make_detector, open_for_flight, track_confidence, warm_up_for

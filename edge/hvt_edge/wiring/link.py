@@ -93,7 +93,7 @@ def make_split(config: EdgeConfig, size: tuple[int, int], *, first_share: float)
 
 
 def make_levers(config: EdgeConfig, operating: Operating, view: View) -> LeverControl | None:
-    """Who decides what is sent beside the video; None where the settings do."""
+    """Make the part that decides what is sent beside the video; None if the settings do."""
     if not config.measures:
         return None
     return LeverControl(operating, lever_settings(config, view))

@@ -61,7 +61,7 @@ def open_for_flight(
 
 
 def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
-    """Run the detector once on what it will be given: a runtime may compile for each shape."""
+    """Run the detector once on a picture of the flight's shape: a runtime may compile for each."""
     if config.detector != MOTION and not is_calibrated(config.detector, role="detector"):
         _log.warning("%s", uncalibrated("detector", config.detector))
     if config.candidates == "source":

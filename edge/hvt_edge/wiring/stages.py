@@ -1,4 +1,4 @@
-"""Every part of an edge, built once from what it needs. The parts form a tree."""
+"""Every part of an edge, built once from the parts it needs. They form a tree."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ from hvt_edge.wiring.video import (
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """What a frame goes through, and what a ground reaches."""
+    """The stages of a frame, and the ends that a ground reaches."""
 
     base: VideoStage
     stills: StillStage

@@ -31,7 +31,7 @@ _DETAIL_WEIGHT = 5.0
 
 
 def check_codecs(config: EdgeConfig) -> None:
-    """Code a picture once: `UserError` where a library behind a codec does not do what it should."""
+    """Code a picture once: `UserError` if a library behind a codec does not do its part."""
     ramp = np.arange(_TRIAL_PX, dtype=np.uint8)
     crop = np.stack(np.broadcast_arrays(4 * ramp[:, None], 4 * ramp, np.uint8(90)), axis=2)
     for flag, name in (("still-codec", config.still_codec), ("fallback-codec", config.fallback_codec)):
@@ -62,7 +62,7 @@ def make_method(config: EdgeConfig, view: View, *, name: str | None = None) -> M
 
 
 def shows_details(config: EdgeConfig, view: View) -> bool:
-    """Whether stills are worth sending for what the base has no pixels for."""
+    """Whether stills are worth sending for pixels that the base does not have."""
     return _hidden_pixels(view) > _FINER and getattr(make_method(config, view), _DETAIL, 0) > 0
 
 

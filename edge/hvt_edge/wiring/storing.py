@@ -35,7 +35,7 @@ def store_folder(config: EdgeConfig) -> Path:
 
 
 def default_folder(edge_id: str) -> Path:
-    """Where programs keep what outlives them: ``$XDG_STATE_HOME`` or ``~/.local/state``, then ``hvt/<edge>``."""
+    """The platform's folder for state: ``$XDG_STATE_HOME`` or ``~/.local/state``, then ``hvt/<edge>``."""
     state = os.environ.get("XDG_STATE_HOME", "")
     if Path(state).is_absolute():
         return Path(state) / "hvt" / edge_id
@@ -80,7 +80,7 @@ def make_backlog(
     info: Callable[[], bytes],
     failures: Failures,
 ) -> BacklogStage | None:
-    """Who stores what the link cannot carry away; None where nobody does. Starts a thread: to be closed."""
+    """Make the store for an outage; None without ``--store``. Starts a thread: to be closed."""
     max_bytes = config.store_bytes(live=live)
     if not max_bytes:
         return None

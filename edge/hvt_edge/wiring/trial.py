@@ -1,4 +1,4 @@
-"""What ``auto`` begins with, profile or preset: the first second of the scene is coded before the flight."""
+"""The start of ``auto``, profile or preset: the first second of the scene is coded before the flight."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Beginning:
     preset: PresetChoice
     """Of x265."""
     shadow: Shadow = UNMEASURED
-    """What the base stream showed of the source."""
+    """The shadow ground's comparison of that second."""
 
 
 def try_scene(
@@ -56,7 +56,7 @@ def try_scene(
     clock: Callable[[], int],
     stop: threading.Event,
 ) -> Beginning:
-    """Code the first second, where what comes of it may matter; else the settings alone decide."""
+    """Code the first second, if its result may matter; else the settings alone decide."""
     size = source.view.base_size
     decimation = first_decimation(config, size)
     fps = config.nominal_fps / decimation
@@ -97,7 +97,7 @@ def try_scene(
 
 
 def _preset(spent: Sequence[tuple[int, int]], *, fps: float) -> PresetChoice:
-    """By what the frames after the keyframe took; a scene of one frame tells nothing."""
+    """By the cost of the frames after the keyframe; a scene of one frame tells nothing."""
     if len(spent) < 2:
         return PresetChoice()
     frame_ns = (spent[-1][0] - spent[0][0]) / (spent[-1][1] - spent[0][1])

@@ -81,7 +81,7 @@ class Parent:
 
 @dataclass(frozen=True, slots=True)
 class CotEvent:
-    """An event. Texts may hold anything: `message` takes out what XML or a reader could be harmed by."""
+    """An event. Texts may hold anything: `message` removes characters that could harm XML or a reader."""
 
     uid: str
     type: str

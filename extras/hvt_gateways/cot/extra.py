@@ -39,7 +39,7 @@ def _url(text: str, *, name: str) -> str:
 
 @dataclass(frozen=True)
 class CotOptions:
-    """What ``hvt-ground`` takes for it."""
+    """The settings of ``hvt-ground`` for it."""
 
     cot: tuple[str, ...] = _GATEWAYS.option(
         SettingType("URL", _url),

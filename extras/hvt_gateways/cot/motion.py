@@ -1,4 +1,4 @@
-"""Course and speed of what is placed now and then: known once it has moved by more than its error."""
+"""Course and speed of an object that is placed now and then: known once it has moved by more than its error."""
 
 from __future__ import annotations
 

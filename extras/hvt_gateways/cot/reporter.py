@@ -93,7 +93,7 @@ class SessionReporter:
         self._noted = False
 
     def log(self, item: Event) -> None:
-        """Report what there is to say of an event."""
+        """Report an event as far as Cursor on Target can."""
         match item:
             case MessageTiming(kind=Channel.BASE):
                 self._offset_ns = item.clock_offset_ns

@@ -56,7 +56,7 @@ class Reported:
 
 
 class TrackSchedule:
-    """Remembers what was reported when. Time is an argument, and rises."""
+    """Remembers each report and its time. Time is an argument, and rises."""
 
     def __init__(self, *, most_a_second: int = _MOST_A_SECOND) -> None:
         self._most = most_a_second

@@ -38,7 +38,7 @@ class TypeTable:
         return self.classes.get(plain) or self.classes.get(kind_of(plain)) or self.classes[_ANY]
 
     def of_edge(self, edge: str) -> str:
-        """The type of what carries the camera: of the first pattern that fits, ``*`` last."""
+        """The type of the camera's platform: of the first pattern that fits, ``*`` last."""
         fits = (
             kind for pattern, kind in self.platforms.items() if pattern != _ANY and fnmatchcase(edge, pattern)
         )
@@ -52,7 +52,7 @@ class TypeTable:
 
 
 def default_types() -> TypeTable:
-    """What ``types.toml`` beside this file says."""
+    """The table of ``types.toml`` beside this file."""
     text = (files("hvt_gateways.cot") / "types.toml").read_text(encoding="utf-8")
     return _parsed(tomllib.loads(text), where="types.toml")
 

@@ -24,7 +24,7 @@ __all__ = ["McapExtra"]
 
 @dataclass(frozen=True)
 class McapOptions:
-    """What ``hvt-ground`` takes for it."""
+    """The settings of ``hvt-ground`` for it."""
 
     mcap: Path | None = Group("gateways").option(
         PATH, None, "also write MCAP for Foxglove: FILE.mcap, or a folder for one file a session"
@@ -42,7 +42,7 @@ class McapExtra(Extra):
             yield "--mcap", config.mcap
 
     def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
-        """Refuse what cannot be written."""
+        """Refuse a file that cannot be written."""
         for name, path in self.writes(config):
             if not path.is_dir():
                 check_writable(path, name=name, reads=reads)

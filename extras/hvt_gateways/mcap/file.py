@@ -65,7 +65,7 @@ class McapFile:
             raise UserError(f"MCAP file {path} cannot be created: {error.strerror}") from None
 
     def log(self, item: Event) -> None:
-        """Write what there is a schema for; the rest passes by."""
+        """Write events that have a schema; ignore the rest."""
         match item:
             case VideoSample():
                 data = self._run.decodable(item)

@@ -20,7 +20,7 @@ __all__ = ["TransportStreamExtra"]
 
 @dataclass(frozen=True)
 class TransportStreamOptions:
-    """What ``hvt-ground`` takes for it."""
+    """The settings of ``hvt-ground`` for it."""
 
     ts: str | None = Group("gateways", rare=True).option(
         TEXT,
@@ -44,12 +44,12 @@ class TransportStreamExtra(Extra):
                 yield "--ts", path
 
     def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
-        """Refuse what cannot be written or sent to."""
+        """Refuse a destination that cannot be written or sent to."""
         if isinstance(config, TransportStreamOptions):
             check_destination(config.ts, reads=reads)
 
     def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
-        """What opens the stream of a session."""
+        """Make the function that opens the stream of a session."""
         if not isinstance(config, TransportStreamOptions) or config.ts is None:
             return lambda _flight: ()
         where, addresses = destination(config.ts), Addresses()

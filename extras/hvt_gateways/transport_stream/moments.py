@@ -45,14 +45,14 @@ class Moments:
         """The newest frame of each."""
 
     def picture(self, frame_index: int, capture_ns: int, *, at: int) -> list[Moment]:
-        """Take a picture; what can be given out now."""
+        """Take a picture; return the moments that are due."""
         self._picture = max(self._picture, frame_index)
         before = self._open.get(frame_index)
         overlay = None if before is None else before.overlay
         return self._take(Moment(frame_index, capture_ns, at, pictured=True, overlay=overlay))
 
     def tracks(self, overlay: Overlay, *, at: int) -> list[Moment]:
-        """Take tracks; what can be given out now."""
+        """Take tracks; return the moments that are due."""
         self._tracks = max(self._tracks, overlay.frame_index)
         moment = self._open.get(overlay.frame_index)
         if moment is None:
@@ -66,7 +66,7 @@ class Moments:
         return given
 
     def forget(self) -> None:
-        """After a gap: what waits is not given out."""
+        """After a gap: drop all waiting moments."""
         self._open.clear()
 
     def _take(self, moment: Moment) -> list[Moment]:

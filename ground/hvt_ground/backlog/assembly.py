@@ -48,7 +48,7 @@ class _Open:
     total_bytes: int
     data: bytearray = field(default_factory=bytearray)
     handed: bool = False
-    """It is complete, and whoever has it has not said yet what came of it."""
+    """It is complete and handed out, and its outcome is not known yet."""
 
     @property
     def size_bytes(self) -> int:
@@ -117,7 +117,7 @@ class BacklogAssembly:
         return None
 
     def settle(self, key: ObjectKey, *, usable: bool) -> None:
-        """Say what came of an object that was handed out: it is where it belongs, or nothing could be made of it."""
+        """Report the outcome of an object that was handed out: it is in its place, or unusable."""
         entry = self._open.get(key)
         if entry is None or not entry.handed:
             return

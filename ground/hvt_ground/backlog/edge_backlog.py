@@ -97,7 +97,7 @@ class EdgeBacklog:
         return True
 
     def session_ended(self, info: Info) -> None:
-        """The session that was open is closed: what was not worked off was not acknowledged, and is to come again."""
+        """The open session is closed: unprocessed objects were not acknowledged, and will come again."""
         with self._lock:
             self._learn(info)
             dropped = self._assembly.drop_handed()

@@ -35,7 +35,7 @@ class LateStills:
                 self._stills.popitem(last=False)
 
     def named(self, overlay: Overlay) -> Iterator[Event]:
-        """The overlay with the classes of the stills so far, and before it what each still of its frame has named."""
+        """The overlay with the classes of the stills so far, after the refinements by the stills of its frame."""
         tracks = overlay.track_ids.tolist()
         for still in self._stills.pop(overlay.frame_index, ()) if tracks else ():
             shares = iou(np.array([still.box_base_px], np.float32), overlay.boxes_base_px)[0]

@@ -38,7 +38,7 @@ class BacklogRecording:
         )
 
     def close(self) -> None:
-        """Say what has come and close the file, without waiting for it."""
+        """Log the amount received and close the file, without waiting for it."""
         totals = self.backlog.totals
         if totals.first is not None and totals.amount():
             text = f"{totals.amount()} of this session arrived after it had ended"

@@ -90,7 +90,7 @@ class SessionBacklog:
         self.video = BacklogVideo(base_size=info.base_size)
         self.log = log
         self.able = able
-        """Whether what is logged will be written. Otherwise it is to come again, for its edge would forget it."""
+        """Whether logged objects will be written. Otherwise they must come again: the edge would forget them."""
         self._outputs = outputs
         self._read = read
         self._stills = stills or StillSequenceWindow()
@@ -144,7 +144,7 @@ class SessionBacklog:
                 totals.take_back(stills=0, frames=len(lengths_s), video_s=sum(lengths_s.values()))
 
     def note(self, still: Refinement) -> None:
-        """Note what became of a still, for the boxes of its frame should it be a stored one."""
+        """Note the outcome of a still, for the boxes of its frame should it be a stored one."""
         self._late.take(still)
 
     def log_boxes(self, event: Event) -> None:
@@ -190,7 +190,7 @@ class SessionBacklog:
         )
 
     def take_news(self) -> BacklogTotals:
-        """Return and forget what has come since the last call."""
+        """Return and forget the arrivals since the last call."""
         with self._lock:
             news, self._news = self._news, BacklogTotals()
             return news

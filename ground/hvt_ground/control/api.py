@@ -50,7 +50,7 @@ __all__ = ["EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge", "RequestedSt
 _ANSWER_S = 2.0
 _POLL_S = 0.3
 _OUTCOME_S = 0.5
-"""So often the edge is asked what became of a still that does not come."""
+"""Time between two queries of the outcome of a still that does not come."""
 _INBOX_MESSAGES = 64
 _JPEG_QUALITY_PCT = 95
 _SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -64,7 +64,7 @@ class RefusedError(UserError):
 
 @dataclass(frozen=True, slots=True)
 class EdgeTrack:
-    """What the edge tracks now."""
+    """A track of the edge now."""
 
     track_id: int
     """The edge's own; a ground numbers its tracks itself."""
@@ -111,7 +111,7 @@ def check_suffix(path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Requester:
-    """What our own file lets us do."""
+    """The rights in our own file."""
 
     file: Path | None = None
     rights: Rights = field(default_factory=Rights)
@@ -165,14 +165,14 @@ class RemoteEdge:
         self._requester = requester or Requester()
 
     def info(self) -> Info:
-        """What the edge says of its session."""
+        """The edge's facts of its session."""
         answer = self._query(Channel.INFO, b"")
         if answer is None:
             raise UserError(self._absent())
         return self._parsed(Info.parse, answer)
 
     def tracks(self, *, on_note: Callable[[str], None] = lambda _note: None) -> list[EdgeTrack]:
-        """What it tracks now, by its own ids; ``on_note`` is called with a sentence where that is not all."""
+        """Its present tracks, by its own ids; ``on_note`` is called with a sentence if that is not all."""
         names = self.info().class_names
         answer = self.command(Command.TRACKS)
         if answer.note:
@@ -284,7 +284,7 @@ class RemoteEdge:
         )
 
     def _note_of(self, number: int) -> str:
-        """What the edge says of a pending still. Raises `RefusedError` where none comes."""
+        """The edge's note on a pending still. Raises `RefusedError` if none comes."""
         try:
             outcome = self._commanded(Command.STILL_OUTCOME, {"ask": number})
         except RefusedError:
@@ -364,7 +364,7 @@ class EdgeClient:
         return cls(session, requester=Requester.of(settings))
 
     def nobody(self) -> str:
-        """What to tell a user where `names` is empty."""
+        """The sentence for a user if `names` is empty."""
         return f"no edge is there{_link_hint(self._session)}"
 
     def names(self) -> list[str]:

@@ -40,7 +40,7 @@ def _only_one(edges: EdgeClient) -> str:
 
 
 def _prepare(arguments: argparse.Namespace) -> Callable[[RemoteEdge], None]:
-    """What is to be done with the edge; all that the user said is checked before anybody is asked."""
+    """Prepare the command; all arguments are checked before any edge is queried."""
     match arguments.command:
         case "still":
             return _still(arguments)

@@ -1,4 +1,4 @@
-"""``hvt-ground doctor``: checks what a ground with these settings needs; asks edges for nothing, changes nothing."""
+"""``hvt-ground doctor``: checks the needs of a ground with these settings; requests nothing, changes nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures with what is on them: base pictures as a COCO data set, and the stills as files with a table."""
+"""Pictures with their objects: base pictures as a COCO data set, and the stills as files with a table."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ __all__ = ["ground_points", "places_of_boxes"]
 _CHI2_95: Final = 5.991
 """Chi-square of two degrees of freedom: the ellipse that holds 95 % (Abramowitz and Stegun, 26.4.9)."""
 _FIELD_ERROR: Final = 0.02
-"""Standard deviation of a field of view, of itself: what data sheets and stabilisation leave."""
+"""Standard deviation of a field of view, as a share of it: the error of data sheets and stabilisation."""
 _BOX_ERROR: Final = (0.15, 0.25)
 """Standard deviation of the point where an object stands, of its box's width and height."""
 _LEAST_BOX_PX: Final = 1.0

@@ -28,7 +28,7 @@ from hvt_ground.geolocation.surface import Points
 __all__ = ["TILE_M", "ElevationModel", "ModelError", "Tile"]
 
 TILE_M: Final = 15_000.0
-"""Half the side of what is in memory at a time."""
+"""Half the side of the part in memory."""
 _MOST_SIDE: Final = 3000
 """Cells on a side of it: a finer model is read more coarsely."""
 _WGS_84: Final = "EPSG:4326"

@@ -18,7 +18,7 @@ STALE_S: Final = 10.0
 _MOST_POSES: Final = 64
 """A minute of them: pictures are not shown later than that."""
 _DRIFT: Final = 0.5
-"""Standard deviation of what it does otherwise than before, of what it did in as long a time."""
+"""Standard deviation of a change of motion, as a share of the motion in as long a time."""
 
 
 class PoseTrail:
@@ -73,7 +73,7 @@ class PoseTrail:
 
 
 def _continued(before: Pose, last: Pose, capture_ns: int) -> Pose:
-    """The pose after the last one, by what changed since the one before."""
+    """The pose after the last one, extrapolated from the one before."""
     lasted_ns = last.capture_ns - before.capture_ns
     age_ns = capture_ns - last.capture_ns
     if lasted_ns > STALE_S * SECOND_NS:

@@ -1,1 +1,1 @@
-"""The ground as a part of another program: `received` gives it what comes."""
+"""The ground as a part of another program: `received` gives it the events."""

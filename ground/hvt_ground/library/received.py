@@ -88,7 +88,7 @@ class Listening:
         return self
 
     def __next__(self) -> Received:
-        """The next event; raises what ended the ground, `UserError` or `FlightError`."""
+        """The next event; raises the error that ended the ground, `UserError` or `FlightError`."""
         while True:
             running = self._thread.is_alive()
             try:
@@ -101,7 +101,7 @@ class Listening:
             raise StopIteration
 
     def close(self) -> None:
-        """End the ground; what it has given out by then can still be taken."""
+        """End the ground; events in the queue can still be taken."""
         atexit.unregister(self.close)
         self._stop.set()
         self._thread.join()

@@ -54,7 +54,7 @@ class DuplicatePublishers:
         return session_id == self._other
 
     def note(self, other: int, *, shown: int, now_ns: int) -> str | None:
-        """A message of ``other`` came while ``shown`` goes on; return what to say of it, if it is time to."""
+        """A message of ``other`` came while ``shown`` goes on; return the warning, if it is time for it."""
         self._other = other
         if self._said_ns is not None and now_ns - self._said_ns < _AGAIN_NS:
             return None

@@ -1,4 +1,4 @@
-"""The messages of an edge once they are parsed: what the receiver gives and sessions take."""
+"""The parsed messages of an edge, from the receiver to its sessions."""
 
 from __future__ import annotations
 

@@ -284,7 +284,7 @@ class Reassembler:
         return [*resolved, self._judged(unit, verdict, starts_session=True)]
 
     def _leave(self) -> list[Arrival]:
-        """End the present session, if any; what waited behind a hole is skipped."""
+        """End the present session, if any; units that waited behind a hole are skipped."""
         resolved = [self._judged(unit, "skip") for _, unit in sorted(self._held.items())]
         self._held.clear()
         self._synced = False

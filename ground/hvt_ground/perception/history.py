@@ -63,7 +63,7 @@ class History:
         return next(reversed(self._tracks), None)
 
     def add_frame(self, frame_index: int, picture: Image | YuvPicture) -> None:
-        """Keep a decoded picture (not copied, so hand over what nobody writes to again)."""
+        """Keep a decoded picture (not copied: nobody may write to it again)."""
         _require_rising(next(reversed(self._frames), None), frame_index)
         self._frames[frame_index] = picture
         self._frame_bytes += picture.nbytes
@@ -79,7 +79,7 @@ class History:
             self._tracks.popitem(last=False)
 
     def revise_tracks(self, tracks: Tracks) -> None:
-        """Put in what is known by now of a frame, whether it has tracks here or not; what is too old stays out."""
+        """Revise a frame's tracks, whether it has some here or not; frames that are too old stay out."""
         if self.oldest_tracked is None or tracks.frame_index > (self.newest_tracked or 0):
             self.add_tracks(tracks)
         elif tracks.frame_index in self._tracks:

@@ -98,7 +98,7 @@ def track_confidence(config: GroundConfig) -> float:
 
 
 def stills_calibrated(config: GroundConfig) -> bool:
-    """Whether what stills are read with gives probabilities."""
+    """Whether the model that reads stills gives probabilities."""
     if config.classifier in (None, NONE):
         return False
     if config.classifier == DETECTOR:

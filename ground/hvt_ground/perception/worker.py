@@ -50,7 +50,7 @@ _AHEAD = 2
 Analyze = Callable[[DecodedFrame, bool], None]
 """Called with a picture, and whether to hurry."""
 Step = Callable[[Tracks, int], None]
-"""Called with what the edge tracked at one frame, and that frame's capture time."""
+"""Called with the edge's tracks at one frame, and that frame's capture time."""
 Read = Callable[[Sequence[ReceivedStill]], None]
 
 
@@ -65,7 +65,7 @@ class Job(ABC):
         """A step has raised: there is no other."""
 
     def close(self) -> None:  # noqa: B027 - many hold nothing
-        """Release what it holds, done or not; called once."""
+        """Release its resources, done or not; called once."""
 
 
 class PerceptionWorker(ABC):
@@ -108,7 +108,7 @@ class PerceptionWorker(ABC):
 
     @abstractmethod
     def step(self, tracks: Tracks, capture_ns: int) -> None:
-        """Hand over what the edge tracked at one frame."""
+        """Hand over the edge's tracks at one frame."""
 
     def pose(self, use: Callable[[], None], capture_ns: int) -> None:  # noqa: ARG002 - for lockstep
         """Hand over where the camera was at that time; ``use()`` makes it count, here at once."""
@@ -127,7 +127,7 @@ class PerceptionWorker(ABC):
 
     @abstractmethod
     def close(self) -> bool:
-        """Finish what is queued, for a second or two; False where the thread did not come back."""
+        """Finish the queue, for a second or two; False if the thread did not come back."""
 
     def _is_done(self, job: Job) -> bool:
         """Do one step of a job; whether it was the last."""
@@ -143,7 +143,7 @@ class PerceptionWorker(ABC):
             return True
 
     def raise_error(self) -> None:  # noqa: B027 - errors may come out of the other methods instead
-        """Raise what ended the thread."""
+        """Raise the error that ended the thread."""
 
 
 class RealtimeWorker(PerceptionWorker):
@@ -237,7 +237,7 @@ class RealtimeWorker(PerceptionWorker):
         return True
 
     def close(self) -> bool:
-        """Finish what waits, for a second or two."""
+        """Finish the queue, for a second or two."""
         self._ending.set()
         self._wake.set()
         self._thread.join(self._finish_s)
@@ -248,7 +248,7 @@ class RealtimeWorker(PerceptionWorker):
         return not self._thread.is_alive()
 
     def raise_error(self) -> None:
-        """Raise what ended the thread."""
+        """Raise the error that ended the thread."""
         if self._error is not None:
             error, self._error = self._error, None
             raise error
@@ -304,7 +304,7 @@ class RealtimeWorker(PerceptionWorker):
             self._analyze(picture, hurry or newer)
 
     def _do_jobs(self) -> None:
-        """Do what can wait, until something comes that cannot."""
+        """Do jobs that can wait, until something comes that cannot."""
         while (jobs := self._jobs or self._last_jobs) and not self._given_up.is_set():
             if self._has_news() and time.monotonic() - self._job_step_s < _JOB_STEP_S:
                 return
@@ -364,12 +364,12 @@ class LockstepWorker(PerceptionWorker):
         self._early.append(still)
 
     def submit(self, job: Job, *, last: bool = False) -> bool:  # noqa: ARG002 - one after the other
-        """Do it after what was handed over before."""
+        """Do it after the jobs handed over before."""
         self._submit(self._worker.submit(self._do, job))
         return True
 
     def close(self) -> bool:
-        """Finish what waits."""
+        """Finish the queue."""
         try:
             self._take_steps(before=None)
             while self._pending:

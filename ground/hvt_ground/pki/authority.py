@@ -73,7 +73,7 @@ class Authority:
 
     @classmethod
     def open(cls, folder: Path) -> Authority:
-        """The CA of the folder; `UserError` where there is none, or its files are not what they should be."""
+        """The CA of the folder; `UserError` if there is none, or its files are not a CA's."""
         try:
             key = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), password=None)
             certificate = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
@@ -124,7 +124,7 @@ class Authority:
         return f"{certificate.not_valid_after_utc:%Y-%m-%d}"
 
     def forget(self, name: str) -> None:
-        """Delete the pair of a machine. A copy elsewhere still holds: what ends it is that no rule names it."""
+        """Delete the pair of a machine. A copy elsewhere still holds: only rules without its name end it."""
         for suffix in ("key", "pem"):
             path = self.folder / f"{name}.{suffix}"
             try:

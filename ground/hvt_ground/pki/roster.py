@@ -1,4 +1,4 @@
-"""Who belongs to a fleet and may do what: ``fleet.json`` beside the keys."""
+"""The members of a fleet and their rights: ``fleet.json`` beside the keys."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class GroundMember:
 
 @dataclass(frozen=True, slots=True)
 class RouterMember:
-    """A router: it sees everything, and lets each through to what is theirs."""
+    """A router: it sees everything, and lets each machine through to its own keys."""
 
     name: str
     hosts: tuple[str, ...] = ()
@@ -86,7 +86,7 @@ class Roster:
 
     @property
     def names(self) -> dict[str, str]:
-        """Each name with what it is."""
+        """Each name with its kind."""
         return (
             dict.fromkeys(self.edges, "edge")
             | {one.name: "ground" for one in self.grounds}

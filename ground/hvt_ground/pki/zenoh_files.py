@@ -77,7 +77,7 @@ def ground_file(ground: GroundMember, roster: Roster, *, folder: str = KEYS_FOLD
 
 
 def router_file(router: RouterMember, roster: Roster, *, folder: str = KEYS_FOLDER) -> str:
-    """The configuration of a router, JSON5: it lets each edge and each ground through to what is theirs."""
+    """The configuration of a router, JSON5: it lets each edge and each ground through to its own keys."""
     grants = {edge: _toward_edge(edge, command=True) for edge in roster.edges}
     for ground in roster.grounds:
         edges = [edge for edge in roster.edges if ground.may_watch(edge)]

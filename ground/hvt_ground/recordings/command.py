@@ -1,4 +1,4 @@
-"""``hvt-ground recordings list | find``: which recordings are there, and in which is what."""
+"""``hvt-ground recordings list | find``: lists recordings, and finds those with given contents."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _HEAD = ("file", "edge", "begin (UTC)", "length", "MB", "frames", "stills", "tra
 
 
 def run(argv: Sequence[str]) -> int:
-    """Print what the index says; `UserError` where there is none."""
+    """Print the index's rows; `UserError` without an index."""
     arguments = _parser().parse_args(argv)
     wanted = _wanted(arguments) if arguments.command == "find" else lambda _: True
     rows = [row for row in read_index(arguments.folder) if wanted(row)]

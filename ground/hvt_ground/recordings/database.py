@@ -65,7 +65,7 @@ class Index:
         self._database.close()
 
     def put(self, row: RecordingRow) -> None:
-        """Note a file, in place of what was known of it."""
+        """Note a file, in place of its former row."""
         if not self._path.exists():  # what is written would be in no file
             raise sqlite3.OperationalError(f"{self._path} was removed")
         values = [getattr(row, name) for name in _COLUMNS]

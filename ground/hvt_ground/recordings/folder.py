@@ -1,4 +1,4 @@
-"""The folder of recordings: its index is written behind a queue, and what is due is removed there."""
+"""The folder of recordings: its index is written behind a queue, and expired files are removed there."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class IndexWriter:
             raise
 
     def log(self, item: RecordingRow | None) -> None:
-        """Note what is known of a file; None looks for what is due."""
+        """Note the facts of a file; None looks for expired files."""
         now = self._pass_time()
         if item is not None:
             self._index.put(replace(item, written_ns=now.unix_ns))
@@ -88,7 +88,7 @@ class IndexWriter:
         self._index.close()
 
     def _pass_time(self) -> Moment:
-        """Before anything is noted or judged: with what the clock says now, all files have the age they have."""
+        """Before anything is noted or judged: by the present clock, all files have the age they have."""
         now = Moment(self._now_ns(), *self._since_boot())
         moved_ns = self._index.pass_time(now, most_ns=self._retention.trusted_ns)
         if abs(moved_ns) > _SET_NS:
@@ -195,12 +195,12 @@ class RecordingsFolder:
             self._clock.start()
 
     def log(self, item: RecordingRow) -> None:
-        """Note what is known of a file."""
+        """Note the facts of a file."""
         if self._sink is not None:
             self._sink.log(item)
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Write what is queued, within a few seconds."""
+        """Write the queue, within a few seconds."""
         self._stop.set()
         if self._sink is not None:
             self._clock.join()

@@ -208,7 +208,7 @@ class _File:
     name: tuple[str, str]
     rows: dict[tuple[str, str], list[_Timed]]
     ours: bool
-    """It has what a recording of one edge has."""
+    """It has the entities of a recording of one edge."""
 
     @property
     def first(self) -> int:

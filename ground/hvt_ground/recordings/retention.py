@@ -1,4 +1,4 @@
-"""Which files of a folder are due to go, as a pure function of what the index says."""
+"""Decides which files of a folder are due to go, as a pure function of the index."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TRUSTED_SHARE = 1 / 4
 
 @dataclass(frozen=True, slots=True)
 class Retention:
-    """What stays: files within all ``limits``, their video up to ``video_age``. Without them all stays."""
+    """The rules: files within all ``limits`` stay, their video up to ``video_age``. Without rules all stays."""
 
     limits: tuple[Limit, ...] = ()
     video_age: Limit | None = None
@@ -112,7 +112,7 @@ def _surplus(ordered: Sequence[RecordingRow], most_bytes: int, in_use: Container
 
 
 def _older(row: RecordingRow, limit: Limit, now_ns: int) -> bool:
-    """Whether it is, by what the index has seen of it and by its own name."""
+    """Whether it is older, by the index's own time and by its name."""
     limit_ns = (limit.seconds or 0.0) * SECOND_NS
     if now_ns - row.written_ns <= limit_ns:
         return False

@@ -66,7 +66,7 @@ def begun_ns(name: str) -> int | None:
 
 
 class FileAccount:
-    """Gathers what a `RecordingRow` says from the events that go into a file. Its memory is bounded."""
+    """Gathers a `RecordingRow` from the events that go into a file. Its memory is bounded."""
 
     def __init__(self, *, backlog: bool = False) -> None:
         self.backlog = backlog
@@ -93,7 +93,7 @@ class FileAccount:
                 self.span(event.capture_ns)
 
     def span(self, capture_ns: int) -> None:
-        """Something is of this time, which comes from the wire: what no timestamp can hold is held at its end."""
+        """Something is of this time, which comes from the wire: a time that no timestamp can hold is clamped."""
         at_ns = min(max(capture_ns, 0), _LATEST_NS)
         self.begin_ns = at_ns if self.begin_ns is None else min(self.begin_ns, at_ns)
         self.end_ns = at_ns if self.end_ns is None else max(self.end_ns, at_ns)

@@ -1,1 +1,1 @@
-"""Receives again what a ground has received and kept: `command` plays a file of ``hvt-ground --log``."""
+"""Receives again a ground's stored messages: `command` plays a file of ``hvt-ground --log``."""

@@ -61,7 +61,7 @@ _OF_A_LINK = (
 )
 """Settings that mean nothing without a link."""
 _MOST_PAUSE_S = 5.0
-"""With ``--speed``: what stood still for longer is shown shorter."""
+"""With ``--speed``: longer pauses are shortened to this."""
 
 
 def run(argv: Sequence[str]) -> int:

@@ -1,4 +1,4 @@
-"""One edge on the ground's link: what came from it, and a way to ask and tell it something. Knows no frames."""
+"""One edge on the ground's link: its messages, and a way to query it. Knows no frames."""
 
 from __future__ import annotations
 
@@ -134,16 +134,16 @@ class EdgePort:
             _log.warning("%s", sentence)
 
     def fail(self, error: Exception) -> None:
-        """Hand over what went wrong in a callback."""
+        """Hand over the error of a callback."""
         self._errors.append(error)
 
     def raise_error(self) -> None:
-        """Raise what went wrong in a callback, once."""
+        """Raise the error of a callback, once."""
         if self._errors:
             raise self._errors.popleft()
 
     def put(self, item: Received, row: Channel) -> None:
-        """Take a message in; what finds no room is dropped."""
+        """Take a message in, or drop it without room."""
         if self._log is not None:
             self._log(item)
         self.inbox.put(item)

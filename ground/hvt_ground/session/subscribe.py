@@ -1,4 +1,4 @@
-"""The ground's end of the link: what it subscribes to, sorted by edge. Knows Zenoh; knows nothing of frames."""
+"""The ground's end of the link: its subscriptions, sorted by edge. Knows Zenoh; knows nothing of frames."""
 
 from __future__ import annotations
 
@@ -228,7 +228,7 @@ class GroundLink:
             (port.present.set if there else port.present.clear)()
 
     def _fail(self, key: str, error: Exception) -> None:
-        """Hand over what went wrong in a callback: to the edge's thread, which ends its session for it."""
+        """Hand over the error of a callback: to the edge's thread, which ends its session for it."""
         parsed = parse_key(key)
         with self._lock:
             port = None if parsed is None else self._ports.get(parsed[0])

@@ -1,4 +1,4 @@
-"""What a sink is, for those that log, and what a `QueuedSink` writes to in its own thread."""
+"""The contract of a sink, for those that log, and of the writer behind a `QueuedSink` in its own thread."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Sink(Protocol[T_contra]):
         """Take an item."""
 
     def close(self, hurry: threading.Event | None = None) -> None:
-        """Write what is buffered; what only helps and may take seconds is left out once ``hurry`` is set."""
+        """Write the buffer; skip slow extras once ``hurry`` is set."""
 
 
 class SinkWriter(Sink[T_contra], Protocol[T_contra]):
-    """A sink that one thread uses. What it raises ends it."""
+    """A sink that one thread uses. An error that it raises ends it."""
 
     @property
     def path(self) -> Path | None:
@@ -45,7 +45,7 @@ def is_stored(item: object) -> bool:
 
 
 def size_bytes(item: object) -> int:
-    """About what an item takes in memory."""
+    """About the memory of an item."""
     match item:
         case Received():
             return item.size_bytes + _SMALL_BYTES

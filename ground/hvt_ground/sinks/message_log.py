@@ -113,7 +113,7 @@ class MessageLog:
 
 
 def _is_info(payload: bytes) -> bool:
-    """Anybody on the link may send what is none, and as large as a picture."""
+    """Anybody on the link may send other bytes here, and as many as a picture."""
     try:
         Info.parse(payload)
     except WireError:

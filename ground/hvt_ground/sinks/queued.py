@@ -1,4 +1,4 @@
-"""A sink behind a bounded queue, in a thread of its own: what goes wrong or slowly there is felt nowhere else."""
+"""A sink behind a bounded queue, in a thread of its own: its failures and delays are felt nowhere else."""
 
 from __future__ import annotations
 
@@ -102,13 +102,13 @@ class QueuedSink(Generic[T]):
                     _log.warning("%s is too slow: %d events were dropped so far", self.part, self._dropped)
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - `join` has its own
-        """Take nothing more; what is queued is written and the sink closed in its own time."""
+        """Take nothing more; the queue is written and the sink closed in its own time."""
         with self._changed:
             self._ending = True
             self._changed.notify_all()
 
     def join(self, deadline_s: float) -> bool:
-        """Wait for the end until ``deadline_s`` (monotonic), then for a second more without what only helps."""
+        """Wait for the end until ``deadline_s`` (monotonic), then for a second more without slow extras."""
         self.close()
         self._thread.join(max(0.0, deadline_s - time.monotonic()))
         self._hurry.set()
@@ -265,7 +265,7 @@ class Receipt:
 
 
 class Outputs:
-    """All sinks of a ground, for its end; ``failures`` learns what becomes of them. For any thread."""
+    """All sinks of a ground, for its end; ``failures`` learns their outcomes. For any thread."""
 
     def __init__(self, failures: Failures) -> None:
         self._failures = failures

@@ -209,7 +209,7 @@ def state_loads(state: GroundState) -> dict[str, tuple[float, float, float, floa
 
 
 def _words(session: SessionState, *, calibrated: bool) -> list[str]:
-    """The session in a few sentences; what is not known is left out."""
+    """The session in a few sentences; unknown facts are left out."""
     words = []
     if session.total_bps is not None:
         words.append(f"{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")

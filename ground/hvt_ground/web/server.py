@@ -42,9 +42,9 @@ MOST_OPEN = _MOST_CONNECTIONS + 64
 REQUEST_S = 10.0
 """So long a client may take for TLS, and from an answer to the next whole request."""
 STALL_S = 20.0
-"""So long nothing of what was sent may be taken."""
+"""So long a client may take none of the sent bytes."""
 _CLOSE_S = 5.0
-"""So long a closed connection may take for what is left."""
+"""So long a closed connection may take for the rest."""
 _END_S = 2.0
 _LIST_ADDRESSES, _ROW_BYTES = 0x8912, 40 if struct.calcsize("P") == 8 else 32
 """SIOCGIFCONF and struct ifreq of netdevice(7)."""
@@ -95,7 +95,7 @@ class WebPage:
             for role, token in tokens.items()
         )
         self.links = by_token or (self.address,)
-        """What to open, one for each role."""
+        """The links to open, one for each role."""
         self._client: EdgeClient | None = None
         self._loop = asyncio.new_event_loop()
         self._hub = Hub(self._loop)
@@ -125,7 +125,7 @@ class WebPage:
         self._client = client
 
     def feed(self, info: Info) -> Callable[[], SessionFeed]:
-        """What opens a sink for a session, in the sink's thread."""
+        """Make the function that opens a sink for a session, in the sink's thread."""
         page = EdgePage(info.edge)
         return lambda: SessionFeed(info, page, self._hub, clock=self._clock)
 
@@ -163,7 +163,7 @@ class WebPage:
             self._loop.close()
 
     async def _served(self) -> None:
-        """What sessions post is taken meanwhile."""
+        """Sessions' posts are taken meanwhile."""
         bound = await asyncio.to_thread(self._socket.wait, self._stop)
         if bound is not None:
             with bound:
@@ -171,7 +171,7 @@ class WebPage:
 
 
 class _Listener(socket.socket):
-    """Accepts so many connections and closes what comes above, before TLS: each has a descriptor of the process."""
+    """Accepts so many connections and closes further ones before TLS: each has a descriptor of the process."""
 
     _open: Sequence[socket.socket] = ()
 
@@ -225,7 +225,7 @@ class _Server(uvicorn.Server):
 
 
 class _NoStall(asyncio.Protocol):
-    """Ends a connection whose other side takes nothing: to close it would wait for what it does not take."""
+    """Ends a connection whose other side takes nothing: closing it would wait for it."""
 
     transport: asyncio.Transport
     loop: asyncio.AbstractEventLoop

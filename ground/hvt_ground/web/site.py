@@ -37,7 +37,7 @@ _FILES = {
     for one in files("hvt_ground.web").joinpath("static").iterdir()
     if (kind := one.name.rpartition(".")[2]) in _KINDS
 }
-"""Read once: what is asked for is a name of this table, never a path."""
+"""Read once: a requested file is a name of this table, never a path."""
 
 
 class Site:
@@ -68,7 +68,7 @@ class Site:
         return _file(request.path_params["name"])
 
     async def still(self, request: Request) -> Response:
-        """A picture of a still, or of what the base showed there."""
+        """A picture of a still, or of the base's view of it."""
         edge = self._hub.edges.get(request.path_params["edge"])
         found = edge and edge.pictures.get(request.path_params["still"], request.path_params["which"])
         if not found:
@@ -147,7 +147,7 @@ class Site:
             times.append(now_s)
 
     def _obey(self, viewer: Viewer, message: dict[str, Any]) -> None:
-        """Raises `ValueError` and the like for what is no message."""
+        """Raises `ValueError` and the like for anything but a message."""
         match message["type"]:
             case "watch":
                 edge = message["edge"]

@@ -22,7 +22,7 @@ _MOST_QUEUED_BYTES = 4 * 2**20
 """Of a viewer; above, it loses pictures up to the next keyframe."""
 _MOST_TEXTS = 2000
 _MOST_TEXT_BYTES = 4 * 2**20
-"""What is not video is not dropped: who lets so much of it lie is given up."""
+"""Text is not dropped: a viewer with so much of it unread is given up."""
 _MOST_RETAINED_BYTES = 16 * 2**20
 _MOST_RETAINED = 2000
 """Fragments since the last keyframe."""
@@ -61,7 +61,7 @@ class Viewer:
         self._there = asyncio.Event()
 
     def put(self, message: str | bytes) -> None:
-        """Queue what is not to be lost."""
+        """Queue a message that must not be lost."""
         if self._texts >= _MOST_TEXTS or self._text_bytes + len(message) > _MOST_TEXT_BYTES:
             self.hopeless = True
             self._queue.clear()
@@ -88,7 +88,7 @@ class Viewer:
         self._add(message, video=True)
 
     def leave_video(self) -> None:
-        """Forget what is queued of the picture that was watched."""
+        """Forget the queued fragments of the watched picture."""
         self._drop_video()
         self._waits_for_keyframe = False
 
@@ -125,7 +125,7 @@ class Viewer:
 
 @dataclass(slots=True)
 class _Stream:
-    """What is under way on one rung, for those who join."""
+    """The fragments under way on one rung, for new viewers."""
 
     number: int
     start: tuple[str, bytes] | None = None
@@ -170,7 +170,7 @@ class EdgePage:
 
 
 class Hub:
-    """Gives out what the edges' feeds post. Build it with the loop it will live in."""
+    """Gives out the posts of the edges' feeds. Build it with the loop it will live in."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
@@ -278,7 +278,7 @@ class Hub:
         self._want_all()
 
     def watch(self, viewer: Viewer, edge_name: str, rung: Rung) -> None:
-        """Show it this edge from now on, beginning with what it needs for the picture of now."""
+        """Show it this edge from now on, beginning with the fragments of the present picture."""
         viewer.leave_video()
         self._put_thumbnails(viewer)
         viewer.watches = (edge_name, rung)

@@ -1,4 +1,4 @@
-"""What a session sees with: pipeline, tracker and reader of stills, from the settings."""
+"""A session's perception: pipeline, tracker and reader of stills, from the settings."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def make_pipeline(
 
 
 def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info) -> BacklogPerception:
-    """What analyzes the stored video and stills of a session."""
+    """Make the analyzer of the stored video and stills of a session."""
     return BacklogPerception(
         info,
         take_models=models.take,

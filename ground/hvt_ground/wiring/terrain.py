@@ -1,4 +1,4 @@
-"""What the tracks of a flight stand on."""
+"""The surface under the tracks of a flight."""
 
 from __future__ import annotations
 

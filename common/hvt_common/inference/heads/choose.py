@@ -13,7 +13,7 @@ HEAD_NAMES = tuple(KINDS)
 """The values of ``--head``."""
 _RT_DETR = ("rt-detr-rows", "rt-detr")
 _RAW_AXES = 5
-"""(1, 3, H, W, 5+C): what YOLOv5's levels say, beside all of them decoded."""
+"""(1, 3, H, W, 5+C): YOLOv5's levels, beside all of them decoded."""
 
 
 def check_head_name(name: str | None) -> None:

@@ -203,7 +203,7 @@ def _pixels(boxes: Boxes, input_size: tuple[int, int]) -> Boxes:
 
 
 def _valid(boxes: Boxes, scores: Array, class_ids: npt.NDArray[Any], confidence: float) -> HeadOutput:
-    """Drop what is not finite, has no area, or falls below the confidence; a broken number is never a detection."""
+    """Drop boxes that are not finite, have no area or too little confidence; a broken number is no detection."""
     valid = np.isfinite(boxes).all(axis=1) & (scores >= confidence) & (scores <= 1.01)
     valid &= np.isfinite(class_ids) & (class_ids >= 0) & (class_ids < _MOST_CLASSES)
     valid &= (boxes[:, 2:] > boxes[:, :2]).all(axis=1)

@@ -93,7 +93,7 @@ def anchor_count(input_size: tuple[int, int], strides: Sequence[int]) -> int:
 
 
 def are_probabilities(scores: Array) -> bool:
-    """Whether all lie in 0…1, give or take what half precision rounds."""
+    """Whether all lie in 0…1, give or take the rounding of half precision."""
     return bool(np.isfinite(scores).all() and ((scores >= -0.01) & (scores <= 1.01)).all())
 
 

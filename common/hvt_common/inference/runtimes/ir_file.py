@@ -1,4 +1,4 @@
-"""Checks an OpenVINO model (IR), ``NAME.xml`` beside ``NAME.bin``, and reads what its exporter wrote into it."""
+"""Checks an OpenVINO model (IR), ``NAME.xml`` beside ``NAME.bin``, and reads its exporter's metadata."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def files_of(path: Path) -> tuple[Path, ...]:
 
 
 def check_ir_file(path: Path) -> None:
-    """Raise `UserError` in one sentence for what is certainly no IR, or not a whole one."""
+    """Raise `UserError` in one sentence if it is certainly no IR, or not a whole one."""
     if not path.is_file():
         state = "is not a file" if path.exists() else "does not exist"
         raise UserError(f"model {path} {state}; an OpenVINO .xml with its .bin is expected")

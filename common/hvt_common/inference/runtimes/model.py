@@ -93,7 +93,7 @@ class Port:
     shape: tuple[int | None, ...]
     """None where the size is free."""
     dtype: np.dtype[Any] | None
-    """None for what is not a plain tensor of numbers."""
+    """None for anything but a plain tensor of numbers."""
 
     def __str__(self) -> str:
         sizes = ", ".join("?" if size is None else str(size) for size in self.shape)

@@ -51,7 +51,7 @@ _Bytes = bytes | mmap.mmap
 
 
 def check_onnx_file(path: Path) -> None:
-    """Raise `UserError` in one sentence for what is certainly no ONNX model, or not a whole one."""
+    """Raise `UserError` in one sentence if it is certainly no ONNX model, or not a whole one."""
     if not path.exists():
         raise UserError(f"model {path} does not exist; an ONNX file is expected")
     if not path.is_file():

@@ -27,7 +27,7 @@ __all__ = [
 EMBEDDED_DETECTOR = "aerial-nano"
 """Finds vehicles and people from straight above or aslant."""
 EMBEDDED_CLASSIFIER = "aerial-cls"
-"""Names what a still shows."""
+"""Names the objects of stills."""
 
 
 def embedded_models() -> dict[str, Path]:

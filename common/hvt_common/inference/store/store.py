@@ -271,6 +271,6 @@ def _put_in_place(part: Path, path: Path) -> None:
 
 
 def _table(entry: ModelEntry) -> dict[str, Any]:
-    """The entry as TOML knows it: without its name, without what is empty."""
+    """The entry as TOML knows it: without its name and without empty values."""
     fields = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(entry).items()}
     return {key: value for key, value in fields.items() if value and key != "name"}

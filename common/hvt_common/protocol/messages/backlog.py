@@ -55,11 +55,11 @@ _SIZE = Int(1, MAX_BACKLOG_BYTES)
 
 _T = TypeVar("_T")
 ObjectKey = tuple[int, str, int]
-"""Session, kind and number: what an object is called on the link."""
+"""Session, kind and number: an object's key on the link."""
 
 
 class BacklogKind(StrEnum):
-    """What an object is."""
+    """The kind of an object."""
 
     INFO = "info"
     """`Info` of the session, as its edge would have answered; number 0."""
@@ -114,7 +114,7 @@ class AcknowledgedRange:
 
 @dataclass(frozen=True, slots=True)
 class BacklogStill:
-    """A stored still: what would have crossed on ``roi``."""
+    """A stored still: its message on ``roi``."""
 
     attachment: bytes = wire_field(Blob(_MAX_HEADER_BYTES))
     """A `RoiHeader` with the flag `STORED`, sealed over ``payload``."""

@@ -42,7 +42,7 @@ class BitWriter:
 
 
 class BitReader:
-    """Reads what a `BitWriter` wrote; `WireError` where the bytes end before."""
+    """Reads the bits of a `BitWriter`; `WireError` if the bytes end before."""
 
     def __init__(self, data: bytes) -> None:
         self._bits = "".join(f"{one:08b}" for one in data)

@@ -33,7 +33,7 @@ class Context:
         self.seen = 0
 
     def learn(self, bit: int) -> None:
-        """Move towards what came, by 1/2, 1/3, 1/4 … and at last 1/32 of the way, in whole numbers."""
+        """Move towards the coded bit, by 1/2, 1/3, 1/4 … and at last 1/32 of the way, in whole numbers."""
         if bit:
             self.zero -= self.zero // (self.seen + 2)
         else:
@@ -125,7 +125,7 @@ class Encoder(Coder):
         return value
 
     def finish(self) -> bytes:
-        """The shortest bytes that stand for all that was written; the reader takes zeros for what follows."""
+        """The shortest bytes for all coded bits; the reader continues them with zeros."""
         for length in range(_WINDOW_BYTES + 1):
             step = 1 << 8 * (_WINDOW_BYTES - length)
             value = -(-self._low // step) * step

@@ -220,7 +220,7 @@ class _Walk:
         return class_id
 
     def _faster(self, velocity: int, off: int) -> int:
-        """Half of what the prediction missed is taken for a change of velocity."""
+        """Take half of the prediction's error for a change of velocity."""
         changed = velocity + (off << _VELOCITY_BITS - 1) // self._frames
         return min(max(changed, -_FAST), _FAST)
 

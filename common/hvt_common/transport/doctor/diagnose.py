@@ -138,7 +138,7 @@ class LinkWatch:
                 next_visit_s, pause_s = time.monotonic() + pause_s, min(2 * pause_s, _LAST_PAUSE_S)
 
     def _check(self, now_s: float) -> bool:
-        """Whether there is a link; what is wrong with those at its other end is said."""
+        """Whether there is a link; faults at its other end are reported."""
         with self._using:
             if self._stop.is_set():
                 return True

@@ -73,7 +73,7 @@ class StillCodec(Protocol):
 
     @property
     def needs_base(self) -> bool:
-        """Whether ``base_bgr`` has to be given: what the decoded base frame shows of the crop, at the same size."""
+        """Whether ``base_bgr`` has to be given: the same crop of the decoded base frame, at the same size."""
         ...
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:

@@ -57,7 +57,7 @@ class ResidualCodec:
     needs_base = True
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:
-        """Code what ``base_bgr``, of the crop's shape, lacks of the crop."""
+        """Code the difference of the crop to ``base_bgr``, which has its shape."""
         if base_bgr is None or base_bgr.shape != crop_bgr.shape:
             raise BaseMissingError(
                 f"a residual of a crop of {crop_bgr.shape} needs a base crop of that shape"

@@ -1,4 +1,4 @@
-"""Opens files and streams through PyAV, and reads what can be read of damaged ones."""
+"""Opens files and streams through PyAV, and reads the usable part of damaged ones."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _TS_BYTES = (188, 192, 204)
 
 
 def is_local(spec: str) -> bool:
-    """Whether it is a path. What is there is one, whatever its name looks like."""
+    """Whether it is a path. An existing path is one, whatever its name looks like."""
     with suppress(OSError, ValueError):
         return "://" not in spec or Path(spec).exists()
     return "://" not in spec
@@ -194,7 +194,7 @@ def decoded(
 
 
 class _Reading:
-    """One pass over a stream, which counts what is damaged."""
+    """One pass over a stream, which counts damaged packets."""
 
     def __init__(self, container: Any, stream: Any) -> None:
         self._container, self._stream = container, stream
@@ -227,7 +227,7 @@ class _Reading:
             yield f"is unfinished: {why}"
 
     def _unfinished(self) -> str:
-        """Why what was played is not all that there should be; empty where nothing says so."""
+        """Why the played part is not all that there should be; empty if nothing says so."""
         container, stream = self._container, self._stream
         if (size := _size_of(container)) != self._size:
             return f"it has grown by {(size or 0) - (self._size or 0)} bytes since: --follow waits for more"
@@ -302,7 +302,7 @@ def _seconds(stamp: int | None, base: Fraction | None) -> Fraction | None:
 
 
 def _size_of(container: Any) -> int | None:
-    """Bytes of a file now; None for what is none."""
+    """Bytes of a file now; None for anything else."""
     name = str(container.name or "")
     with suppress(OSError, ValueError):
         return Path(name.removeprefix("file:")).stat().st_size if name.startswith("file:") else None

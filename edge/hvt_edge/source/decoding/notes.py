@@ -10,7 +10,7 @@ __all__ = ["Notes"]
 
 
 class Notes:
-    """Takes sentences; ``name`` is what they are about, as it may be printed."""
+    """Takes sentences; ``name`` is their subject, as it may be printed."""
 
     def __init__(self, name: str) -> None:
         self._name = name

@@ -155,7 +155,7 @@ class Pictures:
 
 
 def matrix_of(frame: av.VideoFrame) -> int:
-    """The colour matrix of a YUV frame (H.273, table 4): what it says, else by its height."""
+    """The colour matrix of a YUV frame (H.273, table 4): its tag, else by its height."""
     if frame.colorspace not in _UNSAID:
         return int(frame.colorspace)
     return _BT709 if frame.height > _UNTAGGED_SD_PX else _BT601

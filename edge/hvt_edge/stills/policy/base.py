@@ -22,7 +22,7 @@ STILL_OVERHEAD_BYTES = 180.0
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What every method may know of the moment beside the candidates."""
+    """The facts of the moment that every method may use beside the candidates."""
 
     frame_index: int
     now_ns: int
@@ -31,9 +31,9 @@ class Step:
     base_size: tuple[int, int]
     """(width, height) in base pixels."""
     cost: CostEstimate
-    """What a still is expected to cost, learnt from those already sent."""
+    """The expected cost of a still, learnt from those already sent."""
     allowance_bytes: float
-    """What the rolling budget would admit now."""
+    """The bytes that the rolling budget would admit now."""
     still_overhead_bytes: float = STILL_OVERHEAD_BYTES
     """Line bytes that a still takes beside its payload: header, framing, transport."""
     from_source: bool = False
@@ -53,7 +53,7 @@ class Request:
     """Neighbours that the same still shows (`hvt_edge.stills.merging`), by track id; never ``candidate`` itself."""
 
     def without_frame(self) -> Request:
-        """The same, with what is measured on the frame measured now: a pending still must not hold frames."""
+        """The same with measurements of the frame made now: a pending still must not hold frames."""
         return replace(
             self, candidate=_measured(self.candidate), also=tuple(_measured(one) for one in self.also)
         )

@@ -23,7 +23,7 @@ _PRIOR_BYTES_PER_PX = 0.12
 _PRIOR_MEAN_BYTES = 1500.0
 _PRIOR_AREAS_PX = (1_000.0, 6_000.0, 30_000.0)
 _PRIORS = {"residual": (100.0, 0.06), "h264-intra": (120.0, 0.09)}
-"""(fixed bytes, bytes a pixel) between what cars of 60 pixels and vehicles of 15 took at quality 65."""
+"""(fixed bytes, bytes a pixel) between the cost of cars of 60 pixels and of vehicles of 15 at quality 65."""
 _PRIOR_MEAN_PX = 7_000.0
 
 

@@ -56,9 +56,9 @@ class ExpectedGain:
     sharp_half: float = 20.0
     """Sharpness (variance of the Laplacian) at which it is half as useful."""
     border_share: float = 0.2
-    """What a cut-off object takes from the use of its still."""
+    """The part of a still's use that a cut-off object loses."""
     covered_share: float = 0.3
-    """What an object that is wholly covered by another would take from it."""
+    """The part of it that an object wholly covered by another would lose."""
     fade_s: float = 60.0
     """Time constant with which the effect of a still wears off; 0 forgets at once."""
     unanswered: float = 0.3
@@ -68,7 +68,7 @@ class ExpectedGain:
     again: float = 0.1
     """The use of another still of the same view, against the first."""
     detail_weight: float = 0.0
-    """What a large object's details are worth that the base does not show at all, in classes that are set right."""
+    """The worth of a large object's details that the base does not show at all, in corrected classes."""
     detail_px: float = 48.0
     """Side in source pixels at which an object has half of the details that a large one has."""
     min_gain: float = 0.02
@@ -105,7 +105,7 @@ class ExpectedGain:
         return worth * self.use(candidate, from_source=step.from_source) if worth >= self.min_gain else 0.0
 
     def hidden_detail(self, candidate: Candidate) -> float:
-        """0…1: what a still shows of an object that the base, at its size and rate, does not: pixels on target."""
+        """0…1: the details in a still of an object that the base, at its size and rate, lacks: pixels on target."""
         area_px = max(0.0, candidate.area_px)
         half = max(1.0, self.detail_px)
         return self._lost(candidate) * area_px / (area_px + half * half)

@@ -123,7 +123,7 @@ class Small:
 
 @dataclass(frozen=True, slots=True)
 class Utility:
-    """M5: highest score first, above a threshold that follows from what the budget allows."""
+    """M5: highest score first, above a threshold that follows from the budget's allowance."""
 
     uncertainty_weight: float = 0.5
     small_weight: float = 0.3

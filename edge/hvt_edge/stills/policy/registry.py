@@ -32,7 +32,7 @@ class MethodEntry:
 
     make: Callable[..., Method]
     parameters: Mapping[str, float]
-    """Name and default of what may be tuned."""
+    """Name and default of the parameters of ``--tune``."""
 
 
 def _entry(make: type[Any]) -> MethodEntry:

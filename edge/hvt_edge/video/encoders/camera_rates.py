@@ -40,7 +40,7 @@ class FullestWindow:
         """Bytes of the fullest window so far."""
 
     def add(self, size_bytes: int, *, at_ns: int) -> int:
-        """Take in one unit; return what the window that ends with it holds."""
+        """Take in one unit; return the bytes of the window that ends with it."""
         if self._inside and at_ns < self._inside[-1][0]:  # its clock was set back
             self._inside.clear()
             self._held = 0

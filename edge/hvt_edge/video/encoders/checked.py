@@ -1,4 +1,4 @@
-"""An encoder that HVT has not tested itself: what it gives is checked, unit for unit."""
+"""An encoder that HVT has not tested itself: its units are checked one by one."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class CheckedEncoder:
 
     @property
     def mean_qp(self) -> float:
-        """See `Encoder`; NaN for one that does not say, or says what cannot be."""
+        """See `Encoder`; NaN for one that says nothing, or an impossible value."""
         said = getattr(self._encoder, "mean_qp", math.nan)
         return float(said) if isinstance(said, int | float) and 0 <= said <= 51 else math.nan
 
     def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
-        """See `Encoder`. What is a keyframe is read from the unit, whatever the encoder says of it."""
+        """See `Encoder`. The unit itself tells whether it is a keyframe, whatever the encoder says of it."""
         assert not regions, "config.check() refuses regions with another encoder than x265"
         unit = self._encoder.encode(frame, keyframe=keyframe)
         data = getattr(unit, "data", None)

@@ -1,4 +1,4 @@
-"""What the frame loop takes of an encoder, x265's or another's."""
+"""The frame loop's contract with an encoder, x265's or another's."""
 
 from __future__ import annotations
 
@@ -36,4 +36,4 @@ class Encoder(Protocol):
 
 
 MakeEncoder = Callable[[EncoderSettings], Encoder]
-"""What an entry point of the group ``hvt.encoders`` is; it raises where the settings are not taken."""
+"""The entry point of the group ``hvt.encoders``; it raises if it refuses the settings."""

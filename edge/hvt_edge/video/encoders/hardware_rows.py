@@ -21,7 +21,7 @@ class HardwareRow:
     """Its name there, and of ``--encoder``."""
     pixel_format: str
     needs: str
-    """What has to be in the machine."""
+    """The hardware that it needs."""
     options: Mapping[str, str] = field(default_factory=dict)
     """Zero latency, constant rate, and an IDR where a keyframe is forced."""
 

@@ -20,7 +20,7 @@ _LONG_KEYFRAMES_S = 4.0
 
 
 class Passthrough:
-    """An `Encoder` that encodes nothing. What is a keyframe is the camera's to say, whatever is asked for."""
+    """An `Encoder` that encodes nothing. The camera decides on keyframes, whatever is requested."""
 
     mean_qp = math.nan
 
@@ -39,7 +39,7 @@ def unit_of(frame: Frame) -> AccessUnit:
 
 
 def measure_camera(stream: CameraStream, *, window_s: float, edge_id: str) -> Measured:
-    """The fullest window of what was seen of the camera by its own times, and its largest keyframe; line bytes."""
+    """The fullest window of the surveyed camera by its own times, and its largest keyframe; line bytes."""
     window, largest = FullestWindow(round(window_s * SECOND_NS)), 0
     for unit in stream.units:
         size = line_bytes(unit.size_bytes, edge_id)

@@ -17,7 +17,7 @@ __all__ = ["GROUP", "PASSTHROUGH", "X265", "check_encoder", "encoder_names", "op
 GROUP = "hvt.encoders"
 """The entry points' group."""
 X265 = "x265"
-"""What HVT brings and has measured: the only one that takes regions and needs no qualification."""
+"""HVT's own, measured encoder: the only one that takes regions and needs no qualification."""
 PASSTHROUGH = "passthrough"
 """None at all: the units of a camera that makes HEVC itself."""
 _OWN = frozenset({X265, PASSTHROUGH}) | HARDWARE.keys()
@@ -25,7 +25,7 @@ _WHAT = "encoder"
 
 
 def encoder_names() -> tuple[str, ...]:
-    """What ``--encoder`` takes here: HVT's own first, whether or not the device is there; none is loaded."""
+    """The values of ``--encoder`` here: HVT's own first, whether or not the device is there; none is loaded."""
     return (X265, PASSTHROUGH, *HARDWARE, *sorted(installed(GROUP).keys() - _OWN))
 
 

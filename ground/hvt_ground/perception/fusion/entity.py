@@ -24,7 +24,7 @@ MISSED_STEPS = 2
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """A box that somebody else saw at one frame, and how the object moves beyond what the camera does."""
+    """A box of another witness at one frame, and the object's own motion beyond the camera's."""
 
     box: _Floats
     """(4,) float64 x1 y1 x2 y2, base pixels."""
@@ -86,7 +86,7 @@ class Entity:
     own_then: tuple[_Floats, int] | None = None
     """(2,) the centre of our own box at the frame of a step, and that frame."""
     correction: tuple[_Floats, int] | None = None
-    """(4,) what to add to our own box, and the frame of the still that showed it."""
+    """(4,) correction of our own box, and the frame of the still that showed it."""
     last_frame: int = -1
     """The newest at which anybody saw it."""
 

@@ -302,7 +302,7 @@ class Fusion:
     # After news
 
     def _update(self, own: Tracks | None, frame_index: int) -> None:
-        """Find who is who, forget what is over, give ids."""
+        """Associate tracks, forget ended ones, give ids."""
         if own is not None:
             self._pair(own, frame_index)
         self._forget_old(frame_index)
@@ -312,7 +312,7 @@ class Fusion:
                 self._next_id += 1
 
     def _pair(self, own: Tracks, frame_index: int) -> None:
-        """Join what only we see with what only others see, where both are at the same place."""
+        """Join our unmatched tracks with those of others at the same place."""
         rows = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
         theirs = [one for one in self._entities if one.own_id not in rows and self._is_far(one, frame_index)]
         if not theirs:

@@ -32,7 +32,7 @@ class FusionRules:
     """How two opinions on one object become one, where it depends on the session; the reasons stand in `fuse`."""
 
     patience: int
-    """For how many frames what was seen from afar holds."""
+    """For how many frames an edge-only track holds."""
     reach: int
     """For how many frames its own motion is extrapolated."""
     half_life: float

@@ -1,4 +1,4 @@
-"""Whether the edge's silence speaks against what only we see; see `fuse`, "Who is believed"."""
+"""Whether the edge's missed detection is evidence against a track of ours; see `fuse`, "Who is believed"."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class FrameReadings:
 
 
 class StillReader(Protocol):
-    """Names what stills show."""
+    """Names the objects in stills."""
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -81,7 +81,7 @@ def _silent(stills: Sequence[DecodedStill]) -> FrameReadings:
 
 
 class NoReader:
-    """Shows stills and says nothing of them: what a ground without any model does."""
+    """Shows stills without any names: the reader of a ground without models."""
 
     class_names: tuple[str, ...] = ("object",)
 
@@ -133,7 +133,7 @@ class Redetection:
         return self._detector.class_names
 
     def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:
-        """Class and box of what is detected at each object's place; no opinion where nothing is."""
+        """Class and box of the detection at each object's place; no opinion without one."""
         if base_bgr is None or not stills:
             return _silent(stills)
         found = self._detect(stills, base_bgr)

@@ -33,7 +33,7 @@ class Patch:
     top: int
     image_bgr: Image
     opacity: npt.NDArray[np.float32]
-    """(height, width) 0…1: what of each pixel the still covers, soft at the seam."""
+    """(height, width) 0…1: the share of each pixel that the still covers, soft at the seam."""
 
 
 def composite(base_bgr: Image, stills: Sequence[DecodedStill], *, view: View, zoom: float = 1.0) -> Image:

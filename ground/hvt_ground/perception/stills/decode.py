@@ -86,7 +86,7 @@ def decode_still(still: ReceivedStill, *, base: Image | YuvPicture | None, view:
 
 
 def _coded_size(header: RoiHeader, *, view: View) -> tuple[int, int]:
-    """(width, height) as announced. A still may be shrunk, never be larger than what it shows."""
+    """(width, height) as announced. A still may be shrunk, never be larger than its area in the source."""
     x1, y1, x2, y2 = header.crop_source_px
     size = header.parameters.get("w", x2 - x1), header.parameters.get("h", y2 - y1)
     inside = x2 <= view.source_size[0] and y2 <= view.source_size[1]

@@ -90,9 +90,9 @@ class ResolvedStill:
     track_id: int | None
     """The ground's track; None unless the outcome is matched or superseded."""
     class_before: str
-    """The class that was shown for the track; without a track what the edge's detector said."""
+    """The class that was shown for the track; without a track the class of the edge's detector."""
     class_after: str
-    """The class that is shown from now on; without a track what the still alone says."""
+    """The class that is shown from now on; without a track the class of the still alone."""
     confidence: float
     """Confidence of ``class_after``, 0…1."""
     doubted: bool = False

@@ -35,7 +35,7 @@ class Progress:
     """How far the ground is."""
 
     frame_index: int = 0
-    """The newest frame of which anything is known; what happens now is shown there."""
+    """The newest frame of which anything is known; new events are shown there."""
     capture_ns: int = 0
     picture_index: int = -1
     """The newest decoded frame; -1 before the first."""
@@ -77,7 +77,7 @@ class StillStage:
         self.dropped: Counter[str] = Counter()
         """Stills of which nothing could be made, by reason."""
         self.outcomes: Counter[str] = Counter()
-        """What became of each object in the others."""
+        """The outcome of each object in the others."""
 
     @property
     def pending(self) -> int:
@@ -90,7 +90,7 @@ class StillStage:
         self.update(now)
 
     def update(self, now: Progress) -> None:
-        """Read what need not wait any longer, and settle what can be: call it after each picture and each step."""
+        """Read stills that need not wait longer, and settle them if possible: call it after each picture and step."""
         ready = [still for still in self._pending if not self._may_wait(still.header, now)]
         if ready:
             self._pending = [still for still in self._pending if self._may_wait(still.header, now)]
@@ -106,7 +106,7 @@ class StillStage:
             self._resolved(resolved, now)
 
     def end(self, now: Progress) -> None:
-        """The session is over: what still waits is given out as it is."""
+        """The session is over: waiting stills are given out as they are."""
         ready, self._pending = self._pending, []
         self._read(ready, now)
         for resolved in self._refiner.end():

@@ -1,4 +1,4 @@
-"""The screen a recording opens as, and the names of what is on it."""
+"""The screen a recording opens as, and the names of its views."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ EVENTS = "/events"
 SESSION = "/session"
 
 _MAP_ZOOM = 18.0
-"""Half a kilometre on a screen: about what a camera in the air sees."""
+"""Half a kilometre on a screen: about the view of a camera in the air."""
 _PAPER = (14, 17, 22)
 """Background behind pictures."""
 

@@ -49,7 +49,7 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
 
 
 def _read(path: Path) -> tuple[str, list[Chunk]]:
-    """The edge's id, and everything but what is of the file itself."""
+    """The edge's id, and everything but the file's own entities."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that there is no footer

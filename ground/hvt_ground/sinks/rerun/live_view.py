@@ -147,7 +147,7 @@ class LiveRecording:
         """A viewer has them already."""
 
     def close(self, hurry: threading.Event | None) -> None:
-        """Send what is under way and disconnect."""
+        """Send the queue and disconnect."""
         try:
             if not (hurry and hurry.is_set()):
                 self._recording.flush(timeout_sec=2.0)
@@ -159,7 +159,7 @@ class LiveRecording:
                 del self._recording
 
     def _check(self) -> None:
-        """Look for the viewer once a second: the SDK would keep what it cannot send, and slow every call."""
+        """Look for the viewer once a second: the SDK would keep everything it cannot send, and slow every call."""
         now_s = time.monotonic()
         if now_s < self._next_check_s:
             return
@@ -171,7 +171,7 @@ class LiveRecording:
 def started_viewer(
     options: Sequence[str], *, port: int, needs: str, environment: Mapping[str, str] | None = None
 ) -> subprocess.Popen[bytes]:
-    """The viewer's process, once it listens at ``port``; `UserError` with what it ``needs`` where it never does."""
+    """The viewer's process, once it listens at ``port``; `UserError` with its ``needs`` if it never does."""
     process = subprocess.Popen(  # noqa: S603  # the SDK's own program, no shell
         [str(viewer_program()), "--bind", _HOST, "--port", str(port), *options],
         env={**(environment or {}), **viewer_environment()},

@@ -135,7 +135,7 @@ class OverlayEncoder:
         return [LayerUpdate(layer, components) for layer, components in self._written.items()]
 
     def earn(self, received_bytes: int) -> None:
-        """Credit the share of what was received on the link."""
+        """Credit the share of the bytes received on the link."""
         self._credit = min(self._credit + self._share * received_bytes, self._limit)
 
     def choose(self, track_id: int) -> None:
@@ -209,7 +209,7 @@ class BacklogOverlays:
         self._credit_bytes = 0
 
     def note(self, overlay: Overlay, encoder: OverlayEncoder) -> None:
-        """A live overlay was written; ``encoder`` knows what is on the screen."""
+        """Note a live overlay; ``encoder`` knows the screen."""
         frame, newest = overlay.frame_index, self._newest
         if newest is not None and frame <= newest:
             return
@@ -221,7 +221,7 @@ class BacklogOverlays:
             self._holes.append(_Hole(before, frame, overlay.capture_ns, tuple(encoder.screen)))
 
     def earn(self, received_bytes: int) -> None:
-        """Credit what came of stored video, as `OverlayEncoder.earn`."""
+        """Credit the bytes of stored video, as `OverlayEncoder.earn`."""
         self._credit_bytes += received_bytes
 
     def encode(self, overlay: Overlay) -> list[tuple[int, int, LayerUpdate]]:
@@ -246,7 +246,7 @@ class BacklogOverlays:
 
 
 def _held(screen: _Screen, overlay: Overlay) -> _Screen:
-    """The overlay's values on their grids, except where what is on screen is near enough."""
+    """The overlay's values on their grids, except where the screen is near enough."""
     corners = overlay.boxes_base_px
     boxes = np.hstack((corners[:, :2] + corners[:, 2:], corners[:, 2:] - corners[:, :2])) / 2
     percents = np.round(overlay.confidences * 100).astype(np.int64)

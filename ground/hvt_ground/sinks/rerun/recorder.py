@@ -51,7 +51,7 @@ ON_DEMAND = "asked"
 _PLOT_GAP_NS = 2_500_000_000
 """Plots have a hole where nothing was measured for longer."""
 _BYTES_EACH = {"boxes": 6, "identity": 2, "places": 4, "words": 5}
-"""About what the component costs a track; others cost little more than their row."""
+"""About the component's cost for a track; others cost little more than their row."""
 _MOST_CLASSES = 256
 """Names of classes in a recording; more are `OTHER`. A new name is written with all before it, and an edge may name
 thousands."""
@@ -71,7 +71,7 @@ _NOTICE_LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
 @dataclass(frozen=True, slots=True)
 class RecorderSettings:
-    """What a recording is of, and where it goes."""
+    """The subject of a recording, and where it goes."""
 
     path: Path | None
     """The file; None shows it live only."""
@@ -113,10 +113,10 @@ class Recorder:
         """By name and level of brightness; of all files, which may be opened together."""
         self._class_names: set[str] = {OTHER}
         self._shown: dict[tuple[str, str], TableRow] = {}
-        """What is on the screen: the newest row of each table whose values hold until the next."""
+        """The screen: the newest row of each table whose values hold until the next."""
         self._last_sample: int | None = None
         self._awaits_keyframe = False
-        """Whether live video begins anew at its next keyframe. What was stored comes again where it was lost."""
+        """Whether live video begins anew at its next keyframe. Lost stored objects come again."""
         self._skipped = 0
         self._settings = settings
         self._traffic_end: tuple[int, int] | None = None
@@ -222,7 +222,7 @@ class Recorder:
         file.close(hurry, session=came)
 
     def skipped(self, count: int) -> None:
-        """Video goes on at its next keyframe, and the log says what is missing."""
+        """Video goes on at its next keyframe, and the log names the loss."""
         self._skipped += count
         self._awaits_keyframe = True
 
@@ -302,7 +302,7 @@ class Recorder:
         return not self._awaits_keyframe and self._decodable(sample)
 
     def _decodable(self, sample: VideoSample) -> bool:
-        """Rerun shows garbage for what its decoder cannot use, so begin at a keyframe and never go back."""
+        """Rerun shows garbage for undecodable units, so begin at a keyframe and never go back."""
         if self._last_sample is None:
             return sample.keyframe and bool(parameter_sets(sample.data))
         return sample.frame_index > self._last_sample and bool(sample.data)

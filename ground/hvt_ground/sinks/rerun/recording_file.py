@@ -19,11 +19,11 @@ from hvt_ground.sinks.rerun.tables import TABLE_BYTES, SizeLimit, Table, TableRo
 __all__ = ["RecordingFile"]
 
 _CLASS_BYTES = 40
-"""What a class takes each time that names and colours are written: they go with the next compaction."""
+"""Cost of a class each time that names and colours are written: they go with the next compaction."""
 
 
 class RecordingFile:
-    """Takes rows whose time is known. What was written is in the file; ``size_limit`` is told what it costs."""
+    """Takes rows whose time is known. Written rows are in the file; ``size_limit`` is told their cost."""
 
     def __init__(self, output: RrdFile | LiveRecording, *, size_limit: SizeLimit, compact_bytes: int) -> None:
         self.path: Path | None = output.path if isinstance(output, RrdFile) else None
@@ -38,7 +38,7 @@ class RecordingFile:
         self._pending_bytes = 0
         self._tables: dict[tuple[str, str], Table] = {}
         self._contexts: dict[str, Chunk] = {}
-        """Static values since the last compaction, by what they are."""
+        """Static values since the last compaction, by entity."""
         self._classes_written: dict[Layer, int] = {}
         self._legend: tuple[str, ...] = ()
 

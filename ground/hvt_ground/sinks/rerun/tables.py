@@ -34,9 +34,9 @@ __all__ = [
 
 _LATEST_NS = 2**63 - 1
 FIXED_BYTES = 77_000
-"""About what the blueprint and the static values cost."""
+"""About the cost of the blueprint and the static values."""
 TABLE_BYTES = 2_000
-"""About what a table costs in each compaction before its first row: a chunk and its columns."""
+"""About the cost of a table in each compaction before its first row: a chunk and its columns."""
 _HEAD_START_BYTES = 30_000
 """Beyond the ratio, so that the first pictures of a flight are shown."""
 
@@ -147,7 +147,7 @@ class Table:
 
 
 class SizeLimit:
-    """How large a recording may be: what is worth writing depends on how many bytes the link brought."""
+    """The limit of a recording's size: the more bytes the link brought, the more is worth writing."""
 
     def __init__(self) -> None:
         self.received_bytes = 0

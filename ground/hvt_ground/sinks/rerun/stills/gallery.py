@@ -69,7 +69,7 @@ class Gallery:
         self._changed = [False] * slots
         """Whether the still that a slot shows now changed a class."""
         self._times: list[list[tuple[int, int]]] = [[] for _ in range(slots)]
-        """(frame index, capture time) of what was put into each slot, in their order."""
+        """(frame index, capture time) of the pairs put into each slot, in their order."""
 
     def put(self, frame_index: int, capture_ns: int, *, changed: bool) -> int | None:
         """A slot for a still of now; None where all are held.

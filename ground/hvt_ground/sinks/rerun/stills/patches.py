@@ -55,7 +55,7 @@ class _Patch:
 
 
 class Patches:
-    """Hands out slots, one a track, and moves what is in them. Frames must not go back."""
+    """Hands out slots, one a track, and moves their contents. Frames must not go back."""
 
     def __init__(self) -> None:
         self._patches: dict[int, _Patch] = {}  # by slot

@@ -35,7 +35,7 @@ _PATCH_BYTES = 100
 
 
 class StillRows:
-    """Decides what of each still is worth writing. Not safe for threads."""
+    """Decides which parts of each still are worth writing. Not safe for threads."""
 
     def __init__(self, size_limit: SizeLimit) -> None:
         self._size_limit = size_limit
