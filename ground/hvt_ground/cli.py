@@ -8,9 +8,10 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
-from hvt_common.errors import exit_with_sentence, needs_extra
+from hvt_common.errors import UserError, exit_with_sentence, needs_extra
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
+from hvt_common.runtime.plug_ins import the_one
 from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
 
 __all__ = ["main", "program"]
@@ -30,13 +31,14 @@ Other commands, each with --help:
   hvt-ground keys                        make keys, and say who may do what"""
 _COMMANDS = {
     "doctor": "hvt_ground.doctor.command",
-    "export": "hvt_ground.exports.command",
-    "keys": "hvt_ground.pki.command",
     "recordings": "hvt_ground.recordings.command",
-    "replay": "hvt_ground.replay.command",
     "status": "hvt_ground.control.watch",
 }
 """By name, the module whose ``run`` takes the words that follow; imported for none but its own."""
+_EXTRA_COMMANDS = "hvt.ground_commands"
+"""Entry points of commands that extras bring: each is such a ``run``."""
+_BROUGHT = ("export", "keys", "replay")
+"""Commands of the extras that come with HVT."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -61,6 +63,15 @@ def _run(argv: Sequence[str] | None) -> int:
 
         if words[0] in control.COMMANDS:
             return control.run(words)
+        entry = the_one(_EXTRA_COMMANDS, words[0], what="command", built_in=False)
+        if entry is not None:
+            with needs_extra("'hvt[ground]'"):
+                run = entry.load()
+            return int(run(words[1:]))
+        if words[0] in _BROUGHT:
+            raise UserError(
+                f"hvt-ground {words[0]} is of an extra that is not installed: pip install 'hvt[ground]'"
+            )
     from hvt_ground.extras import checked, config_class  # noqa: PLC0415
 
     config, requested = load(config_class(), argv, program="hvt-ground", description=_DESCRIPTION)

@@ -15,8 +15,8 @@ from hvt_common.protocol.channels import check_edge_pattern, matches
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
+from hvt_fleet.pki.roster import GroundMember, Roster, RouterMember
 from hvt_ground.config import GroundConfig
-from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
 from lab.fuzz.contract import Target, scratch
 
 __all__ = ["TARGETS"]

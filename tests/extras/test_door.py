@@ -6,6 +6,7 @@ import pytest
 
 from hvt_common.config import load
 from hvt_common.errors import UserError
+from hvt_ground.cli import main
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import all_extras, config_class
 
@@ -31,3 +32,13 @@ def test_extras_bring_what_the_core_has_not():
     settings = [one for extra in all_extras() for one in vars(extra.options)["__annotations__"]]
     assert sorted(settings) == ["cot", "cot_types", "mcap", "ts"]
     assert not set(settings) & set(GroundConfig.__annotations__)
+
+
+@pytest.mark.parametrize("command", ["export", "keys", "replay"])
+def test_a_command_of_an_extra_that_is_absent(command, monkeypatch, capsys):
+    """It would be an unrecognised argument of the ground."""
+    monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})
+    assert main([command]) == 2
+    assert capsys.readouterr().err == (
+        f"hvt-ground: hvt-ground {command} is of an extra that is not installed: pip install 'hvt[ground]'\n"
+    )

@@ -24,7 +24,6 @@ from hvt_gateways.transport_stream.moments import Moment, Moments
 from hvt_gateways.transport_stream.timeline import TIME_BASE, Timeline
 from hvt_gateways.transport_stream.uas import Platform, uas_local_set
 from hvt_ground.events import Event, Overlay, PoseUpdate, VideoSample
-from hvt_ground.exports.video import from_keyframe
 from hvt_ground.geolocation.trail import PoseTrail
 from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.decodable import DecodableRun
@@ -170,7 +169,7 @@ def write_recorded(recorded: Recorded, path: Path) -> None:
     elif recorded.poses:
         view = recorded.poses[0].view
     else:
-        with av.open(io.BytesIO(from_keyframe(recorded)[0].data), format="hevc") as probe:
+        with av.open(io.BytesIO(recorded.decodable_video()[0].data), format="hevc") as probe:
             size = probe.streams.video[0].width, probe.streams.video[0].height
         view = View.fitted(size, size, fit="letterbox")
     platform = Platform(recorded.edge, recorded.session, view, recorded.surface)

@@ -22,7 +22,7 @@ from rerun.chunk import Chunk, RrdReader
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Info, RoiHeader, WireError
-from hvt_common.video.annex_b import is_keyframe
+from hvt_common.video.annex_b import is_keyframe, parameter_sets
 from hvt_ground.events import Notice, Overlay, PoseUpdate, VideoSample
 from hvt_ground.geolocation.camera import places_of_boxes
 from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
@@ -108,6 +108,13 @@ class Recorded:
         times |= {one.frame_index: one.capture_ns for one in self.video}
         for frame in sorted(times):
             yield self._overlay(frame, times[frame])
+
+    def decodable_video(self) -> list[VideoSample]:
+        """The samples from the first that can be decoded on; `UserError` where there is none."""
+        for number, one in enumerate(self.video):
+            if one.keyframe and parameter_sets(one.data):
+                return list(self.video[number:])
+        raise UserError(f"the recording of {self.edge} has no video: it was removed, or none came")
 
     def all(self) -> Iterator[VideoSample | Overlay | RecordedStill | Notice | PoseUpdate]:
         """All of it, in order of frames; of a frame the picture comes first."""

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import json5
 
 from hvt_common.transport.zenoh_config import LinkSettings
-from hvt_ground.pki.authority import Authority
-from hvt_ground.pki.command import run
+from hvt_fleet.pki.authority import Authority
+from hvt_fleet.pki.command import run
 
 __all__ = ["EXPIRED", "Fleet"]
 

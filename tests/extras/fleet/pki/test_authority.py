@@ -16,9 +16,9 @@ from cryptography.x509.oid import NameOID
 from hvt_common.errors import UserError
 from hvt_common.transport.rights import Rights
 from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_fleet.pki.command import run
+from hvt_fleet.pki.roster import Roster
 from hvt_ground.cli import main
-from hvt_ground.pki.command import run
-from hvt_ground.pki.roster import Roster
 from programs.fleet_keys import Fleet
 
 DEPLOY = Path(__file__).resolve().parents[3] / "deploy"

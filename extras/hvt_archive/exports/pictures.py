@@ -9,9 +9,9 @@ from typing import Any
 
 import cv2
 
+from hvt_archive.exports.video import pictures
 from hvt_common.errors import UserError
 from hvt_ground.events import Overlay
-from hvt_ground.exports.video import pictures
 from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.tracks_table import utc_text
 

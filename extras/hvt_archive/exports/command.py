@@ -10,13 +10,13 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from hvt_archive.exports.maps import write_geojson, write_kml
+from hvt_archive.exports.pictures import write_coco, write_stills
+from hvt_archive.exports.tables import write_csv, write_mot, write_parquet
+from hvt_archive.exports.video import CONTAINERS, write_video
+from hvt_archive.exports.whole import whole_file, whole_folder
 from hvt_common.errors import Parser, UserError, check_not_read
 from hvt_common.runtime.reporting import say
-from hvt_ground.exports.maps import write_geojson, write_kml
-from hvt_ground.exports.pictures import write_coco, write_stills
-from hvt_ground.exports.tables import write_csv, write_mot, write_parquet
-from hvt_ground.exports.video import CONTAINERS, write_video
-from hvt_ground.exports.whole import whole_file, whole_folder
 from hvt_ground.extras import all_extras
 from hvt_ground.recordings.recorded import Recorded, read_recordings
 from hvt_ground.wiring import make_surfaces

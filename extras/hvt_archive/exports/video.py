@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from av.container import OutputContainer
 
-from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
 from hvt_common.video.annex_b import parameter_sets
@@ -22,7 +21,7 @@ from hvt_ground.events import Overlay, VideoSample
 from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.palette import class_colour
 
-__all__ = ["CONTAINERS", "from_keyframe", "pictures", "write_video"]
+__all__ = ["CONTAINERS", "pictures", "write_video"]
 
 CONTAINERS = {"mp4": "mp4", "mkv": "matroska", "ts": "mpegts"}
 """libavformat's names of the containers."""
@@ -37,7 +36,7 @@ def write_video(recorded: Recorded, path: Path, *, container: str, burn_in: bool
     ``burn_in`` draws boxes, ids and classes into them, which codes them again (H.264).
     Raises `UserError` where the recording has no video.
     """
-    samples = from_keyframe(recorded)
+    samples = recorded.decodable_video()
     taken = datetime.fromtimestamp(samples[0].capture_ns / SECOND_NS, UTC).isoformat()
     with av.open(str(path.absolute()), "w", format=CONTAINERS[container]) as output:
         output.metadata["creation_time"] = taken
@@ -52,24 +51,13 @@ def pictures(recorded: Recorded) -> Iterator[tuple[VideoSample, Image, Overlay]]
     """Each decodable sample, its picture (uint8 (H, W, 3) BGR, base pixels) and the boxes on it."""
     decoder = BaseDecoder()
     overlays = recorded.overlays()  # at every sample, and at some frames between
-    for sample in from_keyframe(recorded):
+    for sample in recorded.decodable_video():
         overlay = next(one for one in overlays if one.frame_index == sample.frame_index)
         if sample.keyframe:
             decoder.reset()
         picture = decoder.decode(sample.data)
         if picture is not None:
             yield sample, picture, overlay
-
-
-def from_keyframe(recorded: Recorded) -> list[VideoSample]:
-    """The samples from the first that can be decoded on; `UserError` where there is none."""
-    first = next(
-        (number for number, one in enumerate(recorded.video) if one.keyframe and parameter_sets(one.data)),
-        None,
-    )
-    if first is None:
-        raise UserError(f"the recording of {recorded.edge} has no video: it was removed, or none came")
-    return list(recorded.video[first:])
 
 
 def _copy(samples: list[VideoSample], output: OutputContainer, container: str) -> None:

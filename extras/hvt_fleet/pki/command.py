@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 from hvt_common.errors import Parser, UserError, needs_extra
 from hvt_common.runtime.reporting import say
-from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
-from hvt_ground.pki.zenoh_files import KEYS_FOLDER, edge_file, ground_file, router_file
+from hvt_fleet.pki.roster import GroundMember, Roster, RouterMember
+from hvt_fleet.pki.zenoh_files import KEYS_FOLDER, edge_file, ground_file, router_file
 
 if TYPE_CHECKING:
-    from hvt_ground.pki.authority import Authority
+    from hvt_fleet.pki.authority import Authority
 
 __all__ = ["run"]
 
@@ -26,7 +26,7 @@ def run(argv: Sequence[str]) -> int:
     """Run ``hvt-ground keys …``; `UserError` where the user can mend something."""
     arguments = _parser().parse_args(argv)
     with needs_extra("'hvt[ground]'"):  # only now: a ground that uses no keys needs no cryptography
-        from hvt_ground.pki.authority import Authority  # noqa: PLC0415
+        from hvt_fleet.pki.authority import Authority  # noqa: PLC0415
     folder: Path = arguments.dir
     if arguments.command == "new-ca":
         Authority.create(folder)

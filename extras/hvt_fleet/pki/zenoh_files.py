@@ -14,7 +14,7 @@ from typing import Any
 
 from hvt_common.protocol.channels import DELIVERIES, GROUP_ROOT, ROOT, Channel, Direction, EdgeKeys
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
-from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
+from hvt_fleet.pki.roster import GroundMember, Roster, RouterMember
 
 __all__ = ["KEYS_FOLDER", "edge_file", "ground_file", "router_file"]
 
