@@ -58,7 +58,7 @@ def _known_flags() -> set[str]:
     }
     sources = (
         path
-        for room in ("common", "ground", "study", "lab", "bench", "deploy")
+        for room in ("common", "ground", "extras", "study", "lab", "bench", "deploy")
         for path in (ROOT / room).rglob("*.py")
     )
     declared = (re.findall(r'"(--[a-z][a-z0-9-]+)"', path.read_text(encoding="utf-8")) for path in sources)

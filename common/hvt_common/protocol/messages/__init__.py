@@ -1,6 +1,6 @@
 """Every message of HVT as bytes, and back. docs/wire.md is the same for people of other languages.
 
-Who makes vectors of them reaches into `envelope`, `fields`, `exp_golomb` and `track_boxes`.
+Who makes vectors of them reaches into `envelope`, `fields`, `exp_golomb`, `range_coder` and `track_boxes`.
 """
 
 from __future__ import annotations
