@@ -59,15 +59,15 @@ def _run(argv: Sequence[str] | None) -> int:
         code: int = command.run(words[1:])
         return code
     if words and not words[0].startswith("-"):
-        from hvt_ground.control import command as control  # noqa: PLC0415
-
-        if words[0] in control.COMMANDS:
-            return control.run(words)
         entry = the_one(_EXTRA_COMMANDS, words[0], what="command", built_in=False)
         if entry is not None:
             with needs_extra("'hvt[ground]'"):
                 run = entry.load()
             return int(run(words[1:]))
+        from hvt_ground.control import command as control  # noqa: PLC0415
+
+        if words[0] in control.COMMANDS:
+            return control.run(words)
         if words[0] in _BROUGHT:
             raise UserError(
                 f"hvt-ground {words[0]} is of an extra that is not installed: pip install 'hvt[ground]'"

@@ -21,7 +21,7 @@ from hvt_fleet.pki.roster import Roster
 from hvt_ground.cli import main
 from programs.fleet_keys import Fleet
 
-DEPLOY = Path(__file__).resolve().parents[3] / "deploy"
+DEPLOY = Path(__file__).resolve().parents[4] / "deploy"
 
 
 @pytest.fixture
