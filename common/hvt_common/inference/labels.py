@@ -5,7 +5,9 @@ from __future__ import annotations
 import ast
 import codecs
 import json
+import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from hvt_common.errors import UserError
@@ -20,6 +22,7 @@ __all__ = [
     "decoded",
     "first_synonym",
     "metadata_labels",
+    "numbered_names",
     "read_labels",
 ]
 
@@ -30,6 +33,8 @@ MAX_LABELS = 100_000
 MAX_LABEL_CHARS = 200
 _MAX_FILE_BYTES = 8 << 20
 _MAX_METADATA_CHARS = 1 << 20
+_NAME = re.compile(r"[\w .&'/+-]*[^\W\d_][\w .&'/+-]*")
+"""Between commas or line ends, without brackets around."""
 
 
 def read_labels(path: Path) -> tuple[str, ...]:
@@ -68,12 +73,18 @@ def class_labels(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...] | N
 
 
 def metadata_labels(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
-    """Class names that a model carries: ``names`` as Ultralytics writes it, or a JSON list in ``classes``.
+    """Class names that a model carries in ``names``, as Ultralytics writes it, or ``classes``.
 
-    ``names`` is a Python literal (``{0: 'car', 1: 'bus'}`` or a list), read without executing anything. Metadata
-    that is malformed counts as none.
+    Each may be a list or a table by number (``{0: 'car', 1: 'bus'}``), as a Python literal, which is read without
+    executing anything, or as JSON; or names between commas or line ends. What is malformed counts as none.
     """
-    return _literal_names(metadata.get("names", "")) or _json_names(metadata.get("classes", ""))
+    found = (_written_names(metadata.get(key, "")) for key in ("names", "classes"))
+    return next((names for names in found if names is not None), None)
+
+
+def numbered_names(names: Mapping[int, str]) -> tuple[str, ...]:
+    """Names by number, from 0 on; a number that has none is "class" and that number."""
+    return tuple(names.get(number, f"class {number}") for number in range(max(names, default=-1) + 1))
 
 
 def first_synonym(label: str) -> str:
@@ -107,31 +118,26 @@ def _read_text(path: Path) -> str:
         ) from error
 
 
-def _literal_names(text: str) -> tuple[str, ...] | None:
+def _written_names(text: str) -> tuple[str, ...] | None:
+    text = text.strip()
     if not text or len(text) > _MAX_METADATA_CHARS:
         return None
-    try:
-        value = ast.literal_eval(text)
-        if isinstance(value, dict):
-            if sorted(map(str, value)) != sorted(map(str, range(len(value)))):
-                return None
-            value = [item for _, item in sorted(value.items(), key=lambda pair: int(pair[0]))]
-        return _names(value)
-    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+    if text[0] not in "[{(":
+        names = [name.strip() for name in re.split(r"[,\n]", text) if name.strip()]
+        return _names(names) if all(map(_NAME.fullmatch, names)) else None
+    for read in (ast.literal_eval, json.loads):
         # Not a literal; or a key that is a list, or a number that is too long to print.
-        return None
-
-
-def _json_names(text: str) -> tuple[str, ...] | None:
-    if not text or len(text) > _MAX_METADATA_CHARS:
-        return None
-    try:
-        return _names(json.loads(text))
-    except (ValueError, RecursionError):
-        return None
+        with suppress(ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+            return _names(read(text))
+    return None
 
 
 def _names(value: object) -> tuple[str, ...] | None:
+    if isinstance(value, dict):
+        numbers = {int(key): name for key, name in value.items() if re.fullmatch(r"\d{1,6}", str(key))}
+        if len(numbers) < len(value) or max(numbers, default=MAX_LABELS) >= MAX_LABELS:
+            return None
+        value = numbered_names(numbers)
     if not isinstance(value, list | tuple) or not 0 < len(value) <= MAX_LABELS:
         return None
     return tuple(str(item)[:MAX_LABEL_CHARS] for item in value)

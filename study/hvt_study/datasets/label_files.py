@@ -15,20 +15,23 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from hvt_common.errors import UserError
-from hvt_common.inference.labels import decoded, read_labels
+from hvt_common.inference.labels import decoded, numbered_names, read_labels
 from hvt_edge.source.folder import sequence_files
 
 __all__ = [
     "LOOKED_IN",
+    "Folders",
     "VocFile",
+    "check_strange",
     "class_file",
     "coco_files",
+    "keypoint_columns",
     "label_file",
     "pictures_below",
     "read_class_file",
@@ -44,12 +47,37 @@ _PICTURES = ("images", "JPEGImages", "data", "obj_train_data")
 _LABELS = (("labels", ".txt"), ("annotations", ".txt"), ("Annotations", ".xml"), ("annotations", ".xml"))
 _CLASSES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml")
 _COCO = ("labels.json", "result.json", "annotations.json", "_annotations.coco.json", "coco.json")
+_COCO_BOXES = "instances_"
+"""COCO's own name for the file with boxes, beside captions and keypoints of the same pictures; CVAT's too."""
 _DEPTH = 3
+
+
+class Folders:
+    """What lies in folders, whatever the case of its name: ``A.JPG`` has its labels in ``A.TXT`` too."""
+
+    def __init__(self) -> None:
+        self._names: dict[Path, dict[str, str]] = {}
+
+    def find(self, path: Path) -> Path | None:
+        """The file or folder of this path, each of its names in any case; None where there is none."""
+        if path.exists():
+            return path
+        folder = path.parent if path.parent.is_dir() else self._above(path)
+        if folder is None or not folder.is_dir():
+            return None
+        if folder not in self._names:
+            self._names[folder] = {one.name.lower(): one.name for one in folder.iterdir()}
+        name = self._names[folder].get(path.name.lower())
+        return None if name is None else folder / name
+
+    def _above(self, path: Path) -> Path | None:
+        return None if path.parent == path else self.find(path.parent)
 
 
 def pictures_below(place: Path) -> list[Path]:
     """All pictures of a set, folder by folder, in natural order; those of ``images/`` alone where there is one."""
-    first = next((place / name for name in _PICTURES if (place / name).is_dir()), place)
+    known = (Folders().find(place / name) for name in _PICTURES)
+    first = next((one for one in known if one is not None and one.is_dir()), place)
     found = sequence_files(place) if first == place else []
     if found:
         return found
@@ -62,14 +90,25 @@ def pictures_below(place: Path) -> list[Path]:
     ]
 
 
-def label_file(picture: Path, place: Path) -> Path | None:
+def label_file(picture: Path, place: Path, folders: Folders) -> Path | None:
     """The file of labels of one picture of a set; None where there is none."""
-    return next((file for file in _candidates(picture, place) if file.is_file()), None)
+    found = (folders.find(path) for path in _candidates(picture, place))
+    return next((file for file in found if file is not None and file.is_file()), None)
+
+
+def check_strange(place: Path, pictures: Sequence[Path]) -> None:
+    """Raise `UserError` for labels of a kind that is not read, which nobody means to be left out."""
+    kinds = {place / "annotations.xml": "CVAT for images"}
+    kinds |= {file.with_suffix(".json"): "LabelMe" for file in pictures[:_DEPTH]}
+    for path, kind in kinds.items():
+        if path.is_file():
+            raise UserError(f"{path} holds labels of {kind}, which are not read: export them as COCO or YOLO")
 
 
 def class_file(place: Path, pictures: list[Path]) -> Path | None:
     """The file that names the classes of YOLO's labels."""
-    folders = dict.fromkeys((place, place / "labels", *(file.parent for file in pictures[:1]), place.parent))
+    above = (place.parent, place.parent / "labels", place.parent.parent)
+    folders = dict.fromkeys((place, place / "labels", *(file.parent for file in pictures[:1]), *above))
     for folder in folders:
         for name in _CLASSES:
             if (folder / name).is_file():
@@ -91,7 +130,16 @@ def coco_files(place: Path) -> list[Path]:
     """COCO's files of a set: those of usual names, and of ``annotations/``."""
     folders = _folders(place, 1)
     found = [folder / name for folder in folders for name in _COCO if (folder / name).is_file()]
-    return found + sorted((place / "annotations").glob("*.json"))
+    files = sorted((place / "annotations").glob("*.json"))
+    return found + ([one for one in files if one.name.startswith(_COCO_BOXES)] or files)
+
+
+def keypoint_columns(path: Path | None) -> int:
+    """Columns of keypoints behind the box in YOLO's labels, as ``kpt_shape`` of its YAML says; 0 for none."""
+    if path is None or path.suffix not in (".yaml", ".yml"):
+        return 0
+    shape = re.search(r"(?m)^kpt_shape\s*:\s*\[\s*(\d{1,4})\s*,\s*([23])\s*\]", read_text(path))
+    return 0 if shape is None else int(shape[1]) * int(shape[2])
 
 
 def read_text(path: Path) -> str:
@@ -115,44 +163,72 @@ def _folders(root: Path, depth: int) -> list[Path]:
 def _candidates(picture: Path, place: Path) -> Iterator[Path]:
     """In the folder that stands in place of that of the pictures, wherever it is in the path; then beside."""
     parts = picture.relative_to(place).parts if picture.is_relative_to(place) else picture.parts[-1:]
+    whole = place.absolute()  # the folder of the pictures itself may be given
+    above = [(up, (*whole.relative_to(up).parts, *parts)) for up in whole.parents[:2]]
     for folder, suffix in _LABELS:
-        for index, part in enumerate(parts[:-1]):
-            if part in _PICTURES:
-                yield place.joinpath(*parts[:index], folder, *parts[index + 1 :]).with_suffix(suffix)
-        yield place.joinpath(folder, *parts).with_suffix(suffix)
-    yield picture.with_suffix(".txt")
-    yield picture.with_suffix(".xml")
+        for root, inner in [(place, parts), *above]:
+            yield from _instead(root, inner, folder, suffix)
+    for suffix in (".txt", ".xml"):
+        yield picture.with_suffix(suffix)
+    yield picture.with_name(f"{picture.name}.txt")
+
+
+def _instead(root: Path, parts: tuple[str, ...], folder: str, suffix: str) -> Iterator[Path]:
+    """``folder`` in place of one of pictures that is among the parts of a picture's path below ``root``."""
+    known = [name.lower() for name in _PICTURES]
+    for index, part in enumerate(parts[:-1]):
+        if part.lower() in known:
+            yield root.joinpath(*parts[:index], folder, *parts[index + 1 :]).with_suffix(suffix)
+    yield root.joinpath(folder, *parts).with_suffix(suffix)
 
 
 def _yaml_names(text: str) -> tuple[str, ...]:
-    begin = re.search(r"(?m)^names\s*:[ \t]*(.*)$", text)
+    begin = re.search(r"(?m)^[\"']?names[\"']?\s*:[ \t]*(?:&\w+[ \t]*)?(?=(.*)$)", text)
     if begin is None:
         return ()
     rest = text[begin.end() :]
-    inline = re.match(r"[\[{]([^\]}]*)[\]}]", begin[1] + rest)
-    if inline is not None:
-        words = (word.strip() for word in inline[1].replace("\n", " ").split(","))
-        numbered = inline[0].startswith("{")
-        return tuple(_plain(word.partition(":")[2] if numbered else word) for word in words if word)
-    names = []
-    for line in rest.splitlines():
-        entry = re.match(r"\s*-\s+(.+)|\s+['\"]?\d+['\"]?\s*:\s*(.+)", line)
-        if entry is not None:
-            names.append(_plain(entry[1] or entry[2]))
-        elif line.strip() and not line.lstrip().startswith("#"):
-            break
-    return tuple(names)
+    if rest[:1] in ("[", "{"):
+        entries = list(_flow(rest))
+    else:
+        entries = []
+        for line in rest.splitlines()[1:]:
+            if re.match(r"\s*-\s+\S|\s*['\"]?\d+['\"]?\s*:", line):
+                entries.append(line.strip().removeprefix("- "))
+            elif line.strip() and not line.lstrip().startswith("#"):
+                break
+    keyed = [re.match(r"\s*['\"]?(\d{1,6})['\"]?\s*:\s*(.*)", one, re.DOTALL) for one in entries]
+    if all(keyed):
+        return numbered_names({int(one[1]): _plain(one[2]) for one in keyed if one is not None})
+    return tuple(_plain(one) for one in entries)
+
+
+def _flow(text: str) -> Iterator[str]:
+    """The entries of a list or table in brackets, which may go over lines; quotes keep commas and brackets."""
+    entry, depth = "", 0
+    for piece in re.findall(r"'(?:''|[^'])*'|\"(?:\\.|[^\"\\])*\"|(?<=\s)#[^\n]*|.", text, re.DOTALL):
+        depth += (piece in ("[", "{")) - (piece in ("]", "}"))
+        if not depth or (piece == "," and depth == 1):
+            if entry.strip():
+                yield entry.strip()
+            entry = ""
+            if not depth:
+                return
+        elif piece not in ("[", "{") and not piece.startswith("#"):
+            entry += piece
 
 
 def _plain(word: str) -> str:
     """Without quotes and a comment."""
     word = word.strip()
-    if word[:1] in ("'", '"'):
-        try:
-            return str(ast.literal_eval(word.partition(" #")[0].strip()))
-        except (ValueError, SyntaxError):
-            return word.strip("'\"")
-    return word.partition(" #")[0].strip()
+    quoted = re.match(r"'((?:''|[^'])*)'|\"(?:\\.|[^\"\\])*\"", word)
+    if quoted is None:
+        return word.partition(" #")[0].strip()
+    if quoted[1] is not None:
+        return quoted[1].replace("''", "'")
+    try:
+        return str(ast.literal_eval(quoted[0]))
+    except (ValueError, SyntaxError):
+        return quoted[0].strip('"')
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,17 +238,19 @@ class VocFile:
     size: tuple[int, int] | None
     """(width, height) of the picture as labelled; None where it does not say."""
     objects: tuple[tuple[str, tuple[float, ...]], ...]
-    """Class and x1 y1 x2 y2 in pixels; NaN where the file has no number."""
+    """Class and x1 y1 x2 y2 in pixels; NaN where the file has no number. VOC's difficult ones are of class so."""
 
 
 def read_voc(path: Path) -> VocFile:
     """Read a file; `UserError` where it is no such XML."""
-    text = read_text(path)
-    if "<!ENTITY" in text:
-        raise UserError(f"{path} is not an XML of Pascal VOC (it has entities)")
     try:
-        root = ET.fromstring(text.encode() if text.startswith("<?xml") else text)  # noqa: S314 - no entities
-    except (ET.ParseError, ValueError) as error:
+        content = path.read_bytes()
+        if b"<!ENTITY" in content.replace(b"\0", b""):  # in UTF-16 too
+            raise UserError(f"{path} is not an XML of Pascal VOC (it has entities)")
+        root = ET.fromstring(content)  # noqa: S314 - no entities; in the encoding that it says
+    except OSError as error:
+        raise UserError(f"{path} cannot be read as text: {error}") from None
+    except (ET.ParseError, ValueError, LookupError) as error:
         raise UserError(f"{path} is not an XML of Pascal VOC ({error})") from None
     sides = tuple(int(_number(root.findtext(f"size/{side}"))) for side in ("width", "height"))
     size = (sides[0], sides[1]) if min(sides) > 0 else None
@@ -181,7 +259,7 @@ def read_voc(path: Path) -> VocFile:
         size,
         tuple(
             (
-                (one.findtext("name") or "").strip(),
+                "difficult" if _number(one.findtext("difficult")) else (one.findtext("name") or "").strip(),
                 tuple(_number(one.findtext(f"bndbox/{corner}"), missing=float("nan")) for corner in corners),
             )
             for one in root.iter("object")

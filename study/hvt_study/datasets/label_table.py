@@ -75,6 +75,12 @@ class LabelTable:
         return tuple(sorted(self.class_names))
 
     @property
+    def first_frame(self) -> int | None:
+        """The lowest frame number; None where there is none."""
+        begins = [frames[0] for frames in (self.frames, self.ignored.frames) if len(frames)]
+        return int(min(begins)) if begins else None
+
+    @property
     def last_frame(self) -> int:
         """The highest frame number; -1 where there is none."""
         ends = [frames[-1] for frames in (self.frames, self.ignored.frames) if len(frames)]

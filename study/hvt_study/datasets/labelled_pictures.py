@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import cv2
 import numpy as np
@@ -25,8 +27,12 @@ from hvt_edge.source.folder import sequence_files
 from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.datasets.label_files import (
     LOOKED_IN,
+    Folders,
     VocFile,
+    check_strange,
+    class_file,
     coco_files,
+    keypoint_columns,
     label_file,
     pictures_below,
     read_text,
@@ -37,7 +43,7 @@ from hvt_study.datasets.layouts.mot import open_mot
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.layouts.visdrone import table_of
 from hvt_study.datasets.visdrone_rows import read_image_rows
-from hvt_study.datasets.yolo_labels import labels_of, read_yolo, yolo_names
+from hvt_study.datasets.yolo_labels import IGNORED, YOLO_COLUMNS, labels_of, read_yolo, yolo_names
 
 __all__ = ["LabelledPicture", "doubts_of", "find_pictures", "read_image"]
 
@@ -64,6 +70,8 @@ class LabelledPicture:
     """Of a sequence that labels one object and nothing else that is in view: it can be found or missed, no more."""
     labelled_size: tuple[int, int] | None = None
     """(width, height) that the labels say the picture has."""
+    keypoints: int = 0
+    """Columns of keypoints behind the boxes of a YOLO file."""
     doubts: LabelDoubts = field(default_factory=LabelDoubts)
     """Of the whole set."""
 
@@ -85,7 +93,7 @@ class LabelledPicture:
         if isinstance(self.labels, Path):
             if self.visdrone:
                 return _from_visdrone(self.labels, size)
-            return read_yolo(self.labels, self.class_names, size, self.doubts)
+            return read_yolo(self.labels, self.class_names, size, self.doubts, keypoints=self.keypoints)
         scale = self._scale(size)
         rows: list[_Annotation]
         if isinstance(self.labels, VocFile):
@@ -151,17 +159,21 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
     files = pictures_below(place)
     if not files:
         raise UserError(f"{place} holds no pictures, nor do its folders")
-    found = {file: labels for file in files if (labels := label_file(file, place)) is not None}
+    folders = Folders()
+    found = {file: labels for file in files if (labels := label_file(file, place, folders)) is not None}
     if not found:
         return _coco_beside(place, files, doubts)
-    voc = {file: read_voc(path) for file, path in found.items() if path.suffix == ".xml"}
-    texts = [path for path in found.values() if path.suffix == ".txt"]
+    voc = {file: read_voc(path) for file, path in found.items() if path.suffix.lower() == ".xml"}
+    texts = [path for path in found.values() if path.suffix.lower() == ".txt"]
     visdrone = bool(texts) and _has_commas(texts)
     names: Sequence[str] = VISDRONE_NAMES if visdrone else ()
+    keypoints = 0
     if voc:
-        names = tuple(sorted({name for one in voc.values() for name, _ in one.objects}))
+        named = {name for one in voc.values() for name, _ in one.objects}
+        names = tuple(sorted(name for name in named if name.casefold() not in IGNORED))
     elif texts and not visdrone:
         names = yolo_names(place, classes, files)
+        keypoints = keypoint_columns(class_file(place, files))
     return [
         LabelledPicture(
             file,
@@ -169,6 +181,7 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
             names,
             visdrone,
             labelled_size=voc[file].size if file in voc else None,
+            keypoints=keypoints,
             doubts=doubts,
         )
         for file in files
@@ -199,9 +212,12 @@ def read_image(path: Path, labelled_size: tuple[int, int] | None = None) -> Imag
 
 
 def _has_commas(texts: Sequence[Path]) -> bool:
-    """Whether lines are VisDrone's; of the first file that has any."""
+    """Whether lines are VisDrone's; of the first file that has any. A decimal comma is none of VisDrone's."""
     first = next((line for path in texts for line in read_text(path).splitlines() if line.strip()), None)
-    return "," in first if first is not None else texts[0].parent.name == "annotations"
+    if first is None:
+        return texts[0].parent.name.lower() == "annotations"
+    words = first.split()
+    return "," in first and not (len(words) >= YOLO_COLUMNS and not any("," in one[-1] for one in words))
 
 
 def _coco_beside(place: Path, files: Sequence[Path], doubts: LabelDoubts) -> list[LabelledPicture]:
@@ -211,6 +227,7 @@ def _coco_beside(place: Path, files: Sequence[Path], doubts: LabelDoubts) -> lis
     if any((place / folder).is_dir() for folder in ("labels", "annotations", "Annotations")):
         some = f"any of its {len(files)} pictures, such as {files[0].name}"
         raise UserError(f"{place} has no label of {some}: looked in {LOOKED_IN}")
+    check_strange(place, files)
     return [LabelledPicture(file, None, ()) for file in files]
 
 
@@ -222,31 +239,64 @@ def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
     """COCO's ``images``, ``annotations`` (also ``annotation``) and ``categories``."""
     try:
         about = json.loads(read_text(path))
-        names = {row["id"]: str(row["name"]) for row in about["categories"]}
+        names = {_id(row["id"]): str(row["name"]) for row in about["categories"]}
         rows = about["annotations"] if "annotations" in about else about["annotation"]
-        of: dict[Any, list[dict[str, Any]]] = {image["id"]: [] for image in about["images"]}
-        for number, row in enumerate(rows, start=1):
-            where = f"COCO annotation {row.get('id', number)} of {path.name}"
-            if row.get("image_id") not in of or row.get("category_id") not in names:
-                doubts.leave_out(f"{where} has an image_id or a category_id that the file does not have")
-                continue
-            of[row["image_id"]].append({**row, "name": names[row["category_id"]], "where": where})
         images = [
             (
-                image["id"],
+                _id(image["id"]),
                 str(image["file_name"] if "file_name" in image else image["filename"]),
                 _said_size(image),
             )
             for image in about["images"]
         ]
+        of: dict[Any, list[dict[str, Any]]] = {key: [] for key, _, _ in images}
+        for number, row in enumerate(rows, start=1):
+            where = f"COCO annotation {row.get('id', number)} of {path.name}"
+            image, category = _id(row.get("image_id")), _id(row.get("category_id"))
+            if image not in of or category not in names:
+                doubts.leave_out(f"{where} has an image_id or a category_id that the file does not have")
+                continue
+            of[image].append({**row, "name": names[category], "where": where})
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is not COCO's JSON: {type(error).__name__} {error}") from None
+    _check_pixels(path, rows)
+    folders = Folders()
+    pictures: dict[Path, tuple[str, Any, tuple[int, int] | None]] = {}
+    unclear = {key for key, count in Counter(key for key, _, _ in images).items() if count > 1}
+    for key, name, size in images:
+        picture = _beside(path, name, folders)
+        other = pictures.get(picture)
+        if other is None:
+            pictures[picture] = (name, key, size)
+        elif other[0] == name and key != other[1]:
+            of[other[1]] += of[key]  # the same picture twice, as tools that join sets write it
+        elif other[0] != name:
+            unclear |= {key, other[1]}
+    for key in unclear:
+        for row in of[key]:
+            doubts.leave_out(f"{row['where']} is of image {key}, which may be one of several pictures")
     return [
         LabelledPicture(
-            _beside(path, name), tuple(of[key]), tuple(names.values()), labelled_size=size, doubts=doubts
+            picture,
+            None if key in unclear else tuple(of[key]),
+            tuple(names.values()),
+            labelled_size=size,
+            doubts=doubts,
         )
-        for key, name, size in images
+        for picture, (_, key, size) in pictures.items()
     ]
+
+
+def _id(value: Any) -> Any:
+    """A number is one also where a tool writes it as text."""
+    return int(value) if isinstance(value, str) and value.isdecimal() else value
+
+
+def _check_pixels(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Raise `UserError` where all boxes are shares of their pictures."""
+    numbers = [side for row in rows for side in row.get("bbox") or () if isinstance(side, int | float)]
+    if numbers and 0 < max(map(abs, numbers)) <= 1:
+        raise UserError(f"{path} has boxes of 0 to 1; COCO's are x, y, width, height in pixels")
 
 
 def _said_size(image: Mapping[str, Any]) -> tuple[int, int] | None:
@@ -278,13 +328,21 @@ def _mot_pictures(place: Path) -> list[LabelledPicture]:
     ]
 
 
-def _beside(path: Path, name: str) -> Path:
-    """Where a picture of COCO's file lies: beside it, in images/ or data/ there or a level up."""
+def _beside(path: Path, name: str, folders: Folders) -> Path:
+    """Where a picture of COCO's file lies: beside it, in images/ or data/, or in a folder of the split.
+
+    ::
+
+        annotations/instances_val2017.json    [images/]val2017/NAME.jpg
+    """
     name = name.replace("\\", "/")
-    folders = [
-        folder
+    split = path.stem.partition("_")[2] or "."
+    inner = (".", "images", "data", split, f"images/{split}")
+    places = [
+        root / folder / one
+        for one in dict.fromkeys((name, unquote(name), Path(name).name, Path(unquote(name)).name))
         for root in (path.parent, path.parent.parent)
-        for folder in (root, root / "images", root / "data")
+        for folder in inner
     ]
-    places = [folder / one for one in (name, Path(name).name) for folder in folders]
-    return next((place for place in places if place.is_file()), places[0])
+    found = (folders.find(place) for place in places)
+    return next((place for place in found if place is not None and place.is_file()), places[0])

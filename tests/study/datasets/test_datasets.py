@@ -21,7 +21,7 @@ from hvt_scene import Scene
 from hvt_study.datasets.annotation_rows import read_rows
 from hvt_study.datasets.clip import stage_clip
 from hvt_study.datasets.content import content_hash
-from hvt_study.datasets.layouts.mot import mot_table
+from hvt_study.datasets.layouts.mot import mot_table, read_truth_rows
 from hvt_study.datasets.layouts.uri import open_dataset, open_datasets
 from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
@@ -281,6 +281,18 @@ def test_mot_labels(tmp_path):
     assert [sequence.source_frame(frame_index) for frame_index in range(sequence.clip_frames)] == [0, 1, 3, 5]
     (alone,) = open_dataset(f"mot:{tmp_path / 'train' / 'MOT17-02'}")
     assert alone.name == "MOT17-02"
+
+
+def test_labels_that_count_frames_from_0_are_refused_beside_images_from_1(tmp_path):
+    """Trackers write so (ByteTrack#417), and every label would be a frame late."""
+    write_mot(tmp_path / "MOT17-02")
+    truth = tmp_path / "MOT17-02" / "gt" / "gt.txt"
+    rows = [line.split(",", 1) for line in truth.read_text().splitlines()]
+    truth.write_text("".join(f"{int(frame) - 1},{rest}\n" for frame, rest in rows))
+    with pytest.raises(UserError, match="images from 1, and its annotations count frames from 0"):
+        open_dataset(f"mot:{tmp_path}")
+    with pytest.raises(UserError, match="accepted is a frame number from 1 on"):
+        read_truth_rows(truth, ["x"] * 13)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from hvt_common.errors import UserError
+from hvt_study.datasets.label_files import read_class_file
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
 from hvt_study.datasets.labels import FrameLabels
 
@@ -286,3 +287,133 @@ def test_a_picture_that_is_not_there_is_called_so(tmp_path: Path) -> None:
     text(one.path, "no picture")
     assert one.unreadable.endswith("a.jpg cannot be read as a picture")
     assert cv2.imread(str(one.path)) is None
+
+
+@pytest.mark.parametrize(
+    ("shown", "labels"),
+    [
+        ("A.JPG", "A.TXT"),
+        ("Images/a.jpg", "Labels/a.txt"),
+        ("a.jpg", "a.jpg.txt"),
+        ("a.JPEG", "A.XML"),
+    ],
+)
+def test_names_of_other_case_are_found(tmp_path: Path, shown: str, labels: str) -> None:
+    """A set from Windows was taken for pictures that nobody labelled."""
+    picture(tmp_path / shown)
+    text(tmp_path / labels, voc() if labels.endswith("XML") else ROW)
+    text(tmp_path / "classes.txt", "\n".join(NAMES))
+    ((_, found),) = read(tmp_path)
+    assert (found.class_names, found.boxes_xyxy_px.tolist()) == (("bus",), [BOX])
+
+
+def test_the_folder_of_the_pictures_alone_has_its_labels(tmp_path: Path) -> None:
+    """Ultralytics looks in labels/ beside images/, whatever folder it was given."""
+    picture(tmp_path / "valid/images/a.jpg")
+    text(tmp_path / "valid/labels/a.txt", ROW)
+    text(tmp_path / "data.yaml", "names: [car, bus]\n")
+    assert [found.class_names for _, found in read(tmp_path / "valid/images")] == [("bus",)]
+
+
+@pytest.mark.parametrize(
+    ("yaml", "names"),
+    [
+        ("names:\n  1: bus\n  0: car\n", NAMES),
+        ("names: ['car, small', bus]\n", ("car, small", "bus")),
+        ('names: {0: car, 2: "bus"}  # two\nnc: 2\n', ("car", "class 1", "bus")),
+        ('"names": ["car",  # first\n  "bus"]\n', NAMES),
+        ("names: &all\n- 'it''s'\n- bus #2\n", ("it's", "bus")),
+    ],
+)
+def test_names_of_a_yaml_are_those_of_a_yaml_reader(
+    tmp_path: Path, yaml: str, names: tuple[str, ...]
+) -> None:
+    """Names were taken in the order of the file, and cut at commas within quotes."""
+    assert read_class_file(text(tmp_path / "data.yaml", yaml)) == names
+
+
+@pytest.mark.parametrize("shape", ["kpt_shape: [3, 2]", "kpt_shape: [2, 3]", ""])
+def test_keypoints_behind_a_box_are_no_polygon(tmp_path: Path, shape: str) -> None:
+    """Labels of Ultralytics' pose gave boxes around the keypoints (ultralytics#13221)."""
+    points = "0.1 0.2 0.3 0.4 0.5 0.6" if "2]" in shape else "0.2 0.3 2 0.4 0.6 0"
+    picture(tmp_path / "images/a.jpg")
+    text(tmp_path / "labels/a.txt", f"{ROW.strip()} {points}\n")
+    text(tmp_path / "data.yaml", f"{shape}\nnames: [car, bus]\n")
+    ((_, found),) = read(tmp_path)
+    assert found.boxes_xyxy_px.tolist() == [BOX]
+
+
+def test_a_decimal_comma_is_read(tmp_path: Path) -> None:
+    """Such lines were called VisDrone's."""
+    picture(tmp_path / "a.jpg")
+    text(tmp_path / "a.txt", ROW.replace(".", ","))
+    text(tmp_path / "classes.txt", "\n".join(NAMES))
+    assert [found.boxes_xyxy_px.tolist() for _, found in read(tmp_path)] == [[BOX]]
+
+
+@pytest.mark.parametrize("place", ["val2017", "images/val2017"])
+def test_cocos_own_layout_is_found(tmp_path: Path, place: str) -> None:
+    """Beside the boxes lie captions and keypoints of the same pictures; numbers may be text, names quoted."""
+    picture(tmp_path / place / "a b.JPG")
+    about = json.loads(coco("a%20b.jpg"))
+    about["images"][0]["id"], about["categories"][0]["id"] = "1", "5"
+    text(tmp_path / "annotations/instances_val2017.json", json.dumps(about))
+    text(tmp_path / "annotations/captions_val2017.json", '{"images": [], "annotations": []}')
+    ((_, found),) = read(tmp_path)
+    assert (found.class_names, found.boxes_xyxy_px.tolist()) == (("bus",), [BOX])
+
+
+def test_a_picture_that_coco_names_twice_is_one(tmp_path: Path) -> None:
+    """Sets that were joined so counted each half's objects as missed by the other."""
+    about = json.loads(coco())
+    about["images"].append({"id": 2, "file_name": "a.jpg"})
+    about["annotations"].append({"id": 9, "image_id": 2, "category_id": 5, "bbox": [0, 0, 9, 9]})
+    picture(tmp_path / "a.jpg")
+    text(tmp_path / "coco.json", json.dumps(about))
+    ((_, found),) = read(tmp_path)
+    assert len(found) == 2
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_boxes_of_nobody_knows_which_picture_are_refused(tmp_path: Path, number: int) -> None:
+    """Two pictures of one id, as CVAT wrote them (cvat#7523); or two names that lead to one picture."""
+    about = json.loads(coco("x/a.jpg"))
+    about["images"].append({"id": number, "file_name": "b.jpg" if number == 1 else "y/a.jpg"})
+    picture(tmp_path / "a.jpg")
+    picture(tmp_path / "b.jpg")
+    text(tmp_path / "coco.json", json.dumps(about))
+    found = find_pictures(tmp_path, classes=None)
+    assert all(one.labels is None for one in found)
+    with pytest.raises(UserError, match="may be one of several pictures"):
+        doubts_of(found)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("coco.json", coco().replace("[20.0, 10.0, 60.0, 50.0]", "[0.1, 0.1, 0.3, 0.5]"), "boxes of 0 to 1"),
+        ("annotations.xml", "<annotations/>", "CVAT for images, which are not read"),
+        ("a.json", '{"shapes": []}', "LabelMe, which are not read"),
+    ],
+)
+def test_labels_that_are_not_read_are_said(tmp_path: Path, name: str, content: str, said: str) -> None:
+    """The set was taken for pictures that nobody labelled, or for boxes of no size."""
+    picture(tmp_path / "a.jpg")
+    text(tmp_path / name, content)
+    with pytest.raises(UserError, match=said):
+        find_pictures(tmp_path, classes=None)
+
+
+@pytest.mark.parametrize("encoding", ["iso-8859-1", "utf-16"])
+def test_an_xml_is_read_in_its_encoding_and_difficult_objects_do_not_count(
+    tmp_path: Path, encoding: str
+) -> None:
+    """VOC's own evaluation leaves them out."""
+    picture(tmp_path / "a.jpg")
+    head = f'<?xml version="1.0" encoding="{encoding}"?>'
+    text(tmp_path / "a.xml", head + voc("lärm"), encoding)
+    picture(tmp_path / "b.jpg")
+    text(tmp_path / "b.xml", voc().replace("</name>", "</name><difficult>1</difficult>"))
+    (_, first), (_, second) = read(tmp_path)
+    assert first.class_names == ("lärm",)
+    assert (len(second), second.ignored_xyxy_px.tolist()) == (0, [BOX])

@@ -64,9 +64,17 @@ class ImageSequence:
         labels: TableLabels | None,
         attributes: Mapping[str, str] | None = None,
     ) -> Sequence:
-        """The sequence as a flight plays it. Labels are read once, to say what is wrong before anything is flown."""
+        """The sequence as a flight plays it. Labels are read once, to say what is wrong before anything is flown.
+
+        Raises `UserError` where labels count frames from 0 and images from 1: all labels would be a frame late.
+        """
         frame_count = base_frame_count(self.frame_count / exact_rate(fps), fps=exact_rate(NOMINAL_FPS))
         known = None if labels is None else labels.table()
+        if known is not None and known.first_frame == 0 and self.first_number == 1:
+            raise UserError(
+                f"sequence folder {self.folder} counts its images from 1, and its annotations count frames from 0: "
+                "number them alike"
+            )
         found = () if labels is None else (path for path in labels.arguments if isinstance(path, Path))
         return Sequence(
             name=name,
