@@ -18,6 +18,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from hvt_common.errors import UserError
+from hvt_common.inference.labels import decoded
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
 from hvt_edge.pose.angles import compass_deg
@@ -50,6 +51,11 @@ _BOUNDS: Mapping[str, tuple[float, float]] = {
 }
 _FAR = 1e6
 _ANY_TIME = (-1e11, 1e11)
+_LONGEST_PAUSE_S = 86_400.0
+_NOWHERE = 0.001
+"""Degrees around 0, 0: there a receiver without a fix says it is."""
+_UNKNOWN_YAW = (655.35, 65535.0)
+"""What senders of MAVLink write where they know none, in degrees and in hundredths."""
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+\s*", re.ASCII)
 _Values = Mapping[str, float]
 
@@ -71,7 +77,7 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise UserError(f"pose file {path} is larger than {_MOST_BYTES // 10**6} MB")
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
+        text = _text(path.read_bytes())
     except OSError as error:
         raise UserError(f"pose file {path} cannot be read: {error.strerror}") from None
     try:
@@ -84,6 +90,15 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
         raise UserError(f"pose file {path} has no row with a time, a latitude and a longitude")
     poses = [one if one.hfov_deg is not None else replace(one, hfov_deg=hfov_deg) for one in poses]
     return PoseTable(_in_order(poses, path), notes=tuple(notes))
+
+
+def _text(content: bytes) -> str:
+    """In the encoding that its byte order mark says, else UTF-8; what is none is replaced, for it is no number."""
+    try:
+        text = decoded(content)
+    except UnicodeDecodeError:
+        text = content.decode("utf-8-sig", errors="replace")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _good(rows: Iterable[_Values | UserError], path: Path) -> list[Pose]:
@@ -106,8 +121,41 @@ def _good(rows: Iterable[_Values | UserError], path: Path) -> list[Pose]:
         raise wrong[0]
     if wrong:
         _log.warning("%d of %d rows are left out: %s", len(wrong), len(wrong) + len(good), wrong[0])
-    begin_s = min((row["utc_s"] for _, row in good if "utc_s" in row), default=0.0)
-    return [_pose(row, begin_s) for _, row in good]
+    here = _of_one_time([row for _, row in good], path)
+    begin_s = min((row["utc_s"] for row in here if "utc_s" in row), default=0.0)
+    placed = [row for row in here if max(abs(row["latitude_deg"]), abs(row["longitude_deg"])) >= _NOWHERE]
+    if len(placed) < len(here):
+        _log.warning(
+            "pose file %s: %d of %d rows are at 0, 0, as before there is a fix, and are left out",
+            path,
+            len(here) - len(placed),
+            len(here),
+        )
+    return [_pose(row, begin_s) for row in placed]
+
+
+def _of_one_time(rows: list[_Values], path: Path) -> list[_Values]:
+    """Without UTC times that are days from most: of a receiver before its fix, or with another count of weeks."""
+    times = sorted(row["utc_s"] for row in rows if "utc_s" in row)
+    if not times:
+        return rows
+    runs: list[list[float]] = [[times[0]]]
+    for one, two in pairwise(times):
+        if two - one > _LONGEST_PAUSE_S:
+            runs.append([])
+        runs[-1].append(two)
+    longest = max(runs, key=len)
+    kept = [row for row in rows if "utc_s" not in row or longest[0] <= row["utc_s"] <= longest[-1]]
+    if len(kept) < len(rows):
+        begin = datetime.fromtimestamp(longest[0], UTC)
+        _log.warning(
+            "pose file %s: %d of %d poses are more than a day from the others, which begin at %s, and are left out",
+            path,
+            len(rows) - len(kept),
+            len(rows),
+            begin.isoformat(timespec="seconds"),
+        )
+    return kept
 
 
 def _in_order(poses: list[Pose], path: Path) -> list[Pose]:
@@ -162,7 +210,7 @@ def _pose(row: _Values, begin_s: float) -> Pose:
 def _orientation(row: _Values, prefix: str) -> Orientation | None:
     """None where it is not known which way it points, or how far down; a roll that nobody says is none."""
     yaw, pitch = row.get(f"{prefix}yaw_deg"), row.get(f"{prefix}pitch_deg")
-    if yaw is None or pitch is None:
+    if yaw is None or pitch is None or yaw in _UNKNOWN_YAW:
         return None
     return Orientation(compass_deg(yaw), pitch, row.get(f"{prefix}roll_deg", 0.0))
 
@@ -170,8 +218,8 @@ def _orientation(row: _Values, prefix: str) -> Orientation | None:
 def _table_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     head = text.lstrip().partition("\n")[0]
     between = max(",;\t", key=head.count)
-    lines = csv.DictReader(text.splitlines(), delimiter=between)
-    names = [(name or "").strip() for name in lines.fieldnames or ()]
+    lines = csv.DictReader(text.splitlines(), delimiter=between, skipinitialspace=between != "\t")
+    names = [(name or "").strip().lower() for name in lines.fieldnames or ()]
     lines.fieldnames = names
     unknown = [name for name in names if name not in COLUMNS]
     if unknown:
@@ -219,8 +267,8 @@ def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
                 "latitude_deg": _number(point.get("lat", ""), f"{where}: lat"),
                 "longitude_deg": _number(point.get("lon", ""), f"{where}: lon"),
             }
-            elevation = point.findtext("{*}ele")
-            if elevation is not None:
+            elevation = (point.findtext("{*}ele") or "").strip()
+            if elevation:
                 row["altitude_m"] = _number(elevation, f"{where}: ele")
         except UserError as error:
             yield error

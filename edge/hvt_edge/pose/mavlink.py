@@ -237,7 +237,7 @@ def _attitude(message: Any) -> Orientation | None:
 def _camera(known: dict[str, Any], platform: Orientation | None) -> Orientation | None:
     """Where the gimbal points; None where its yaw is the platform's and that is not known."""
     device = known.get("GIMBAL_DEVICE_ATTITUDE_STATUS")
-    if device is not None:
+    if device is not None and all(map(math.isfinite, device.q)):  # NaN where it does not know
         yaw, pitch, roll = euler_deg(*device.q)
         if _is_of_the_earth(device.flags):
             return _orientation(yaw, pitch, roll)

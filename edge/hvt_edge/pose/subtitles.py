@@ -16,6 +16,8 @@ _NUMBER = r"[+-]?\d+(?:[.,]\d+)?"
 """With a point, or with the comma that half of Europe writes."""
 _TIMES = re.compile(r"(?<!\d)(\d{1,4}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER})")
+_HEMISPHERES = re.compile(rf"([EWNS])\s*:\s*({_NUMBER})")
+"""Autel's GPS(E: 8.5, N: 47.1, 30.5m)."""
 _GPS = re.compile(r"\bGPS\s*\(([^()\n]{1,80})\)")
 _HEIGHT = re.compile(rf"(?<![\w.])H\s+({_NUMBER})\s*m\b")
 _ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{1,80})\)")
@@ -41,12 +43,11 @@ _MOST_SATELLITES = 60
 
 def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[str, float]]:
     """Rows of values as `hvt_edge.pose.files.COLUMNS` names them; ``note`` gets the guesses and their reasons."""
-    blocks = [
-        (time, block[time.end() :])
-        for block in re.split(r"\r?\n\s*\r?\n", text)
-        if (time := _TIMES.search(block)) is not None
-    ]
-    places = [_numbers(found[1]) for _, body in blocks if (found := _GPS.search(body)) is not None]
+    times = list(_TIMES.finditer(text))  # whatever lines are empty: tools leave them out, or double them
+    ends = (*(time.start() for time in times[1:]), len(text))
+    blocks = [(time, text[time.end() : end]) for time, end in zip(times, ends, strict=False)]
+    founds = [found[1] for _, body in blocks if (found := _GPS.search(body)) is not None]
+    places = [_numbers(found) for found in founds if not _HEMISPHERES.search(found)]
     latitude_first = _latitude_first([one for one in places if len(one) >= 2], note)
     unplaced = 0
     said: set[str] = set()
@@ -68,10 +69,7 @@ def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[st
 
 
 def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
-    row: dict[str, float] = {}
-    if (gps := _GPS.search(body)) is not None and len(place := _numbers(gps[1])) >= 2:
-        names = ("latitude_deg", "longitude_deg") if latitude_first else ("longitude_deg", "latitude_deg")
-        row |= {name: value for name, (value, _) in zip(names, place, strict=False)}
+    row = _place(body, latitude_first=latitude_first)
     if (height := _HEIGHT.search(body)) is not None:
         row["height_m"] = _value(height[1])
     for whose, angles in _ANGLES.findall(body):
@@ -91,6 +89,24 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
     if 90 < abs(pitch) <= _OVERSHOT_DEG:
         row["camera_pitch_deg"] = math.copysign(90.0, pitch)
     return row
+
+
+def _place(body: str, *, latitude_first: bool) -> dict[str, float]:
+    """What GPS(…) says."""
+    found = _GPS.search(body)
+    if found is None:
+        return {}
+    if letters := _HEMISPHERES.findall(found[1]):
+        return {
+            "longitude_deg" if letter in "EW" else "latitude_deg": _value(number)
+            * (-1 if letter in "WS" else 1)
+            for letter, number in letters
+        }
+    place = _numbers(found[1])
+    if len(place) < 2:
+        return {}
+    names = ("latitude_deg", "longitude_deg") if latitude_first else ("longitude_deg", "latitude_deg")
+    return {name: value for name, (value, _) in zip(names, place, strict=False)}
 
 
 def _latitude_first(places: Sequence[Sequence[tuple[float, str]]], note: Callable[[str], None]) -> bool:

@@ -46,8 +46,8 @@ def read_yolo(
 ) -> FrameLabels:
     """The labels of a picture of this (width, height), in its pixels: rows of boxes, or of polygons.
 
-    Behind the boxes there may be so many columns of ``keypoints``, which are no polygon. What ends outside the picture
-    is cut, and a row that cannot be is left out; ``doubts`` counts both.
+    Behind the boxes there may be so many columns of ``keypoints``, which are no polygon. What ends outside the
+    picture is cut, and a row that cannot be is left out; ``doubts`` counts both.
     """
     boxes, kinds, wheres = [], [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):

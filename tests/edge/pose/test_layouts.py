@@ -135,3 +135,59 @@ def test_a_table_is_read_as_a_spreadsheet_writes_it(tmp_path, text):
     """Half of Europe would have to convert each table by hand."""
     _, pose = read(tmp_path, "a.csv", text)
     assert (pose.latitude_deg, pose.longitude_deg, pose.height_m) == pytest.approx((47.5, 9.7, 50.5))
+
+
+@pytest.mark.parametrize("change", ["none", "doubled", "inside", "utf-16"])
+def test_subtitles_are_told_apart_by_their_times(tmp_path, change):
+    """Tools leave the empty lines out, or double them: one row was left of a flight, or its height was lost."""
+    text = blocks(lambda n: f"[latitude: 47.{n}]\n[longitude: 8.5] [rel_alt: 30.0 abs_alt: 500.0]")
+    text = {
+        "none": text.replace("\n\n", "\n"),
+        "doubled": text.replace("\n", "\r\r\n"),
+        "inside": text.replace("]\n[", "]\n\n["),
+    }.get(change, text)
+    file = tmp_path / "a.srt"
+    file.write_bytes(text.encode("utf-16" if change == "utf-16" else "utf-8"))
+    table = read_poses(file, hfov_deg=60.0)
+    poses = [table.at(n * SECOND_NS, capture_ns=0) for n in range(4)]
+    assert [one.latitude_deg for one in poses] == pytest.approx([47.0, 47.1, 47.2, 47.3])
+    assert {one.height_m for one in poses} == {30.0}
+
+
+def test_autels_letters_say_which_number_is_which(tmp_path):
+    """They are written longitude first, without a sign."""
+    line = "HOME(W: 70.4, S: 33.1) 2020-01-01\nGPS(W: 70.5, S: 33.25, 30.5m)\nG.PRY (-90.0°, 0.0°, 3.0°)"
+    table, pose = read(tmp_path, "a.srt", blocks(lambda _: line))
+    assert (pose.latitude_deg, pose.longitude_deg) == (-33.25, -70.5)
+    assert not table.notes
+
+
+@pytest.mark.parametrize("ending", ["csv", "gpx"])
+@pytest.mark.parametrize(
+    ("first", "begins_s", "said"),
+    [
+        ("2026-01-01T09:59:58Z,0,0", 2, "1 of 4 rows are at 0, 0"),
+        ("1980-01-06T00:00:00Z,47,8", 0, "1 of 4 poses are more than a day from the others"),
+        ("2006-05-18T10:00:01Z,47,8", 0, "1 of 4 poses are more than a day from the others"),
+    ],
+)
+def test_a_receiver_without_a_fix_moves_nothing(tmp_path, caplog, ending, first, begins_s, said):
+    """Its first rows put the camera into the Gulf of Guinea, or all else 46 years behind the clip's first frame."""
+    rows = [first, *(f"2026-01-01T10:00:0{n}Z,47.{n},8.5" for n in range(3))]
+    points = [row.split(",") for row in rows]
+    text = "utc,latitude_deg,longitude_deg\n" + "\n".join(rows)
+    if ending == "gpx":
+        track = "".join(f'<trkpt lat="{y}" lon="{x}"><ele/><time>{t}</time></trkpt>' for t, y, x in points)
+        text = f"<gpx><trk><trkseg>{track}</trkseg></trk></gpx>"
+    table, _ = read(tmp_path, f"a.{ending}", text)
+    assert table.at(begins_s * SECOND_NS, capture_ns=0).latitude_deg == 47.0
+    assert said in caplog.text
+
+
+def test_a_table_of_windows_is_read(tmp_path):
+    """In UTF-16, with quotes, spaces, and names in capitals; 655.35 is how MAVLink says that no heading is known."""
+    text = '"Time_s" , "Latitude_deg", "Longitude_deg",yaw_deg,pitch_deg\r\n0,47,8,655.35,0\r\n'
+    file = tmp_path / "a.csv"
+    file.write_bytes(text.encode("utf-16"))
+    pose = read_poses(file, hfov_deg=60.0).at(0, capture_ns=0)
+    assert (pose.latitude_deg, pose.longitude_deg, pose.platform) == (47.0, 8.0, None)

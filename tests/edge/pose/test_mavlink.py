@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import socket
 import time
@@ -73,6 +74,14 @@ def test_the_gimbal_says_which_way_its_yaw_counts(source, send, autopilot, wait_
     send(one.place(), one.attitude(50), one.gimbal(90, -30, flags=flags))
     pose = wait_for(source, accept=has_camera)
     assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((yaw, -30), abs=0.01)
+
+
+def test_a_gimbal_that_does_not_know_hides_no_mount(source, send, autopilot, wait_for):
+    """It writes NaN before it has found north, and the mount's direction was left out."""
+    one = autopilot()
+    send(one.place(), one.attitude(50), one.gimbal(math.nan, -30, flags=32), one.mount())
+    pose = wait_for(source, accept=has_camera)
+    assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((60, -60), abs=0.01)
 
 
 @pytest.mark.parametrize("yaw", [33.0, 90.0, 200.0])
