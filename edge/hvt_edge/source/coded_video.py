@@ -130,9 +130,8 @@ class CodedVideoSource(Source):
         self, container: Any, stream: Any, *, say: bool = False
     ) -> Generator[tuple[float, bytes], None, None]:
         """(seconds, packet) in order; a jump of the time stamps is mended, and told of in the log if ``say``."""
-        timeline = Timeline(
-            self._stamps.period_s, quantum_s=stream.time_base if self._stamps.usable else None
-        )
+        quantum_s = stream.time_base if self._stamps.usable else None
+        timeline = Timeline(self._stamps.period_s, quantum_s=quantum_s, long_s=self._stamps.long_s)
         packets = container.demux(stream)
         while True:
             try:

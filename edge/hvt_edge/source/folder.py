@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -23,6 +24,8 @@ __all__ = ["FolderSource", "sequence_files"]
 
 _log = logging.getLogger(__name__)
 
+_MOSTLY = 0.5
+"""Of the steps from one number to the next, so many have to be 1 for others to be gaps."""
 _ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"})
 
 
@@ -37,6 +40,18 @@ def sequence_files(folder: Path) -> list[Path]:
 def _natural(name: str) -> list[tuple[int, str]]:
     parts = re.split(r"(\d+)", name.lower())
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+
+def _gaps(files: list[Path]) -> str:
+    """What there is to say of numbers that are left out, where most follow each other; else empty."""
+    found = [re.findall(r"[0-9]+", file.stem)[-1:] for file in files]
+    numbers = [int(digits[0][-15:]) for digits in found if digits]
+    steps = [later - earlier for earlier, later in pairwise(numbers)]
+    missing = sum(step - 1 for step in steps if step > 1)
+    if not missing or len(numbers) < len(files) or steps.count(1) < _MOSTLY * len(steps):
+        return ""
+    first = next(file for file, step in zip(files, steps, strict=False) if step > 1)
+    return f"{missing} numbers are missing, the first after {first.name}: it is shown as if they were never there"
 
 
 class FolderSource(Source):
@@ -72,6 +87,8 @@ class FolderSource(Source):
             )
         if source_fps is None:
             notes(f"images have no time: {fps:g} a second, as --fps says; --source-fps N says another rate")
+        if gaps := _gaps(self._files):
+            notes(gaps)
         self.notes = notes.taken()
         self._first = first
         self.fps = fps
@@ -118,9 +135,9 @@ class _Reader:
             if not data.size:
                 return None
             image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
-            if image is not None and image.dtype == np.uint16 and image.ndim == 2:
-                self._notes(DEEP_GREY.format(bits=16))
-                return self._stretch.bgr(np.asarray(image, np.uint16), at_s=at_s)
+            if image is not None and image.itemsize > 1 and image.ndim == 2:
+                self._notes(DEEP_GREY.format(bits=8 * image.itemsize))
+                return self._stretch.bgr(image, at_s=at_s)
             # All else as OpenCV takes it: without transparency, in 8 bits, turned as its EXIF data say.
             image = cv2.imdecode(data, cv2.IMREAD_COLOR)
         except (OSError, cv2.error):  # it was there a moment ago, or its header says what no memory holds

@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from av.stream import Disposition
 
 from hvt_common.errors import UserError
 from hvt_common.redaction import redacted
-from hvt_edge.source.decoding.timeline import Stamps, Timeline, surveyed
+from hvt_edge.source.decoding.timeline import LONG_PAUSE_S, LONG_STEP_S, Stamps, Timeline, surveyed
 
 __all__ = [
     "cause_of",
@@ -40,6 +41,10 @@ _NO_FILM = Disposition.attached_pic | Disposition.still_image | Disposition.time
 _OPEN_S, _READ_S = 10.0, 10.0
 _NO_STAMPS = 0x80
 """``AVFMT_NOTIMESTAMPS`` of libavformat: a raw stream, whose times FFmpeg invents at 25 frames a second."""
+_MAY_JUMP = 0x200
+"""``AVFMT_TS_DISCONT``: a container whose stamps may jump by what it is."""
+_MOST_FPS = 240
+"""A stream that says more has its clock there, or was told no rate: 500, 90000."""
 _SURVEYED = 256
 """Packets at the start of a clip whose stamps are looked at."""
 _QUIET_S, _POLL_S = 10.0, 0.1
@@ -125,6 +130,8 @@ def choose_stream(container: Any, *, note: Callable[[str], None] = lambda _: Non
         is_default = bool(stream.disposition & Disposition.default)
         return is_default, stream is best, codec.width * codec.height, -stream.index
 
+    if films[0].disposition & Disposition.attached_pic:
+        note("it holds no film: what is shown is its cover picture")
     moving = [one for one in films if one.codec_context.name not in _PICTURE_CODECS] or films
     chosen = max(moving, key=rank)
     if len(able) > 1:
@@ -146,10 +153,12 @@ def without_stamps(stream: Any) -> bool:
 
 
 def said_rate(stream: Any) -> Fraction | None:
-    """Frames a second as the container says, or the stream itself where the container invents them."""
-    rate = None if without_stamps(stream) else stream.average_rate
-    rate = rate or stream.guessed_rate or stream.base_rate
-    return Fraction(rate) if rate else None
+    """Frames a second as the container says, or the stream itself where the container invents them; else None."""
+    if without_stamps(stream):
+        rate = stream.codec_context.framerate
+    else:
+        rate = stream.average_rate or stream.guessed_rate or stream.base_rate
+    return Fraction(rate) if rate and rate <= _MOST_FPS else None
 
 
 def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
@@ -169,7 +178,8 @@ def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
     if without_stamps(stream):
         return Stamps(1 / (rate or Fraction(25)), usable=False), first
     reorders = bool(stream.codec_context.has_b_frames)
-    return surveyed(times, said_fps=rate, reorders=reorders), first
+    stamps = surveyed(times, said_fps=rate, reorders=reorders)
+    return replace(stamps, long_s=LONG_STEP_S if container.format.flags & _MAY_JUMP else LONG_PAUSE_S), first
 
 
 def decoded(
@@ -179,12 +189,21 @@ def decoded(
 
     Damage is skipped and reported once, at the end; a jump of the time stamps is mended and reported when it comes.
     """
-    timeline = Timeline(stamps.period_s, quantum_s=stream.time_base if stamps.usable else None)
+    quantum_s = stream.time_base if stamps.usable else None
+    timeline = Timeline(stamps.period_s, quantum_s=quantum_s, long_s=stamps.long_s)
     reading = _Reading(container, stream)
+    before_s: Fraction | None = None
+    paused = False
     for frame in reading.frames():
         stamp = frame.pts if stamps.ordered else frame.dts
         jumped = bool(timeline.jumps)
-        yield timeline.at(_seconds(stamp, frame.time_base) if stamps.usable else None), frame
+        at_s = timeline.at(_seconds(stamp, frame.time_base) if stamps.usable else None)
+        if not paused and before_s is not None and at_s - before_s > max(LONG_STEP_S, 3 * stamps.period_s):
+            paused = True
+            pause = f"{float(at_s - before_s):.1f} s at {float(before_s):.1f} s"
+            _log.warning("%s: its picture stands for %s, as its time stamps say", name, pause)
+        before_s = at_s
+        yield at_s, frame
         if timeline.jumps and not jumped:
             _log.warning("%s: %s", name, timeline.says)
     if len(timeline.jumps) > 1:
@@ -199,7 +218,7 @@ class _Reading:
     def __init__(self, container: Any, stream: Any) -> None:
         self._container, self._stream = container, stream
         self._size = _size_of(container)
-        self._damaged = self._count = 0
+        self._damaged = self._shown_damaged = self._count = 0
         self._ended = ""
         self._end_s: Fraction | None = None
 
@@ -208,20 +227,24 @@ class _Reading:
         for packet in _packets(self._container, self._stream):
             if isinstance(packet, Exception):
                 self._ended = f"it breaks off ({cause_of(packet)})"
-            elif packet.dts is not None:
-                self._end_s = _seconds(packet.dts + (packet.duration or 0), packet.time_base)
+            else:
+                self._count += bool(packet.size)  # what an edit list hides is there too
+                if packet.dts is not None:
+                    self._end_s = _seconds(packet.dts + (packet.duration or 0), packet.time_base)
             try:
                 frames = _decode(self._stream, packet)
             except av.error.FFmpegError:
                 self._damaged += 1
                 continue
-            self._count += len(frames)
+            self._shown_damaged += sum(frame.is_corrupt for frame in frames)
             yield from frames
 
     def faults(self) -> Iterator[str]:
         """The faults, for the end of the flight."""
         if self._damaged:
             yield f"has {self._damaged} damaged packets, which were skipped"
+        if self._shown_damaged:
+            yield f"has {self._shown_damaged} damaged pictures, shown as the decoder has patched them"
         why = self._ended or self._unfinished()
         if why:
             yield f"is unfinished: {why}"
@@ -231,7 +254,6 @@ class _Reading:
         container, stream = self._container, self._stream
         if (size := _size_of(container)) != self._size:
             return f"it has grown by {(size or 0) - (self._size or 0)} bytes since: --follow waits for more"
-        # An edit list may hide a few on purpose.
         if self._count < stream.frames and (self._lacks_bytes() or self._count < 0.98 * stream.frames - 2):
             return f"{self._count} of its {stream.frames} frames are there"
         if container.format.name == "mpegts":

@@ -1,8 +1,9 @@
-"""Sixteen bits of heat as eight that a person and a network can read. Pure."""
+"""A sensor's levels of heat as eight bits that a person and a network can read. Pure."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,8 @@ DEEP_GREY = (
 _LOW_PCT, _HIGH_PCT = 0.5, 99.5
 _LEAST_SPAN = 64
 """Sensor levels: a wall of one temperature is not to become noise from black to white."""
+_LEAST_DEGREES = 1.0
+"""The same of floating-point pictures, which are in degrees, or from 0 to 1."""
 _SETTLING_S = 3.0
 """A warm body that comes in must not darken all else at once."""
 _LONGEST_S = 1.0
@@ -32,10 +35,18 @@ class Stretch:
         self._range: tuple[float, float] | None = None
         self._at_s = 0.0
 
-    def bgr(self, levels: npt.NDArray[np.uint16], *, at_s: float) -> Image:
-        """(height, width) uint16 as (height, width, 3) uint8; ``at_s`` is the picture's time in seconds."""
+    def bgr(self, levels: npt.NDArray[Any], *, at_s: float) -> Image:
+        """(height, width) numbers as (height, width, 3) uint8; ``at_s`` is the picture's time in seconds.
+
+        What is not finite, as where a sensor saw nothing, is black.
+        """
+        least = _LEAST_SPAN
+        if np.issubdtype(levels.dtype, np.floating):
+            finite = levels[np.isfinite(levels)]
+            levels = np.nan_to_num(levels, nan=float(finite.min(initial=np.inf)) if finite.size else 0.0)
+            least = _LEAST_DEGREES
         low, high = self._settle(np.percentile(levels[::_EACH, ::_EACH], (_LOW_PCT, _HIGH_PCT)), at_s)
-        missing = max(0.0, _LEAST_SPAN - (high - low)) / 2
+        missing = max(0.0, least - (high - low)) / 2
         low, high = low - missing, high + missing
         scaled = (levels.astype(np.float32) - np.float32(low)) * np.float32(255 / (high - low))
         return np.repeat(np.clip(np.rint(scaled), 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)

@@ -9,10 +9,12 @@ from fractions import Fraction
 from itertools import pairwise
 from statistics import median
 
-__all__ = ["LONG_STEP_S", "Stamps", "Timeline", "surveyed"]
+__all__ = ["LONG_PAUSE_S", "LONG_STEP_S", "Stamps", "Timeline", "surveyed"]
 
 LONG_STEP_S = Fraction(10)
-"""A step of more than this, and than three usual ones, is a jump (``max_frame_duration`` of ffplay)."""
+"""A step of more than this, and than three usual ones, is a jump where a container may have some (MPEG-TS)."""
+LONG_PAUSE_S = Fraction(3600)
+"""The same in any other, where a recorder that waits for motion leaves pauses (``max_frame_duration`` of ffplay)."""
 _LONG_STEPS = 3
 _FEW = 8
 """After so many stamps that do not rise, the stream has none."""
@@ -29,6 +31,8 @@ class Stamps:
     """Whether they rise at all; else frames follow each other by ``period_s``."""
     ordered: bool = True
     """Whether they are of the presentation; else of the decoding, as in AVI: the n-th frame shown has the n-th."""
+    long_s: Fraction = LONG_STEP_S
+    """A step of more is a jump."""
 
 
 def surveyed(
@@ -60,16 +64,18 @@ def surveyed(
 class Timeline:
     """One reading of a stream, whose stamps are whole ``quantum_s``.
 
-    What steps back, or further than a frame takes, follows its predecessor as usual.
+    What steps back, or by more than ``long_s`` and three usual steps, follows its predecessor as usual.
 
     Such a step is a clock that was set or ran over, a damaged stamp, or two recordings put together. Two frames of
     one time are both shown: the second comes a little later.
     """
 
-    def __init__(self, period_s: Fraction, *, quantum_s: Fraction | None = None) -> None:
+    def __init__(
+        self, period_s: Fraction, *, quantum_s: Fraction | None = None, long_s: Fraction = LONG_STEP_S
+    ) -> None:
         # A mended step is one that the stamps can say, whole ones, as those around it.
         self._period_s = period_s if not quantum_s else math.ceil(period_s / quantum_s) * quantum_s
-        self._most_s = max(LONG_STEP_S, _LONG_STEPS * period_s)
+        self._most_s = max(long_s, _LONG_STEPS * period_s)
         self._stamp_s: Fraction | None = None
         self._at_s: Fraction | None = None
         self._offset_s = Fraction(0)

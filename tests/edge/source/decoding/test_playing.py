@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from av.stream import Disposition
+from PIL import Image
 
 from hvt_common.errors import UserError
 from hvt_edge.source.decoding.container import open_video
@@ -65,12 +66,54 @@ def test_a_stamp_far_ahead_repeats_no_picture(tmp_path, late):
     assert len(play(clip)[1]) in range(58, 62)
 
 
+@pytest.mark.parametrize("name", ["a.mkv", "a.mp4", "a.ts"])
+def test_a_pause_is_a_pause_but_where_containers_jump(tmp_path, caplog, name):
+    """A recorder that waits for motion leaves some; poses and times of all that follows would be 19 s off."""
+    times = [33 * one + 19_000 * (one >= 30) for one in range(60)]
+    _, pictures = play(write_numbered(tmp_path / name, 60, times_ms=times, bf="0"), fps=2.0)
+    is_ts = name.endswith(".ts")
+    assert len(pictures) in (range(3, 6) if is_ts else range(41, 44))
+    assert ("jump by +19.0" if is_ts else "stands for 19.0 s at 1.0 s") in caplog.text
+
+
+def test_what_an_edit_list_hides_is_not_missing(tmp_path, caplog):
+    """A clip that was trimmed without being coded anew would be called unfinished."""
+    whole = write_numbered(tmp_path / "whole.mp4", 60, bf="0")
+    with av.open(str(whole)) as source, av.open(str(tmp_path / "a.mp4"), "w") as trimmed:
+        stream = trimmed.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.size:
+                packet.pts -= 15 * packet.duration
+                packet.dts -= 15 * packet.duration
+                packet.stream = stream
+                trimmed.mux(packet)
+    assert numbers(play(tmp_path / "a.mp4")[1]) == list(range(15, 60))
+    assert "unfinished" not in caplog.text
+
+
 @pytest.mark.parametrize(("name", "codec"), [("a.h264", "libx264"), ("a.hevc", "libx265")])
 def test_a_raw_stream_runs_at_its_own_rate(tmp_path, name, codec):
     """Its film would be slow: FFmpeg takes 25 frames a second for any."""
     source, pictures = play(write_numbered(tmp_path / name, 60, codec=codec))
     assert numbers(pictures) == list(range(60))
     assert "30 frames a second, as the stream itself says" in " ".join(source.notes)
+
+
+def test_a_raw_stream_that_says_an_impossible_rate_is_guessed_at(tmp_path):
+    """Encoders that were told no rate write their clock (picamera#541): the log called it the stream's own 25."""
+    source, _ = play(write_numbered(tmp_path / "a.h264", 9, rate=500))
+    assert "25 frames a second, which is a guess" in " ".join(source.notes)
+
+
+def test_pictures_that_a_decoder_patched_are_counted(tmp_path, caplog):
+    """A link that loses packets would show squares, and nobody be told where they come from."""
+    clip = write_numbered(tmp_path / "a.ts", 60, bf="0", g="60", preset="ultrafast")
+    data = bytearray(clip.read_bytes())
+    for place in range(188 * 12 + 100, len(data), 188 * 20):
+        data[place : place + 60] = bytes(60)
+    clip.write_bytes(data)
+    play(clip)
+    assert "damaged pictures, shown as the decoder has patched them" in caplog.text
 
 
 # -- which stream, which shape ----------------------------------------------
@@ -95,6 +138,20 @@ def test_a_cover_picture_is_no_film(tmp_path, attached):
     source, pictures = play(clip)
     assert numbers(pictures) == list(range(30))
     assert "is the film (h264, 320x240)" in source.notes[0]
+
+
+def test_a_cover_picture_alone_is_called_so(tmp_path):
+    """A song would fly as a film of one picture."""
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        cover = container.add_stream("mjpeg", rate=30)
+        cover.width, cover.height, cover.pix_fmt = 320, 240, "yuvj420p"
+        cover.disposition = Disposition.attached_pic
+        frame = av.VideoFrame.from_ndarray(numbered(3), format="bgr24")
+        container.mux(cover.encode(frame.reformat(format="yuvj420p")))
+        container.mux(cover.encode(None))
+    source, pictures = play(tmp_path / "a.mp4")
+    assert numbers(pictures[:1]) == [3]
+    assert "it holds no film: what is shown is its cover picture" in source.notes
 
 
 @pytest.mark.parametrize(
@@ -204,6 +261,27 @@ def test_sixteen_bit_pictures_of_a_folder_are_stretched_too(tmp_path):
     source, pictures = play(tmp_path)
     assert pictures[0][60, 70, 0] - np.median(pictures[0]) > 150
     assert "stretched" in " ".join(source.notes)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.int32])
+def test_pictures_of_degrees_are_stretched_too(tmp_path, dtype):
+    """Thermal converters write 32 bits (opencv#7025): they were called unreadable, or all black."""
+    levels = heat().astype(np.float32) / 100 - 273.15
+    if dtype == np.float32:
+        levels[0, :9] = np.nan
+        cv2.imwrite(str(tmp_path / "0.tiff"), levels)
+    else:
+        Image.fromarray(heat().astype(np.int32)).save(tmp_path / "0.tiff")
+    _, pictures = play(tmp_path)
+    assert pictures[0][60, 70, 0] - np.median(pictures[0]) > 150
+
+
+def test_missing_numbers_of_a_folder_are_said(tmp_path):
+    """Whatever follows comes too early, and poses do not fit any more."""
+    for number in (*range(6), *range(9, 12)):
+        cv2.imwrite(str(tmp_path / f"f{number:04d}.png"), numbered(number))
+    source, _ = play(tmp_path)
+    assert "3 numbers are missing, the first after f0005.png" in " ".join(source.notes)
 
 
 @pytest.mark.parametrize("transfer", ["smpte2084", "arib-std-b67"])
