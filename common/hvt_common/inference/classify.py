@@ -18,6 +18,7 @@ crop 224" is meant for photographs; a crop around a box is already centred on it
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -45,6 +46,8 @@ _BACKGROUND = "background"
 _MAX_BATCH = 32
 _MAX_SIDE = 2048
 _USUAL_SIDE = 224
+_OPPOSITE = -30.0
+"""Times noise of 1: with it logits leave 0…1."""
 
 
 class Classifier(Protocol):
@@ -141,21 +144,23 @@ class OnnxClassifier:
     def _try_out(self, names: int | None) -> tuple[int, int, bool]:
         """Index of the output of scores, number of classes, and whether they are logits.
 
-        Of several outputs the one counts that has as many classes as there are ``names``.
+        Probabilities add up to 1, or are one a class, which stay within 0…1 whatever comes in. Of several outputs the
+        one counts that has as many classes as there are ``names``.
         """
         batch, (width, height) = self._batch or 1, self._size
         shape = (batch, 3, height, width) if self._channels_first else (batch, height, width, 3)
-        noise = np.random.default_rng(0).normal(0, 1, shape).astype(self.model.inputs[0].dtype)
+        noise = np.random.default_rng(0).normal(0, 1, shape)
+        runs = [self.model.run((noise * top).astype(self.model.inputs[0].dtype)) for top in (1, _OPPOSITE)]
         rows = {
-            index: output.reshape(batch, -1)[0].astype(np.float64)
-            for index, output in enumerate(self.model.run(noise))
+            index: np.stack([run[index].reshape(batch, -1)[0].astype(np.float64) for run in runs])
+            for index, output in enumerate(runs[0])
             if _is_scores(output, batch)
         }
         if not rows:
             raise UserError(_not_a_classifier(self.model, "no output is one row of scores an image"))
-        sizes = {row.size for row in rows.values()}
+        sizes = {row.shape[1] for row in rows.values()}
         fitting = (
-            [index for index, row in rows.items() if row.size == names] if len(sizes) > 1 else list(rows)
+            [index for index, row in rows.items() if row.shape[1] == names] if len(sizes) > 1 else list(rows)
         )
         if not fitting:
             raise UserError(
@@ -164,7 +169,14 @@ class OnnxClassifier:
                 )
             )
         row = rows[fitting[0]]
-        return fitting[0], row.size, not (row.min() >= 0 and abs(row.sum() - 1) < 1e-2)
+        sums_to_one = row[0].min() >= 0 and abs(row[0].sum() - 1) < 1e-2
+        each = bool(np.isfinite(row).all() and row.min() >= 0 and row.max() <= 1)
+        if each and not sums_to_one:
+            _log.warning(
+                "%s says a probability of each class by itself (sigmoid): they are made to add up to 1",
+                self.model.path.name,
+            )
+        return fitting[0], row.shape[1], not (sums_to_one or each)
 
 
 def _geometry(model: OnnxModel) -> tuple[bool, int | None, tuple[int, int]]:
@@ -175,7 +187,10 @@ def _geometry(model: OnnxModel) -> tuple[bool, int | None, tuple[int, int]]:
     if model.inputs[0].dtype not in (np.float32, np.float16):
         raise UserError(_not_a_classifier(model, "its input is neither float32 nor float16"))
     channels_first = shape[1] == 3
-    height, width = (side or _USUAL_SIDE for side in (shape[2:] if channels_first else shape[1:3]))
+    said = [int(word) for word in re.findall(r"\d{2,4}", model.metadata.get("imgsz", ""))]  # height, width
+    usual = (said * 2)[:2] if said else [_USUAL_SIDE, _USUAL_SIDE]
+    declared = shape[2:] if channels_first else shape[1:3]
+    height, width = (side or free for side, free in zip(declared, usual, strict=True))
     if max(width, height) > _MAX_SIDE:
         raise UserError(_not_a_classifier(model, f"its input is {width}x{height} pixels"))
     return channels_first, shape[0], (width, height)

@@ -242,11 +242,16 @@ class OnnxDetector:
         return max(width, cell), max(height, cell)
 
     def _run(self, tensor: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
-        """All outputs; a second input is the size of the picture, in which boxes are then given."""
+        """All outputs; a second input is the size of the picture, in which boxes are then given.
+
+        It is width and height, as RT-DETR's ``orig_target_sizes``; one that is called a shape is height and width.
+        """
         if len(self.model.inputs) == 1:
             return self.model.run(tensor)
+        port = self.model.inputs[1]
         height, width = tensor.shape[1:3] if self._channels_last else tensor.shape[2:]
-        return self.model.run(tensor, np.array([[width, height]], self.model.inputs[1].dtype))
+        sides = (height, width) if "shape" in port.name.lower() else (width, height)
+        return self.model.run(tensor, np.array([sides], port.dtype))
 
     def _try_out(self, names: int | None) -> Trial:
         """Run the network on `trial_pictures`; where its sides are free, at the least multiples that it takes."""
@@ -338,6 +343,9 @@ def _geometry(model: OnnxModel) -> tuple[bool, tuple[int | None, int | None]]:
         raise UserError(
             _not_a_detector(model, "its input is not one (1, 3, height, width) image, or that and its size")
         )
+    if more and "scale" in more[0].name.lower():
+        what = f"its second input {more[0].name!r} is no size of the picture: export it without"
+        raise UserError(_not_a_detector(model, what))
     if image.shape[0] not in (1, None):
         raise UserError(_not_a_detector(model, f"it takes {image.shape[0]} images at once"))
     if image.dtype not in (np.float32, np.float16, np.uint8):

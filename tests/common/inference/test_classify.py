@@ -93,6 +93,29 @@ def test_logits_and_probabilities_give_the_same_posterior(tmp_path: Path) -> Non
         assert answer.entropy_nats == pytest.approx(-(expected * np.log(expected)).sum(), rel=1e-3)
 
 
+def test_a_sigmoid_a_class_is_no_logit(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A network of independent classes would find all of them about as likely."""
+    model = colour_classifier(tmp_path / "c.onnx", metadata=PLAIN, gain=0.05, sigmoid=True)
+    (answer,) = open_classifier(str(model)).classify([np.full((5, 5, 3), (0, 0, 120), np.uint8)])
+    each = 1 / (1 + np.exp([-6.0, 0.0, 0.0]))
+    np.testing.assert_allclose(answer.probabilities, each / each.sum(), rtol=1e-4)
+    assert "a probability of each class by itself" in caplog.text
+
+
+@pytest.mark.parametrize(("imgsz", "size"), [("[64, 96]", (96, 64)), ("128", (128, 128)), ("", (224, 224))])
+def test_a_free_input_has_the_size_that_it_was_trained_at(
+    tmp_path: Path, imgsz: str, size: tuple[int, int]
+) -> None:
+    """A crop of 64 pixels would come enlarged to 224, and be something else."""
+    taken: list[tuple[int, ...]] = []
+    model = open_model(colour_classifier(tmp_path / "c.onnx", side="side", metadata={"imgsz": imgsz}))
+    classifier = OnnxClassifier(model)
+    run = model.run
+    model.run = lambda feed: taken.append(feed.shape[:0:-1]) or run(feed)  # type: ignore[method-assign, assignment]
+    classifier.classify([np.zeros((9, 9, 3), np.uint8)])
+    assert taken == [(*size, 3)]
+
+
 def test_broken_scores_say_nothing_rather_than_anything(tmp_path: Path) -> None:
     """A NaN in a posterior would poison the fusion of a whole track."""
     model = open_model(constant_model(tmp_path / "c.onnx", np.array([[1.0, np.nan, 3.0, 0.0]])))

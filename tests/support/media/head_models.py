@@ -16,7 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from media.onnx_models import cells
 
-__all__ = ["COLOURS", "FAMILIES", "SQUARES", "family_model", "picture"]
+__all__ = ["COLOURS", "FAMILIES", "SQUARES", "Graph", "family_model", "picture"]
 
 COLOURS = ((1, 0, 0), (0, 0, 1))
 """(red, green, blue) of class 0 and 1."""
@@ -314,6 +314,37 @@ def _tf_lists(graph: Graph, image: _Tensor) -> _Outputs:
     }
 
 
+def _padded_rows(graph: Graph, image: _Tensor) -> _Outputs:
+    """Behind the end of the list all is -1."""
+    boxes, scores = graph.find(image)
+    table = graph.op("Concat", boxes, graph.column(scores), graph.const([[0.0], [1.0]]), axis=1)
+    return {"output0": (graph.batch(graph.padded(table, np.full((98, 6), -1.0, np.float32))), 1)}
+
+
+def _padded_lists(graph: Graph, image: _Tensor) -> _Outputs:
+    """Likewise, with a count that says more than there is."""
+    boxes, scores = graph.find(image)
+    more = np.full((98, 5), -1.0, np.float32)
+    kinds = np.concatenate([[0, 1], np.full(98, -1)])[None]
+    return {
+        "num_dets": (graph.const([[100]], np.int32), TensorProto.INT32),
+        "det_boxes": (graph.batch(graph.padded(boxes, more[:, :4])), 1),
+        "det_scores": (graph.batch(graph.op("Concat", scores, graph.const(more[:, 4]), axis=0)), 1),
+        "det_classes": (graph.const(kinds, np.int32), TensorProto.INT32),
+    }
+
+
+def _tf_eight(graph: Graph, image: _Tensor) -> _Outputs:
+    """As the Object Detection API saves a model: what it came from stands beside."""
+    beside = {
+        "detection_anchor_indices": np.zeros((1, 2)),
+        "detection_multiclass_scores": np.zeros((1, 2, 3)),
+        "raw_detection_boxes": np.full((1, 50, 4), 0.5),
+        "raw_detection_scores": np.full((1, 50, 3), 0.1),
+    }
+    return _tf_lists(graph, image) | {name: (graph.const(value), 1) for name, value in beside.items()}
+
+
 FAMILIES: Mapping[str, tuple[str, Callable[[Graph, _Tensor], _Outputs]]] = {
     "yolox": ("yolox", _yolox),
     "yolox-decoded": ("yolox-decoded", _yolox_decoded),
@@ -336,6 +367,9 @@ FAMILIES: Mapping[str, tuple[str, Callable[[Graph, _Tensor], _Outputs]]] = {
     "ssd": ("ssd", _ssd),
     "atss": ("atss", _atss),
     "tensorflow": ("tf-lists", _tf_lists),
+    "tensorflow, eight outputs": ("tf-lists", _tf_eight),
+    "NMS inside, -1 behind": ("end-to-end", _padded_rows),
+    "TensorRT's NMS, -1 behind": ("nms-lists", _padded_lists),
 }
 """By what a user calls it: the head that it has, and what builds it."""
 

@@ -135,6 +135,8 @@ def colour_classifier(
     batch: int | str = "N",
     channels_last: bool = False,
     softmax: bool = False,
+    sigmoid: bool = False,
+    side: int | str = 32,
     gain: float = 10.0,
     metadata: Mapping[str, str] | None = None,
     dtype: type = np.float32,
@@ -146,14 +148,16 @@ def colour_classifier(
     nodes += [
         helper.make_node("GlobalAveragePool", ["chw" if channels_last else "input"], ["mean"]),
         helper.make_node("Flatten", ["mean"], ["flat"]),
-        helper.make_node("MatMul", ["flat", "w"], ["logits" if softmax else "scores"]),
+        helper.make_node("MatMul", ["flat", "w"], ["logits" if softmax or sigmoid else "scores"]),
     ]
     if softmax:
         nodes.append(helper.make_node("Softmax", ["logits"], ["scores"], axis=1))
+    if sigmoid:
+        nodes.append(helper.make_node("Sigmoid", ["logits"], ["scores"]))
     return save(
         path,
         nodes,
-        inputs={"input": (batch, 32, 32, 3) if channels_last else (batch, 3, 32, 32)},
+        inputs={"input": (batch, side, side, 3) if channels_last else (batch, 3, side, side)},
         outputs={"scores": (batch, classes)},
         constants={"w": weights},
         metadata=metadata,

@@ -67,6 +67,8 @@ def _says_rt_detr(trial: Trial) -> bool:
 
 def _explains(trial: Trial, match: Match) -> bool:
     """Whether every other output is the head's too: raw levels, or a second branch of the same shape."""
+    if match.by_name:
+        return True
     shapes = {trial.shape(index) for index in match.outputs}
     rest = set(range(len(trial.ports))) - set(match.outputs)
     return all(len(trial.shape(index)) == _RAW_AXES or trial.shape(index) in shapes for index in rest)

@@ -25,7 +25,7 @@ from hvt_common.inference.heads.decode import (
     cell_grid,
     rows_of,
 )
-from hvt_common.inference.heads.trial import Trial, anchor_count, are_probabilities, are_whole
+from hvt_common.inference.heads.trial import Trial, anchor_count, are_probabilities, are_scores, are_whole
 from hvt_common.inference.letterbox import Anchor
 from hvt_common.inference.preparation import Preparation
 
@@ -53,6 +53,8 @@ class Match:
     """The evidence that excludes all other heads; None if the shape alone fits."""
     possible: bool = True
     """False where the values speak against it, and only the user can know better."""
+    by_name: bool = False
+    """The names of its outputs tell it, whatever other outputs there are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +278,7 @@ def _ssd(trial: Trial) -> Match | None:
 
 def _is_score_and_class(trial: Trial, index: int) -> bool:
     table = trial.table(index)
-    return are_probabilities(table[:, 4]) and are_whole(table[:, 5])
+    return are_scores(table[:, 4]) and are_whole(table[:, 5])
 
 
 def _shown(table: Array) -> Array:
@@ -371,7 +373,8 @@ def _labels_boxes_scores(trial: Trial) -> Match | None:
     lists = _lists(trial, leave=None) if len(trial.ports) == 3 else None
     if lists is None:
         return None
-    proof = "boxes, scores and classes" if _are_corners_or_none(trial, lists[0]) else None
+    said = "boxes, scores and classes (torchvision counts them from 1: its class 0 is the background)"
+    proof = said if _are_corners_or_none(trial, lists[0]) else None
     return Match(lists, None, Parallel(), proof)
 
 
@@ -381,7 +384,7 @@ def _tf_lists(trial: Trial) -> Match | None:
     if not lists or trial.shape(lists[0])[-1] != _BOX:
         return None
     proof = "outputs detection_boxes, detection_scores and detection_classes"
-    return Match((*lists, *count), None, Parallel("corners-yx", first_class=1), proof)
+    return Match((*lists, *count), None, Parallel("corners-yx", first_class=1), proof, by_name=True)
 
 
 def _atss(trial: Trial) -> Match | None:
@@ -394,7 +397,8 @@ def _atss(trial: Trial) -> Match | None:
     table = trial.table(boxes)
     if not are_probabilities(table[:, 4]) or not _are_corners_or_none(trial, boxes):
         return None
-    return Match((boxes, kinds), None, Corners(), "boxes with their score, and classes")
+    proof = "boxes with their score, and classes; pixels as the Open Model Zoo takes them, which hvt.mean overrules"
+    return Match((boxes, kinds), None, Corners(), proof)
 
 
 def _lists(trial: Trial, *, leave: int | None) -> tuple[int, int, int] | None:
@@ -411,7 +415,7 @@ def _lists(trial: Trial, *, leave: int | None) -> tuple[int, int, int] | None:
     scores = _only([i for i in long if i != kinds])
     if kinds is None or scores is None:
         return None
-    fits = are_probabilities(trial.numbers(scores)) and are_whole(trial.numbers(kinds))
+    fits = are_scores(trial.numbers(scores)) and are_whole(trial.numbers(kinds))
     return (boxes, scores, kinds) if fits else None
 
 

@@ -15,9 +15,10 @@ from hvt_common.inference.heads.decode import MOST_RELATIVE
 if TYPE_CHECKING:  # the runtimes take a while to import, and a list of heads needs none
     from hvt_common.inference.runtimes.model import Port
 
-__all__ = ["Trial", "anchor_count", "are_probabilities", "are_whole", "trial_pictures"]
+__all__ = ["Trial", "anchor_count", "are_probabilities", "are_scores", "are_whole", "trial_pictures"]
 
 _BLOCK_PX = 32
+_PADDING = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +57,12 @@ class Trial:
         return np.concatenate([run[index].astype(np.float32).ravel() for run in self.runs])
 
     def named(self, *words: str) -> tuple[int, ...]:
-        """The one output whose name has each word, in their order; () where one of them has none, or several."""
+        """The one output whose name is, or has, each word, in their order; () where one has none, or several."""
+        names = [port.name.lower().partition(":")[0] for port in self.ports]
         found = [
-            [index for index, port in enumerate(self.ports) if word in port.name.lower()] for word in words
+            [index for index, name in enumerate(names) if name == word]
+            or [index for index, name in enumerate(names) if word in name]
+            for word in words
         ]
         return tuple(one[0] for one in found) if all(len(one) == 1 for one in found) else ()
 
@@ -95,6 +99,11 @@ def anchor_count(input_size: tuple[int, int], strides: Sequence[int]) -> int:
 def are_probabilities(scores: Array) -> bool:
     """Whether all lie in 0…1, give or take the rounding of half precision."""
     return bool(np.isfinite(scores).all() and ((scores >= -0.01) & (scores <= 1.01)).all())
+
+
+def are_scores(numbers: Array) -> bool:
+    """Whether they are probabilities, or -1 as behind the end of a list."""
+    return are_probabilities(numbers[numbers != _PADDING])
 
 
 def are_whole(numbers: Array) -> bool:

@@ -13,7 +13,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.model import open_model
-from media.head_models import FAMILIES, NEEDS_NAMES, SQUARES, family_model, picture
+from media.head_models import FAMILIES, NEEDS_NAMES, SQUARES, Graph, family_model, picture
 from media.onnx_models import constant_model, save
 
 NAMED = {"names": "['red', 'blue']"}
@@ -224,3 +224,47 @@ def test_models_of_the_open_model_zoo_find_people(data: Path, name: str, head: s
     overlap = np.clip(shared, 0, None).prod(axis=1)
     area = (found[:, 2:] - found[:, :2]).prod(axis=1) + (target[2:] - target[:2]).prod()
     assert (overlap / (area - overlap)).max() > 0.4
+
+
+@pytest.mark.parametrize(("name", "swap"), [("orig_target_sizes", False), ("image_shape", True)])
+def test_the_size_of_the_picture_comes_as_its_name_says(tmp_path: Path, name: str, *, swap: bool) -> None:
+    """Boxes of an input that is no square would be stretched."""
+    graph = Graph()
+    boxes, scores = graph.find("images")
+    size = graph.op("Cast", name, to=TensorProto.FLOAT)
+    size = graph.op("Gather", size, graph.ints(1, 0), axis=1) if swap else size
+    shares = graph.op("Div", boxes, graph.const([[320.0, 192, 320, 192]]))
+    outputs = {
+        "labels": graph.const([[0, 1]], np.int64),
+        "boxes": graph.batch(graph.op("Mul", shares, graph.op("Concat", size, size, axis=1))),
+        "scores": graph.batch(scores),
+    }
+    path = write(tmp_path / "m.onnx", graph, outputs, second=name)
+    check(opened(path), "labels-boxes-scores")
+
+
+def test_a_second_input_that_is_a_scale_is_refused(tmp_path: Path) -> None:
+    """Paddle's boxes would be divided by the size of the picture (PaddleDetection#6202)."""
+    graph = Graph()
+    boxes, scores = graph.find("images")
+    table = graph.op("Concat", boxes, graph.column(scores), graph.const([[0.0], [1.0]]), axis=1)
+    path = write(tmp_path / "m.onnx", graph, {"output0": graph.batch(table)}, second="scale_factor")
+    with pytest.raises(UserError, match="second input 'scale_factor' is no size of the picture"):
+        opened(path)
+
+
+def write(path: Path, graph: Graph, outputs: dict[str, str], *, second: str) -> Path:
+    """A detector of two inputs, the first 320x192."""
+    inputs = [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, 192, 320])]
+    inputs.append(helper.make_tensor_value_info(second, TensorProto.FLOAT, [1, 2]))
+    graph.nodes += [helper.make_node("Identity", [tensor], [name]) for name, tensor in outputs.items()]
+    ports = [
+        helper.make_tensor_value_info(
+            name, TensorProto.INT64 if name == "labels" else TensorProto.FLOAT, None
+        )
+        for name in outputs
+    ]
+    made = helper.make_graph(graph.nodes, "two inputs", inputs, ports, graph.weights)
+    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    path.write_bytes(model.SerializeToString())
+    return path
