@@ -40,7 +40,7 @@ class Stretch:
 
         What is not finite, as where a sensor saw nothing, is black.
         """
-        least = _LEAST_SPAN
+        least: float = _LEAST_SPAN
         if np.issubdtype(levels.dtype, np.floating):
             finite = levels[np.isfinite(levels)]
             levels = np.nan_to_num(levels, nan=float(finite.min(initial=np.inf)) if finite.size else 0.0)
