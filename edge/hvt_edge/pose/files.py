@@ -145,17 +145,17 @@ def _of_one_time(rows: list[_Values], path: Path) -> list[_Values]:
             runs.append([])
         runs[-1].append(two)
     longest = max(runs, key=len)
-    kept = [row for row in rows if "utc_s" not in row or longest[0] <= row["utc_s"] <= longest[-1]]
-    if len(kept) < len(rows):
+    together = [row for row in rows if "utc_s" not in row or longest[0] <= row["utc_s"] <= longest[-1]]
+    if len(together) < len(rows):
         begin = datetime.fromtimestamp(longest[0], UTC)
         _log.warning(
             "pose file %s: %d of %d poses are more than a day from the others, which begin at %s, and are left out",
             path,
-            len(rows) - len(kept),
+            len(rows) - len(together),
             len(rows),
             begin.isoformat(timespec="seconds"),
         )
-    return kept
+    return together
 
 
 def _in_order(poses: list[Pose], path: Path) -> list[Pose]:

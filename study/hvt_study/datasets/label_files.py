@@ -205,16 +205,16 @@ def _yaml_names(text: str) -> tuple[str, ...]:
 def _flow(text: str) -> Iterator[str]:
     """The entries of a list or table in brackets, which may go over lines; quotes keep commas and brackets."""
     entry, depth = "", 0
-    for piece in re.findall(r"'(?:''|[^'])*'|\"(?:\\.|[^\"\\])*\"|(?<=\s)#[^\n]*|.", text, re.DOTALL):
-        depth += (piece in ("[", "{")) - (piece in ("]", "}"))
-        if not depth or (piece == "," and depth == 1):
+    for word in re.findall(r"'(?:''|[^'])*'|\"(?:\\.|[^\"\\])*\"|(?<=\s)#[^\n]*|.", text, re.DOTALL):
+        depth += (word in ("[", "{")) - (word in ("]", "}"))
+        if not depth or (word == "," and depth == 1):
             if entry.strip():
                 yield entry.strip()
             entry = ""
             if not depth:
                 return
-        elif piece not in ("[", "{") and not piece.startswith("#"):
-            entry += piece
+        elif word not in ("[", "{") and not word.startswith("#"):
+            entry += word
 
 
 def _plain(word: str) -> str:
