@@ -97,10 +97,10 @@ def _place(body: str, *, latitude_first: bool) -> dict[str, float]:
     if found is None:
         return {}
     if letters := _HEMISPHERES.findall(found[1]):
+        values = [(letter, _value(number)) for letter, number in letters]
         return {
-            "longitude_deg" if letter in "EW" else "latitude_deg": _value(number)
-            * (-1 if letter in "WS" else 1)
-            for letter, number in letters
+            "longitude_deg" if letter in "EW" else "latitude_deg": -abs(value) if letter in "WS" else value
+            for letter, value in values  # some write the sign as well
         }
     place = _numbers(found[1])
     if len(place) < 2:

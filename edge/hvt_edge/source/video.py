@@ -15,7 +15,15 @@ from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_common.values import Fit, Frame
 from hvt_edge.source.contract import BaseSize, Source
-from hvt_edge.source.decoding.container import decoded, name_of, open_video, said_rate, survey, without_stamps
+from hvt_edge.source.decoding.container import (
+    decoded,
+    name_of,
+    open_video,
+    said_rate,
+    shown_times,
+    survey,
+    without_stamps,
+)
 from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.decoding.timeline import Stamps
@@ -73,6 +81,19 @@ class VideoSource(Source):
     def source_fps(self) -> float:
         """The clip's own frame rate, as it says or as it was overridden."""
         return float(1 / self._stamps.period_s)
+
+    def shown_frames(self) -> tuple[int, tuple[int, ...]]:
+        """How many frames the clip has, and which one each base frame shows, by its packets: nothing is decoded.
+
+        A clip of which frames cannot be decoded plays fewer.
+        """
+        container, stream = open_video(self._spec)
+        with container:
+            times = shown_times(container, stream, stamps=self._stamps)
+            slack_s = Fraction(stream.time_base or 0) if self._stamps.usable else Fraction(0)
+        timed = ((at_s, index) for index, at_s in enumerate(times))
+        held = hold(timed, fps=exact_rate(self.fps), tail_s=self._stamps.period_s, slack_s=slack_s)
+        return len(times), tuple(index for _, index in held)
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         """The clip from its beginning."""

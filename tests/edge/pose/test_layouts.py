@@ -154,9 +154,12 @@ def test_subtitles_are_told_apart_by_their_times(tmp_path, change):
     assert {one.height_m for one in poses} == {30.0}
 
 
-def test_autels_letters_say_which_number_is_which(tmp_path):
-    """They are written longitude first, without a sign."""
-    line = "HOME(W: 70.4, S: 33.1) 2020-01-01\nGPS(W: 70.5, S: 33.25, 30.5m)\nG.PRY (-90.0°, 0.0°, 3.0°)"
+@pytest.mark.parametrize("sign", ["", "-"])
+def test_autels_letters_say_which_number_is_which(tmp_path, sign):
+    """They are written longitude first, with or without a sign."""
+    line = (
+        f"HOME(W: 70.4, S: 33.1) 2020-01-01\nGPS(W: {sign}70.5, S: 33.25, 30.5m)\nG.PRY (-90.0°, 0.0°, 3.0°)"
+    )
     table, pose = read(tmp_path, "a.srt", blocks(lambda _: line))
     assert (pose.latitude_deg, pose.longitude_deg) == (-33.25, -70.5)
     assert not table.notes

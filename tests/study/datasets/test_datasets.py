@@ -26,6 +26,7 @@ from hvt_study.datasets.layouts.uri import open_dataset, open_datasets
 from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
 from media.clips import smooth_pictures
+from media.numbered import number_of, write_numbered
 from rigs.flight import RedSquares
 from studies.layouts import SIZE, square_xywh, write_images, write_mot, write_uavdt, write_visdrone
 
@@ -514,3 +515,23 @@ def test_lines_of_any_length_are_read_alike(tmp_path):
     assert rows["y"].tolist() == [-1, -1, -1]
     path.write_text("")
     assert len(read_rows(path, columns="frame,id,x", least=2)) == 0
+
+
+@pytest.mark.parametrize("kind", ["two put together", "raw", "B-frames in AVI"])
+def test_a_clip_plays_the_frames_that_its_sequence_names(tmp_path, kind):
+    """Half of a recording was left out of a study, or reference labels stood a frame beside what was flown."""
+    name, settings = {
+        "two put together": ("a.ts", {"bf": "2"}),
+        "raw": ("a.h264", {"bf": "0"}),
+        "B-frames in AVI": ("a.avi", {"bf": "2"}),
+    }[kind]
+    clip = write_numbered(tmp_path / name, 60, **settings)
+    count = 60
+    if kind == "two put together":
+        clip.write_bytes(clip.read_bytes() * 2)
+        count = 120
+    (sequence,) = open_dataset(f"clips:{clip}")
+    assert sequence.frame_count == count
+    told = [sequence.source_frame(index) for index in range(sequence.clip_frames)]
+    assert told == list(range(0, count, 2))
+    assert [number_of(picture) for picture in sequence.clip.images()] == [number % 60 for number in told]

@@ -18,7 +18,7 @@ from av.stream import Disposition
 
 from hvt_common.errors import UserError
 from hvt_common.redaction import redacted
-from hvt_edge.source.decoding.timeline import LONG_PAUSE_S, LONG_STEP_S, Stamps, Timeline, surveyed
+from hvt_edge.source.decoding.timeline import LONG_PAUSE_S, LONG_STEP_S, Stamps, Timeline, presented, surveyed
 
 __all__ = [
     "cause_of",
@@ -28,6 +28,7 @@ __all__ = [
     "name_of",
     "open_video",
     "said_rate",
+    "shown_times",
     "survey",
     "without_stamps",
 ]
@@ -180,6 +181,21 @@ def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
     reorders = bool(stream.codec_context.has_b_frames)
     stamps = surveyed(times, said_fps=rate, reorders=reorders)
     return replace(stamps, long_s=LONG_STEP_S if container.format.flags & _MAY_JUMP else LONG_PAUSE_S), first
+
+
+def shown_times(container: Any, stream: Any, *, stamps: Stamps) -> list[Fraction]:
+    """When each frame is shown, in seconds and in presentation order, by packets alone: nothing is decoded.
+
+    The same times as of `decoded`, where all decodes.
+    """
+    packets = [
+        (_seconds(one.pts, one.time_base), _seconds(one.dts, one.time_base))
+        for one in _packets(container, stream)
+        if not isinstance(one, Exception) and one.size and not one.is_discard
+    ]
+    quantum_s = stream.time_base if stamps.usable else None
+    timeline = Timeline(stamps.period_s, quantum_s=quantum_s, long_s=stamps.long_s)
+    return [timeline.at(stamp) for stamp in presented(packets, stamps)]
 
 
 def decoded(

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Words
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-import av
-import av.error
 
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_edge.source.folder import sequence_files
-from hvt_edge.source.resample import base_frame_count, hold
+from hvt_edge.source.resample import base_frame_count
 from hvt_edge.source.video import VideoSource
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.layouts.image_sequence import image_size
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["open_clips", "shown_frames"]
+__all__ = ["open_clips"]
 
 _NAMED = (
     ".mp4 .m4v .mov .mkv .webm .avi .wmv .flv .ts .mts .m2ts .mpg .mpeg .3gp .ogv "
@@ -53,34 +48,6 @@ def open_clips(place: Path, options: Options) -> Mapping[str, Callable[[], Seque
     return {name: partial(_open, name, file, options) for name, file in zip(names, files, strict=True)}
 
 
-def shown_frames(path: Path, *, rate: Fraction | None = None) -> tuple[int, tuple[int, ...]]:
-    """How many frames a video has, and which one each frame shows, by its time stamps alone: nothing is decoded.
-
-    ``rate`` overrides the time stamps. The rule is the player's (`VideoSource`); a file of which frames cannot be
-    decoded plays fewer.
-    """
-    try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            frame_s = Fraction(stream.time_base or 0)
-            own = Fraction(
-                stream.average_rate or stream.guessed_rate or stream.base_rate or exact_rate(NOMINAL_FPS)
-            )
-            packets: Any = container.demux(stream)
-            stamps = [packet.pts for packet in packets if packet.size and not packet.is_discard]
-    except (av.error.FFmpegError, OSError, IndexError) as error:
-        raise UserError(
-            f"clip {path} cannot be read as a video: {getattr(error, 'strerror', error)}"
-        ) from None
-    known = [stamp for stamp in stamps if stamp is not None]
-    if rate is not None or len(known) < len(stamps):
-        frame_s, known = 1 / (rate or own), list(range(len(stamps)))
-    timed = [(stamp * frame_s, index) for index, stamp in enumerate(sorted(known))]
-    slack_s = Fraction(0) if rate is not None else frame_s
-    held = hold(timed, fps=exact_rate(NOMINAL_FPS), tail_s=1 / (rate or own), slack_s=slack_s)
-    return len(timed), tuple(index for _, index in held)
-
-
 def _open_images(place: Path, images: Words[Path], options: Options) -> Sequence:
     fps = options.fps or NOMINAL_FPS
     size = image_size(images[0])
@@ -99,11 +66,10 @@ def _open_images(place: Path, images: Words[Path], options: Options) -> Sequence
 
 
 def _open(name: str, path: Path, options: Options) -> Sequence:
-    rate = None if options.fps is None else exact_rate(options.fps)
     source = VideoSource(str(path), size=_ANY_SIZE, fps=NOMINAL_FPS, fit="letterbox", source_fps=options.fps)
     size, fps = source.view.source_size, source.source_fps
+    count, shown = source.shown_frames()
     source.close()
-    count, shown = shown_frames(path, rate=rate)
     return Sequence(
         name=name,
         dataset="clips",
