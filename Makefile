@@ -8,7 +8,7 @@ UV     := $(shell command -v uv 2>/dev/null)
 # Containers often forbid bytecode; each start of a program would then compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test check arm lint type format docs bench bench-fleet bench-stills bench-compare bench-peers link soak kills failures fuzz training clean help
+.PHONY: setup demo test check arm lint type format docs bench bench-board bench-fleet bench-stills bench-compare bench-peers link soak kills failures fuzz training clean help
 
 .PHONY: nightly nightly-tests
 
@@ -74,6 +74,9 @@ format: setup    ## write what `make check` wants to see
 
 bench: setup     ## memory, and speed as ratios against a peer or a floor; fails where a bar of bench/bars.py is missed
 	@$(BIN)/python -m bench
+
+bench-board: setup ## an edge with a quarter of two cores for a minute: no frame lost, boxes, the doctor's forecast; left out where nothing limits it
+	@$(BIN)/python -m bench.board
 
 bench-fleet: setup ## one ground with 1, 2, 4, 8 and 16 played edges: frames a second and core, delay, memory
 	@$(BIN)/python -m bench.fleet

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from bench.bars import measured
 
-PARTS = ("memory", "latency", "pipeline", "joining", "tracker", "detector", "batching", "providers")
+PARTS = ("light", "memory", "latency", "pipeline", "joining", "tracker", "detector", "batching", "providers")
 
 
 def main(argv: list[str]) -> int:

@@ -35,6 +35,12 @@ BARS = {
     "50 boxes, time / roboflow trackers": _at_most(0.35),
     "provider / cpu, time": _at_most(1.0),
     "F1 of provider against cpu": _at_least(0.99),
+    "hvt-edge imported, processor time over numpy alone": _at_most(3.5),
+    "hvt-ground imported, processor time over numpy alone": _at_most(3.5),
+    "M0, processor time of the edge over decode and x265 bare": _at_most(1.15),
+    "board: frames lost for want of processor time": _at_most(0),
+    "board: oldest boxes, s": _at_most(1.5),
+    "board: what the doctor's forecast is off by": _at_most(0.2),
 }
 
 

@@ -69,7 +69,7 @@ def _p95_ms(cores: tuple[int | None, int | None]) -> float:
             ) as ground,
             running(
                 "hvt_edge.cli", "--source", clip(), "--connect", endpoint, "--quiet", "--detector", nano(),
-                "--method", "M5", core=cores[1],
+                "--method", "M5", "--preset", "veryfast", core=cores[1],
             ) as edge,
         ):  # fmt: skip
             peaks = Peaks([edge, ground])

@@ -59,7 +59,7 @@ class BaseEncoder:
             self._context = _open(settings)
         self._tagger = RegionTagger() if settings.side_data else None
         self._count = 0
-        self._own_ns = self._wall_ns = 0
+        self._caller_ns = self._wall_ns = 0
         self.mean_qp = math.nan
         """Of the frame encoded last: the quantiser parameter (0…51), averaged over its blocks."""
 
@@ -69,7 +69,7 @@ class BaseEncoder:
         ``regions`` need ``EncoderSettings.side_data``; where they overlap the deeper one counts.
         """
         assert self._tagger is not None or not regions, "regions need EncoderSettings.side_data"
-        began_ns, began_own_ns = time.perf_counter_ns(), time.thread_time_ns()
+        began_ns, began_cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         picture = yuv_picture(self._to_yuv, frame.base_bgr)
         if self._tagger is not None:
             picture = self._tagger.tag(picture, regions)
@@ -80,7 +80,7 @@ class BaseEncoder:
         if packet.is_keyframe:  # the first is one, and by then each worker has lowered its priority
             self._workers.raise_priority()
         self.mean_qp = mean_qp_of(packet)
-        self._own_ns += time.thread_time_ns() - began_own_ns
+        self._caller_ns += time.thread_time_ns() - began_cpu_ns
         self._wall_ns += time.perf_counter_ns() - began_ns
         return AccessUnit(
             frame_index=frame.index,
@@ -93,7 +93,7 @@ class BaseEncoder:
     def spent(self) -> tuple[int, int]:
         """(processor time in nanoseconds, frames) so far; time by the clock where the system says no more."""
         workers_ns = self._workers.cpu_ns
-        return self._wall_ns if workers_ns is None else self._own_ns + workers_ns, self._count
+        return self._wall_ns if workers_ns is None else self._caller_ns + workers_ns, self._count
 
 
 def yuv_picture(

@@ -1,0 +1,72 @@
+"""What an edge takes of a processor beyond what nobody can do without: at its start, and with video alone."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+from bench.bars import measured
+from bench.material import FPS, SIZE, clip, frames
+from hvt_edge.video.encoder_settings import encoder_settings
+from hvt_edge.video.x265 import BaseEncoder
+
+_FRAMES = 100
+_FIRST = 20
+
+
+def rows() -> list[dict[str, object]]:
+    numpy_s = _spent_s("-c", "import numpy")
+    starts = [
+        measured(
+            f"hvt-{side} imported, processor time over numpy alone",
+            _spent_s("-c", f"import hvt_{side}.cli") / numpy_s,
+        )
+        for side in ("edge", "ground")
+    ]
+    bare_s = _bare_s()
+    video_s = (_edge_s(_FIRST + _FRAMES) - _edge_s(_FIRST)) / _FRAMES
+    return [
+        *starts,
+        measured("M0, processor time of the edge over decode and x265 bare", video_s / bare_s),
+        measured("that floor, ms a frame", bare_s * 1e3),
+    ]
+
+
+def _bare_s() -> float:
+    """Of one frame, in this process: reading the clip, then x265."""
+    began_s = time.process_time()
+    taken = frames(_FRAMES)
+    read_s = time.process_time() - began_s
+    encoder = BaseEncoder(
+        encoder_settings(
+            size=SIZE, fps=FPS, preset="veryfast", total_bps=800_000, base_bps=800_000, edge_id="edge-1"
+        )
+    )
+    began_s = time.process_time()
+    for frame in taken:
+        encoder.encode(frame)
+    return (read_s + time.process_time() - began_s) / len(taken)
+
+
+def _edge_s(count: int) -> float:
+    """Of a flight of so many frames in lockstep, with video alone."""
+    return _spent_s(
+        *("-m", "hvt_edge.cli", "--source", str(clip()), "--method", "M0", "--pace", "lockstep", "--quiet"),
+        *("--size", "{}x{}".format(*SIZE), "--wait", "0s", "--max-frames", str(count)),
+        *("--connect", "tcp/127.0.0.1:9"),
+    )
+
+
+def _spent_s(*arguments: str) -> float:
+    """Processor seconds of this Python with these arguments."""
+    before = os.times()
+    subprocess.run([sys.executable, *arguments], check=False, stdout=subprocess.DEVNULL, timeout=300)
+    after = os.times()
+    return after.children_user + after.children_system - before.children_user - before.children_system
+
+
+if __name__ == "__main__":
+    for one in rows():
+        print(one)
