@@ -28,6 +28,7 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
+from hvt_study.datasets.label_files import class_file, keypoint_columns
 from hvt_study.datasets.labels import FrameLabels, LabelDoubts, covered_share
 from hvt_study.datasets.visdrone_rows import read_image_rows
 from hvt_study.datasets.yolo_labels import IGNORED, read_yolo, yolo_names
@@ -138,9 +139,10 @@ def read_annotations(
     """
     if path.parent.name != _YOLO:
         return _visdrone(path)
-    names = yolo_names(path.parent.parent, tuple(classes) or None)
+    root = path.parent.parent
+    names = yolo_names(root, tuple(classes) or None)
     doubts = LabelDoubts()
-    found = read_yolo(path, names, size, doubts)
+    found = read_yolo(path, names, size, doubts, keypoints=keypoint_columns(class_file(root, [])))
     for sentence in doubts.sentences():
         _log.warning("%s", sentence)
     return Annotations(

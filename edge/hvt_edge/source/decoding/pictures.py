@@ -27,6 +27,8 @@ _HDR = {16: "PQ", 18: "HLG"}
 _BT709, _BT601 = 1, 6
 _UNSAID = (0, 2, 3)
 """Matrices of H.273, table 4: 0 is RGB, which no YUV is, 2 says nothing, 3 is reserved."""
+_CONVERTED = (1, 4, 5, 6, 7, 9)
+"""Those that swscale converts: not YCgCo, ICtCp and what broken encoders invent."""
 _MOST_ASPECT = 8
 _Turn = tuple[bool, bool, bool]
 """Whether rows become columns, and whether it is then mirrored left to right, and upside down."""
@@ -106,10 +108,12 @@ class Pictures:
             return self._stretch.bgr(np.asarray(levels, np.uint16), at_s=frame.time or 0.0)
         more: dict[str, Any] = {}
         if not frame.format.is_rgb and not name.startswith("gray"):
-            if frame.colorspace in _UNSAID:
+            if frame.colorspace not in _CONVERTED:
                 matrix = matrix_of(frame)
                 standard = "BT.709" if matrix == _BT709 else "BT.601"
-                self._say(f"it says no colour matrix: {standard}, because it has {frame.height} lines")
+                said = int(frame.colorspace)
+                which = "no colour matrix" if said in _UNSAID else f"colour matrix {said}, which FFmpeg lacks"
+                self._say(f"it says {which}: {standard}, because it has {frame.height} lines")
                 more["src_colorspace"] = Colorspace.ITU709 if matrix == _BT709 else Colorspace.ITU601
             if frame.color_trc in _HDR:
                 self._say(f"it is HDR ({_HDR[frame.color_trc]}): tone-mapped to BT.709")
@@ -156,7 +160,7 @@ class Pictures:
 
 def matrix_of(frame: av.VideoFrame) -> int:
     """The colour matrix of a YUV frame (H.273, table 4): its tag, else by its height."""
-    if frame.colorspace not in _UNSAID:
+    if frame.colorspace in _CONVERTED:
         return int(frame.colorspace)
     return _BT709 if frame.height > _UNTAGGED_SD_PX else _BT601
 

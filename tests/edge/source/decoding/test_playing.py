@@ -328,6 +328,14 @@ def test_untagged_colour_goes_by_height(tmp_path, size, standard):
 # -- damage -------------------------------------------------------------------
 
 
+def test_a_matrix_that_nobody_converts_goes_by_height(tmp_path):
+    """YCgCo, or what a broken encoder invents, ended the flight with the operating system's error."""
+    clip = write_numbered(tmp_path / "a.mkv", 3, **{"x264-params": "colormatrix=YCgCo"})
+    source, pictures = play(clip)
+    assert numbers(pictures) == [0, 1, 2]
+    assert "it says colour matrix 8, which FFmpeg lacks: BT.601" in " ".join(source.notes)
+
+
 def test_a_picture_whose_header_is_damaged_is_held_over(tmp_path, caplog):
     """One of four would end the flight in a traceback."""
     for number in range(4):
@@ -359,7 +367,13 @@ def test_an_mp4_without_its_index_says_what_it_is(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("a.mp4", {"movflags": "faststart"}), ("a.mkv", {}), ("a.ts", {})]
+    ("name", "options"),
+    [
+        ("a.mp4", {"movflags": "faststart"}),
+        ("b.mp4", {"movflags": "frag_keyframe+empty_moov"}),
+        ("a.mkv", {}),
+        ("a.ts", {}),
+    ],
 )
 def test_a_cut_clip_says_that_it_is_unfinished(tmp_path, caplog, name, options):
     """Half of a clip would pass for a whole one."""
