@@ -1,7 +1,7 @@
 """A small HTTP server for programs that watch this one: metrics, and whether it is alive.
 
-Few requests at a time, each within some seconds, each answer made when it is asked for: a scraper comes every few
-seconds, and whoever does something else with the port disturbs nobody but other askers.
+It serves few requests at a time, each within some seconds, and makes each answer on request: a scraper comes every
+few seconds, and misuse of the port disturbs no other part of the program.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
 """ByteTrack: others use `bytetrack`, and `association` of boxes; Kalman filter and table are its parts.
 
-`alone` says what to think of an object that only one of two observers sees.
+`recall` weighs an object that only one of two detectors finds.
 """

@@ -1,7 +1,7 @@
-"""Whether the link is away, and which frames it took with it. Time is an argument.
+"""Whether the link is down, and which frames were lost with it. Time is an argument.
 
-Two signs that it is away: nobody subscribes any more (Zenoh notices that some seconds after the link broke), or a
-ground that used to report is silent (it reports twice a second whatever it receives, so this is noticed much sooner).
+It is down if nobody subscribes any more (Zenoh notices that some seconds after the link broke), or if a ground that
+used to report is silent (it reports twice a second whatever it receives, so this is noticed much sooner).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The frame loop says once a second that it turns: a state for who watches, and a word for systemd's watchdog.
+"""The frame loop reports once a second that it turns: a state for watchers, and a message for systemd's watchdog.
 
-Whoever lets the loop wait for something that may take long turns it meanwhile: a clip waits for its ground, a camera
-that is away yields a step without a frame each second. Only a loop that hangs says nothing.
+A long wait in the loop turns it meanwhile: a clip waits for its ground, a lost camera yields a step without a frame
+each second. Only a loop that hangs reports nothing.
 """
 
 from __future__ import annotations

@@ -1,15 +1,14 @@
-"""``--profile auto``: which levers the edge pulls follows from what they were measured to give.
+"""``--profile auto``: sends tracks and stills while their measured gain is worth their bits.
 
-Two levers cost bits that the video could have: the edge's own tracks, and stills. Each is pulled while it pays.
+Both cost bits that the video could have.
 
-**Tracks** pay where the ground does not see objects on the base, or sees some that are not there: their gain in F1
-is what the shadow ground measured, less what the video would gain by the same bits. **Stills** pay where they change
-what the ground shows: it says of each what it made of it. Where hardly any changed anything they pause, and a few are
-sent now and then to find out whether that holds. A source much finer than the base is reason enough: they go on, and
-show details.
+**Tracks** pay if the ground's detector misses objects on the base, or finds false ones: their gain in F1 is the
+shadow ground's measurement, less the gain of video by the same bits. **Stills** pay if they change the ground's
+list: it reports the outcome of each. If hardly any changed anything they pause, and a few are sent now and then as
+a test. If the source is much finer than the base, they never pause, because they show details.
 
-A ground that lies in its reports can stop stills and tracks or bring them back, and with them move some of the bits
-of the video, within auto's bounds. It cannot change the budget.
+False reports of a ground can stop stills and tracks or bring them back, and with them move some of the bits of the
+video, within auto's bounds. They cannot change the budget.
 """
 
 from __future__ import annotations
@@ -37,14 +36,14 @@ class Measured:
     """The same where of few objects hardly any count."""
     hidden: float = 0.0
     """Objects a picture that the base does not show."""
-    denied: float = 0.0
-    """Objects a picture that the base shows, the source does not, and the ground lists unless it hears of it."""
+    suppressed: float = 0.0
+    """Objects a picture that only the base shows, and that the ground lists without the edge's tracks."""
     misnamed: float = 0.0
     """Objects a picture that the base shows under another class."""
     misnamed_share: float = 0.0
     """Share of the shown objects that bear another class there."""
     reported: bool = False
-    """The ground's own detector shows even fewer: ``hidden`` are those that it does not see."""
+    """The ground's own detector shows even fewer: ``hidden`` are those that it misses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +180,7 @@ class LeverControl:
         measured = self._measured
         who = "the ground overlooks" if measured.reported else "the video hides"
         hidden = f"{who} {_objects(measured.hidden)}"
-        for count, what in ((measured.denied, "shows {} false"), (measured.misnamed, "misnames {}")):
+        for count, what in ((measured.suppressed, "shows {} false"), (measured.misnamed, "misnames {}")):
             if round(count):
                 hidden += f", {what.format(f'{count:.0f}')}"
         why = hidden if measured.comparisons else "not measured yet"

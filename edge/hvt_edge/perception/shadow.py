@@ -1,4 +1,4 @@
-"""The shadow ground: what the ground's detector would miss on the base stream of what the source shows.
+"""The shadow ground: which of the source's objects the ground's detector would miss on the base stream.
 
 The edge decodes its own stream and holds the untouched source, so it can measure instead of guess. Now and then, on a
 frame whose source the detector has just seen, it runs the detector on the decoded base frame too, as the ground does,
@@ -7,16 +7,16 @@ confidence: with a calibrated detector a box of .6 is real three times in five. 
 show counts as much for being sent as against it.
 
 Expected named F1 of a list (F1 = 2 TP / (listed + true); a box counts only under its class; expectations by the
-confidences p, those of base-only boxes by what the source's silence leaves of them, `Recall.real`):
+confidences p, those of base-only boxes after the source's missed detection, `Recall.real`):
 
     true    = sum of p over source boxes and base-only boxes
     base    = 2 (sum of p over source boxes that the base shows, w of it where it bears another class there,
                 and over base-only boxes) / (shown + base-only + true)
     sent    = 2 (sum of p over shown and hidden boxes, 1 - w of it where the base bears another class,
-                and over base-only boxes but the denied) / (shown + hidden + base-only - denied + true)
+                and over base-only boxes but the suppressed) / (shown + hidden + base-only - suppressed + true)
 
-``hidden`` are the source boxes that the base does not show and the ground would list: from `ALONE_CONFIDENCE` on.
-``denied`` are the base-only boxes that the ground no longer lists once it hears that the source does not show them.
+``hidden`` are the source boxes that the base does not show and the ground would list: from `EDGE_ONLY_CONFIDENCE` on.
+``suppressed`` are the base-only boxes that the ground no longer lists once the edge's tracks miss them.
 ``w`` is 1/3: of two names for one object that of the finer picture is right twice as often (our choice).
 
 The ground's detector may be another, or none. It reports how many objects it shows; where that differs from what was
@@ -32,7 +32,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.tracking.alone import ALONE_CONFIDENCE, Recall
+from hvt_common.tracking.recall import EDGE_ONLY_CONFIDENCE, Recall
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
 from hvt_edge.operating.levers import Measured
@@ -87,9 +87,9 @@ class Shadow:
     false: float = 0.0
     """Boxes of the base where the source has none."""
     false_p: float = 0.0
-    denied: float = 0.0
+    suppressed: float = 0.0
     """Those of them that the ground would not list if it were sent tracks."""
-    denied_p: float = 0.0
+    suppressed_p: float = 0.0
 
     @property
     def misnamed_share(self) -> float:
@@ -107,7 +107,7 @@ class Shadow:
 
         Pictures of one second show the same objects, and of two or three the detector may just be wrong.
         """
-        changed = self.hidden + self.misnamed + self.denied
+        changed = self.hidden + self.misnamed + self.suppressed
         return self._gain(1 - 1 / math.sqrt(changed)) if changed > 1 else 0.0
 
     def corrected(self, more: float, *, sure: bool) -> Shadow:
@@ -133,8 +133,8 @@ class Shadow:
             misnamed_p=self.misnamed_p * left,
             false=self.false * left,
             false_p=self.false_p * left,
-            denied=self.denied * left,
-            denied_p=self.denied_p * left,
+            suppressed=self.suppressed * left,
+            suppressed_p=self.suppressed_p * left,
         )
 
     @property
@@ -145,7 +145,7 @@ class Shadow:
             gain=self.gain,
             sure_gain=self.sure_gain,
             hidden=self.hidden,
-            denied=self.denied,
+            suppressed=self.suppressed,
             misnamed=self.misnamed,
             misnamed_share=self.misnamed_share,
         )
@@ -155,12 +155,14 @@ class Shadow:
         true = self.source_p + self.false_p
         if not true:
             return 0.0
-        hidden, denied = share * self.hidden, share * self.denied
-        hidden_p, misnamed_p, denied_p = (share * p for p in (self.hidden_p, self.misnamed_p, self.denied_p))
+        hidden, suppressed = share * self.hidden, share * self.suppressed
+        hidden_p, misnamed_p, suppressed_p = (
+            share * p for p in (self.hidden_p, self.misnamed_p, self.suppressed_p)
+        )
         named_p = self.shown_p + self.false_p - (1 - _BASE_NAMES) * misnamed_p
-        sent_p = self.shown_p + self.false_p - denied_p + hidden_p - _BASE_NAMES * misnamed_p
+        sent_p = self.shown_p + self.false_p - suppressed_p + hidden_p - _BASE_NAMES * misnamed_p
         listed = self.shown + self.false
-        return 2 * sent_p / (listed + hidden - denied + true) - 2 * named_p / (listed + true)
+        return 2 * sent_p / (listed + hidden - suppressed + true) - 2 * named_p / (listed + true)
 
 
 def _per(total: float, count: float) -> float:
@@ -263,14 +265,14 @@ class ShadowGround:
         began = np.isin(tracks.ids[rows], self._shown_ids)
         shown = (same & (strong[:, None] | began)).any(axis=0)
         self._shown_ids = tracks.ids[rows][shown]
-        hidden = ~shown & (p >= ALONE_CONFIDENCE)
+        hidden = ~shown & (p >= EDGE_ONLY_CONFIDENCE)
         in_source = np.any(same, axis=1)
-        sure = found.confidences >= ALONE_CONFIDENCE
+        sure = found.confidences >= EDGE_ONLY_CONFIDENCE
         self._recall.take(
             found.class_ids[sure], reported=in_source[sure], at_s=seen.frame.capture_ns / SECOND_NS
         )
-        alone = strong & ~in_source
-        alone_p, denied_p = self._alone(found, np.flatnonzero(alone))
+        base_only = strong & ~in_source
+        base_only_p, suppressed_p = self._base_only(found, np.flatnonzero(base_only))
         misnamed = np.zeros(len(rows), bool)
         if shown.any():
             best = overlaps[:, shown].argmax(axis=0)
@@ -284,22 +286,22 @@ class ShadowGround:
             hidden_p=float(p[hidden].sum()),
             misnamed=int(misnamed.sum()),
             misnamed_p=float(p[misnamed].sum()),
-            false=int(alone.sum()),
-            false_p=sum(alone_p),
-            denied=len(denied_p),
-            denied_p=sum(denied_p),
+            false=int(base_only.sum()),
+            false_p=sum(base_only_p),
+            suppressed=len(suppressed_p),
+            suppressed_p=sum(suppressed_p),
         )
 
-    def _alone(self, found: Detections, rows: npt.NDArray[np.int64]) -> tuple[list[float], list[float]]:
-        """How probably each of these is real that the source does not show, and those of them that are denied."""
-        alone_p, denied_p = [], []
+    def _base_only(self, found: Detections, rows: npt.NDArray[np.int64]) -> tuple[list[float], list[float]]:
+        """The probability that each of these base-only boxes is real, and those of the suppressed ones."""
+        base_only_p, suppressed_p = [], []
         for confidence, class_id in zip(
             found.confidences[rows].tolist(), found.class_ids[rows].tolist(), strict=True
         ):
-            alone_p.append(self._recall.real(confidence, class_id))
+            base_only_p.append(self._recall.real(confidence, class_id))
             if confidence < self._recall.least_confidence(class_id):
-                denied_p.append(alone_p[-1])
-        return alone_p, denied_p
+                suppressed_p.append(base_only_p[-1])
+        return base_only_p, suppressed_p
 
     def _take(self, one: Shadow, capture_ns: int) -> None:
         weight = 0.0

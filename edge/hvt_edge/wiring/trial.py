@@ -123,6 +123,6 @@ def _share(config: EdgeConfig, view: View, decimation: int, seen: Shadow = UNMEA
     if not config.measures or config.fixed_share is not None:
         return config.share
     share = min(config.share, SPARSE_SHARE) if decimation > 1 else config.share
-    seen = replace(seen, denied=0.0, denied_p=0.0)
+    seen = replace(seen, suppressed=0.0, suppressed_p=0.0)
     pay = lever_settings(config, view).tracks_pay(seen.measured, total_bps=config.budget_bps)
     return FIRST_SHARE if pay and not method(config.method).video_only else share

@@ -1,13 +1,13 @@
-"""Puts together again what an edge stored while the link was down: chunks in, whole objects and acknowledgements out.
+"""Assembles an edge's stored objects: chunks in, whole objects and acknowledgements out.
 
-Pure, and bounded whatever comes. Of an object is held what has come without a hole from its beginning: a chunk beyond
-that is not taken, and the edge learns how far it got. Where space is short the object that has waited longest for its
-next chunk goes; its edge begins it again. What has been delivered is remembered, so that a repetition is acknowledged
-and nothing more.
+Pure, and bounded whatever comes. An object is held from its beginning without a hole: a chunk beyond that is
+refused, and the edge learns how far it got. If space is short, the object that has waited longest for its next
+chunk is dropped; its edge begins it again. Delivered objects are remembered, so a repetition is acknowledged and
+nothing more.
 
-An object is acknowledged when it is where it belongs, and not before: its edge forgets it then. While it is being
-worked on, all of it but the last byte is said to be here. So an edge that asks again hears that somebody is there,
-and what it asks with is one byte.
+An object is acknowledged when it is in its place, and not before, because its edge then deletes it. While it is
+being processed, all of it but the last byte is acknowledged: so an edge that repeats gets an answer, and repeats
+one byte.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def test_it_says_who_does_not_see_them():
     for reported, who in ((True, "the ground overlooks"), (False, "the video hides")):
         rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, reported=reported))
         assert rig.second().says.startswith(f"tracks: {who} 16 objects; ")
-    rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, denied=4.2, misnamed=2.6))
+    rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, suppressed=4.2, misnamed=2.6))
     says = "tracks: the video hides 16 objects, shows 4 false, misnames 3; "
     assert rig.second().says.startswith(says)
 

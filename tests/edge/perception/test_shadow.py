@@ -92,7 +92,9 @@ def test_what_the_base_shows_in_error_counts():
     shadow = compared(base, confidences=objects).now
     recall = min(0.9, (18 + 10 * 18 / (19 + 2)) / (19 + 10))  # see `Recall`
     weak, strong = (c * (1 - recall) / (c * (1 - recall) + 1 - c) for c in (0.5, 0.95))
-    assert (shadow.hidden, shadow.false, shadow.denied) == (0, 5, 4), "one is surer than the source is silent"
+    assert (shadow.hidden, shadow.false, shadow.suppressed) == (0, 5, 4), (
+        "one is surer than the source is silent"
+    )
     true = 18 * 0.9 + 4 * weak + strong
     for share, gain in ((1, shadow.gain), (1 - 1 / 4**0.5, shadow.sure_gain)):
         base_f1 = 2 * true / (23 + true)
@@ -100,7 +102,7 @@ def test_what_the_base_shows_in_error_counts():
         assert gain == pytest.approx(sent_f1 - base_f1, abs=1e-5)
         assert gain > 0.02
     fewer = compared(found(0, 1, *range(30, 34), confidence=0.7), confidences=objects).now
-    assert fewer.denied == 0, "of an edge that lists other things than the base shows nothing follows"
+    assert fewer.suppressed == 0, "of an edge that lists other things than the base shows nothing follows"
 
 
 def test_two_that_are_hidden_tell_less_than_twenty():
@@ -219,7 +221,7 @@ def test_reports_of_the_scene_before_say_nothing_of_this_one():
     st.booleans(),
 )
 def test_whatever_a_ground_reports_no_object_is_made_up(
-    shown, hidden, false, more, p, misnamed, denied, sure
+    shown, hidden, false, more, p, misnamed, suppressed, sure
 ):
     """A ground that lies may have tracks sent or not; it can put nothing into the account that is not there."""
     before = Shadow(
@@ -233,15 +235,15 @@ def test_whatever_a_ground_reports_no_object_is_made_up(
         misnamed_p=misnamed * p * shown,
         false=false,
         false_p=p * false,
-        denied=denied * false,
-        denied_p=denied * p * false,
+        suppressed=suppressed * false,
+        suppressed_p=suppressed * p * false,
     )
     after = before.corrected(more, sure=sure)
     assert after.shown + after.hidden == pytest.approx(shown + hidden)
     assert after.shown_p + after.hidden_p == pytest.approx(before.source_p)
     assert min(after.shown, after.hidden, after.shown_p, after.hidden_p, after.misnamed) >= -1e-9
     assert after.misnamed <= after.shown + 1e-9
-    assert 0 <= after.denied <= after.false + 1e-9
+    assert 0 <= after.suppressed <= after.false + 1e-9
     assert after.gain <= 1 + 1e-9
 
 

@@ -1,4 +1,4 @@
-"""One object of the world, and who reports it; see `fuse`."""
+"""One object of the world and its sources; see `fuse`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from hvt_ground.events import Origin
 from hvt_ground.perception.fusion.camera_path import CameraPath
 
-__all__ = ["Entity", "Vote", "Witness"]
+__all__ = ["Entity", "Observation", "Vote"]
 
 _Floats = npt.NDArray[np.float64]
 
@@ -23,8 +23,8 @@ MISSED_STEPS = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Witness:
-    """A box of another witness at one frame, and the object's own motion beyond the camera's."""
+class Observation:
+    """A box reported by the edge or a still at one frame, and the object's own motion beyond the camera's."""
 
     box: _Floats
     """(4,) float64 x1 y1 x2 y2, base pixels."""
@@ -33,16 +33,16 @@ class Witness:
     velocity: _Floats = field(default_factory=lambda: np.zeros(2))
     """(2,) float64, base pixels a frame."""
     steps: int = 1
-    """How often it has been seen."""
+    """Number of observations."""
 
-    def seen_again(self, box: _Floats, frame_index: int, confidence: float, *, path: CameraPath) -> Witness:
+    def updated(self, box: _Floats, frame_index: int, confidence: float, *, path: CameraPath) -> Observation:
         """The same object at a later frame."""
         frames = frame_index - self.frame_index
         stood = path.carry(self.box[None], start=self.frame_index, end=frame_index)[0]
         newest = (_centre(box) - _centre(stood)) / max(1, frames)
         share = 1.0 if self.steps == 1 else _NEW_VELOCITY
         velocity = share * newest + (1 - share) * self.velocity
-        return Witness(box, frame_index, confidence, velocity, self.steps + 1)
+        return Observation(box, frame_index, confidence, velocity, self.steps + 1)
 
 
 @dataclass(slots=True)
@@ -62,46 +62,46 @@ class Vote:
 
 @dataclass(slots=True, eq=False)
 class Entity:
-    """An id that never changes, and who knows of it."""
+    """An id that never changes, and its sources."""
 
     born: int
     id: int = 0
     """0 until it is listed for the first time."""
     own_id: int | None = None
     edge_id: int | None = None
-    afar: Witness | None = None
-    """Of the edge, or of a still where the edge has never listed it."""
+    reported: Observation | None = None
+    """The edge's newest box, or a still's if the edge has never listed it."""
     own_vote: Vote = field(default_factory=Vote)
-    far_vote: Vote = field(default_factory=Vote)
+    edge_vote: Vote = field(default_factory=Vote)
     missed: int = 0
     """Steps in a row that have not listed it."""
     unlisted: int = 0
     """Steps in a row that have not shown it though we track it."""
     is_doubted: bool = False
-    """Whether that speaks against it: only we see it, and are not sure enough."""
+    """Suppressed by the edge: it is ground-only, missed by the edge, and not sure enough."""
     still_frame: int = -1
     """Frame of the newest still that showed it."""
     apart: int = 0
-    """Steps in a row at which its two witnesses lay apart."""
+    """Steps in a row at which its two tracks lay apart."""
     own_then: tuple[_Floats, int] | None = None
     """(2,) the centre of our own box at the frame of a step, and that frame."""
     correction: tuple[_Floats, int] | None = None
     """(4,) correction of our own box, and the frame of the still that showed it."""
     last_frame: int = -1
-    """The newest at which anybody saw it."""
+    """The newest frame at which any source observed it."""
 
-    def is_live_afar(self, frame_index: int, *, patience: int) -> bool:
+    def is_report_live(self, frame_index: int, *, patience: int) -> bool:
         """Whether the edge's knowledge of it, or a still's, holds at this frame."""
-        if self.afar is None or frame_index - self.afar.frame_index > patience:
+        if self.reported is None or frame_index - self.reported.frame_index > patience:
             return False
         return self.edge_id is None or self.missed < MISSED_STEPS
 
     def origin(self, own_ids: Container[int | None], frame_index: int, *, patience: int) -> Origin | None:
-        """Who knows of it; ``own_ids`` are our tracks at this frame. None where nobody does (any more)."""
-        far = self.is_live_afar(frame_index, patience=patience)
+        """Its sources; ``own_ids`` are our tracks at this frame. None without any (any more)."""
+        observed = self.is_report_live(frame_index, patience=patience)
         if self.own_id is not None and self.own_id in own_ids:
-            return "edge+base" if far and self.edge_id is not None else "base"
-        if not far:
+            return "edge+base" if observed and self.edge_id is not None else "base"
+        if not observed:
             return None
         return "still" if self.edge_id is None else "edge"
 

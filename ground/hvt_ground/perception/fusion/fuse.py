@@ -1,39 +1,40 @@
-"""One list of tracks from three sources: the ground's own tracker on the base, the edge's report, and stills.
+"""Track-to-track fusion: one list from the ground's own tracker on the base, the edge's tracks, and stills.
 
-An *entity* is one object of the world. It has an id that never changes and up to three witnesses: a
-track of the ground's own, a track of the edge, and stills in which it was found.
+An *entity* is one object of the world, with an id that never changes. Up to three sources observe it: a track of
+the ground's own, a track of the edge, and stills in which it was found. It is *ground-only*, *edge-only* or
+*matched*.
 
-**Who is who.** Witnesses stay with their entity. Where one entity has only a track of our own and another is known
-from afar only (edge or still), and their boxes overlap by `PAIR_IOU`, they are one: the most overlap in sum goes
-first (assignment), and the older id stays. A track of the edge that is new where another has just gone is the same
-under a new number. Two witnesses that lie apart (`APART_IOU`) at two steps in a row part again. Ids are given in one
-sequence for all, so without an edge's report they are the order in which tracks were listed first.
+**Association.** Sources stay with their entity. If a ground-only and an edge-only entity (or one that only a still
+has shown) overlap by `PAIR_IOU`, they are matched: the assignment of the most overlap in sum, and the older id
+stays. A new track of the edge where another has just ended is the same under a new number. Two matched tracks that
+lie apart (`APART_IOU`) at two steps in a row are split. Ids are one sequence for all, so without an edge's report
+they are the order in which tracks were listed first.
 
-**Where it is.** A box from afar is moved from its frame by the camera's motion (`CameraPath`) and by the object's own
-velocity, from its last steps, and where we track it too by the way that our box has gone since. With both at hand
-the box is their mean, weighted by confidence and by age: the weight halves every `HALF_LIFE_S` since the box was
-seen, and the edge's counts `EDGE_BOX_WEIGHT` times.
+**Box.** A reported box is moved from its frame by the camera's motion (`CameraPath`) and by the object's own
+velocity over its last steps; a matched one also by the motion of our box since. The fused box is the mean of both,
+weighted by confidence and age: the weight halves every `HALF_LIFE_S`, and the edge's counts `EDGE_BOX_WEIGHT`
+times.
 
-**What it is.** Each side has one vote, the class that its own tracker has settled on, and the confidence, smoothed
-over some detections, is its weight; the edge's counts `EDGE_CLASS_WEIGHT` times, and as often more as its source is
-finer than the base. A still's opinion comes after, in `refine`, and stands above both.
+**Class.** Each side has one vote, the class that its own tracker has settled on; its weight is the confidence,
+smoothed over some detections. The edge's counts `EDGE_CLASS_WEIGHT` times, and as often more as its source is finer
+than the base. The classes of stills come after, in `refine`, and stand above both.
 
-**How long.** The edge's knowledge ends when two steps in a row do not list the track, or nothing has been reported of
-it for `PATIENCE_S` or, where an edge is so slow that half of that passes from one step to the next, for twice the
-time between them; what only a still has shown ends so long after the still.
+**Expiry.** An edge's track ends when two steps in a row do not list it, or nothing has been reported of it for
+`PATIENCE_S`; if half of that passes from one step to the next, for twice the time between them. An entity that only
+a still has shown ends so long after the still.
 
-**Who is believed.** What only the edge sees is listed where it is sure. What only we see has its silence against it:
-where a step shows nothing there, of a class that the edge can name, we have to be the surer the more of what is there
-the edge was seen to list (`silence`). That ends when nothing is reported for `PATIENCE_S`, and does not hold for
-`FORGET_S` after a still has shown it.
+**Missed-detection evidence.** An edge-only entity is listed from a sure confidence on. If a step shows nothing at a
+ground-only one, of a class that the edge can name, it must be the surer the larger the share of objects is that the
+edge usually reports (`missed_detections`). That ends when nothing is reported for `PATIENCE_S`, and does not hold
+for `FORGET_S` after a still has shown it.
 
-**Once each.** What only one side sees on top of what the other sees is listed once (`SAME_IOU`); so are two boxes of
+**Duplicates.** A box of one side on top of one of the other is listed once (`SAME_IOU`); so are two boxes of
 different class that are almost one (`TWIN_IOU`; less, and riders vanish on their motorcycles), which class-wise
 suppression lets pass. Without an edge's report the list is the tracker's, box for box.
 
-The constants were tried out on a 90-pixel and a 15-pixel scene at 200 and 800 kbit/s, steps three times a second and
-0.2 s late, against the list of one side alone. F1 does not depend on them much (0.01); the class agreement gains 0.01
-where the edge's class counts double.
+The constants were tried out on a 90-pixel and a 15-pixel scene at 200 and 800 kbit/s, steps three times a second
+and 0.2 s late, against the list of one side alone. F1 does not depend on them much (0.01); the class agreement
+gains 0.01 where the edge's class counts double.
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ import numpy.typing as npt
 from hvt_common.tracking.association import assign
 from hvt_common.values import Detections, Tracks, iou
 from hvt_ground.perception.fusion.camera_path import CameraPath
-from hvt_ground.perception.fusion.entity import MISSED_STEPS, Entity, Witness
-from hvt_ground.perception.fusion.object_list import FusedTracks, FusionRules, far_boxes, list_entities
-from hvt_ground.perception.fusion.silence import EdgeSilence
+from hvt_ground.perception.fusion.entity import MISSED_STEPS, Entity, Observation
+from hvt_ground.perception.fusion.missed_detections import MissedDetections
+from hvt_ground.perception.fusion.object_list import FusedTracks, FusionRules, list_entities, reported_boxes
 
 __all__ = ["FusedTracks", "Fusion", "unified_names"]
 
@@ -67,7 +68,7 @@ EDGE_CLASS_WEIGHT = 0.85
 """At equal size nearly as much as ours: the drone's network is often the smaller one. What is small in the base is
 called a car, and surely so: on drawn scenes at 640x360, a third of the source, 8 of 94 objects were."""
 FORGET_S = 10.0
-"""How long an entity without any witness keeps its id for a track that is found again."""
+"""How long an entity that nothing observes keeps its id for a track that is found again."""
 MAX_ENTITIES = 2048
 _REMEMBERED_OWN = 64
 
@@ -111,7 +112,7 @@ class Fusion:
         )
         self._usual_patience = self._rules.patience
         self._forget = max(1, round(FORGET_S * fps))
-        self._silence = EdgeSilence(edge_classes, fps=fps, still_frames=self._forget)
+        self._missed = MissedDetections(edge_classes, fps=fps, still_frames=self._forget)
         self._entities: list[Entity] = []
         self._by_own: dict[int, Entity] = {}
         self._by_edge: dict[int, Entity] = {}
@@ -178,7 +179,7 @@ class Fusion:
         self._update(own, frame_index)
         if own is not None:
             self._note_own(own, frame_index)
-            self._silence.take(step, own, by_own=self._by_own)
+            self._missed.take(step, own, by_own=self._by_own)
         return True
 
     def take_found(self, found: Detections, *, known: Tracks) -> None:
@@ -194,12 +195,14 @@ class Fusion:
                 continue
             confidence = float(found.confidences[row])
             entity = self._add(Entity(born=frame_index, still_frame=frame_index, last_frame=frame_index))
-            entity.afar = Witness(found.boxes_xyxy_px[row].astype(np.float64), frame_index, confidence)
-            entity.far_vote.update(int(found.class_ids[row]), confidence)
+            entity.reported = Observation(
+                found.boxes_xyxy_px[row].astype(np.float64), frame_index, confidence
+            )
+            entity.edge_vote.update(int(found.class_ids[row]), confidence)
         self._update(self._own.get(frame_index), frame_index)
 
     def take_box(self, track_id: int, box_base_px: Sequence[float], *, frame_index: int) -> None:
-        """Take where a still shows a listed entity, at the still's frame.
+        """Take the box of a listed entity in a still, at the still's frame.
 
         It confirms one that only stills know, and moves it. Where we have a track of our own its box is corrected by
         the same amount from then on, less with time. A box of the edge is as good as the still's.
@@ -209,9 +212,9 @@ class Fusion:
             return
         box = np.array(box_base_px, np.float64)
         entity.still_frame, entity.is_doubted = max(entity.still_frame, frame_index), False
-        far, own = entity.afar, self._own.get(frame_index)
-        if entity.edge_id is None and far is not None and frame_index > far.frame_index:
-            entity.afar = far.seen_again(box, frame_index, far.confidence, path=self._path)
+        observed, own = entity.reported, self._own.get(frame_index)
+        if entity.edge_id is None and observed is not None and frame_index > observed.frame_index:
+            entity.reported = observed.updated(box, frame_index, observed.confidence, path=self._path)
             entity.last_frame = max(entity.last_frame, frame_index)
         if own is not None and entity.own_id in own.ids:
             row = int(np.flatnonzero(own.ids == entity.own_id)[0])
@@ -225,7 +228,7 @@ class Fusion:
     # Learning
 
     def _patience(self, gap: int) -> int:
-        """For how long a step is believed, in frames, where the one before it came so many frames earlier."""
+        """How long a step counts, in frames, if the one before it came so many frames earlier."""
         usual = self._usual_patience
         return usual if 2 * gap <= usual else min(2 * gap, max(usual, self._forget))
 
@@ -239,13 +242,13 @@ class Fusion:
 
     def _update_edge(self, entity: Entity, step: Tracks, row: int) -> None:
         frame_index, confidence = step.frame_index, float(step.confidences[row])
-        box, far = step.boxes_xyxy_px[row].astype(np.float64), entity.afar
-        if far is None or frame_index - far.frame_index > self._rules.patience:
-            entity.afar = Witness(box, frame_index, confidence)
+        box, observed = step.boxes_xyxy_px[row].astype(np.float64), entity.reported
+        if observed is None or frame_index - observed.frame_index > self._rules.patience:
+            entity.reported = Observation(box, frame_index, confidence)
         else:
-            entity.afar = far.seen_again(box, frame_index, confidence, path=self._path)
+            entity.reported = observed.updated(box, frame_index, confidence, path=self._path)
         entity.last_frame = max(entity.last_frame, frame_index)
-        entity.far_vote.update(int(self._edge_classes[step.class_ids[row]]), confidence)
+        entity.edge_vote.update(int(self._edge_classes[step.class_ids[row]]), confidence)
 
     def _welcome(self, step: Tracks, fresh: Sequence[int]) -> None:
         """Find which of the edge's new tracks continue one that it no longer lists; the others are new entities."""
@@ -279,11 +282,11 @@ class Fusion:
         rows = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
         for entity in list(self._entities):
             row = rows.get(entity.own_id) if entity.own_id is not None else None
-            if row is None or entity.afar is None or entity.afar.frame_index != frame_index:
+            if row is None or entity.reported is None or entity.reported.frame_index != frame_index:
                 continue
             if frame_index - int(own.seen_frames[row]) > self._rules.half_life:
                 continue  # ours is a guess by now and says nothing against the edge's
-            overlap = iou(entity.afar.box[None], own.boxes_xyxy_px[row : row + 1])[0, 0]
+            overlap = iou(entity.reported.box[None], own.boxes_xyxy_px[row : row + 1])[0, 0]
             entity.apart = entity.apart + 1 if overlap < APART_IOU else 0
             if entity.apart >= MISSED_STEPS:
                 other = Entity(own_id=entity.own_id, born=int(own.born_frames[row]), last_frame=frame_index)
@@ -320,7 +323,7 @@ class Fusion:
         ours = [one for one in self._entities if one.own_id in rows and not self._is_far(one, frame_index)]
         places = [rows[one.own_id] for one in ours if one.own_id is not None]
         overlaps = iou(own.boxes_xyxy_px[places], self._far_boxes(theirs, frame_index))
-        classes = np.array([one.far_vote.class_id for one in theirs])
+        classes = np.array([one.edge_vote.class_id for one in theirs])
         same = own.class_ids[places][:, None] == classes[None]
         for line, column in _pairs(overlaps, bonus=CLASS_BONUS * same):
             self._merge(ours[line], theirs[column])
@@ -343,7 +346,11 @@ class Fusion:
         survivor.still_frame = max(survivor.still_frame, merged.still_frame)
         survivor.own_id, survivor.own_vote, survivor.correction = ours.own_id, ours.own_vote, ours.correction
         survivor.own_then = ours.own_then
-        survivor.edge_id, survivor.far_vote, survivor.afar = theirs.edge_id, theirs.far_vote, theirs.afar
+        survivor.edge_id, survivor.edge_vote, survivor.reported = (
+            theirs.edge_id,
+            theirs.edge_vote,
+            theirs.reported,
+        )
         survivor.missed, survivor.apart = theirs.missed, 0
         survivor.unlisted, survivor.is_doubted = 0, False
         if survivor.own_id is not None:
@@ -364,10 +371,10 @@ class Fusion:
         self._by_edge = {key: one for key, one in self._by_edge.items() if id(one) not in merged}
 
     def _is_far(self, entity: Entity, frame_index: int) -> bool:
-        return entity.is_live_afar(frame_index, patience=self._rules.patience)
+        return entity.is_report_live(frame_index, patience=self._rules.patience)
 
     def _far_boxes(self, entities: Sequence[Entity], frame_index: int) -> npt.NDArray[np.float64]:
-        return far_boxes(entities, frame_index, path=self._path, reach=self._rules.reach)
+        return reported_boxes(entities, frame_index, path=self._path, reach=self._rules.reach)
 
 
 def _usable(step: Tracks, *, classes: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""The list of one frame out of all entities: boxes, classes and who reports each."""
+"""The list of one frame out of all entities: boxes, classes and sources."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.tracking.alone import ALONE_CONFIDENCE
+from hvt_common.tracking.recall import EDGE_ONLY_CONFIDENCE
 from hvt_common.values import Tracks, iou
 from hvt_ground.events import Origin
 from hvt_ground.perception.fusion.camera_path import CameraPath
-from hvt_ground.perception.fusion.entity import Entity, Witness
+from hvt_ground.perception.fusion.entity import Entity, Observation
 
-__all__ = ["FusedTracks", "FusionRules", "far_boxes", "list_entities"]
+__all__ = ["FusedTracks", "FusionRules", "list_entities", "reported_boxes"]
 
 _Floats = npt.NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class FusionRules:
 
 @dataclass(frozen=True, slots=True)
 class FusedTracks:
-    """The tracks of one frame and who knows of each."""
+    """The tracks of one frame and the sources of each."""
 
     tracks: Tracks
     """Ids are those of the entities; class ids index the unified names."""
@@ -59,9 +59,9 @@ class _Line:
     """Row of our own list."""
 
     @property
-    def far(self) -> Witness | None:
-        """The box from afar, where it holds."""
-        return None if self.origin == "base" else self.entity.afar
+    def observed(self) -> Observation | None:
+        """The reported box, while it holds."""
+        return None if self.origin == "base" else self.entity.reported
 
 
 def list_entities(
@@ -69,7 +69,7 @@ def list_entities(
 ) -> FusedTracks:
     """The list at the frame of ``own``, our tracker's list there; changes nothing.
 
-    ``doubting``: the edge reports at present, and what its silence speaks against is left out.
+    ``doubting``: the edge reports at present, and tracks that it suppresses are left out.
     """
     lines = _lines(entities, own, rules, doubting=doubting)
     boxes = _boxes(lines, own, path, rules)
@@ -90,16 +90,18 @@ def list_entities(
     return FusedTracks(tracks, tuple(line.origin for line in lines))
 
 
-def far_boxes(entities: Sequence[Entity], frame_index: int, *, path: CameraPath, reach: int) -> _Floats:
-    """(N, 4) float64: where entities that were seen from afar are at a frame, base pixels."""
+def reported_boxes(entities: Sequence[Entity], frame_index: int, *, path: CameraPath, reach: int) -> _Floats:
+    """(N, 4) float64: the reported boxes of entities, moved to a frame, base pixels."""
     boxes = np.empty((len(entities), 4))
     by_start: dict[int, list[int]] = {}
     for place, entity in enumerate(entities):
-        assert entity.afar is not None
-        boxes[place] = entity.afar.box
-        by_start.setdefault(entity.afar.frame_index, []).append(place)
+        assert entity.reported is not None
+        boxes[place] = entity.reported.box
+        by_start.setdefault(entity.reported.frame_index, []).append(place)
     for start, places in by_start.items():
-        velocities = np.array([far.velocity for place in places if (far := entities[place].afar) is not None])
+        velocities = np.array(
+            [observed.velocity for place in places if (observed := entities[place].reported) is not None]
+        )
         moved = velocities * np.clip(frame_index - start, -reach, reach)
         boxes[places] = path.carry(boxes[places], start=start, end=frame_index) + np.tile(moved, 2)
     return boxes
@@ -110,7 +112,7 @@ def _lines(entities: Sequence[Entity], own: Tracks, rules: FusionRules, *, doubt
     lines = []
     for entity in entities:
         origin = entity.origin(rows, own.frame_index, patience=rules.patience)
-        unsure = (origin == "edge" and entity.far_vote.confidence < ALONE_CONFIDENCE) or (
+        unsure = (origin == "edge" and entity.edge_vote.confidence < EDGE_ONLY_CONFIDENCE) or (
             origin == "base" and doubting and entity.is_doubted
         )
         if origin is not None and entity.id and not unsure:
@@ -124,32 +126,34 @@ def _boxes(
     """(N, 4): ours, theirs, or the mean of both, weighted by confidence and age."""
     frame_index = own.frame_index
     boxes = np.empty((len(lines), 4))
-    far = [place for place, line in enumerate(lines) if line.far is not None]
+    observed = [place for place, line in enumerate(lines) if line.observed is not None]
     near = [place for place, line in enumerate(lines) if line.row is not None]
     rows = [line.row for line in lines if line.row is not None]
-    boxes[far] = far_boxes([lines[place].entity for place in far], frame_index, path=path, reach=rules.reach)
+    boxes[observed] = reported_boxes(
+        [lines[place].entity for place in observed], frame_index, path=path, reach=rules.reach
+    )
     ours = own.boxes_xyxy_px[rows].astype(np.float64)
     weights = own.confidences[rows] * 0.5 ** ((frame_index - own.seen_frames[rows]) / rules.half_life)
     for place, box, weight in zip(near, ours, weights.tolist(), strict=True):
-        entity, witness = lines[place].entity, lines[place].far
-        if witness is None:
+        entity, reported = lines[place].entity, lines[place].observed
+        if reported is None:
             boxes[place] = box if entity.correction is None else box + _correction(entity, frame_index, rules)
             continue
-        theirs = _moved_with_ours(entity, witness, box, boxes[place])
-        age = abs(frame_index - witness.frame_index)
-        against = EDGE_BOX_WEIGHT * witness.confidence * 0.5 ** (age / rules.half_life)
+        theirs = _moved_with_ours(entity, reported, box, boxes[place])
+        age = abs(frame_index - reported.frame_index)
+        against = EDGE_BOX_WEIGHT * reported.confidence * 0.5 ** (age / rules.half_life)
         share = weight / max(weight + against, 1e-9)
         boxes[place] = share * box + (1 - share) * theirs
     return boxes.astype(np.float32)
 
 
-def _moved_with_ours(entity: Entity, far: Witness, ours: _Floats, predicted: _Floats) -> _Floats:
+def _moved_with_ours(entity: Entity, observed: Observation, ours: _Floats, predicted: _Floats) -> _Floats:
     """The edge's box after the way that ours has gone since; the mean of both ways where it has one of its own."""
     then = entity.own_then
-    if then is None or then[1] != far.frame_index:
+    if then is None or then[1] != observed.frame_index:
         return predicted
-    moved = far.box + np.tile((ours[:2] + ours[2:]) / 2 - then[0], 2)
-    return moved if far.steps == 1 else (moved + predicted) / 2
+    moved = observed.box + np.tile((ours[:2] + ours[2:]) / 2 - then[0], 2)
+    return moved if observed.steps == 1 else (moved + predicted) / 2
 
 
 def _correction(entity: Entity, frame_index: int, rules: FusionRules) -> _Floats:
@@ -170,13 +174,13 @@ def _classes(
         entity = line.entity
         if line.row is not None:
             classes[place], confidences[place] = own.class_ids[line.row], own.confidences[line.row]
-        if line.far is None:
+        if line.observed is None:
             continue
-        theirs = rules.edge_class_weight * entity.far_vote.confidence
+        theirs = rules.edge_class_weight * entity.edge_vote.confidence
         if line.row is None or theirs > entity.own_vote.confidence:
-            classes[place] = entity.far_vote.class_id
-        if line.row is None or line.far.confidence > confidences[place]:
-            confidences[place] = line.far.confidence
+            classes[place] = entity.edge_vote.class_id
+        if line.row is None or line.observed.confidence > confidences[place]:
+            confidences[place] = line.observed.confidence
     return classes, confidences
 
 
@@ -188,11 +192,11 @@ def _once_each(
 ) -> npt.NDArray[np.bool_]:
     """(N,) which to list: of two that are one object the better known, then the surer, then the older."""
     listed = np.ones(len(lines), np.bool_)
-    if all(line.far is None for line in lines):
+    if all(line.observed is None for line in lines):
         return listed
     overlaps = iou(boxes, boxes)
     both = np.array([line.origin == "edge+base" for line in lines])
-    edge = np.array([line.entity.edge_id is not None and line.far is not None for line in lines])
+    edge = np.array([line.entity.edge_id is not None and line.observed is not None for line in lines])
     # The edge's tracker lists what it takes for two objects; what it does not know of it cannot tell apart.
     mixed, alike = edge[:, None] != edge[None], classes[:, None] == classes[None]
     order = np.lexsort((np.arange(len(lines)), -confidences, ~both))
@@ -208,11 +212,15 @@ def _once_each(
 
 def _seen_frame(line: _Line, own: Tracks) -> int:
     ours = -1 if line.row is None else int(own.seen_frames[line.row])
-    theirs = -1 if line.far is None else line.far.frame_index
+    theirs = -1 if line.observed is None else line.observed.frame_index
     return max(ours, min(theirs, own.frame_index))
 
 
 def _started(line: _Line, own: Tracks) -> bool:
     if line.row is not None:
         return bool(own.started[line.row])
-    return line.far is not None and line.far.steps == 1 and line.far.frame_index == own.frame_index
+    return (
+        line.observed is not None
+        and line.observed.steps == 1
+        and line.observed.frame_index == own.frame_index
+    )

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_common.tracking.alone import Recall
+from hvt_common.tracking.recall import Recall
 
 CONFIDENCES = np.linspace(0, 1, 101).tolist()
 CAR, PERSON, BUS = range(3)

@@ -1,12 +1,12 @@
-"""What only one of two observers sees of one scene: edge and ground, each with a detector.
+"""The evidence of a missed detection: edge and ground have a detector each, and one of them reports nothing.
 
-What the edge alone sees is listed from `ALONE_CONFIDENCE` on. What the ground alone sees has the edge's silence
-against it, and the edge mostly looks at the source: how much that says depends on how much of what is surely there it
-reports (its `Recall`, r). A detection of confidence c, calibrated, that it does not report is real with
+An edge-only object is listed from `EDGE_ONLY_CONFIDENCE` on. A ground-only object has the edge's missed detection
+against it, and the edge mostly detects on the source: the weight of that depends on the share of sure objects that
+the edge reports (its `Recall`, r). A calibrated detection of confidence c that it does not report is real with
 
     c (1 - r) / (c (1 - r) + 1 - c)                                                       (Bayes)
 
-and is listed from `_LEAST_REAL` on: of a confidence of .8 where it reports nine of ten.
+and is listed from `_LEAST_REAL` on: from a confidence of .8 if the edge reports nine of ten.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["ALONE_CONFIDENCE", "Recall"]
+__all__ = ["EDGE_ONLY_CONFIDENCE", "Recall"]
 
-ALONE_CONFIDENCE: Final = 0.6
-"""What only the edge sees, in its source, is listed from this confidence on. Of what it reports at less, one in two
-was there on drawn scenes and hardly any on real labelled pictures. What is as sure on the base counts as there."""
+EDGE_ONLY_CONFIDENCE: Final = 0.6
+"""An edge-only object is listed from this confidence on. Below it one in two was real on drawn scenes, and hardly any
+on real labelled pictures. A ground's object as sure as this counts as real."""
 _LEAST_REAL: Final = 0.3
 _LEAST_SHARE: Final = 0.5
-"""Who reports less than this looks for other things: its silence says nothing."""
+"""A detector that reports less than this looks for other things: its misses say nothing."""
 _STILL_SHARE: Final = 0.4
-"""Once it says something it does so down to here, or a list would come and go."""
+"""Once its misses count they do so down to here, or a list would come and go."""
 _MOST_SHARE: Final = 0.9
 """Limit of the reported share: sure objects are easy to detect, and no more of the others are reported."""
 _CAUTION: Final = 2
 """Unreported objects that are assumed at the start: after the first that both detect, nothing is known yet."""
 _OTHERS: Final = 20
-"""What is known of all classes counts as so many objects of each: few are enough to learn that an observer does not
-know one of them."""
+"""The rate over all classes counts as so many objects of each: few are enough to learn that a detector does not know
+one of them."""
 _MEMORY_S: Final = 10.0
 
 
 class Recall:
-    """Which share of what is surely there one observer reports; few objects count for little, and old ones fade.
+    """The share of sure objects that one detector reports; few objects count for little, and old ones fade.
 
-    By class: who reports each car may know no people. What is not known of a class is taken from all of them.
+    By class: a detector of each car may know no people. A class without counts has the share of all.
     """
 
     def __init__(self) -> None:
@@ -62,13 +62,13 @@ class Recall:
         of_all = reports / (there + _CAUTION)
         of_others = np.array([_OTHERS, _OTHERS * of_all])
         self._shares = {
-            class_id: _believed(_share(counts + of_others), before=self.share(class_id))
+            class_id: _limited(_share(counts + of_others), before=self.share(class_id))
             for class_id, counts in self._counts.items()
         }
-        self._share_of_others = _believed(of_all, before=self._share_of_others)
+        self._share_of_others = _limited(of_all, before=self._share_of_others)
 
     def share(self, class_id: int) -> float:
-        """0.4…0.9, or 0 where silence says nothing."""
+        """0.4…0.9, or 0 if a miss says nothing."""
         return self._shares.get(class_id, self._share_of_others)
 
     def least_confidence(self, class_id: int) -> float:
@@ -77,7 +77,7 @@ class Recall:
         return _LEAST_REAL / (_LEAST_REAL + (1 - _LEAST_REAL) * (1 - share)) if share else 0.0
 
     def real(self, confidence: float, class_id: int) -> float:
-        """The probability that a detection is real that is not reported; see the module."""
+        """The probability that an unreported detection is real; see the module."""
         found = min(max(confidence, 0.0), 1.0)
         there = found * (1 - self.share(class_id))
         return there / max(there + 1 - found, 1e-9)
@@ -88,6 +88,6 @@ def _share(counts: npt.NDArray[np.float64]) -> float:
     return float(reports / there)
 
 
-def _believed(share: float, *, before: float) -> float:
-    """What the share counts as, when it counted as so much ``before``."""
+def _limited(share: float, *, before: float) -> float:
+    """The share as it counts, after it counted as so much ``before``."""
     return min(share, _MOST_SHARE) if share >= (_STILL_SHARE if before else _LEAST_SHARE) else 0.0
