@@ -270,7 +270,7 @@ class _Reading:
         container, stream = self._container, self._stream
         if (size := _size_of(container)) != self._size:
             return f"it has grown by {(size or 0) - (self._size or 0)} bytes since: --follow waits for more"
-        if self._is_cut_fragment():
+        if self._ends_in_fragment():
             return "its last fragment is cut"
         if self._count < stream.frames and (self._lacks_bytes() or self._count < 0.98 * stream.frames - 2):
             return f"{self._count} of its {stream.frames} frames are there"
@@ -286,7 +286,7 @@ class _Reading:
                 return f"it ends {float(missing_s):.1f} s before the end that its header says"
         return ""
 
-    def _is_cut_fragment(self) -> bool:
+    def _ends_in_fragment(self) -> bool:
         """Whether an MP4 in fragments, which counts no frames, ends within one."""
         return "mp4" in self._container.format.name and not self._stream.frames and self._lacks_bytes()
 
