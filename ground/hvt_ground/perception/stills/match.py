@@ -84,7 +84,7 @@ class Matcher:
         later: Iterable[Tracks],
         class_names: Sequence[str],
     ) -> dict[Hashable, TrackMatch]:
-        """A `Candidate` for each key of ``wanted``, all of which are stills of the frame of ``tracks``.
+        """A `TrackMatch` for each key of ``wanted``, all of which are stills of the frame of ``tracks``.
 
         ``later`` are the tracks of the following frames, in order, as far as a late confirmation counts.
         ``class_names`` are those of ``tracks.class_ids``. Stills of one edge track go to one ground track.
