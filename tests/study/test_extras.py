@@ -41,17 +41,34 @@ def done(tmp_path, module, words, without):
     ("module", "words", "without", "install"),
     [
         ("hvt_study.cli", ("run", "demo:0", "--out", "out"), (*STUDY, *GROUND), "hvt[study]"),
-        (
+        pytest.param(
             "hvt_study.cli",
             ("compare", "demo", "--detector", "aerial-nano", "--out", "o"),
             GROUND,
             "hvt[study]",
+            marks=pytest.mark.nightly,
         ),
-        ("hvt_study.cli", ("plan", "demo:0"), ("rerun",), "hvt[study]"),
-        ("hvt_study.cli", ("tune", "demo:0-1", "--method", "M5", "--out", "out"), ("optuna",), "hvt[study]"),
-        ("hvt_study.cli", ("report", "out"), ("jinja2",), "hvt[study]"),
+        pytest.param(
+            "hvt_study.cli", ("plan", "demo:0"), ("rerun",), "hvt[study]", marks=pytest.mark.nightly
+        ),
+        pytest.param(
+            "hvt_study.cli",
+            ("tune", "demo:0-1", "--method", "M5", "--out", "out"),
+            ("optuna",),
+            "hvt[study]",
+            marks=pytest.mark.nightly,
+        ),
+        pytest.param(
+            "hvt_study.cli", ("report", "out"), ("jinja2",), "hvt[study]", marks=pytest.mark.nightly
+        ),
         ("hvt_study.cli", ("read", "demo:codes", "--out", "out"), ("rapidocr",), "hvt[reading]"),
-        ("hvt_study.cli", ("score", "a.csv", "--truth", "gt.txt"), ("sklearn",), "hvt[study]"),
+        pytest.param(
+            "hvt_study.cli",
+            ("score", "a.csv", "--truth", "gt.txt"),
+            ("sklearn",),
+            "hvt[study]",
+            marks=pytest.mark.nightly,
+        ),
         ("hvt_ground.cli", ("--help",), ("rerun",), "hvt[ground]"),
         (
             "hvt_ground.cli",

@@ -9,13 +9,12 @@ from contextlib import ExitStack
 
 import pytest
 
-from hvt_common.inference.store import resolve_model
 from programs.processes import eventually, free_ports
-from studies.small_study import PATIENT_S, arguments, flights, said, study, table, until
+from studies.small_study import PATIENT_S, REGIME, arguments, detector, flights, said, study, table, until
 
 pytest.importorskip("distributed")
 pytestmark = pytest.mark.nightly
-WORDS = ("--methods", "M0,R0,M5", "--regimes", "150kbps")
+WORDS = ("--methods", "M0,R0,M5", "--regimes", REGIME)
 
 
 class Cluster:
@@ -64,7 +63,7 @@ def test_a_worker_is_lost_in_mid_run(scene, tmp_path):
     out, alone = tmp_path / "out", tmp_path / "alone"
     home = tmp_path / "home"
     home.mkdir()
-    shutil.copy(resolve_model("aerial-nano"), home / "nano.onnx")
+    shutil.copy(detector(scene), home / "nano.onnx")
     (home / "flights").symlink_to(scene.removeprefix("visdrone:").removesuffix("?fps=15"))
     scene, words = "visdrone:flights?fps=15", (*WORDS, "--detector", "nano.onnx")
     with Cluster(tmp_path) as cluster:

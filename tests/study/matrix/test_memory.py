@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.small_study import FRAMES, SIZE, write_scene
+from studies.small_study import FRAMES, detector, write_scene
 
 FLY = """
 import sys
@@ -19,10 +19,10 @@ from hvt_study.runs.methods import chosen_methods
 from hvt_study.matrix.plan import StudyPlan, first_runs, parse_regimes
 from hvt_study.runs.spec import ModelChoice
 
-uri, cache, frames, width, height = sys.argv[1:]
+uri, network, cache, frames, width, height = sys.argv[1:]
 plan = StudyPlan(
-    sequences=((uri, "street"),), methods=chosen_methods("M5"), regimes=parse_regimes("150kbps"),
-    still_codecs=("jpeg",), models=(ModelChoice("aerial-nano", "aerial-nano"),), labels="annotations",
+    sequences=((uri, "street"),), methods=chosen_methods("M5"), regimes=parse_regimes("300kbps"),
+    still_codecs=("jpeg",), models=(ModelChoice(network, network),), labels="annotations",
     cache=Path(cache), size=(int(width), int(height)), max_frames=int(frames),
 )
 (spec,) = first_runs(plan)
@@ -33,6 +33,7 @@ status = Path("/proc/self/status").read_text()
 print(status.partition("VmHWM:")[2].split()[0])  # ru_maxrss would be the peak of whoever started this process
 """
 LONG = 240
+SIZE = (640, 384)
 
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not say")
@@ -42,7 +43,7 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="
 def uri(tmp_path_factory):
     """The same two seconds again and again."""
     root = tmp_path_factory.mktemp("scene")
-    found = write_scene(root, "street")
+    found = write_scene(root, "street", size=SIZE)
     folder, file = root / "sequences" / "street", root / "annotations" / "street.txt"
     lines = [line.partition(",") for line in file.read_text().splitlines()]
     for again in range(1, LONG // FRAMES):
@@ -54,7 +55,7 @@ def uri(tmp_path_factory):
 
 
 def peak_mb(uri, cache, frames):
-    words = [uri, str(cache), str(frames), *map(str, SIZE)]
+    words = [uri, detector(uri), str(cache), str(frames), *map(str, SIZE)]
     done = subprocess.run([sys.executable, "-c", FLY, *words], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return int(done.stdout) / 1024
@@ -64,6 +65,6 @@ def peak_mb(uri, cache, frames):
 def test_a_longer_clip_takes_no_more_memory(uri, tmp_path):
     """A study of long clips would end in the middle of the night for want of memory."""
     short, long = (peak_mb(uri, tmp_path / f"{frames}", frames) for frames in (60, LONG))
-    frames_mb = (LONG - 60) * 640 * 360 * 3 / 2**20
+    frames_mb = (LONG - 60) * SIZE[0] * SIZE[1] * 3 / 2**20
     assert frames_mb > 110
     assert long - short < frames_mb / 2, f"{short:.0f} MB at 60 frames, {long:.0f} MB at {LONG}"

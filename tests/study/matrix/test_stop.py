@@ -9,9 +9,9 @@ import signal
 import psutil
 import pytest
 
-from studies.small_study import PATIENT_S, arguments, entries, flights, said, study, table, until
+from studies.small_study import PATIENT_S, REGIME, arguments, entries, flights, said, study, table, until
 
-METHODS = ("--methods", "M0,R0,M5", "--regimes", "150kbps")
+METHODS = ("--methods", "M0,R0,M5", "--regimes", REGIME)
 
 
 @pytest.mark.nightly
@@ -19,14 +19,14 @@ METHODS = ("--methods", "M0,R0,M5", "--regimes", "150kbps")
 def test_a_full_disk_is_one_sentence_and_what_is_finished_stays(scene, tmp_path, full_for):
     """Hours of flights would be lost with the one that no longer fitted."""
     out = tmp_path / "out"
-    first = study("run", *arguments(scene, out, "--methods", "M0", "--regimes", "150kbps"), folder=tmp_path)
+    first = study("run", *arguments(scene, out, "--methods", "M0", "--regimes", REGIME), folder=tmp_path)
     assert first.wait(PATIENT_S) == 0, said(tmp_path)
     before, rows = entries(out / "cache"), (out / "results.parquet").read_bytes()
     pictures, flight = (_sizes(out / "cache" / folder) for folder in ("detections", "flights"))
     limit = {"detections": min(pictures), "flights": (max(pictures) + min(flight)) // 2}[full_for]
     full = study(
         "run",
-        *arguments(scene, out, "--methods", "M0,R0", "--regimes", "150kbps", "--jobs", "1"),
+        *arguments(scene, out, "--methods", "M0,R0", "--regimes", REGIME, "--jobs", "1"),
         folder=tmp_path,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )
@@ -40,6 +40,7 @@ def test_a_full_disk_is_one_sentence_and_what_is_finished_stays(scene, tmp_path,
     assert (out / "results.parquet").read_bytes() == rows
 
 
+@pytest.mark.nightly
 def test_killed_in_the_middle_it_goes_on_from_there(scene, tmp_path):
     """A lost machine would cost all that was flown on it."""
     out, words = tmp_path / "out", (*METHODS, "--jobs", "2")
@@ -59,7 +60,7 @@ def test_killed_in_the_middle_it_goes_on_from_there(scene, tmp_path):
     assert all(row["matched"] for row in table(out))
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.nightly)])
 def test_nothing_is_left_running(scene, tmp_path, how):
     """Interrupted, it would go on in the background for hours, beside the study that is started again."""
     out = tmp_path / "out"

@@ -26,6 +26,8 @@ def test_codes_change_nothing_but_the_roofs_that_bear_them(pair):
         first, second = plain.truth(t_s), marked.truth(t_s)
         assert np.array_equal(first.boxes_source_px, second.boxes_source_px)
         assert np.array_equal(first.visible, second.visible)
+        if t_s != MOMENTS[1]:
+            continue
         changed = np.abs(plain.image(t_s).astype(int) - marked.image(t_s)).max(2) > 8
         for code in marked.codes(t_s):
             x1, y1, x2, y2 = np.round(code.box_source_px).astype(int)
@@ -62,7 +64,7 @@ def test_characters_have_their_height_in_pixels_of_the_source(size):
     # The camera rises and sinks by an eighth about its mean altitude.
     assert HEIGHTS_PX[0] * 0.85 <= min(heights) < 8
     assert 9 < max(heights) <= HEIGHTS_PX[1] * 1.2
-    assert scene.image(1.0).shape == (size[1], size[0], 3)
+    assert scene.size == size
 
 
 def test_no_two_characters_look_alike():

@@ -1,4 +1,4 @@
-"""A real study that takes seconds: the demo scene, small, in VisDrone's layout, and ``hvt-study`` as a process."""
+"""A real study that takes seconds: coloured squares in VisDrone's layout, and ``hvt-study`` as a process."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hvt_scene import Scene
 from hvt_study.report.data.table_file import read_results
+from media.onnx_models import colour_detector
 from programs.processes import eventually
 
 __all__ = [
     "FRAMES",
     "PATIENT_S",
+    "REGIME",
     "SIZE",
     "arguments",
+    "detector",
     "entries",
     "flights",
     "said",
@@ -32,27 +34,37 @@ __all__ = [
 
 PATIENT_S = 200.0
 """How long a study may take on a busy machine."""
-SIZE = (480, 270)
+SIZE = (160, 96)
+REGIME = "60kbps"
+"""Twice what this picture needs at the least."""
 _MAIN = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"  # a shell's background job ignores it
     "from hvt_study.cli import main; raise SystemExit(main())"
 )
 FRAMES = 30
-_CATEGORIES = {"car": 4, "van": 5, "truck": 6, "bus": 9, "motor": 10, "pedestrian": 1}
 _CLOCKS = frozenset({"wall_s", "edge_cpu_ms"})
 """Columns that a second flight on another day fills in otherwise."""
 
 
-def write_scene(root: Path, *names: str, count: int = FRAMES) -> str:
-    """Sequences of the demo scene at 15 images a second, a seed each; the URI."""
+def write_scene(root: Path, *names: str, count: int = FRAMES, size: tuple[int, int] = SIZE) -> str:
+    """Sequences at 15 images a second, a seed each, and the network that sees what is in them; the URI."""
     for seed, name in enumerate(names):
-        _write_sequence(root, name, Scene(seed), count)
+        _write_sequence(root, name, seed, count, size)
+    names_of_colours = {"names": "{0: 'truck', 1: 'bus', 2: 'car'}"}
+    colour_detector(root / "red.onnx", "yolox", size=size, metadata=names_of_colours)
     return f"visdrone:{root}?fps=15"
 
 
 def arguments(uri: str, out: Path, *more: str) -> list[str]:
     """Of ``hvt-study run`` and its like, small."""
-    return [uri, "--out", str(out), "--size", f"{SIZE[0]}x{SIZE[1]}", *more]
+    own = "--detector" not in more and Path(detector(uri)).is_file()
+    network = ["--detector", detector(uri)] if own else []
+    return [uri, "--out", str(out), "--size", f"{SIZE[0]}x{SIZE[1]}", *network, *more]
+
+
+def detector(uri: str) -> str:
+    """The network of `write_scene`."""
+    return str(Path(uri.removeprefix("visdrone:").removesuffix("?fps=15")) / "red.onnx")
 
 
 def study(command: str, *words: str, folder: Path, **named: Any) -> subprocess.Popen[str]:
@@ -101,28 +113,21 @@ def _timeless(row: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in row.items() if name not in _CLOCKS}
 
 
-def _write_sequence(root: Path, name: str, scene: Scene, count: int) -> None:
+def _write_sequence(root: Path, name: str, seed: int, count: int, size: tuple[int, int]) -> None:
+    """Red squares on dark ground, a large one and two small and darker ones: cars, of which stills tell more."""
     folder = root / "sequences" / name
     folder.mkdir(parents=True)
+    ground = cv2.resize(np.random.default_rng(seed).integers(20, 70, (12, 20, 3), np.uint8), size)
     lines: list[str] = []
     for index in range(count):
-        picture = scene.image(index / 15)
-        small = cv2.resize(picture, (640, 360), interpolation=cv2.INTER_AREA)
-        assert cv2.imwrite(str(folder / f"{index + 1:07d}.png"), small)
-        lines += _lines(scene, index, scale=640 / picture.shape[1])
+        picture = np.array(ground)
+        for number, (side, red, top, speed) in enumerate(
+            ((32, 230, 8, 3), (16, 150, 48, 2), (16, 190, 72, -2))
+        ):
+            left = (20 * number + 5 + speed * index + 9 * seed) % (size[0] - side)
+            picture[top : top + side, left : left + side] = (30, 40, red)
+            picture[top + 4 : top + side - 4 : 3, left + 4 : left + side - 4] = (30, 40, red // 2 + 60)
+            lines.append(f"{index + 1},{number + 1},{left},{top},{side},{side},1,4,0,0")
+        assert cv2.imwrite(str(folder / f"{index + 1:07d}.png"), picture)
     (root / "annotations").mkdir(exist_ok=True)
     (root / "annotations" / f"{name}.txt").write_text("\n".join(lines) + "\n")
-
-
-def _lines(scene: Scene, index: int, *, scale: float) -> list[str]:
-    """VisDrone's annotations; what is hardly to be seen is an object that does not count."""
-    truth = scene.truth(index / 15)
-    lines = []
-    rows = zip(truth.boxes_source_px * scale, truth.ids, truth.class_ids, truth.visible, strict=True)
-    for box, track_id, kind, visible in rows:
-        x1, y1, x2, y2 = np.round(box).astype(int).tolist()
-        category = _CATEGORIES.get(scene.class_names[kind], 11)
-        lines.append(
-            f"{index + 1},{track_id},{x1},{y1},{x2 - x1},{y2 - y1},{int(visible >= 0.5)},{category},0,0"
-        )
-    return lines
