@@ -3,82 +3,42 @@
 from __future__ import annotations
 
 import csv
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from hvt_common.geodesy import metres_per_degree
-from hvt_common.values import View, iou
-from hvt_scene import Scene
 from programs.processes import Link
 from programs.rrd import Recording
+from rigs.drawn_flight import FPS, fly, off_m
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
-
-FRAMES, FPS = 75, 15
-VIEW = View.fitted((1920, 1080), (1280, 720), fit="letterbox")
+pytestmark = [pytest.mark.integration, pytest.mark.xdist_group("drawn"), pytest.mark.timeout(300)]
 
 
-def fly(folder: Path, *edge: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Five seconds of the drawn scene."""
-    with Link(folder) as link:
-        ground = link.ground("--once", "--record", "flight.rrd", "--tracks", "tracks.csv")
-        flying = link.edge(
-            *("--source", "demo", "--seed", "3", "--max-frames", str(FRAMES), "--pace", "lockstep"),
-            *("--budget", "800kbps", "--preset", "ultrafast", "--wait", "60s", *edge),
-        )
-        return flying.finish(), ground.finish(within_s=40)
-
-
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory) -> tuple[Path, dict[str, Any], dict[str, Any]]:
-    """With the scene's own pose."""
-    folder = tmp_path_factory.mktemp("pose")
-    return (folder, *fly(folder, "--pose", "demo"))
-
-
-def test_the_pose_is_part_of_the_budget_and_of_both_accounts(flight):
+def test_the_pose_is_part_of_the_budget_and_of_both_accounts(drawn):
     """It would be bytes that nobody counts, and a thin link would overflow."""
-    _, edge, ground = flight
+    edge, ground = drawn.edge, drawn.ground
     assert edge["meta_bytes"] == ground["meta_bytes"]
     assert edge["worst_window_bps"] == ground["worst_window_bps"]
     assert edge["worst_window_bps"]["total"] <= 800_000
 
 
-def test_tracks_are_placed_where_the_scene_has_them(flight):
+def test_tracks_are_placed_where_the_scene_has_them(drawn):
     """The map would be nonsense, and everything else green."""
-    folder, _, _ = flight
-    scene = Scene(3)
-    inside, off_m = [], []
-    with (folder / "tracks.csv").open(encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if int(row["frame"]) > 2 * FPS]
-    for frame in sorted({int(row["frame"]) for row in rows})[::5]:
-        t_s = (frame - 1) / FPS
-        truth, middles = scene.truth(t_s), scene.places(t_s)
-        real = VIEW.to_base(truth.boxes_source_px)
-        mine = [row for row in rows if int(row["frame"]) == frame]
-        boxes = np.array([[float(row[name]) for name in "xywh"] for row in mine], np.float32)
-        boxes[:, 2:] += boxes[:, :2]
-        overlap = iou(boxes, real)
-        for number, row in enumerate(mine):
-            best = int(overlap[number].argmax())
-            if overlap[number, best] < 0.6:
-                continue
-            at = np.array(scene.geographic(*middles[int(truth.ids[best])]))
-            said = np.array([float(row["latitude"]), float(row["longitude"])])
-            distance_m = float(np.linalg.norm((said - at) * metres_per_degree(52.0)))
-            off_m.append(distance_m)
-            inside.append(distance_m <= float(row["error_m"]))
-    assert len(off_m) > 200
-    assert np.percentile(off_m, 95) < 3.0
-    assert np.mean(inside) >= 0.95
+    rows = [row for row in drawn.tracks() if int(row["frame"]) > 2 * FPS]
+    each = {*sorted({row["frame"] for row in rows}, key=int)[::5]}
+    found = [
+        (off, off <= float(row["error_m"]))
+        for row in rows
+        if row["frame"] in each and row["latitude"] and (off := off_m(row)) is not None
+    ]
+    assert len(found) > 150
+    assert np.percentile([off for off, _ in found], 95) < 3.0
+    assert np.mean([inside for _, inside in found]) >= 0.95
 
 
-def test_the_recording_shows_camera_and_tracks_on_a_map(flight):
+def test_the_recording_shows_camera_and_tracks_on_a_map(drawn):
     """Who opens it would have numbers in a table and no picture."""
-    recording = Recording(flight[0] / "flight.rrd")
+    recording = Recording(drawn.folder / "flight.rrd")
     assert len(recording.rows("/map/camera", "GeoPoints:positions")) >= 4
     assert recording.rows("/map/tracks", "GeoPoints:positions")
 
@@ -91,12 +51,14 @@ def test_a_pose_that_ends_is_said_to_be_stale_and_places_nothing_more(tmp_path):
         "0,52,13,150,0,-90,45\n0.5,52,13,150,0,-90,45\n",
         encoding="utf-8",
     )
-    edge, _ = fly(tmp_path, "--pose", "short.csv", "--max-frames", "195", "--size", "320x180")
+    settings = ("--pose", "short.csv", "--max-frames", "195", "--size", "320x180", "--pace", "lockstep")
+    with Link(tmp_path) as link:
+        edge, *_ = fly(link, edge=settings)
     (part,) = edge["failed"]
     assert part["part"] == "pose"
     events = [text for _, _, text in Recording(tmp_path / "flight.rrd").events()]
     assert any("the pose is stale" in text for text in events)
-    with (tmp_path / "tracks.csv").open(encoding="utf-8") as file:
+    with (tmp_path / "flight.csv").open(encoding="utf-8") as file:
         placed = {int(row["frame"]) for row in csv.DictReader(file) if row["latitude"]}
     assert min(placed) >= 1
     assert max(placed) <= 12 * FPS

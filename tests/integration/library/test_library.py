@@ -85,6 +85,7 @@ def test_what_is_pushed_arrives_as_pictures_and_tracks(tmp_path, monkeypatch):
     assert list(tmp_path.glob("*.rrd")) == [], "nobody asked for a recording"
 
 
+@pytest.mark.nightly
 def test_a_program_that_takes_nothing_holds_nobody(tmp_path, monkeypatch):
     """The ground's recording, or another edge, would wait for it."""
     monkeypatch.chdir(tmp_path)

@@ -13,7 +13,7 @@ import pytest
 from media.recorded_feed import coded, drawn_frames
 from programs.processes import eventually, free_ports
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.nightly, pytest.mark.integration]
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -8,8 +8,9 @@ __all__ = ["checked", "snapshot"]
 
 
 def snapshot(folder: Path) -> set[tuple[Path, int, int]]:
-    """Every file and folder below, with size and time of change."""
-    found = ((path, path.lstat()) for path in folder.rglob("*"))
+    """Every file and folder below, with size and time of change; compiled modules are Python's own."""
+    found = ((path, path.lstat()) for path in folder.rglob("*") if "__pycache__" not in path.parts)
+    found = ((path, status) for path, status in found if not (path / "__pycache__").exists())
     return {(path, status.st_size if path.is_file() else 0, status.st_mtime_ns) for path, status in found}
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 from collections import defaultdict
-from pathlib import Path
 
 import pytest
 
@@ -12,30 +10,9 @@ import hvt_ground.cli
 from hvt_common.video.annex_b import nal_units
 from hvt_ground.recordings.recorded import read_recordings
 from media.klv_reader import read_stream
-from programs.processes import Link
+from rigs.drawn_flight import FRAMES, VIEW
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
-
-FRAMES = 60
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    """Four seconds in lockstep, with the scene's own pose."""
-    folder = tmp_path_factory.mktemp("flight")
-    with Link(folder) as link:
-        ground = link.ground(
-            *("--once", "--provider", "cpu", "--record", "flight.rrd"),
-            *("--tracks", "tracks.csv", "--ts", "flight.ts"),
-        )
-        edge = link.edge(
-            *("--source", "demo", "--pose", "demo", "--max-frames", str(FRAMES), "--pace", "lockstep"),
-            *("--size", "640x360", "--budget", "400kbps", "--preset", "ultrafast", "--edge-id", "uav-1"),
-        )
-        edge.finish()
-        summary = ground.finish(within_s=60)
-    assert summary["frames"] == FRAMES
-    return folder
+pytestmark = [pytest.mark.integration, pytest.mark.xdist_group("drawn"), pytest.mark.timeout(300)]
 
 
 def units(data: bytes) -> list[bytes]:
@@ -43,19 +20,18 @@ def units(data: bytes) -> list[bytes]:
     return [one for one in nal_units(data) if one[0] >> 1 != 35]
 
 
-def test_video_tracks_and_places_are_those_of_the_other_sinks(folder):
+def test_video_tracks_and_places_are_those_of_the_other_sinks(drawn):
     """An operator with another program would see another flight."""
-    found = read_stream(folder / "flight.ts")
-    recorded = read_recordings([folder / "flight.rrd"])
+    found = read_stream(drawn.folder / "flight.ts")
+    recorded = read_recordings([drawn.folder / "flight.rrd"])
     assert [units(data) for _, data in found.video] == [units(one.data) for one in recorded.video]
     assert len(found.video) == FRAMES
-    with (folder / "tracks.csv").open(encoding="utf-8") as file:
-        rows = defaultdict(dict)
-        for row in csv.DictReader(file):
-            if row["doubted"] == "0":
-                rows[int(row["frame"]) - 1][int(row["id"])] = row
+    rows = defaultdict(dict)
+    for row in drawn.tracks():
+        if row["doubted"] == "0":
+            rows[int(row["frame"]) - 1][int(row["id"])] = row
     assert len(found.klv) >= FRAMES
-    placed = 0
+    placed, wide = 0, VIEW.base_size[0]
     for packet in found.klv:
         assert packet.vmti is not None
         mine = rows.pop(int.from_bytes(packet.vmti[7]), {})
@@ -64,7 +40,7 @@ def test_video_tracks_and_places_are_those_of_the_other_sinks(folder):
             row = mine[target.track_id]
             assert target.class_name == row["class"]
             assert target.number(5) == pytest.approx(100 * float(row["confidence"]), abs=0.6)
-            x, y = target.number(2) % 640 - 1, target.number(2) // 640
+            x, y = target.number(2) % wide - 1, target.number(2) // wide
             assert (x, y) == pytest.approx((float(row["x"]), float(row["y"])), abs=1.1)
             if row["latitude"]:
                 offset = int.from_bytes(target.items[10]) * 2.0**-17 - 19.2
@@ -74,11 +50,11 @@ def test_video_tracks_and_places_are_those_of_the_other_sinks(folder):
     assert placed > 1_000
 
 
-def test_an_export_of_the_recording_says_the_same(folder, tmp_path):
+def test_an_export_of_the_recording_says_the_same(drawn, tmp_path):
     """Who asks for it afterwards would have less."""
     out = tmp_path / "again.ts"
-    assert hvt_ground.cli.main(["export", str(folder / "flight.rrd"), "--out", str(out)]) == 0
-    live, again = read_stream(folder / "flight.ts"), read_stream(out)
+    assert hvt_ground.cli.main(["export", str(drawn.folder / "flight.rrd"), "--out", str(out)]) == 0
+    live, again = read_stream(drawn.folder / "flight.ts"), read_stream(out)
     assert again.video == live.video
     assert len(again.klv) == len(live.klv)
     for mine, other in zip(live.klv, again.klv, strict=True):
