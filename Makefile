@@ -31,13 +31,12 @@ demo: setup      ## three edges and one ground on the drawn scene: a table, demo
 	@$(BIN)/python deploy/demo.py
 
 # A flight is three processes, and its networks give way to everything else: more at once than there are processors would
-# leave them none. Flights that a busy machine would spoil run alone afterwards. Nothing has a second chance.
+# leave them none. Nothing has a second chance.
 JOBS ?= $(shell getconf _NPROCESSORS_ONLN)
-CHOSEN := $(if $(CORE),--ignore=tests/extras)
+AT_ONCE = $(if $(CORE),--ignore=tests/extras) --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder
 
 test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS= CORE=1
-	@$(BIN)/python -m pytest $(CHOSEN) -m 'not realtime' --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder; \
-		together=$$?; $(BIN)/python -m pytest $(CHOSEN) -m realtime && exit $$together
+	@$(BIN)/python -m pytest $(AT_ONCE)
 
 nightly: setup   ## an hour: the nightly tests, training, every scenario at full length, kills, fuzzers, parts taken away, soak; fails where a bar is missed; COUNT= RUNS= LASTS=
 	@failed=; for part in nightly-tests training link 'kills COUNT=$(or $(COUNT),50)' 'fuzz RUNS=$(or $(RUNS),15000)' \
@@ -45,8 +44,9 @@ nightly: setup   ## an hour: the nightly tests, training, every scenario at full
 		$(MAKE) --no-print-directory COUNT= RUNS= LASTS= STRICT=1 $$part || failed="$$failed, $${part%% *}"; done; \
 		test -z "$$failed" || { echo "failed$$failed"; exit 1; }
 
-nightly-tests: setup ## the tests that `make test` leaves out, and nothing else
-	@$(BIN)/python -m pytest --nightly -m nightly
+nightly-tests: setup ## the tests that `make test` leaves out: JOBS at once, then alone those that a busy machine would spoil
+	@$(BIN)/python -m pytest --nightly -m 'nightly and not realtime' $(AT_ONCE); \
+		together=$$?; $(BIN)/python -m pytest --nightly -m realtime && exit $$together
 
 training: setup  ## the tests of training, in an environment of their own, for PyTorch is large; TORCH=
 	@test -x build/training/bin/python || $(PYTHON) -m venv build/training

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import settings
 
 from programs.processes import free_ports
+from rigs.drawn_flight import DrawnFlight, fly_into_all_sinks
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -32,17 +33,21 @@ for ending in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--nightly``."""
-    parser.addoption("--nightly", action="store_true", help="run the tests marked nightly, too")
+    parser.addoption("--nightly", action="store_true", help="run the tests marked nightly or realtime, too")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Those that wait for other processes come first, then the long ones."""
+    """Those that wait for other processes come first, then the long ones; what is for the night is left out."""
     items.sort(
         key=lambda item: (item.get_closest_marker("integration") is None, "study" not in item.path.parts)
     )
     for item in items:
+        if not item.get_closest_marker("xdist_group"):  # one process for all tests of a file
+            item.add_marker(pytest.mark.xdist_group(str(item.path.relative_to(ROOT))))
+        if item.get_closest_marker("realtime"):
+            item.add_marker("nightly")
         if item.get_closest_marker("nightly") and not config.getoption("nightly"):
-            item.add_marker(pytest.mark.skip(reason="takes minutes: `make nightly` runs it"))
+            item.add_marker(pytest.mark.skip(reason="`make nightly` runs it"))
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -58,6 +63,12 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real data at {folder}; set HVT_DATA to the folder that holds it")
     return folder
+
+
+@pytest.fixture(scope="session")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> DrawnFlight:
+    """The flight that the tests marked ``xdist_group("drawn")`` read, and nobody changes."""
+    return fly_into_all_sinks(tmp_path_factory.mktemp("drawn"))
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pytest
 
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(400)]
 
 ROOT = Path(__file__).resolve().parents[2]
 EDGES = ("m0", "paper", "auto")

@@ -23,7 +23,7 @@ FRAMES = 90
 Run = Callable[..., dict[str, Any]]
 
 
-EACH_TIME = ("M0", "M1", "M5", "M6", "R0")
+EACH_TIME = ("M0", "M5")
 """Methods that `make test` flies; `make nightly` flies all."""
 
 
@@ -77,13 +77,14 @@ def test_every_method_holds_the_budget(run, method):
     assert (summary["stills"]["sent"] > 0) == (method not in ("M0", "R0"))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("method", "regime", "budget_bps", "base_bps"),
     [
-        pytest.param("M0", "low", 800_000, 800_000, marks=pytest.mark.nightly),
+        ("M0", "low", 800_000, 800_000),
         ("M0", "moderate", 1_400_000, 1_400_000),
         ("M5", "low", 800_000, 650_000),
-        pytest.param("M5", "moderate", 1_400_000, 1_200_000, marks=pytest.mark.nightly),
+        ("M5", "moderate", 1_400_000, 1_200_000),
     ],
 )
 def test_the_regimes_of_the_paper_are_held_at_full_size(run, method, regime, budget_bps, base_bps):
@@ -92,7 +93,7 @@ def test_the_regimes_of_the_paper_are_held_at_full_size(run, method, regime, bud
     held(summary, budget_bps=budget_bps, base_bps=base_bps)
 
 
-@pytest.mark.parametrize("method", ["M1", "permissive"])
+@pytest.mark.parametrize("method", ["M1", pytest.param("permissive", marks=pytest.mark.nightly)])
 def test_a_thin_budget_is_held(run, method):
     """On the thinnest links, where one still is a large part of a second, the video would stall most."""
     summary = run("--method", method, "--size", "640x360", "--budget", "300kbps", "--video-share", "0.8")
@@ -106,6 +107,7 @@ def test_the_total_is_held_even_where_keyframes_are_most_of_a_second(run):
     assert summary["worst_window_bps"]["total"] <= 100_000
 
 
+@pytest.mark.nightly
 def test_stills_without_cooldown_hold_the_budget(run):
     """The paper's plain method asks for far more than fits: nothing but the budget is in the way."""
     summary = run(

@@ -246,7 +246,14 @@ def test_the_killed_edge_left_a_base_file_that_plays(fleet):
     assert shown >= killed["frames_decoded"] - 3, "a fifth of a second may be missing at the end"
 
 
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "sign",
+    [
+        pytest.param(signal.SIGINT, marks=pytest.mark.nightly),
+        signal.SIGTERM,
+        pytest.param(signal.SIGHUP, marks=pytest.mark.nightly),
+    ],
+)
 def test_either_side_stops_before_anybody_came(link, scene, sign):
     """Who started the wrong side first, or a service manager, would need a kill -9."""
     ground = link.ground(*ANALYSES, "--record", "recordings")

@@ -13,7 +13,7 @@ import pytest
 from programs.processes import Link
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(180)]
 
 FRAMES = 60
 
@@ -130,7 +130,6 @@ def test_the_grounds_opinion_counts(plays):
     assert mute.stills != one.stills
 
 
-@pytest.mark.nightly
 def test_what_auto_decides_is_the_same_and_stands_in_the_recording(tmp_path: Path):
     """It goes by what the ground reports it sees; and nobody could tell from a recording why there were no tracks."""
     runs = []

@@ -216,6 +216,7 @@ def test_both_ledgers_know_what_was_asked_for(flight):
     assert copies or flight.ground["roi_bytes"] == flight.edge["roi_bytes"]
 
 
+@pytest.mark.nightly
 def test_video_alone_follows_objects_once_somebody_asks_for_them(tmp_path):
     """A pilot who flies video alone would never get a list of objects, or the edge would follow them for nobody."""
     with Link(tmp_path) as link:

@@ -174,6 +174,7 @@ def router(endpoint: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
+@pytest.mark.nightly
 def test_both_sides_come_back_to_a_router_that_was_killed(link: Link):
     """After a power cut at the relay station somebody would have to start everything again, in the right order."""
     with router(link.ground_endpoint):
@@ -205,6 +206,7 @@ def as_list(summaries: Any) -> list[dict[str, Any]]:
 # Two edges of one id
 
 
+@pytest.mark.nightly
 def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
     """Two drones would fight for one screen; a fleet's copy-and-paste mistake would be found out in the air."""
     ground = link.ground(*SEES, "--record", "flights", "--timing", "timing.csv")
@@ -299,6 +301,7 @@ def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
 # Clocks that are set
 
 
+@pytest.mark.nightly
 def test_clocks_that_are_set_leave_no_trace(link: Link, monkeypatch: pytest.MonkeyPatch):
     """For hours the picture would be an hour old by the ground's account, or reports and keyframes cease.
 

@@ -43,14 +43,6 @@ def acme(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), *([old] if old else [])]))
 
 
-def test_stills_of_another_codec_reach_the_recording(link, scene, acme):
-    """A better codec of tomorrow would need a fork of HVT on both sides."""
-    edge, ground = fly(link, scene, "--still-codec", "acme-pixels")
-    assert edge["stills"]["sent"] == ground["stills"]["received"] > 5
-    assert edge["roi_bytes"] == ground["roi_bytes"] > 0
-    assert len(Recording(link.folder / "flight.rrd").stills()) >= 5
-
-
 def test_a_broken_plug_in_is_one_sentence(link, scene, acme):
     """A traceback in place of the name of the package to mend."""
     edge = link.edge("--source", str(scene), "--still-codec", "acme-broken")
@@ -84,13 +76,15 @@ def test_the_package_is_found_by_its_metadata_alone(acme):
     assert "acme_codecs" not in sys.modules
 
 
-def test_a_detector_of_another_runtime_flies(link, scene, acme):
-    """Who has TensorRT, RKNN, Hailo or NCNN would need a fork of HVT to fly with it."""
+def test_a_codec_and_a_detector_of_others_fly(link, scene, acme):
+    """A better codec of tomorrow, TensorRT, RKNN, Hailo or NCNN would need a fork of HVT on both sides."""
     detector = "acme-blobs:person,crate"
-    edge, ground = fly(link, scene, "--detector", detector, detector=detector)
+    edge, ground = fly(link, scene, "--detector", detector, "--still-codec", "acme-pixels", detector=detector)
     assert edge["stills"]["sent"] == ground["stills"]["received"] > 5
+    assert edge["roi_bytes"] == ground["roi_bytes"] > 0
     assert ground["tracks"] > 2
     recording = Recording(link.folder / "flight.rrd")
+    assert len(recording.stills()) >= 5
     shown = {box.class_after for frame in range(FRAMES) for box in recording.boxes(frame).values()}
     assert shown <= {"person", "crate"}
     assert shown

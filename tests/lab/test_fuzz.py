@@ -98,6 +98,7 @@ def test_the_run_ends_before_any_input_where_a_target_cannot_start(tmp_path, mon
     assert not (tmp_path / "summary.json").exists()
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(find_spec("atheris") is None, reason="atheris is not installed: dependency group 'fuzz'")
 def test_the_fuzzer_finds_a_planted_bug_and_keeps_its_input(tmp_path):
     """A million inputs would be reported as harmless by a fuzzer that sees nothing."""

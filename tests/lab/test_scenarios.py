@@ -1,7 +1,6 @@
 """The short scenarios, with hvt-edge and hvt-ground as real processes: cheap settings, so no bar of speed is asked.
 
-`make link` measures; here it is only asked that both survive, keep their account, and show a picture again. Two of
-the scenarios are flown by `make test`, all of them by `make nightly`.
+`make link` measures; here it is only asked that both survive, keep their account, and show a picture again.
 """
 
 from __future__ import annotations
@@ -38,10 +37,7 @@ AT_ONCE = min(5, os.cpu_count() or 1)
 """Flights in real time: so many as the machine has time for."""
 PICTURE_WITHIN_S = 3.0
 SOAK_S = 60
-EACH_TIME = ("steady-300k", "outage-8s")
-"""Scenarios that `make test` flies."""
-nightly = pytest.mark.nightly
-NAMES = [pytest.param(name, marks=() if name in EACH_TIME else nightly) for name in scenario_names()]
+NAMES = scenario_names()
 
 
 @pytest.fixture(scope="module")
@@ -68,14 +64,9 @@ def short(name: str, scene: Path, folder: Path, **more: str) -> Outcome:
 
 
 @pytest.fixture(scope="module")
-def outcomes(scene, tmp_path_factory, request) -> dict[str, Outcome | str]:
+def outcomes(scene, tmp_path_factory) -> dict[str, Outcome | str]:
     """The scenarios over the relay, a few at a time."""
     folder = tmp_path_factory.mktemp("link")
-    if not request.config.getoption("nightly"):
-        with concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool:
-            return dict(
-                zip(EACH_TIME, pool.map(lambda name: short(name, scene, folder), EACH_TIME), strict=True)
-            )
     with concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool:
         soak = pool.submit(short, "drone-fade", scene, folder / "soak", lasts=f"{SOAK_S}s")
         names = sorted(scenario_names(), key=lambda name: -load_scenario(name).script("short").lasts_s)
@@ -113,7 +104,7 @@ def test_there_is_a_picture_at_the_end(outcomes, name):
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param("steady-1M", marks=nightly), "steady-300k", pytest.param("satellite-600ms", marks=nightly)],
+    ["steady-1M", "steady-300k", "satellite-600ms"],
 )
 def test_a_steady_link_loses_nothing(outcomes, name):
     """The two accounts would differ, and with them what the budget means."""
@@ -125,14 +116,13 @@ def test_a_steady_link_loses_nothing(outcomes, name):
 
 @pytest.mark.parametrize(
     "name",
-    ["outage-8s", *(pytest.param(name, marks=nightly) for name in ("outage-60s", "flapping", "drone-fade"))],
+    ["outage-8s", "outage-60s", "flapping", "drone-fade"],
 )
 def test_darkness_is_dark(outcomes, name):
     """The lab would be testing nothing."""
     assert measures(outcomes[name])["received in darkness, bytes"] == 0
 
 
-@nightly
 @pytest.mark.parametrize("side", ["edge", "ground"])
 def test_a_minute_of_fading_costs_neither_descriptors_nor_threads(outcomes, side):
     """An hour of it would cost sixty times as many (`make soak` flies that hour)."""
@@ -141,7 +131,6 @@ def test_a_minute_of_fading_costs_neither_descriptors_nor_threads(outcomes, side
     assert found[f"{side}, threads more at the end"] <= 0
 
 
-@nightly
 def test_a_minute_of_fading_keeps_its_account(outcomes):
     """What a bad link costs would be told wrongly by one of the two."""
     outcome = outcomes["soak"]
@@ -152,7 +141,6 @@ def test_a_minute_of_fading_keeps_its_account(outcomes):
     assert found["base messages lost"] == 0
 
 
-@nightly
 def test_a_satellite_is_far_away(outcomes):
     """As above."""
     assert measures(outcomes["satellite-600ms"])["frame delay p50, ms"] >= 300
@@ -164,7 +152,6 @@ def test_no_process_is_left(outcomes):
     assert not psutil.Process().children(recursive=True)
 
 
-@nightly
 def test_the_same_on_the_kernels_own_tcp(outcomes):
     """The model would be kind where the real thing is not."""
     outcome = outcomes["kernel"]

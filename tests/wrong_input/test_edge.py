@@ -29,6 +29,10 @@ def edge(refused, pictures, free_port):
             "96x64",
             "--max-frames",
             "2",
+            "--detector",
+            "motion",
+            "--preset",
+            "ultrafast",
         )
         return refused("hvt-edge", "--source", source, *link, *settings, code=code)
 

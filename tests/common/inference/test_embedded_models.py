@@ -59,6 +59,7 @@ def test_any_picture_size_goes_in():
         assert len(found) <= 2  # an empty grey picture shows nothing to speak of
 
 
+@pytest.mark.nightly
 def test_detector_on_held_out_scenes():
     """The demo would show a detector that finds nothing, and a retrained file could be worse unseen."""
     floors = {CLEAN: 0.80, 800_000: 0.70}
@@ -68,6 +69,7 @@ def test_detector_on_held_out_scenes():
         assert evaluate_drawn(detector, pictures[bitrate_bps]).mean >= floor
 
 
+@pytest.mark.nightly
 def test_classifier_on_held_out_stills():
     """Stills would turn right classes into wrong ones."""
     stills = list(held_out_crops(range(200, 202), moments=1))
@@ -88,6 +90,7 @@ def test_vehicles_on_real_pixels(data):
     assert result.precision >= 0.75
 
 
+@pytest.mark.nightly
 @pytest.mark.realdata
 def test_vehicles_and_people_that_training_never_saw(data, tmp_path):
     """Paint marks and shrubs would be people, and the ground of a real town full of cars."""
@@ -107,6 +110,7 @@ def test_vehicles_and_people_that_training_never_saw(data, tmp_path):
     assert scored["hit_uav"]["person"]["recall"] >= 0.35, "most of these flights were trained on"
 
 
+@pytest.mark.nightly
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", ["uav123_car10", "uavdt_S0601", "otb_Crossing"])
 def test_what_is_seen_aslant(data, name):
@@ -124,6 +128,7 @@ def test_what_is_seen_aslant(data, name):
     assert found / len(labels) >= 0.65
 
 
+@pytest.mark.nightly
 @pytest.mark.realdata
 def test_asphalt_shows_nobody(data):
     """Chipped paint and stones were pedestrians, .99 sure."""

@@ -5,15 +5,24 @@ from __future__ import annotations
 import datetime as dt
 import json
 import socket
+from pathlib import Path
 
 import pytest
 
 from hvt_edge.cli import main
+from media.pictures import write_scene
 from programs.fleet_keys import Fleet
 from programs.processes import Link, free_ports
 from programs.rtsp_camera import RtspCamera
 
 CHEAP = ("--size", "640x360", "--detector", "motion", "--preset", "ultrafast")
+
+
+def small_scene(folder: Path) -> str:
+    """Pictures that are drawn in a moment."""
+    (folder / "scene").mkdir()
+    write_scene(folder / "scene", frames=3)
+    return str(folder / "scene")
 
 
 def examined(capsys, *words: str) -> tuple[int, dict[str, dict[str, str]]]:
@@ -85,7 +94,7 @@ def test_keys_of_another_edge_are_found_out(tmp_path, capsys):
         "tls/127.0.0.1:7447",
     )
     capsys.readouterr()  # what making the keys said
-    code, found = examined(capsys, "--source", "demo", *CHEAP, *words)
+    code, found = examined(capsys, "--source", small_scene(tmp_path), *CHEAP, *words)
     assert code == 2
     assert "the certificate of 'uav-1'" in found["link"]["found"] + found["link"]["todo"]
 
@@ -103,11 +112,11 @@ def test_a_certificate_that_ends_is_found_out(tmp_path, capsys):
         "--connect",
         "tls/127.0.0.1:7447",
     )
-    now = dt.datetime.now(dt.UTC)
+    now, scene = dt.datetime.now(dt.UTC), small_scene(tmp_path)
     for made, state, said in ((now - dt.timedelta(days=4000), "wrong", "expired on"), (now, "warning", "")):
         fleet.reissue("uav-1", now=made)
         capsys.readouterr()
-        code, found = examined(capsys, "--source", "demo", *CHEAP, *words)
+        code, found = examined(capsys, "--source", scene, *CHEAP, *words)
         assert (code, found["link"]["state"]) == (2 if state == "wrong" else 0, state)
         assert said in found["link"]["found"]
 

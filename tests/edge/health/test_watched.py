@@ -121,6 +121,7 @@ def test_an_edge_says_how_it_is_from_its_start_to_its_flight(tmp_path, address):
         assert edge.summary()["session"] == now["session"]
 
 
+@pytest.mark.nightly
 def test_a_camera_that_went_away_is_no_dead_process_and_is_said(tmp_path, address):
     """A probe would restart an edge that only waits for its camera, or call one healthy that shows nothing."""
     port = free_ports(1)[0]

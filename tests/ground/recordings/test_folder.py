@@ -404,7 +404,7 @@ def killed(folder: Path, events: list[Event], *, at: int, retention: str = "()")
     process.stdout.close()
 
 
-@pytest.mark.parametrize("at", [2, 29, 30, 31, 45])
+@pytest.mark.parametrize("at", [2, 30, *(pytest.param(at, marks=pytest.mark.nightly) for at in (29, 31, 45))])
 def test_a_killed_ground_leaves_an_index_that_goes_on(tmp_path, events, at):
     """A power cut, and the index has to be mended by hand or tells less than there is."""
     folder = tmp_path / "flights"

@@ -107,6 +107,7 @@ def test_a_full_card_ends_the_local_copy_and_nothing_else(link, tmp_path):
     assert "Traceback" not in edge.said
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("how", ["full", "removed"])
 def test_a_store_that_fails_in_an_outage_costs_what_it_would_have_stored(link, tmp_path, how):
     """A full card, or one that is pulled out while the link is down, would end the flight, or storing for good."""
@@ -140,6 +141,7 @@ def test_a_store_that_fails_in_an_outage_costs_what_it_would_have_stored(link, t
     assert "Traceback" not in edge.said
 
 
+@pytest.mark.nightly
 def test_a_model_that_fails_leaves_the_video(link, tmp_path):
     """The flight would end in the first bright minute of a model that cannot bear light."""
     model = failing_in_the_light(tmp_path / "model.onnx")
@@ -172,6 +174,7 @@ def test_a_model_that_fails_leaves_the_video(link, tmp_path):
     assert "Traceback" not in edge.said
 
 
+@pytest.mark.nightly
 def test_a_camera_that_comes_back_begins_with_a_keyframe(link, free_port):
     """The operator would look at smear after each loose contact, or never learn why the picture stands."""
     camera = RtspCamera(free_port)

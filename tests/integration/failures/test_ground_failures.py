@@ -12,7 +12,7 @@ from media.onnx_models import failing_in_the_light
 from programs.processes import Link
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(240)]
 
 SOON_S = 60.0
 FLIGHT = (

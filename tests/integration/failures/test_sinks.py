@@ -104,6 +104,7 @@ def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, long_sce
     assert len(shown) == sum(summary["frames"] for summary in summaries), "no line of any message is missing"
 
 
+@pytest.mark.nightly
 def test_a_folder_that_goes_in_flight_costs_what_is_written_there(long_scene, link):
     """A stick that was pulled out would end the flight, or all would be written to a file that is in no folder."""
     folder = link.folder / "tables"

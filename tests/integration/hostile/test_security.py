@@ -275,6 +275,7 @@ def told(fleet: Fleet, scene: Path, tmp_path_factory: pytest.TempPathFactory) ->
                 one.kill()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("who", TOLD)
 def test_who_may_not_is_told_by_its_own_program_and_goes_on(told: dict[str, Running], who: str) -> None:
     """The operator waits for a picture and nothing comes; the engineer beside the drone sees only the drone's log."""

@@ -117,6 +117,7 @@ def test_the_picture_moves_at_the_rate_of_the_stream(page):
     assert int(page.locator("#age").get_attribute("data-ms")) < 3000
 
 
+@pytest.mark.nightly
 def test_boxes_are_drawn_on_the_frame_that_is_shown(page):
     """Boxes would run before or behind what they are about."""
     shows(page)
@@ -148,6 +149,7 @@ def test_a_click_brings_a_still_of_that_place(page):
     page.locator("#keyframe").click()
 
 
+@pytest.mark.nightly
 def test_a_second_viewer_joins_between_keyframes(flight, page):
     """Who comes later would wait for a keyframe, which may be a minute away."""
     shows(page)
@@ -158,6 +160,7 @@ def test_a_second_viewer_joins_between_keyframes(flight, page):
     second.context.close()
 
 
+@pytest.mark.nightly
 def test_a_thin_browser_gets_single_pictures(flight):
     """A browser without Media Source would show nothing."""
     page = flight.page("rung=jpeg")
@@ -184,6 +187,7 @@ def test_a_gap_greys_the_last_picture_and_ends_with_the_next(flight, page):
     shows(page, after=last + 5)
 
 
+@pytest.mark.nightly
 def test_what_an_operator_must_see_stands_on_the_picture(flight, page):
     """He would scroll for it, or take a paused picture for the one of now."""
     for viewport in ({"width": 1440, "height": 900}, {"width": 390, "height": 844}):
@@ -204,6 +208,7 @@ def test_what_an_operator_must_see_stands_on_the_picture(flight, page):
     )
 
 
+@pytest.mark.nightly
 def test_an_edge_that_is_not_here_is_not_another(flight):
     """Another edge's picture would be shown to who asked for this one."""
     page = flight.page("edge=uav-9")
@@ -215,6 +220,7 @@ def test_an_edge_that_is_not_here_is_not_another(flight):
     page.context.close()
 
 
+@pytest.mark.nightly
 def test_scrolling_commands_nothing(flight):
     """A wheel over the page would change the budget in flight, or a finger ask for a closer look."""
     page = flight.page()
@@ -239,6 +245,7 @@ def test_scrolling_commands_nothing(flight):
     page.context.close()
 
 
+@pytest.mark.nightly
 def test_steps_back_and_to_the_picture_of_now(page):
     """What was missed could not be looked at again."""
     first = shows(page)
@@ -253,6 +260,7 @@ def test_steps_back_and_to_the_picture_of_now(page):
     shows(page, after=paused + 5)
 
 
+@pytest.mark.nightly
 def test_an_event_leads_to_its_picture(page):
     """Who reads that something happened would search two minutes for it."""
     shows(page)
@@ -266,6 +274,7 @@ def test_an_event_leads_to_its_picture(page):
     assert "ago" in page.inner_text("#age")
 
 
+@pytest.mark.nightly
 def test_the_page_fits_a_phone(flight):
     """Half of it would lie beside the screen."""
     page = flight.page(viewport={"width": 390, "height": 844}, color_scheme="light")
@@ -274,6 +283,7 @@ def test_the_page_fits_a_phone(flight):
     page.context.close()
 
 
+@pytest.mark.nightly
 def test_nothing_jumps_while_the_picture_comes(flight):
     """Who wants to click on a car would hit a button that just moved there."""
     page = flight.page()

@@ -31,10 +31,10 @@ def ground_of(link: Link) -> Running:
 @pytest.mark.parametrize(
     ("name", "more", "pace"),
     [
-        ("camera.hevc", "", "lockstep"),
+        pytest.param("camera.hevc", "", "lockstep", marks=pytest.mark.nightly),
         ("camera.ts", "aud=1:repeat-headers=1", "realtime"),
-        ("camera.mp4", "", "realtime"),
-        ("camera.mkv", "open-gop=1", "lockstep"),
+        pytest.param("camera.mp4", "", "realtime", marks=pytest.mark.nightly),
+        pytest.param("camera.mkv", "open-gop=1", "lockstep", marks=pytest.mark.nightly),
     ],
 )
 def test_the_recording_holds_the_cameras_own_units(link, name, more, pace):
@@ -58,6 +58,7 @@ def test_the_recording_holds_the_cameras_own_units(link, name, more, pace):
     assert pictures_of(link.folder / "copy.mkv") == slices
 
 
+@pytest.mark.nightly
 def test_a_closer_look_and_a_keyframe_are_refused_with_their_reasons(link):
     """Bits would go to a still of the pixels that the video has; whoever joins would ask for a keyframe for ever."""
     clip = write_clip(link.folder / "camera.mp4", smooth_pictures(200, size=SIZE), keyint=30)

@@ -399,7 +399,9 @@ def test_the_session_panel_says_what_came(units: list[tuple[bytes, bool]], tmp_p
 
 
 @pytest.mark.realdata
-@pytest.mark.parametrize(("base_kbps", "total_kbps"), [(240, 300), (650, 800)])
+@pytest.mark.parametrize(
+    ("base_kbps", "total_kbps"), [(240, 300), pytest.param(650, 800, marks=pytest.mark.nightly)]
+)
 def test_a_recording_is_at_most_half_as_large_again_as_what_was_received(
     data: Path, tmp_path: Path, base_kbps: int, total_kbps: int
 ) -> None:
