@@ -10,16 +10,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, make_dataclass
 from functools import cache
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
-from hvt_common.protocol.messages import Info
-from hvt_common.runtime.checkup import Finding
 from hvt_common.runtime.plug_ins import installed, loaded
 from hvt_ground.config import GroundConfig, check
-from hvt_ground.events import Event, Refinement
-from hvt_ground.geolocation.surface import Surface
-from hvt_ground.recordings.recorded import Recorded
-from hvt_ground.sinks import Outputs, SinkWriter
+
+if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no recording
+    from hvt_common.protocol.messages import Info
+    from hvt_common.runtime.checkup import Finding
+    from hvt_ground.events import Event, Refinement
+    from hvt_ground.geolocation.surface import Surface
+    from hvt_ground.recordings.recorded import Recorded
+    from hvt_ground.sinks import Outputs, SinkWriter
 
 __all__ = ["Extra", "Flight", "NewFile", "OpenSinks", "Opening", "all_extras", "checked", "config_class"]
 
@@ -27,7 +29,7 @@ _GROUP = "hvt.ground"
 _BROUGHT_BY = {"cot": "cot", "cot-types": "cot", "mcap": "mcap", "ts": "ground"}
 """Settings of the extras that come with HVT, and the package to install for each."""
 
-NewFile = Callable[[Path, str, Callable[[Path], SinkWriter[Event]]], Callable[[], SinkWriter[Event]]]
+NewFile = Callable[[Path, str, "Callable[[Path], SinkWriter[Event]]"], "Callable[[], SinkWriter[Event]]"]
 """Opens a file, or one of the suffix in a folder, by a name that no other session of this ground has."""
 
 

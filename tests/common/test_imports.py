@@ -21,11 +21,18 @@ HEAVY = {
 }
 
 
-@pytest.mark.parametrize("module", ["hvt_edge.cli", "hvt_ground.cli"])
-def test_a_command_line_imports_what_its_settings_need_and_no_more(module):
+@pytest.mark.parametrize(
+    ("asked", "heavy"),
+    [
+        ("import hvt_edge.cli", HEAVY),
+        ("import hvt_ground.cli", HEAVY),
+        ("from hvt_ground.extras import config_class; config_class()", {"rerun", "onnxruntime", "zenoh"}),
+    ],
+)
+def test_a_command_line_imports_what_its_settings_need_and_no_more(asked, heavy):
     """``--help``, a wrong setting and a script that asks for the status would take a second of a small board."""
-    code = f"import sys, {module}; print(*sys.modules)"
+    code = f"import sys; {asked}; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60
     )
-    assert HEAVY & set(done.stdout.split()) == set()
+    assert heavy & set(done.stdout.split()) == set()

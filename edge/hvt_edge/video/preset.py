@@ -53,7 +53,8 @@ def choose_preset(slowest_cores: float, *, most_cores: float) -> PresetChoice:
     preset = within[-1] if within else next(iter(_COST))
     if preset == SLOWEST:
         return PresetChoice()
-    return PresetChoice(preset, f"preset {preset}: {SLOWEST} would take {slowest_cores:.2g} of a core")
+    took = f"{slowest_cores:.2g} of a core" if slowest_cores < 1 else f"{slowest_cores:.1f} cores"
+    return PresetChoice(preset, f"preset {preset}: {SLOWEST} would take {took}")
 
 
 class PresetControl:

@@ -13,11 +13,11 @@ from hvt_common.errors import needs_extra
 from hvt_common.runtime.reporting import check_writable
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
-from hvt_ground.recordings.recorded import Recorded, RecordedStill
 from hvt_ground.sinks import Outputs
 
 if TYPE_CHECKING:
     from hvt_gateways.mcap.file import McapFile
+    from hvt_ground.recordings.recorded import Recorded
 
 __all__ = ["McapExtra"]
 
@@ -62,6 +62,8 @@ class McapExtra(Extra):
 
 
 def _export(recorded: Recorded, path: Path) -> None:
+    from hvt_ground.recordings.recorded import RecordedStill  # noqa: PLC0415 - it brings Rerun
+
     file = _file()(path, edge=recorded.edge)
     try:
         for item in recorded.all():

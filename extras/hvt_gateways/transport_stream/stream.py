@@ -10,7 +10,7 @@ import io
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import av
 import av.error
@@ -25,8 +25,10 @@ from hvt_gateways.transport_stream.timeline import TIME_BASE, Timeline
 from hvt_gateways.transport_stream.uas import Platform, uas_local_set
 from hvt_ground.events import Event, Overlay, PoseUpdate, VideoSample
 from hvt_ground.geolocation.trail import PoseTrail
-from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.decodable import DecodableRun
+
+if TYPE_CHECKING:
+    from hvt_ground.recordings.recorded import Recorded
 
 __all__ = ["TransportStream", "live_stream", "stream_file", "write_recorded"]
 
