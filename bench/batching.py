@@ -17,7 +17,7 @@ import onnx
 from onnx import numpy_helper
 
 from bench.bars import measured
-from bench.material import nano
+from bench.support.material import nano
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 
 _SHAPE = (3, 384, 640)

@@ -25,8 +25,8 @@ import av
 import cv2
 
 from bench.bars import measured
-from bench.material import frames
-from bench.processes import free_endpoint, running
+from bench.support.material import frames
+from bench.support.processes import free_endpoint, running
 
 _SHARE, _CORES = 0.25, 2
 _PERIOD_US = 100_000

@@ -18,7 +18,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.material import data
+from bench.support.material import data
 from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.compare import print_result
 from hvt_study.matrix.compare import ComparePlan, CompareResult, CompareRow, compare

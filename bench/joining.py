@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 
 from bench.bars import measured
-from bench.material import FPS, clip, nano
-from bench.processes import free_endpoint, running
+from bench.support.material import FPS, clip, nano
+from bench.support.processes import free_endpoint, running
 
 _GROUNDS = 5
 _PATIENCE_S = 60.0

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from bench.bars import measured
-from bench.material import FPS, SIZE, clip, frames, nano
-from bench.processes import Peaks, free_endpoint, pin_to, running
+from bench.support.material import FPS, SIZE, clip, frames, nano
+from bench.support.processes import Peaks, free_endpoint, pin_to, running
 from hvt_common.inference.detect import open_detector
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video.encoder_settings import encoder_settings

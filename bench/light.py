@@ -8,7 +8,7 @@ import sys
 import time
 
 from bench.bars import measured
-from bench.material import FPS, SIZE, clip, frames
+from bench.support.material import FPS, SIZE, clip, frames
 from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 

@@ -13,8 +13,8 @@ import cv2
 
 from bench.bars import measured
 from bench.fleet.played import SIZE, coded, played
-from bench.material import frames
-from bench.processes import Peaks, free_endpoint, running
+from bench.support.material import frames
+from bench.support.processes import Peaks, free_endpoint, running
 
 _FPS = 5.0
 _EDGES = 8

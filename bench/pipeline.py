@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from bench.bars import measured
-from bench.material import FPS, SIZE, clip, frames, nano
+from bench.support.material import FPS, SIZE, clip, frames, nano
 from hvt_common import __version__
 from hvt_common.inference.detect import open_detector
 from hvt_common.protocol.messages import BaseHeader, Flags, Info

@@ -23,7 +23,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bench.material import FPS, SIZE, data, frames
+from bench.support.material import FPS, SIZE, data, frames
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.values import Image, View

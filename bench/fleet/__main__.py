@@ -22,7 +22,7 @@ from rich.progress import track
 from rich.table import Table
 
 from bench.fleet.played import SIZE, coded, played
-from bench.processes import Peaks, free_endpoint, running
+from bench.support.processes import Peaks, free_endpoint, running
 from hvt_edge.source.opening import open_source
 
 COUNTS = (1, 2, 4, 8, 16)

@@ -27,7 +27,7 @@ from hvt_ground.extras import checked, config_class
 
 __all__ = ["Listening", "Picture", "Received", "listen"]
 
-_MOST_QUEUED, _MOST_QUEUED_BYTES = 32, 128 * 2**20
+_MOST_QUEUED, MOST_QUEUED_BYTES = 32, 128 * 2**20
 """Events, of which each may be a picture, and their pixels."""
 _POLL_S = 0.2
 
@@ -140,7 +140,7 @@ class _Events(queue.Queue[Received]):
 
     def _count_bytes(self, item: Received, *, by: int) -> None:
         self._bytes += by * item.event.image_bgr.nbytes if isinstance(item.event, Picture) else 0
-        self.maxsize = _MOST_QUEUED if self._bytes < _MOST_QUEUED_BYTES else max(1, len(self.queue))
+        self.maxsize = _MOST_QUEUED if self._bytes < MOST_QUEUED_BYTES else max(1, len(self.queue))
 
 
 class _Queue:

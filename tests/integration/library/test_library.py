@@ -191,7 +191,7 @@ time.sleep(1)
 
 def test_large_pictures_that_nobody_takes_have_a_bound_in_bytes(monkeypatch):
     """32 pictures of 8192x4352 would be three gigabytes, of an edge that sent a few kilobytes."""
-    monkeypatch.setattr("hvt_ground.library.received._MOST_QUEUED_BYTES", 1000)
+    monkeypatch.setattr("hvt_ground.library.received.MOST_QUEUED_BYTES", 1000)
     events, large = _Events(), Picture(0, 0, np.zeros((10, 10, 3), np.uint8))
     for _ in range(4):
         events.put(Received("uav-1", 1, large), block=False)

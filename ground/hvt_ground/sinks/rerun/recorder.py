@@ -52,7 +52,7 @@ _PLOT_GAP_NS = 2_500_000_000
 """Plots have a hole where nothing was measured for longer."""
 _BYTES_EACH = {"boxes": 6, "identity": 2, "places": 4, "words": 5}
 """About the component's cost for a track; others cost little more than their row."""
-_MOST_CLASSES = 256
+MOST_CLASSES = 256
 """Names of classes in a recording; more are `OTHER`. A new name is written with all before it, and an edge may name
 thousands."""
 OTHER = "other"
@@ -350,7 +350,7 @@ class Recorder:
         return CodedIdentity(identity.track_ids, before, tuple(self._class_id(*one) for one in shown))
 
     def _class_id(self, name: str, level: int) -> int:
-        if len(self._class_names) < _MOST_CLASSES:
+        if len(self._class_names) < MOST_CLASSES:
             self._class_names.add(name)
         known = name if name in self._class_names else OTHER
         return self._class_ids.setdefault((known, level), len(self._class_ids))

@@ -546,7 +546,7 @@ def test_colours_tell_kinds_apart() -> None:
 
 def test_a_new_class_a_frame_fills_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each new name is written with all before it: an edge that names 2048 would write gigabytes."""
-    monkeypatch.setattr(recorder_module, "_MOST_CLASSES", 60)
+    monkeypatch.setattr(recorder_module, "MOST_CLASSES", 60)
     path, largest = tmp_path / "flight.rrd", 0
     with Recorder(settings(path, compact_bytes=20_000)) as written:
         box = moving_boxes(0, 1, SIZE)

@@ -1,0 +1,1 @@
+"""What the benchmarks share: pictures and clips (`material`), programs with their time and memory (`processes`)."""
