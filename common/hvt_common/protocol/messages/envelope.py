@@ -12,7 +12,7 @@ bit in either is always noticed.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, ClassVar, Self, TypeVar
 
@@ -56,16 +56,15 @@ _T = TypeVar("_T")
 class UnknownVersionError(WireError):
     """The message is of another schema version: count it apart, warn once, skip it."""
 
-    def __init__(self, message: str, version: int) -> None:
-        known = " and ".join(map(str, READ_VERSIONS))
-        super().__init__(f"{message} has schema version {version}, only {known} are known here")
-        self.version = version
+    def __init__(self, message: str, version: int, *, read: Sequence[int]) -> None:
+        self.version, self._read = version, " and ".join(map(str, read))
+        known = f"{self._read} are" if len(read) > 1 else f"{self._read} is"
+        super().__init__(f"{message} has schema version {version}, only {known} known here")
 
     def between(self, sender: str, reader: str) -> str:
         """What to do about it, as one sentence."""
-        known = " and ".join(map(str, READ_VERSIONS))
         older = reader if self.version > WIRE_VERSION else sender
-        return f"{sender} speaks wire version {self.version}, {reader} reads {known}: update {older}"
+        return f"{sender} speaks wire version {self.version}, {reader} reads {self._read}: update {older}"
 
 
 class CorruptError(WireError):
@@ -93,8 +92,8 @@ class Message:
         return PackedMessage.of(self).pack(payload)
 
     @classmethod
-    def parse(cls, data: bytes, payload: bytes = b"") -> Self:
-        """The message that ``data`` holds and that fits ``payload``.
+    def parse(cls, data: bytes, payload: bytes = b"", *, versions: Sequence[int] = READ_VERSIONS) -> Self:
+        """The message that ``data`` holds and that fits ``payload``; ``versions`` are those that are read.
 
         Raises UnknownVersionError, CorruptError or another WireError, and nothing else, for any bytes whatever.
         """
@@ -104,7 +103,8 @@ class Message:
         if len(payload) > cls.MAX_PAYLOAD:
             raise WireError(f"payload of {len(payload)} bytes is longer than {cls.MAX_PAYLOAD}")
         array = _unpack(data, name)
-        _check_version(array, name)
+        if array[0] not in versions:
+            raise UnknownVersionError(name, array[0], read=versions)
         if len(data) <= _CRC_BYTES or data[-_CRC_BYTES] != _CRC_TAG:
             raise WireError(f"{name} does not end with its checksum")
         if array[-1] != _checksum(data[:-_CRC_BYTES], payload):
@@ -200,11 +200,6 @@ def _once(pairs: list[tuple[str | bytes, Any]]) -> dict[str, Any]:
     if any(type(key) is not str for key in found):
         raise ValueError("a map has a key that is no text")
     return found  # type: ignore[return-value]
-
-
-def _check_version(array: list[Any], name: str) -> None:
-    if array[0] not in READ_VERSIONS:
-        raise UnknownVersionError(name, array[0])
 
 
 def wire_version(data: bytes) -> int:
