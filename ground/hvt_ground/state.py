@@ -41,7 +41,7 @@ class PoseState:
     height_m: float | None
     """Above the ground."""
     age_s: float
-    """Of the newest pose at the newest picture; after 10 s it places nothing."""
+    """Of the newest pose now, or in lockstep at the newest picture; 10 s before a picture it places nothing on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +65,13 @@ class SessionState:
     mean_bps: int
     """Over the session, all that crossed the line."""
     total_bps: float | None
-    """Over the budget's window, like the two below; None while the link is lost."""
+    """Over the budget's window, like the two below; None while no picture comes, like all that is of now."""
     budget_share: float | None
     """What that is of the budget."""
     base_bps: float | None
     roi_bps: float | None
     delay_p50_ms: float | None
-    """Capture to overlay over the session; None in lockstep, and before the first."""
+    """Capture to overlay over the session; None in lockstep, before the first, and while no picture comes."""
     delay_p95_ms: float | None
     picture_age_s: float | None
     """Since the newest picture was captured; None in lockstep."""
@@ -95,8 +95,8 @@ class SessionState:
     """Why candidates have no still: the edge's counts, by reason."""
     tracks: int
     tracks_refined: int
-    tracks_doubted: int
-    """Shown now, and nothing of what is looked for as stills have it."""
+    tracks_doubted: int | None
+    """Shown now, and nothing of what is looked for as stills have it; None while no picture comes."""
     class_changes: int
     detections: int
     backlog_stills: int
@@ -110,6 +110,7 @@ class SessionState:
     """At the edge before encoding, all; None before its first report, as all below."""
     edge_frames_dropped_cpu: int | None
     edge_encode_ms: float | None
+    """None where nothing was encoded, or no report comes, as the two below."""
     edge_detect_ms: float | None
     edge_still_queue: int | None
     edge_failed: tuple[FailedPart, ...]
@@ -246,19 +247,23 @@ def _left_out(status: Status | None) -> int:
     return 0 if status is None else status.frame_account.groups.get("link", 0)
 
 
-def _pose(session: GroundSession) -> PoseState | None:
+def _pose(session: GroundSession, now_ns: int) -> PoseState | None:
     newest = session.geolocation.newest
     if newest is None:
         return None
-    age_s = max(0.0, (session.newest_capture_ns - newest.capture_ns) / SECOND_NS)
+    age_ns = session.newest_capture_ns - newest.capture_ns
+    if not session.lockstep:  # the camera may be gone, and flies on
+        age_ns = now_ns - session.to_local_ns(newest.capture_ns)
+    age_s = max(0.0, age_ns / SECOND_NS)
     return PoseState(newest.latitude_deg, newest.longitude_deg, newest.height_m, age_s)
 
 
 def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState, now_ns: int) -> SessionState:
     info, pipeline, counters, status = session.info, session.pipeline, session.counters, session.last_status
-    now: Traffic | None = None if link == "lost" else session.traffic
+    now: Traffic | None = None if link == "lost" else session.traffic(now_ns)
+    delayed = now is not None and not session.lockstep
     captured_ns = None if session.lockstep else session.newest_captured_ns
-    health = None if status is None else status.health
+    counts, health = None if status is None else status.health, session.health(now_ns)
     totals = session.backlog.totals
     return SessionState(
         session=f"{info.session_id:016x}",
@@ -276,10 +281,10 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
         budget_share=None if now is None else now.total_bps / session.budget_bps,
         base_bps=None if now is None else now.base_bps,
         roi_bps=None if now is None else now.roi_bps,
-        delay_p50_ms=None if session.lockstep else session.overlay_latency.percentile(50),
-        delay_p95_ms=None if session.lockstep else session.overlay_latency.percentile(95),
+        delay_p50_ms=session.overlay_latency.percentile(50) if delayed else None,
+        delay_p95_ms=session.overlay_latency.percentile(95) if delayed else None,
         picture_age_s=None if captured_ns is None else max(0.0, (now_ns - captured_ns) / SECOND_NS),
-        pose=_pose(session),
+        pose=_pose(session, now_ns),
         frames_received=session.frames_received,
         frames_decoded=session.frames_decoded,
         frames_untracked=session.frames_untracked,
@@ -293,17 +298,18 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
         stills_not_sent=dict(session.not_sent),
         tracks=pipeline.tracks,
         tracks_refined=pipeline.refined,
-        tracks_doubted=pipeline.doubted,
+        tracks_doubted=None if now is None else pipeline.doubted,
         class_changes=pipeline.class_changes,
         detections=pipeline.detections_run,
         backlog_stills=totals.stills,
         backlog_video_s=totals.video_s,
         backlog_working=sessions.backlog.working,
         edge_frames=None if status is None or not status.frames else status.frame_account,
-        edge_frames_dropped=None if health is None else health.frames_dropped,
-        edge_frames_dropped_cpu=None if health is None else health.frames_dropped_cpu,
-        edge_encode_ms=None if health is None else health.encode_ms,
-        edge_detect_ms=None if health is None else health.detect_ms,
+        edge_frames_dropped=None if counts is None else counts.frames_dropped,
+        edge_frames_dropped_cpu=None if counts is None else counts.frames_dropped_cpu,
+        # On the wire 0 is where nothing was measured.
+        edge_encode_ms=None if health is None else health.encode_ms or None,
+        edge_detect_ms=None if health is None else health.detect_ms or None,
         edge_still_queue=None if health is None else health.still_queue,
         edge_failed=()
         if status is None

@@ -34,9 +34,12 @@ def _edge_text(one: EdgeState) -> str:
         not_sent = session.stills_not_sent
         why = f" (not sent: {counts_text(not_sent, most=2)})" if not_sent else ""
         age = "" if session.delay_p50_ms is None else f"  {session.delay_p50_ms:.0f} ms"
+        rate = f"{bitrate_text(session.mean_bps)} of {bitrate_text(session.budget_bps)}"
+        if session.total_bps is None:
+            since = "" if session.picture_age_s is None else f" for {session.picture_age_s:.0f} s"
+            rate = f"NO PICTURE{since}"
         said = (
-            f"{one.edge}: {session.duration_s:.1f} s  {bitrate_text(session.mean_bps)} of "
-            f"{bitrate_text(session.budget_bps)}{' (thin link)' if one.link == 'thin' else ''}  "
+            f"{one.edge}: {session.duration_s:.1f} s  {rate}{' (thin link)' if one.link == 'thin' else ''}  "
             f"stills {session.stills_received}{why}  "
             f"tracks {session.tracks}, {session.tracks_refined} refined{age}"
         )

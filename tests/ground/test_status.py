@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +13,14 @@ import pytest
 from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.messages import FailedPart, Info, Status
 from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
 from hvt_ground.metrics import metrics_text
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.state import StateMaker
+from hvt_ground.state import SessionState, StateMaker
 from hvt_ground.status import completed, status_text, summary, table
 from programs.processes import eventually
 from programs.rrd import Recording
@@ -28,11 +30,12 @@ from rigs.flight import Flight, Port, pipeline_of
 class Ground:
     """One edge at a ground, in this thread, with a recording and one that cannot be made."""
 
-    def __init__(self, folder: Path, flight: Flight) -> None:
+    def __init__(self, folder: Path, flight: Flight, clock: Callable[[], int] = time.time_ns) -> None:
         self.port, self.path = Port(), folder / "a.rrd"
         self.port.flight = flight
-        self.failures = Failures(time.time_ns)
-        self.maker = StateMaker(time.time_ns, failures=self.failures)
+        self.failures = Failures(clock)
+        self.clock = clock
+        self.maker = StateMaker(clock, failures=self.failures)
         self.outputs = Outputs(self.failures)
         self.ended: list[GroundSession] = []
         self.sessions = EdgeSessions(self.port, open_session=self.open_one, on_ended=self.ended.append)
@@ -46,7 +49,7 @@ class Ground:
             self.outputs.open("second recording of uav-1", lambda: Recorder(gone)),
             self.outputs.open("recording of uav-10", lambda: Recorder(gone)),
         ]
-        return GroundSession(info, sinks=sinks, pipeline_of=pipeline_of, clock=time.time_ns, reports=reports)
+        return GroundSession(info, sinks=sinks, pipeline_of=pipeline_of, clock=self.clock, reports=reports)
 
     def line(self) -> str:
         """The status line."""
@@ -187,3 +190,43 @@ def test_words_of_an_edge_do_not_become_series_without_end(ground):
         'hvt_part_failed{edge="uav-1",part="encoder"} 1.0',
     ):
         assert line in text
+
+
+def test_what_was_is_not_said_to_be_now(tmp_path):
+    """A camera that is gone has sent 300 kbps for an hour, by every table, plot and alert."""
+    flight, now_ns = Flight(8), time.time_ns()
+    ground = Ground(tmp_path, flight, clock=lambda: now_ns)
+    for index in range(5):
+        ground.sessions.handle(flight.base(index))
+
+    def report() -> None:
+        item = flight.status(base=5)
+        said = Status.parse(item.payload)
+        said = replace(said, health=replace(said.health, encode_ms=4.0))
+        ground.sessions.handle(replace(item, payload=said.pack()))
+
+    report()
+
+    def state() -> SessionState:
+        return ground.maker.make([("uav-1", ground.sessions)]).edges[0].session
+
+    first = state()
+    now = (first.total_bps, first.budget_share, first.base_bps, first.roi_bps, first.tracks_doubted)
+    assert None not in (*now, first.edge_encode_ms)
+    assert first.edge_detect_ms is None, "nothing was detected there: 0 is not how long it took"
+    now_ns += 4 * SECOND_NS
+    report()
+    gone = state()
+    stale = (gone.total_bps, gone.budget_share, gone.base_bps, gone.roi_bps, gone.tracks_doubted)
+    assert {*stale, gone.delay_p50_ms, gone.delay_p95_ms} == {None}
+    assert gone.edge_encode_ms == 4.0, "its report is of now"
+    assert "NO PICTURE for" in ground.line()
+    now_ns += 4 * SECOND_NS
+    silent = state()
+    assert (silent.edge_encode_ms, silent.edge_still_queue) == (None, None)
+    assert silent.edge_frames_dropped is not None, "what is counted stays"
+    text = metrics_text(ground.maker.make([("uav-1", ground.sessions)])).decode()
+    for name in ("hvt_received_bits_per_second", "hvt_edge_encode_seconds", "hvt_overlay_delay_p95_seconds"):
+        assert f'{name}{{edge="uav-1"}}' not in text
+    ground.sessions.close()
+    ground.outputs.close()

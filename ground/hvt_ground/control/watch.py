@@ -60,7 +60,7 @@ def _place(pose: dict[str, Any]) -> str:
 def _session_cells(session: dict[str, Any] | None) -> tuple[str, ...]:
     if session is None:
         return ("",) * (len(_COLUMNS) - 3)
-    rate = "no bits" if session["total_bps"] is None else bitrate_text(session["total_bps"])
+    rate = "unknown" if session["total_bps"] is None else bitrate_text(session["total_bps"])
     p95, age, why = session["delay_p95_ms"], session["picture_age_s"], session["stills_not_sent"]
     return (
         f"{rate} of {bitrate_text(session['budget_bps'])}",

@@ -17,6 +17,7 @@ from hvt_common.protocol.messages import (
     BacklogHeader,
     BacklogKind,
     BaseHeader,
+    Health,
     Info,
     PoseReport,
     RoiHeader,
@@ -50,6 +51,8 @@ __all__ = ["GroundSession", "WorkerFactory"]
 _MILLION = 1_000_000
 _ANEW_NS = 5 * SECOND_NS
 """What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""
+_LATELY_NS, _FRAMES_LATELY = 3 * SECOND_NS, 4
+"""What came longer ago, and so many frames, says nothing of now."""
 _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""
 
@@ -112,8 +115,8 @@ class GroundSession:
         """What the edge last said that it sends beside the video, and why."""
         self._log = SessionLog(self._emit, clock=clock)
         self._last_step = -1
-        self._stepped_ns = self._status_ns = 0
-        """When the newest report of tracks came, and the newest status."""
+        self._stepped_ns = self._status_ns = self._base_ns = 0
+        """When the newest report of tracks came, the newest status, and the newest access unit."""
         self._first_capture_ns: int | None = None
         self._last_index = -1
         self._last_capture_ns = 0
@@ -161,6 +164,7 @@ class GroundSession:
         if self._first_capture_ns is None:
             self._first_capture_ns = header.capture_ns
         self._last_index, self._last_capture_ns = header.frame_index, header.capture_ns
+        self._base_ns = self._clock()
         if not decode:
             return True
         if starts_run:
@@ -308,10 +312,17 @@ class GroundSession:
         """When the newest picture was captured, this ground's clock; None before the first."""
         return None if self._first_capture_ns is None else self.to_local_ns(self._last_capture_ns)
 
-    @property
-    def traffic(self) -> Traffic | None:
-        """How full the link was, twice a second of the stream; None before the first."""
-        return self._account.last_traffic
+    def traffic(self, now_ns: int) -> Traffic | None:
+        """How full the link is; None before the first access unit, and where none has come lately."""
+        fps = self.info.fps if self.last_status is None else self.last_status.coded_fps or self.info.fps
+        lately_ns = max(_LATELY_NS, round(_FRAMES_LATELY * SECOND_NS / fps))
+        return None if now_ns - self._base_ns > lately_ns else self._account.last_traffic
+
+    def health(self, now_ns: int) -> Health | None:
+        """How the edge is; None before its first report, and where none has come lately."""
+        if self.last_status is None or now_ns - self._status_ns > _LATELY_NS:
+            return None
+        return self.last_status.health
 
     def to_local_ns(self, edge_ns: int) -> int:
         """A time of the edge's clock as this ground's."""
