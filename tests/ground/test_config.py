@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,9 @@ from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import checked, config_class
+from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.wiring import output_path
+from hvt_ground.wiring.files import backlog_path, free_path
 
 
 def read(*argv: str) -> GroundConfig:
@@ -113,3 +116,31 @@ def test_no_recording_is_written_over_another(tmp_path):
     names = [output_path(named, suffix=".rrd", edge=edge, stamp="t", taken=taken).name for edge in edges]
     assert names == ["flight.rrd", "flight-uav-2.rrd", "flight-uav-2-2.rrd", "flight-uav-1.rrd"]
     assert len(set(names)) == 4
+
+
+def test_two_grounds_of_one_folder_never_get_one_name(tmp_path):
+    """Both would write one file, and neither flight could be read."""
+    names = [output_path(tmp_path, suffix=".rrd", edge="uav-1", stamp="t", taken=set()) for _ in range(3)]
+    late = [backlog_path(tmp_path, edge="uav-1", stamp="t", taken=set()) for _ in range(3)]
+    numbered = [free_path([tmp_path / "timing.csv"], set(), number=2) for _ in range(3)]
+    assert len({*names, *late, *numbered}) == 9
+    (tmp_path / "t.rrd").symlink_to(tmp_path / "nowhere")  # a link that leads nowhere is a name that is taken
+    assert free_path([tmp_path / "t.rrd"], set(), number=2).name == "t-2.rrd"
+
+
+def test_the_beginning_of_names_is_no_file(tmp_path):
+    """With --split an empty file of the session's name would stand beside its parts, and be nobody's recording."""
+    for _ in range(2):
+        output_path(tmp_path, suffix=".rrd", edge="uav-1", stamp="t", taken=set(), claim=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_device_is_never_taken_for_an_empty_file(tmp_path):
+    """A ground of root with --record /dev/full would remove it."""
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "empty").touch()
+    os.mkfifo(tmp_path / "pipe")
+    nothing = {one.name: has_nothing(one) for one in sorted(tmp_path.iterdir())}
+    assert nothing == {"empty": True, "link": False, "pipe": False}
+    assert not has_nothing(Path("/dev/full"))
+    assert has_nothing(tmp_path / "new")

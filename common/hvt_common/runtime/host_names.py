@@ -13,13 +13,19 @@ from urllib.parse import urlsplit
 
 from hvt_common.errors import UserError
 
-__all__ = ["host_and_port", "is_loopback", "names_this_machine", "requested_host"]
+__all__ = ["host_and_port", "is_group", "is_loopback", "names_this_machine", "requested_host"]
 
 
 def is_loopback(host: str) -> bool:
     """Whether only this machine reaches it: `localhost`, or an address of loopback and nothing like one."""
     address = _address(host)
     return host == "localhost" if address is None else address.is_loopback
+
+
+def is_group(host: str | None) -> bool:
+    """Whether it is the address of a multicast group."""
+    address = _address(host or "")
+    return address is not None and address.is_multicast
 
 
 def names_this_machine(host: str, *, served_at: str) -> bool:

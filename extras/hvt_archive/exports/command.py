@@ -67,7 +67,7 @@ def run(argv: Sequence[str]) -> int:
             write = partial(write_video, container=kind, burn_in=given.burn_in)
         else:
             write = (_FILES | brought)[kind]
-        with whole_file(out) as part:
+        with whole_file(out, new=given.out is None) as part:
             write(recorded, part)
     say(f"{out}: {recorded.edge}, {len(recorded.video)} pictures, {len(recorded.stills)} stills")
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,20 +11,23 @@ from pathlib import Path
 import av.error
 
 from hvt_common.errors import UserError
+from hvt_ground.sinks.line_file import claim_name
 
 __all__ = ["whole_file", "whole_folder"]
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
     """The name to write to; it takes the place of ``path`` at the end, and is removed where that fails.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: it cannot be written, or is to be ``new`` and somebody has made one meanwhile.
     """
     part = _part_of(path)
     try:
         yield part
+        if new and not claim_name(path):
+            raise UserError(f"{path} is there already: name another with --out")
         part.replace(path)
     except (OSError, av.error.FFmpegError) as error:
         raise UserError(f"{path} cannot be written: {error.strerror or error}") from error
@@ -57,4 +61,4 @@ def whole_folder(path: Path) -> Iterator[Path]:
 def _part_of(path: Path) -> Path:
     if not path.name:
         raise UserError(f"--out {path} has no name: name a file, or a folder that is new")
-    return path.with_name(f".{path.name}.part")
+    return path.with_name(f".{path.name}.{os.getpid()}.part")  # another export may write the same

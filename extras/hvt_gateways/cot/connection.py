@@ -7,6 +7,7 @@ its other programs. Of these only `VARIABLES` are used: no enrolment, which alon
 from __future__ import annotations
 
 import asyncio
+import errno
 import ipaddress
 import logging
 import os
@@ -28,6 +29,7 @@ with warnings.catch_warnings():
     from pytak.client_functions import get_ssl_ctx, get_tls_config
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.host_names import is_group
 from hvt_gateways.cot.event import CotMessage
 
 __all__ = ["VARIABLES", "CotConnection", "check_connection"]
@@ -220,7 +222,7 @@ class CotConnection:
         try:
             self._loop.run_until_complete(self._use())
         except Exception as error:  # noqa: BLE001 - pytak and the network raise what they like
-            failure = UserError(f"{self._url}: {_reason(error)}")
+            failure = UserError(f"{self._url}: {_reason(error, self._url)}")
             with self._lock:
                 self._error = failure
                 self._unsent.clear()
@@ -293,7 +295,7 @@ async def _close(writer: Any) -> None:
     await asyncio.sleep(0)  # transports close in the loop's next round
 
 
-def _reason(error: BaseException) -> str:
+def _reason(error: BaseException, url: str) -> str:
     """The cause in a few words; pytak wraps OpenSSL's message into advice not to verify."""
     root = error.__cause__ if isinstance(error, SyntaxError) and error.__cause__ is not None else error
     if isinstance(root, ssl.SSLCertVerificationError):
@@ -305,8 +307,14 @@ def _reason(error: BaseException) -> str:
     if isinstance(root, ssl.SSLError):
         return f"TLS failed ({root.reason or root})"
     if isinstance(root, OSError) and root.strerror:
-        return os.strerror(root.errno) if root.errno and root.errno > 0 else root.strerror
+        return _os_reason(root, url)
     return str(root) or type(root).__name__
+
+
+def _os_reason(error: OSError, url: str) -> str:
+    if error.errno == errno.ENETUNREACH and is_group(urlsplit(url).hostname):
+        return f"no route leads to the group: set {_ADDRS} to this machine's address in the network of its receivers"
+    return os.strerror(error.errno) if error.errno and error.errno > 0 else str(error.strerror)
 
 
 def _say_quietly(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import socket
@@ -17,6 +18,7 @@ import av
 import av.error
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.host_names import is_group
 from hvt_common.runtime.reporting import check_writable
 from hvt_ground.sinks.line_file import check_there
 
@@ -169,6 +171,31 @@ class Output(Protocol):
         """The last came; a second call does nothing."""
 
 
+class AsynchronousKlv:
+    """Calls the packets of KLV private stream 1, as MISB ST 1402 has it of asynchronous carriage.
+
+    libavformat gives them that stream type, and the stream id of the synchronous one (0xFC); with the right id it
+    leaves out the times, which many readers want.
+    """
+
+    def __init__(self, output: Output) -> None:
+        self._output = output
+
+    def write(self, data: bytes) -> int:
+        """As `Output.write`."""
+        named = bytearray(data)
+        for at in range(0, len(data) - _PACKET_BYTES + 1, _PACKET_BYTES):
+            begins, adapts = data[at + 1] & 0x40, data[at + 3] & 0x20
+            head = at + 4 + (1 + data[at + 4] if adapts else 0)
+            if begins and data[head : head + 4] == b"\0\0\1\xfc":
+                named[head + 3] = 0xBD
+        return self._output.write(bytes(named))
+
+    def close(self) -> None:
+        """As `Output.close`."""
+        self._output.close()
+
+
 class StreamFile:
     """A file; takes the place of one of that name. `UserError` where it cannot be written, or no further."""
 
@@ -235,9 +262,10 @@ class Datagrams:
             except OSError as error:
                 if not self._said:
                     self._said = True
-                    _log.warning(
-                        "%s does not take all: %s; what is lost is lost", self._shown, error.strerror
-                    )
+                    why = error.strerror
+                    if error.errno == errno.ENETUNREACH and is_group(str(self._where[0])):
+                        why = "no route leads to the group (ip route add 224.0.0.0/4 dev INTERFACE makes one)"
+                    _log.warning("%s does not take all: %s; what is lost is lost", self._shown, why)
         return len(data)
 
     def close(self) -> None:

@@ -19,7 +19,14 @@ from av.stream import Stream
 
 from hvt_common.errors import UserError
 from hvt_common.values import View
-from hvt_gateways.transport_stream.destination import Address, Addresses, Datagrams, Output, StreamFile
+from hvt_gateways.transport_stream.destination import (
+    Address,
+    Addresses,
+    AsynchronousKlv,
+    Datagrams,
+    Output,
+    StreamFile,
+)
 from hvt_gateways.transport_stream.moments import Moment, Moments
 from hvt_gateways.transport_stream.timeline import TIME_BASE, Timeline
 from hvt_gateways.transport_stream.uas import Platform, uas_local_set
@@ -59,7 +66,9 @@ class TransportStream:
         ended: Callable[[], None] | None = None,
     ) -> None:
         self._platform = platform
-        self._output = None if isinstance(output, str) else output
+        self._output = None
+        if not isinstance(output, str):
+            self._output = output = AsynchronousKlv(output)
         self._ended = ended
         self._trail = trail or PoseTrail()
         self._timeline = Timeline(fps=fps)

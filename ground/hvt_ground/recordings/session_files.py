@@ -22,6 +22,7 @@ from hvt_common.units import SECOND_NS, Limit
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.row import FileAccount, RecordingRow
 from hvt_ground.sinks import Sink
+from hvt_ground.sinks.line_file import claim_name
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.recording_file import RecordingFile
 
@@ -234,4 +235,4 @@ def _stored(item: FrameEvent) -> bool:
 
 
 def _free(paths: Iterable[Path]) -> Path:
-    return next(path for path in paths if not path.exists())
+    return next(path for path in paths if claim_name(path))

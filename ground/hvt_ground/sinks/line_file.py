@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
@@ -10,13 +11,36 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 
-__all__ = ["LineFile", "check_there"]
+__all__ = ["LineFile", "check_there", "claim_name", "has_nothing"]
 
 
 def check_there(file: int, path: Path) -> None:
     """Raise `FileNotFoundError` where the open file has been removed: what is written to it would be in none."""
     if os.fstat(file).st_nlink == 0:
         raise FileNotFoundError(None, "it was removed", str(path))
+
+
+def claim_name(path: Path) -> bool:
+    """Whether the name was free: from now on it is ours, with an empty file, and no other process gets it.
+
+    True as well where no file can be made there; whoever opens it says why.
+    """
+    try:
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644))
+    except FileExistsError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def has_nothing(path: Path) -> bool:
+    """Whether there is no file of that name, or an empty one: never a device, a link or a pipe."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return not path.is_symlink()
+    return stat.S_ISREG(found.st_mode) and not found.st_size
 
 
 class LineFile:
@@ -28,7 +52,7 @@ class LineFile:
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self.path = path
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
-        self._size_bytes, fresh = 0, not path.exists()
+        self._size_bytes, fresh = 0, has_nothing(path)
         try:
             self._file = os.open(path, flags, 0o644)
         except OSError as error:

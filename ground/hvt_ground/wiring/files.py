@@ -11,6 +11,7 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.reporting import check_writable
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import all_extras
+from hvt_ground.sinks.line_file import claim_name
 
 __all__ = ["backlog_path", "check_outputs", "free_path", "make_record_folder", "output_path"]
 
@@ -54,19 +55,22 @@ def make_record_folder(config: GroundConfig) -> None:
         ) from None
 
 
-def output_path(target: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path]) -> Path:
+def output_path(
+    target: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path], claim: bool = True
+) -> Path:
     """Where a file of one session goes, and note it in ``taken``.
 
     ``target`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. A named file
     is written anew, but each session of this process gets one of its own: the first takes the name, others have the
-    edge's id in it. A file that nobody named is never overwritten.
+    edge's id in it. A file that nobody named is never overwritten. Without ``claim`` the name is but the beginning of
+    others, and no file.
     """
     if target is None or target.is_dir() or target.suffix != suffix:
         first = further = (target or Path()) / f"hvt-{edge}-{stamp}{suffix}"
     else:
         first, further = target, target.with_name(f"{target.stem}-{edge}{suffix}")
     names = [first] if further == first else [first, further]
-    return free_path(names, taken, number=len(names), may_exist=target)
+    return free_path(names, taken, number=len(names), may_exist=target, claim=claim)
 
 
 def backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
@@ -79,12 +83,18 @@ def backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path]
     return free_path([(target or Path()) / f"hvt-{edge}-{stamp}-backlog.rrd"], taken, number=2)
 
 
-def free_path(names: list[Path], taken: set[Path], *, number: int, may_exist: Path | None = None) -> Path:
-    """The first that is free of the names and of the last one with a number from ``number`` on; it is taken."""
+def free_path(
+    names: list[Path], taken: set[Path], *, number: int, may_exist: Path | None = None, claim: bool = True
+) -> Path:
+    """The first that is free of the names and of the last one with a number from ``number`` on; it is taken.
+
+    With ``claim`` it is an empty file then, unless it is ``may_exist``: two grounds may share a folder.
+    """
+    is_free = claim_name if claim else lambda one: not one.exists()
     last = names[-1]
     numbered = (last.with_name(f"{last.stem}-{count}{last.suffix}") for count in count_from(number))
     path = next(
-        one for one in chain(names, numbered) if one not in taken and (one == may_exist or not one.exists())
+        one for one in chain(names, numbered) if one not in taken and (one == may_exist or is_free(one))
     )
     taken.add(path)
     return path

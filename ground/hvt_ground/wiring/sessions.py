@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -25,6 +25,7 @@ from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
+from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.sinks.message_log import MessageLog
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -103,7 +104,8 @@ class SessionFactory:
         wait_s = _LOCKSTEP_WAIT_S if info.pace == "lockstep" else 0.0
         sinks: list[Sink[Event]] = []
         if self.records:
-            names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp)
+            whole = config.split is None
+            names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp, claim=whole)
             open_recording = partial(self._opened, self._files(settings, split=config.split), names)
             part = f"recording of {edge}"
             sinks.append(self._outputs.open(part, open_recording, wait_s=wait_s, for_backlog=True))
@@ -186,10 +188,18 @@ class SessionFactory:
         with self._naming:
             path = name(taken=self._paths)
         with ExitStack() as undo:
-            undo.callback(self._paths.discard, path)
+            undo.callback(self._give_up, path)
             sink = make(path)
             undo.pop_all()
         return sink
+
+    def _give_up(self, path: Path) -> None:
+        """The name is free again."""
+        self._paths.discard(path)
+        config = self._config
+        if path not in (config.record, config.tracks, config.stills) and has_nothing(path):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
 
     def _recorder_settings(self, info: Info) -> RecorderSettings:
         config = self._config

@@ -29,7 +29,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk, RrdReader
 
 from hvt_common.errors import UserError
-from hvt_ground.sinks.line_file import check_there
+from hvt_ground.sinks.line_file import check_there, has_nothing
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
 __all__ = ["RrdFile", "copy_whole_messages"]
@@ -62,7 +62,7 @@ class RrdFile:
         self._id = recording_id
         self._screen = screen
         self._compacted_bytes = self.size_bytes = 0
-        fresh = not path.exists()
+        fresh = has_nothing(path)
         self._file = _created(path)
         self._recording = new_recording(recording_id)
         self._stream = rr.binary_stream(self._recording)
@@ -215,11 +215,13 @@ def _created(path: Path) -> int:
         raise UserError(f"recording {path} cannot be created: its folder {path.parent} does not exist")
     for _ in range(_LOCK_TRIES):
         try:
-            file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+            file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise UserError(f"recording {path} cannot be created: {error.strerror}") from error
         # Whoever looks through the folder removes empty files that nobody has locked: this one perhaps, just now.
         if _locked(file) and os.fstat(file).st_nlink:
+            if os.fstat(file).st_size:
+                os.ftruncate(file, 0)  # not before: another ground may be writing it
             return file
         os.close(file)
         time.sleep(_LOCK_PAUSE_S)
@@ -229,7 +231,7 @@ def _created(path: Path) -> int:
 def _locked(file: int) -> bool:
     """Lock it; False where somebody else has claimed it."""
     try:
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:  # a file system without locks: nobody can claim it either

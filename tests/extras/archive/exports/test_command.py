@@ -25,6 +25,7 @@ from hvt_common.errors import UserError
 from hvt_common.units import Limit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
+from hvt_ground.exports.whole import whole_file
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks.rerun.joined import join_recordings
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -344,3 +345,13 @@ def test_recordings_are_not_joined_into_one_of_them(recording, tmp_path):
     with pytest.raises(UserError, match=f"--out {source} is {source} itself"):
         join_recordings([source], source, base_size=SIZE, fps=15)
     assert source.read_bytes() == recording.read_bytes()
+
+
+def test_a_name_that_nobody_gave_is_never_taken_from_another_export(tmp_path):
+    """Two exports of one recording at once: the table of the first would be gone."""
+    out = tmp_path / "flight.csv"
+    with pytest.raises(UserError, match="is there already"), whole_file(out, new=True) as part:  # noqa: PT012
+        part.write_text("late")
+        out.write_text("first")
+    assert out.read_text() == "first"
+    assert [one.name for one in tmp_path.iterdir()] == ["flight.csv"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import socket
 import ssl
@@ -430,3 +431,16 @@ def test_no_private_key_is_left_behind(port, fleet, tmp_path, monkeypatch):
     (tmp_path / "tmp").mkdir()
     test_the_keystore_of_a_tak_user_works(port, fleet, tmp_path, "x")
     assert list(Path(tmp_path / "tmp").iterdir()) == []
+
+
+def test_a_group_without_a_route_names_the_remedy(monkeypatch):
+    """On a laptop in the field, without a gateway, "Network is unreachable" says nothing to whoever reads it."""
+
+    async def refuse(_settings: object) -> None:
+        raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    monkeypatch.setattr("pytak.protocol_factory", refuse)
+    with pytest.raises(UserError, match="set PYTAK_MULTICAST_LOCAL_ADDRS to this machine's address"):
+        CotConnection("udp://239.2.3.1:6969")
+    with pytest.raises(UserError, match="Network is unreachable"):
+        CotConnection("udp://10.0.0.1:6969")

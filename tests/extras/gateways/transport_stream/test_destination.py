@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import av.error
@@ -146,3 +148,16 @@ def test_a_file_that_is_gone_or_full_is_said(tmp_path):
     full.close()
     with pytest.raises(UserError, match="cannot be created"):
         StreamFile(tmp_path / "absent" / "flight.ts")
+
+
+def test_a_group_without_a_route_names_the_remedy(monkeypatch, caplog):
+    """On a laptop in the field, without a gateway, "Network is unreachable" says nothing to whoever reads it."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    stream = Datagrams(Address("udp://239.2.3.1:5600"))
+    stream.close()
+    monkeypatch.setattr(stream, "_socket", SimpleNamespace(sendto=refuse, close=lambda: None))
+    stream.write(bytes(188))
+    assert "ip route add 224.0.0.0/4 dev INTERFACE" in caplog.text

@@ -279,3 +279,18 @@ def test_an_address_that_cannot_be_used_is_free_again():
     for _ in range(2):
         with pytest.raises(UserError, match="has no host that can be found"):
             live_stream(address, platform=PLATFORM, fps=15, addresses=addresses)
+
+
+def test_metadata_is_carried_in_one_of_the_two_ways_of_the_standard(events, tmp_path):
+    """Strict readers refuse stream type 0x06 with the stream id of the other way; others want the time."""
+    path = tmp_path / "flight.ts"
+    written(path, events)
+    heads = set()
+    data = path.read_bytes()
+    for at in range(0, len(data), 188):
+        packet = data[at : at + 188]
+        pid, head = (packet[1] & 31) << 8 | packet[2], 4 + (1 + packet[4] if packet[3] & 32 else 0)
+        if packet[1] & 64 and packet[head : head + 3] == b"\0\0\1":
+            heads.add((pid, packet[head + 3], packet[head + 7] >> 7))
+    assert heads == {(256, 0xE0, 1), (257, 0xBD, 1)}
+    assert b"\x06\xe1\x01\xf0\x06\x05\x04KLVA" in data, "stream type 0x06, PID 257"
