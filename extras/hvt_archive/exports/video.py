@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
@@ -60,7 +60,7 @@ def pictures(recorded: Recorded) -> Iterator[tuple[VideoSample, Image, Overlay]]
             yield sample, picture, overlay
 
 
-def _copy(samples: list[VideoSample], output: OutputContainer, container: str) -> None:
+def _copy(samples: Sequence[VideoSample], output: OutputContainer, container: str) -> None:
     with av.open(io.BytesIO(samples[0].data), format="hevc") as probe:
         stream = output.add_stream_from_template(probe.streams.video[0])
     if container == "mp4" and len({parameter_sets(one.data) for one in samples if one.keyframe}) == 1:
@@ -111,11 +111,11 @@ def _with_boxes(picture: Image, overlay: Overlay) -> Image:
     return drawn
 
 
-def _timed(samples: list[VideoSample]) -> Iterator[tuple[VideoSample, int]]:
+def _timed(samples: Sequence[VideoSample]) -> Iterator[tuple[VideoSample, int]]:
     """With the time of each in `_TIME_BASE`, which grows."""
-    last = -1
+    last, first_ns = -1, samples[0].capture_ns
     for sample in samples:
-        last = max(last + 1, _since(sample.capture_ns, samples[0].capture_ns))
+        last = max(last + 1, _since(sample.capture_ns, first_ns))
         yield sample, last
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from hvt_ground.events import Origin
+from hvt_ground.recordings.spool import SpooledRows, Timed
 from hvt_ground.sinks.rerun.overlays import ORIGINS
 
 __all__ = ["TRACK_COMPONENTS", "DrawnBox", "DrawnLayer"]
@@ -18,9 +17,6 @@ TRACK_COMPONENTS = frozenset(
 )
 """The rest is of the layer, once: how it is drawn."""
 _HUNDRED = 100
-
-_Timed = tuple[int, int, Any]
-"""Frame index, capture time in nanoseconds, value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,29 +36,25 @@ class DrawnLayer:
     """The components of one layer of boxes, each with its rows in order of frames."""
 
     def __init__(self) -> None:
-        self._rows: dict[str, list[_Timed]] = defaultdict(list)
-        self._frames: dict[str, list[int]] = {}
+        self._rows: dict[str, SpooledRows] = {}
+        self._shown: dict[str, tuple[int, list[Any]]] = {}
+        """By component, the row that was asked for last, and its place."""
         self._names: dict[int, str] = {}
 
-    def add(self, component: str, rows: Iterable[_Timed]) -> None:
-        """Take rows of a component; the names of classes hold for all times."""
+    def add(self, component: str, rows: Sequence[Timed]) -> None:
+        """Take all rows of a component; the names of classes hold for all times."""
         name = component.rpartition(":")[2]
-        if name == "context":
-            for _, _, value in rows:
-                for one in value[0]:
-                    self._names[one["class_id"]] = one["class_description"]["info"]["label"]
-        elif name in TRACK_COMPONENTS:
-            self._rows[name] += rows
+        if isinstance(rows, SpooledRows):
+            rows.sort()
+            self._rows[name] = rows
+            return
+        for _, _, value in rows:
+            for one in value[0]:
+                self._names[one["class_id"]] = one["class_description"]["info"]["label"]
 
-    def sort(self) -> None:
-        """After the last row."""
-        for name, rows in self._rows.items():
-            rows.sort(key=lambda row: row[0])
-            self._frames[name] = [row[0] for row in rows]
-
-    def times(self) -> dict[int, int]:
-        """Capture time by frame, where boxes changed."""
-        return {frame: capture_ns for rows in self._rows.values() for frame, capture_ns, _ in rows}
+    def times(self) -> list[SpooledRows]:
+        """Where boxes changed."""
+        return list(self._rows.values())
 
     def at(self, frame: int, *, reported: bool) -> Iterator[DrawnBox]:
         """The boxes drawn at a frame."""
@@ -84,5 +76,10 @@ class DrawnLayer:
             )
 
     def _latest(self, name: str, frame: int) -> list[Any]:
-        place = bisect_right(self._frames.get(name, []), frame)
-        return list(self._rows[name][place - 1][2]) if place else []
+        rows = self._rows.get(name)
+        place = -1 if rows is None else rows.latest(frame)
+        if rows is None or place < 0:
+            return []
+        if self._shown.get(name, (-1,))[0] != place:
+            self._shown[name] = place, rows.value(place)
+        return self._shown[name][1]

@@ -13,7 +13,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from hvt_ground.geolocation.camera import places_of_boxes
 from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
 from hvt_ground.geolocation.trail import PoseTrail
 from hvt_ground.recordings.drawn_layer import TRACK_COMPONENTS, DrawnLayer
+from hvt_ground.recordings.spool import Mapped, Spool, SpooledRows, Timed
 from hvt_ground.sinks.rerun.blueprint import (
     DOUBTED,
     EVENTS,
@@ -55,8 +56,8 @@ _ONE_COMPONENT = {MAP_CAMERA: _POSE, SESSION: _INFO, STILL_MESSAGES: _MESSAGE}
 """The components that are read of these entities."""
 _SAMPLE, _PICTURE, _CAPTION = "VideoStream:sample", "EncodedImage:blob", "Boxes2D:labels"
 
-_Timed = tuple[int, int, Any]
-"""Frame index, capture time in nanoseconds, value."""
+_Rows = dict[tuple[str, str], list[Timed] | SpooledRows]
+"""By entity and component; what grows with the flight is on disk."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +78,7 @@ class RecordedStill:
 
 @dataclass(frozen=True)
 class Recorded:
-    """One session, from one file or from several that follow each other."""
+    """One session, from one file or from several that follow each other; pictures and boxes stay on disk."""
 
     edge: str
     session: str
@@ -91,6 +92,7 @@ class Recorded:
     surface: Surface
     """The surface that tracks stand on."""
     _layers: Mapping[str, DrawnLayer] = field(repr=False)
+    _samples: SpooledRows = field(repr=False)
 
     @cached_property
     def trail(self) -> PoseTrail:
@@ -102,18 +104,21 @@ class Recorded:
 
     def overlays(self) -> Iterator[Overlay]:
         """The boxes at each frame that has a picture or at which boxes changed, in order of frames."""
-        times: dict[int, int] = {}
-        for layer in self._layers.values():
-            times |= layer.times()
-        times |= {one.frame_index: one.capture_ns for one in self.video}
-        for frame in sorted(times):
-            yield self._overlay(frame, times[frame])
+        timed = [*(rows for layer in self._layers.values() for rows in layer.times()), self._samples]
+        frames, captures_ns = (
+            np.concatenate([np.asarray(column, np.int64) for column in columns])[::-1]
+            for columns in zip(*((one.frames, one.captures_ns) for one in timed), strict=True)
+        )
+        # Of one frame the last word holds, and that of a picture before others.
+        found, places = np.unique(frames, return_index=True)
+        for frame, capture_ns in zip(found, captures_ns[places], strict=True):
+            yield self._overlay(int(frame), int(capture_ns))
 
-    def decodable_video(self) -> list[VideoSample]:
+    def decodable_video(self) -> Sequence[VideoSample]:
         """The samples from the first that can be decoded on; `UserError` where there is none."""
         for number, one in enumerate(self.video):
             if one.keyframe and parameter_sets(one.data):
-                return list(self.video[number:])
+                return self.video[number:]
         raise UserError(f"the recording of {self.edge} has no video: it was removed, or none came")
 
     def all(self) -> Iterator[VideoSample | Overlay | RecordedStill | Notice | PoseUpdate]:
@@ -163,13 +168,18 @@ def read_recordings(paths: Sequence[Path], *, surface: Surface = FLAT_GROUND) ->
     Raises:
         UserError: a file is no recording of hvt-ground, or they are of several sessions.
     """
-    files = sorted((_opened(path) for path in paths), key=lambda one: one.first)
+    spool = Spool()
+    files = sorted((_opened(path, spool) for path in paths), key=lambda one: one.first)
     names = {one.name for one in files}
-    rows = defaultdict[tuple[str, str], list[_Timed]](list)
+    rows: _Rows = {}
     for file in files:
         file.go_on_from(rows)
         for where, found in file.rows.items():
-            rows[where] += found
+            before = rows.setdefault(where, found)
+            if isinstance(before, list):
+                before.extend(found if before is not found else ())
+            elif before is not found and isinstance(found, SpooledRows):
+                before.extend(found)
     if len(names) > 1:
         raise UserError(
             f"{', '.join(map(str, paths))} are of {len(names)} sessions: give the files of one session"
@@ -179,32 +189,32 @@ def read_recordings(paths: Sequence[Path], *, surface: Surface = FLAT_GROUND) ->
             f"{', '.join(map(str, paths))}: no recording of one edge: give the files that hvt-ground wrote"
         )
     try:
-        return _recorded(*names.pop(), rows, surface)
+        return _recorded(*names.pop(), rows, surface, spool)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise UserError(
             f"{', '.join(map(str, paths))}: not as hvt-ground writes a recording ({type(error).__name__}: {error})"
         ) from None
 
 
-def _recorded(
-    edge: str, session: str, rows: Mapping[tuple[str, str], list[_Timed]], surface: Surface
-) -> Recorded:
+def _recorded(edge: str, session: str, rows: _Rows, surface: Surface, spool: Spool) -> Recorded:
     layers = {path: DrawnLayer() for path in _LAYERS}
     for (entity, component), found in rows.items():
         if entity in layers:
             layers[entity].add(component, found)
-    for layer in layers.values():
-        layer.sort()
+    samples = rows.get((VIDEO, _SAMPLE), SpooledRows(spool, blobs=True))
+    assert isinstance(samples, SpooledRows)
+    samples.sort(unique=True)
     return Recorded(
         edge=edge,
         session=session,
         info=_info(rows.get((SESSION, _INFO), [])),
-        video=_video(rows.get((VIDEO, _SAMPLE), [])),
+        video=Mapped(samples, _sample),
         stills=_stills(rows),
         notices=_notices(rows),
         poses=_poses(rows),
         surface=surface,
         _layers=layers,
+        _samples=samples,
     )
 
 
@@ -213,7 +223,7 @@ class _File:
     """One file: its edge and session, and its rows by entity and component."""
 
     name: tuple[str, str]
-    rows: dict[tuple[str, str], list[_Timed]]
+    rows: _Rows
     ours: bool
     """It has the entities of a recording of one edge."""
 
@@ -228,7 +238,7 @@ class _File:
         samples = self.rows.get((VIDEO, _SAMPLE))
         return samples[0][:2] if samples else (0, 0)
 
-    def go_on_from(self, before: Mapping[tuple[str, str], list[_Timed]]) -> None:
+    def go_on_from(self, before: _Rows) -> None:
         """Take what the files before it had into account, if there are any.
 
         A file that follows another begins with what is on the screen: stills that are known, and boxes of each layer
@@ -237,20 +247,26 @@ class _File:
         if not before:
             return
         for (entity, component), found in self.rows.items():
-            if component == _PICTURE:
-                known = {bytes(value) for _, _, value in before.get((entity, component), [])}
-                found[:] = [row for row in found if row[0] > self.first or bytes(row[2]) not in known]
+            if component == _PICTURE and isinstance(found, SpooledRows):
+                found.keep(partial(self._is_new, found, _hashes(before.get((entity, component), []))))
         for layer in _LAYERS:
-            ids = self.rows.get((layer, "track_id"), [])
-            if not any(frame <= self.first for frame, _, _ in ids):
-                for (entity, component), found in before.items():
-                    if entity == layer and found and component.rpartition(":")[2] in TRACK_COMPONENTS:
-                        self.rows.setdefault((entity, component), []).insert(0, (*self._begins, []))
+            ids = self.rows.get((layer, "track_id"))
+            if not (isinstance(ids, SpooledRows) and any(frame <= self.first for frame in ids.frames)):
+                for where, former in before.items():
+                    if where[0] == layer and former and isinstance(former, SpooledRows):
+                        self.rows[where] = former.begun(*self._begins, [], then=self.rows.get(where))
+
+    def _is_new(self, found: SpooledRows, known: set[int], place: int) -> bool:
+        return found.frames[place] > self.first or hash(found.value(place)) not in known
 
 
-def _opened(path: Path) -> _File:
+def _hashes(rows: Iterable[Timed]) -> set[int]:
+    return {hash(value) for _, _, value in rows}
+
+
+def _opened(path: Path, spool: Spool) -> _File:
     try:
-        return _read(path)
+        return _read(path, spool)
     except (OSError, RuntimeError, ValueError, LookupError) as error:
         refused = f"{path} is no recording ({error}): give .rrd files of hvt-ground"
     with tempfile.TemporaryDirectory() as folder:
@@ -258,15 +274,15 @@ def _opened(path: Path) -> _File:
         try:
             if not copy_whole_messages(path, whole):
                 raise UserError(refused)
-            file = _read(whole)
+            file = _read(whole, spool)
         except (OSError, RuntimeError, ValueError, LookupError):
             raise UserError(refused) from None
     _log.warning("%s breaks off: what comes before is exported", path)
     return file
 
 
-def _read(path: Path) -> _File:
-    rows = defaultdict[tuple[str, str], list[_Timed]](list)
+def _read(path: Path, spool: Spool) -> _File:
+    rows: _Rows = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that there is no footer
         reader = RrdReader(path)
@@ -275,14 +291,25 @@ def _read(path: Path) -> _File:
     for chunk in reader.stream():
         ours |= chunk.entity_path.startswith("/base/")
         for component, found in _rows(chunk):
-            rows[chunk.entity_path, component] += found
-    for found in rows.values():
-        found.sort(key=lambda row: row[0])
+            entity = chunk.entity_path
+            blobs = component in (_SAMPLE, _PICTURE)
+            if blobs or (entity in _LAYERS and not component.endswith("context")):
+                spooled = rows.setdefault((entity, component), SpooledRows(spool, blobs=blobs))
+                assert isinstance(spooled, SpooledRows)
+                for row in found:
+                    spooled.add(*row)
+            else:
+                rows.setdefault((entity, component), []).extend(found)  # type: ignore[arg-type]
+    for everything in rows.values():
+        if isinstance(everything, SpooledRows):
+            everything.sort()
+        else:
+            everything.sort(key=lambda row: row[0])
     edge = entry.application_id.removeprefix("hvt-")
     return _File((edge, entry.recording_id.removeprefix(f"{edge}-")), rows, ours=ours)
 
 
-def _rows(chunk: Chunk) -> Iterator[tuple[str, list[_Timed]]]:
+def _rows(chunk: Chunk) -> Iterator[tuple[str, list[Timed]]]:
     entity = chunk.entity_path
     batch = chunk.to_record_batch()
     columns = dict(zip(batch.schema.names, batch.columns, strict=True))
@@ -316,46 +343,70 @@ def _bytes(value: Any) -> bytes | None:
     return bytes(memoryview(value.values[0].values.to_numpy()))
 
 
-def _video(rows: Iterable[_Timed]) -> list[VideoSample]:
-    samples = {frame: (capture_ns, data) for frame, capture_ns, data in rows}
-    return [
-        VideoSample(frame, capture_ns, data, keyframe=is_keyframe(data))
-        for frame, (capture_ns, data) in sorted(samples.items())
-    ]
+def _sample(row: Timed) -> VideoSample:
+    frame, capture_ns, data = row
+    return VideoSample(frame, capture_ns, data, keyframe=is_keyframe(data))
 
 
-def _stills(rows: Mapping[tuple[str, str], list[_Timed]]) -> list[RecordedStill]:
+@dataclass(frozen=True, slots=True)
+class _StillPlace:
+    """Where a still's pictures are."""
+
+    frame: int
+    picture: tuple[SpooledRows, int]
+    base: tuple[SpooledRows, int] | None
+    caption: str
+    header: RoiHeader | None
+
+    def read(self) -> RecordedStill:
+        """The still."""
+        rows, place = self.picture
+        frame, capture_ns, jpeg = rows[place]
+        base = b"" if self.base is None else self.base[0].value(self.base[1])
+        return RecordedStill(frame, capture_ns, jpeg, base, self.caption, self.header)
+
+
+def _stills(rows: _Rows) -> Sequence[RecordedStill]:
     """Pairs of the gallery, stills that were never on the screen, and those on the enhanced picture alone."""
     headers = _Headers(rows.get((STILL_MESSAGES, _MESSAGE), []))
-    found = []
-    for (entity, component), pictures in rows.items():
-        if component != _PICTURE or not entity.endswith("/still"):
+    found, there = [], set()
+    of_pictures = [
+        (entity, pictures)
+        for (entity, component), pictures in rows.items()
+        if component == _PICTURE and isinstance(pictures, SpooledRows)
+    ]
+    for entity, pictures in of_pictures:
+        if not entity.endswith("/still"):
             continue
         slot = entity.removesuffix("/still")
         captions = {frame: value[0] for frame, _, value in rows.get((slot, _CAPTION), []) if value}
-        base = rows.get((f"{slot}/base", component), [])
-        crops = {frame: data for frame, _, data in base}
+        base = rows.get((f"{slot}/base", _PICTURE))
+        crops = (
+            {frame: (base, at) for at, frame in enumerate(base.frames)}
+            if isinstance(base, SpooledRows)
+            else {}
+        )
         # Off the screen several may come at one frame, and nothing says which base crop is whose.
-        several = Counter(frame for frame, _, _ in pictures)
-        for frame, capture_ns, jpeg in pictures:
-            crop = crops.get(frame, b"") if several[frame] == 1 else b""
-            caption = str(captions.get(frame, ""))
-            found.append(RecordedStill(frame, capture_ns, jpeg, crop, caption, headers.of(jpeg, frame=frame)))
-    there = {(one.frame_index, one.jpeg) for one in found}
-    for (entity, component), pictures in rows.items():
-        if component != _PICTURE or not entity.startswith(PATCHES):
+        several = Counter(pictures.frames)
+        for place, (frame, _, jpeg) in enumerate(pictures):
+            crop = crops.get(frame) if several[frame] == 1 else None
+            caption, header = str(captions.get(frame, "")), headers.of(jpeg, frame=frame)
+            found.append(_StillPlace(frame, (pictures, place), crop, caption, header))
+            there.add((frame, hash(jpeg)))
+    for entity, pictures in of_pictures:
+        if not entity.startswith(PATCHES):
             continue
-        for frame, capture_ns, jpeg in pictures:
+        for place, (frame, _, jpeg) in enumerate(pictures):
             header = headers.of(jpeg, frame=frame)
-            if header is not None and (frame, jpeg) not in there:
-                found.append(RecordedStill(frame, capture_ns, jpeg, b"", "", header))
-    return sorted(found, key=lambda one: (one.frame_index, one.caption))
+            if header is not None and (frame, hash(jpeg)) not in there:
+                found.append(_StillPlace(frame, (pictures, place), None, "", header))
+    return Mapped(sorted(found, key=lambda one: (one.frame, one.caption)), _StillPlace.read)
 
 
 class _Headers:
     """The messages of stills, by the frame at which each was known."""
 
-    def __init__(self, rows: Iterable[_Timed]) -> None:
+    def __init__(self, rows: Iterable[Timed]) -> None:
         self._by_frame = defaultdict[int, list[bytes]](list)
         for frame, _, value in rows:
             self._by_frame[frame].append(bytes(value[0]))
@@ -368,14 +419,14 @@ class _Headers:
         return None
 
 
-def _info(rows: Iterable[_Timed]) -> Info | None:
+def _info(rows: Iterable[Timed]) -> Info | None:
     for _, _, value in rows:
         with suppress(WireError):
             return Info.parse(bytes(value[0]))
     return None
 
 
-def _poses(rows: Mapping[tuple[str, str], list[_Timed]]) -> list[PoseUpdate]:
+def _poses(rows: _Rows) -> list[PoseUpdate]:
     found = [
         pose_of(numbers, frame_index=frame, capture_ns=capture_ns)
         for frame, capture_ns, numbers in rows.get((MAP_CAMERA, _POSE), [])
@@ -383,7 +434,7 @@ def _poses(rows: Mapping[tuple[str, str], list[_Timed]]) -> list[PoseUpdate]:
     return sorted(found, key=lambda one: one.capture_ns)
 
 
-def _notices(rows: Mapping[tuple[str, str], list[_Timed]]) -> list[Notice]:
+def _notices(rows: _Rows) -> list[Notice]:
     texts, levels = rows.get((EVENTS, "TextLog:text"), []), rows.get((EVENTS, "TextLog:level"), [])
     found = [
         Notice(frame, capture_ns, _LEVELS.get(level[0], "info"), text[0])  # type: ignore[arg-type]

@@ -258,7 +258,11 @@ function showAge() {
   by("pause").textContent = by("video").paused && !player.live ? "Play" : "Pause";
 }
 setInterval(showAge, 200);
-setInterval(() => wall.tick(connection.now(), connected && performance.now() - stateAt < STATE_OLD_MS), 500);
+setInterval(() => {
+  const told = connected && performance.now() - stateAt < STATE_OLD_MS;
+  wall.tick(connection.now(), told);
+  if (!told && by("link-text").textContent) by("link-text").textContent = "not known: the ground says nothing now";
+}, 500);
 
 function listTracks() {
   tracksAt = performance.now();
@@ -448,6 +452,7 @@ function onGroundState(message) {
     describe();
     showState(/** @type {Message} */ (states.get(edge)));
   }
+  plot.tick(message.at);
 }
 
 /**

@@ -1,6 +1,7 @@
 // The link over the last four minutes: all bits, those of the base stream, and the budget.
 
 const SECONDS = 240;
+const GAP_MS = 3000; // a row comes each second: where none came, nothing is known
 
 export class Plot {
   /** @param {HTMLCanvasElement} canvas */
@@ -9,8 +10,18 @@ export class Plot {
     /** @type {Map<string, {at: number, total: number, base: number, budget: number}[]>} */
     this.rows = new Map();
     this.edge = "";
+    this.now = 0;
     new ResizeObserver(() => this.draw()).observe(canvas);
     matchMedia("(prefers-color-scheme: light)").addEventListener("change", () => this.draw());
+  }
+
+  /**
+   * What is at the right end: rows may have ended long ago.
+   * @param {number} now
+   */
+  tick(now) {
+    this.now = now;
+    this.draw();
   }
 
   /** @param {string} edge @param {{at: number, total: number, base: number, budget: number}} row */
@@ -19,7 +30,6 @@ export class Plot {
     rows.push(row);
     while (rows.length > SECONDS + 5) rows.shift();
     this.rows.set(edge, rows);
-    if (edge === this.edge) this.draw();
   }
 
   /**
@@ -47,7 +57,7 @@ export class Plot {
     if (!context || !canvas.width || !rows.length) return;
     const style = getComputedStyle(document.documentElement);
     const colour = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
-    const newest = rows[rows.length - 1].at;
+    const newest = Math.max(this.now, rows[rows.length - 1].at);
     const top = 1.15 * Math.max(1, ...rows.map((row) => Math.max(row.total, row.budget)));
     const foot = 16 * ratio;
     const x = (/** @type {number} */ at) => canvas.width * (1 - (newest - at) / (SECONDS * 1000));
@@ -61,7 +71,12 @@ export class Plot {
     }
     const line = (/** @type {"total" | "base" | "budget"} */ what, /** @type {string} */ ink, /** @type {number[]} */ dash) => {
       context.beginPath();
-      rows.forEach((row, index) => (index ? context.lineTo(x(row.at), y(row[what])) : context.moveTo(x(row.at), y(row[what]))));
+      let before = -Infinity;
+      for (const row of rows) {
+        if (row.at - before > GAP_MS) context.moveTo(x(row.at), y(row[what]));
+        else context.lineTo(x(row.at), y(row[what]));
+        before = row.at;
+      }
       context.strokeStyle = ink;
       context.lineWidth = 1.5 * ratio;
       context.setLineDash(dash);

@@ -65,8 +65,10 @@ export class Wall {
   state(edge, state, now) {
     const card = this.card(edge);
     card.link = state.link;
-    card.light.dataset.state = state.link;
-    card.state.textContent = `${state.link} ${lasting(now - state.since)}`;
+    const age = now - card.captured;
+    const silent = card.captured > 0 && age > OLD_MS && (state.link === "up" || state.link === "thin");
+    card.light.dataset.state = silent ? "silent" : state.link;
+    card.state.textContent = silent ? `no picture ${lasting(age)}` : `${state.link} ${lasting(now - state.since)}`;
     const { total, budget } = state;
     const known = total !== null && budget !== null;
     card.bar.hidden = !known;
