@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import cast
 
+from hvt_common.config import AUTO
 from hvt_common.errors import UserError
 from hvt_common.runtime.log import START_LOGGER
 from hvt_common.units import SECOND_NS, bitrate_text
@@ -166,7 +167,7 @@ def make_encoder(
     settings = encoder_settings(
         size=size,
         fps=config.nominal_fps / decimation,
-        preset=preset or (SLOWEST if config.auto_preset else config.preset),
+        preset=preset or (SLOWEST if config.preset == AUTO else config.preset),
         # What is kept for tracks may be the base's while none are sent.
         total_bps=_video_bps(config, total_bps=total_bps, base_bps=base_bps),
         base_bps=base_bps,
