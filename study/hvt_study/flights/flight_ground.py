@@ -29,6 +29,7 @@ from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import Arrival as AccessUnitArrival
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
+from hvt_ground.perception.turns import Turns
 from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
 from hvt_ground.session.session import GroundSession
 from hvt_ground.wiring import Models, make_pipeline
@@ -74,6 +75,7 @@ class SharedModels(Models):
 
     def __init__(self, detector: Detector, classifier: Classifier | None = None) -> None:
         self._shared = detector, classifier
+        self.turns = Turns()
 
     def take(self) -> tuple[Detector, Classifier | None]:
         """The same for every session."""
