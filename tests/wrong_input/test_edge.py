@@ -225,10 +225,9 @@ def test_a_flag_that_does_not_exist(edge, words):
 @pytest.mark.parametrize(("name", "instead"), sorted(EdgeConfig.GONE.items()))
 def test_a_setting_of_an_earlier_version(edge, here, name, instead):
     """A script that worked would end with a list of flags to search."""
-    expected = f"is no longer accepted: {instead}"
-    assert f"--{name} {expected}" in edge(f"--{name}", "1")
+    assert f"--{name} {instead}" in edge(f"--{name}", "1")
     Path("old.toml").write_text(f"{name} = 1\n", encoding="utf-8")
-    assert f"{name} in old.toml {expected}" in edge("--config", "old.toml")
+    assert f"{name} in old.toml {instead}" in edge("--config", "old.toml")
     new = [word for word in instead.split() if word.startswith("--")]
     assert new
     known = {"--" + field.name.replace("_", "-") for field in dataclasses.fields(EdgeConfig)}
