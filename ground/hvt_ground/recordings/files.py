@@ -7,15 +7,18 @@ import os
 import re
 import shutil
 import subprocess
+import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rerun.chunk import Chunk, RrdReader
 
 from hvt_ground.recordings.row import FileAccount, RecordingRow
+from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages
 from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 
 __all__ = ["SCRATCH", "claimed", "described", "is_claimed", "remove_video"]
@@ -57,6 +60,19 @@ def is_claimed(path: Path) -> bool:
 
 def described(path: Path) -> RecordingRow | None:
     """Read a file's description of itself; None if it is no recording of ours."""
+    found = _described(path)
+    if found is not None:
+        return found
+    with tempfile.TemporaryDirectory() as folder, suppress(OSError):
+        whole = Path(folder) / path.name
+        if copy_whole_messages(path, whole):  # it breaks off: what comes before counts
+            found = _described(whole)
+            state = path.stat()
+            return found and replace(found, written_ns=state.st_mtime_ns, size_bytes=state.st_size)
+    return None
+
+
+def _described(path: Path) -> RecordingRow | None:
     content = _Content()
     try:
         with warnings.catch_warnings():

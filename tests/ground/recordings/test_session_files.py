@@ -14,6 +14,7 @@ from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS, Limit
 from hvt_common.values import Pose, View
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, VideoSample
+from hvt_ground.recordings.files import described
 from hvt_ground.recordings.recorded import read_recordings
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
@@ -268,3 +269,13 @@ def test_capture_times_that_jump_do_not_fill_the_disk(tmp_path, events):
         sink.log(replace(key, frame_index=number, capture_ns=START_NS + number + jump_ns))
     sink.close()
     assert len(list(tmp_path.glob("*.rrd"))) == 9
+
+
+def test_a_file_that_breaks_off_is_described_up_to_there(parts: list[Path], tmp_path: Path) -> None:
+    """After a power cut the flight would be in no index, and go neither by age nor by size."""
+    broken = tmp_path / "hvt-uav-1-20261122-130000.rrd"
+    broken.write_bytes(parts[0].read_bytes()[: parts[0].stat().st_size * 2 // 3])
+    row = described(broken)
+    assert row is not None
+    assert (row.edge, row.session, row.size_bytes) == ("uav-1", "00ff", broken.stat().st_size)
+    assert 0 < row.frames <= 30
