@@ -1,4 +1,5 @@
 """Decoded base in, tracks out: a `pipeline` for each session, the `worker` it runs in, the `models` they share.
 
 `history` is what was decoded lately; `fusion` makes one list of all tracks, `stills` refines them.
+Sessions take `turns` with the detector.
 """
