@@ -10,6 +10,7 @@ from dataclasses import KW_ONLY, dataclass
 from hvt_common.protocol.frame_account import FrameGroup
 from hvt_common.protocol.messages import Feedback
 from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.link.feedback import FeedbackInbox
@@ -25,7 +26,8 @@ __all__ = ["LinkControl", "wait_for_ground"]
 
 _PART = "reports"
 _MOST_WAIT_NS = 100_000_000
-"""A frame that would wait longer for the budget's window is dropped before it is encoded."""
+"""A frame that would wait longer for the budget's window, and longer than half the time to the camera's next, is left
+out before it is encoded."""
 
 
 @dataclass(eq=False)
@@ -76,16 +78,19 @@ class LinkControl:
         if self.reconfiguration.track_link(now_ns) or back:
             self.keyframes.require(now_ns)
 
-    def admits(self, now_ns: int, line_bytes: int | None = None) -> bool:
+    def admits(self, now_ns: int, line_bytes: int | None = None, coding_ns: int = 0) -> bool:
         """Whether a message of so many line bytes may be coded now; held back it would only wait and grow old.
 
+        What counts is the room once it is coded, ``coding_ns`` from now: at two frames a second, of which two fill a
+        window, the last but one has left it by then.
         The size is of what would go: a keyframe, with which x265 is opened at the link's rate, has room where a
         frame of the rate of before has none. None is an average frame.
         """
         if self.pacer is None:
             return True
-        wait_ns = self.transmitter.base_wait_ns(now_ns, line_bytes=line_bytes)
-        return self.pacer.admits_base(now_ns) and wait_ns <= _MOST_WAIT_NS
+        wait_ns = self.transmitter.base_wait_ns(now_ns + coding_ns, line_bytes=line_bytes)
+        most_ns = max(_MOST_WAIT_NS, SECOND_NS / 2 / self.reconfiguration.settings.nominal_fps)
+        return self.pacer.admits_base(now_ns, coding_ns=coding_ns) and wait_ns <= most_ns
 
     def holder(self, now_ns: int) -> FrameGroup:
         """What has no room for a frame that `admits` has just held back."""

@@ -28,6 +28,8 @@ __all__ = ["BaseStage"]
 
 _PART, _SIZE_PART = "encoder", "video"
 _MOST_FAILURES, _FAILURES_NS = 3, 10 * SECOND_NS
+_CODING_MEMORY = 4
+"""Over about so many frames it is averaged how long coding takes."""
 _COARSER = (2, 4, 8)
 """By how much a picture is made coarser whose unit is too large. x265 cannot code more coarsely than at quantiser 51;
 what it has to code can have less detail."""
@@ -40,9 +42,9 @@ class BaseStage:
     ``first_keyframe_bytes`` is the guess until a keyframe has been coded. ``reconfigure(decimation, now_ns)`` runs
     before each keyframe for the link and returns a newly opened encoder, or None where nothing has changed: x265
     takes neither another frame rate nor another bit rate once it is open. ``keyframe_bytes(last_bytes)`` says about
-    how many line bytes that keyframe takes, ``admits(now_ns, line_bytes)`` whether pacer and budget have room for so
-    many, ``holder(now_ns)`` which of them has none. ``open_again()`` gives another encoder for one that has failed;
-    without it, as in lockstep, the failure is raised.
+    how many line bytes that keyframe takes, ``admits(now_ns, line_bytes, coding_ns)`` whether pacer and budget have
+    room for so many once it is coded, ``holder(now_ns)`` which of them has none. ``open_again()`` gives another
+    encoder for one that has failed; without it, as in lockstep, the failure is raised.
     """
 
     encoder: Encoder
@@ -56,7 +58,7 @@ class BaseStage:
     frame_skip: FrameSkip | None = None
     reconfigure: Callable[[int, int], Encoder | None] | None = None
     keyframe_bytes: Callable[[int], int] = lambda last_bytes: last_bytes
-    admits: Callable[[int, int], bool] = lambda _now_ns, _line_bytes: True
+    admits: Callable[[int, int, int], bool] = lambda _now_ns, _line_bytes, _coding_ns: True
     holder: Callable[[int], FrameGroup] = lambda _now_ns: "budget"
     backlog: BacklogStage | None = None
     open_again: Callable[[], Encoder] | None = None
@@ -67,6 +69,8 @@ class BaseStage:
         self._keyframe_bytes = self.first_keyframe_bytes
         self._frame_skip = self.frame_skip or FrameSkip()
         self._failed_ns: deque[int] = deque(maxlen=_MOST_FAILURES)
+        self._coding_began_ns = self._coding_ns = 0
+        """When the newest frame came to the encoder, and how long frames take there of late."""
         self._begins_anew = False
         """The encoder was opened again, or a frame that others build on was left out: the next is a keyframe."""
 
@@ -79,7 +83,7 @@ class BaseStage:
         keyframe_due = self._plan.now(now_ns, fits=fits) or self._begins_anew
         line_bytes = keyframe_bytes if keyframe_due else self.transmitter.frame_bytes
         backlog = self.backlog
-        due, admitted = self._frame_skip.codes(frame.index), self.admits(now_ns, line_bytes)
+        due, admitted = self._frame_skip.codes(frame.index), self.admits(now_ns, line_bytes, self._coding_ns)
         link = State.LIVE if backlog is None else backlog.state
         coded = due and admitted and not keyframe_due and link is State.LIVE
         decision = decide(
@@ -107,6 +111,7 @@ class BaseStage:
         """
         if not decision.codes:
             return None
+        self._coding_began_ns = now_ns
         try:
             if decision.reconfigures:
                 self._at_keyframe(frame.index, now_ns=now_ns)
@@ -142,6 +147,8 @@ class BaseStage:
 
         False where the store did not take it, or nothing has room for it on the link.
         """
+        taken_ns = now_ns - self._coding_began_ns
+        self._coding_ns += (taken_ns - self._coding_ns) // (_CODING_MEMORY if self._coding_ns else 1)
         if self.backlog is not None and decision.to_store:
             taken = self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
             if decision.to_link:  # a probe; what it builds on was not sent

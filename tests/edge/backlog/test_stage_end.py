@@ -131,7 +131,9 @@ def test_after_frames_that_were_kept_the_link_goes_on_with_a_keyframe(tmp_path):
     rig = Rig(tmp_path / "store")
     rig.play(0, 21, reports=True)
     rig.play(21, 30, linked=False)
-    rig.admits = lambda _now_ns, _line_bytes: len(rig.asked) % 3 == 1  # the link fills between two questions
+    rig.admits = lambda _now_ns, _line_bytes, _coding_ns: (
+        len(rig.asked) % 3 == 1
+    )  # the link fills between two questions
     asked = len(rig.asked)
     rig.play(30, 60, linked=True)
     assert len(rig.asked) - asked == 30, "once for each frame"
@@ -152,12 +154,12 @@ def test_a_segment_that_begins_while_the_link_returns_does_not_put_the_picture_o
     rig = Rig(tmp_path / "store")
     rig.play(0, 21, reports=True)
     rig.play(21, 169, linked=False)
-    rig.admits = lambda _now_ns, _line_bytes: False
+    rig.admits = lambda _now_ns, _line_bytes, _coding_ns: False
     assert not rig.backlog.segment_due(rig.now_ns)
     rig.play(169, 171, linked=True)  # the link returns, and is full
     assert not rig.backlog.offline
     rig.play(171, 179, linked=True)  # ten seconds after the segment began, the next begins
-    rig.admits = lambda _now_ns, _line_bytes: True
+    rig.admits = lambda _now_ns, _line_bytes, _coding_ns: True
     rig.play(179, 199, linked=True)
     after = [header.frame_index for header in rig.out.base if header.frame_index >= 169]
     assert after == list(range(after[0], 199))

@@ -102,7 +102,7 @@ class Flight:
             local_copy=None,
             first_keyframe_bytes=5000,
             frame_skip=FrameSkip(decimation),
-            admits=lambda _now_ns, _line_bytes: self.held_by is None,
+            admits=lambda _now_ns, _line_bytes, _coding_ns: self.held_by is None,
             holder=lambda _now_ns: self.held_by,
             open_again=encoder,
             failures=Failures(time.time_ns),

@@ -248,7 +248,7 @@ class Rig:
         """Called before the edge is told whether anybody is there."""
         self.asked: list[int] = []
         """When the link was asked for room for a frame."""
-        self.admits: Callable[[int, int], bool] = self.link_control.admits
+        self.admits: Callable[[int, int, int], bool] = self.link_control.admits
         self.stage = BaseStage(
             BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=200_000, preset="ultrafast")),
             keyframes=self.keyframes,
@@ -284,9 +284,9 @@ class Rig:
         self.before_link()
         return self.linked
 
-    def _asked_to_admit(self, now_ns: int, line_bytes: int) -> bool:
+    def _asked_to_admit(self, now_ns: int, line_bytes: int, coding_ns: int) -> bool:
         self.asked.append(now_ns)
-        return self.admits(now_ns, line_bytes)
+        return self.admits(now_ns, line_bytes, coding_ns)
 
     def report(self) -> None:
         """The ground says what it has, unless nobody hears it."""

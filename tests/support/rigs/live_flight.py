@@ -104,7 +104,7 @@ class _Encoder:
             wanted = min(8 * mean, 0.9 * self.vbv_s * self.bitrate_bps / 8)
         else:
             least = self.texture * minimum_bps(self.size, self.fps) / 8 / self.fps
-            wanted = 0.95 * mean * self.chance.uniform(0.75, 1.25)
+            wanted = min(0.95 * mean * self.chance.uniform(0.75, 1.25), self.vbv_s * self.bitrate_bps / 8)
         return AccessUnit(frame.index, frame.capture_ns, bytes(max(20, round(max(least, wanted)))), keyframe)
 
 
@@ -141,7 +141,7 @@ class LiveFlight:
 
     ``late_s(second)`` is how much later a report comes that is made then, None: not at all. ``joins_s`` is when the
     ground comes. ``commands`` are ``(second, budget)``. ``store`` is a folder for what is stored while the link is
-    away.
+    away. To code a frame takes about ``coding_s``.
     """
 
     def __init__(
@@ -155,6 +155,7 @@ class LiveFlight:
         texture: float = 1.0,
         track_bytes: int = 250,
         pose_bytes: int = 60,
+        coding_s: float = 0.0,
         loss: float = 0.0,
         seed: int = 0,
         **settings: Any,
@@ -164,7 +165,7 @@ class LiveFlight:
         assert size is not None, "given"
         check_rate(config, size)
         self.link, self.loss, self.late_s, self.joins_s = link, loss, late_s, joins_s
-        self.commands = list(commands)
+        self.commands, self.coding_s = list(commands), coding_s
         self.track_bytes, self.pose_bytes = track_bytes, pose_bytes
         self.chance, self.texture = random.Random(seed), texture
         self.now_ns = _START_NS
@@ -368,6 +369,7 @@ class LiveFlight:
         decision = self.stage.decide(frame, now_ns=self.now_ns)
         unit = self.stage.encode(frame, decision, now_ns=self.now_ns)
         if unit is not None:
+            self._pass(self.now_ns + round(self.coding_s * self.chance.uniform(0.7, 1.3) * SECOND_NS))
             self.stage.send(unit, decision, now_ns=self.now_ns)
         self._in_loop = False
         if self.pacer is not None:

@@ -1,0 +1,27 @@
+"""Frames that take long to be coded, at frame rates of which few fill a window of the budget."""
+
+from __future__ import annotations
+
+import pytest
+
+from rigs.live_flight import LiveFlight, SteppedLink
+
+
+@pytest.mark.parametrize("method", ["M0", "M6"])
+@pytest.mark.parametrize("budget", [100_000, 300_000])
+@pytest.mark.parametrize(("fps", "coding_s"), [(1, 0.3), (2, 0.12), (2, 0.25), (3, 0.2), (5, 0.1)])
+def test_nearly_every_frame_is_sent_however_long_it_takes_to_be_coded(fps, budget, method, coding_s):
+    """A third of them would find no room in the budget: the frame before the last has not left the window yet."""
+    size = (1280, 720) if budget > 100_000 else (640, 360)
+    flight = LiveFlight(
+        SteppedLink(((0, 1.3 * budget),)),
+        coding_s=coding_s,
+        track_bytes=0 if method == "M0" else 250,
+        fps=fps,
+        budget=budget,
+        method=method,
+        size=size,
+        window=max(1, 2 / fps),
+    ).fly(20)
+    assert len(flight.sent) >= 0.95 * 20 * fps
+    assert flight.ledger.worst_window_bps.total <= budget
