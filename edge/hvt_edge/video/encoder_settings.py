@@ -18,19 +18,23 @@ __all__ = [
     "minimum_bps",
     "most_keyframe_bytes",
     "payload_bps",
+    "usual_keyframe_bytes",
 ]
 
 PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium")
 VBV_S = 0.15
 """Depth of the VBV buffer in seconds of the base rate."""
 
-# At QP 51 a keyframe of textured pictures of 320x180, 640x360, 960x540 and 1280x720 takes 3.0, 3.9, 4.9 and 5.9 kB:
-# about 2060 bytes and 4 for each pixel of the square root of the area. x265 can go no lower, whatever the target is.
-# 2.4 kB of each were text that is left out since (`info=0`): they stay in the account for pictures with more texture.
-# The frames after it follow a target down to some 300 bits and 0.0045 bit a pixel each: 67 kbps at 1280x720 and
-# 15 fps.
-_KEYFRAME_FLOOR_BYTES = 2060
-_KEYFRAME_FLOOR_BYTES_PER_SIDE_PX = 4.0
+# At QP 51 the keyframes of 25 aerial pictures took at the most 0.6, 1.6, 2.5, 3.9 and 7.8 kB at 320x180, 640x360,
+# 960x540, 1280x720 and 1920x1080, half of them less than half of it: 770 bytes and 0.0034 a pixel. x265 can go no
+# lower, whatever the target is; where one takes more, the stage codes it again with less detail.
+_KEYFRAME_FLOOR_BYTES = 770
+_KEYFRAME_FLOOR_BYTES_PER_PX = 0.0034
+# At usual thin rates keyframes take more, as far as the VBV lets them: 3.0, 3.9, 4.9 and 5.9 kB up to 1280x720.
+_KEYFRAME_BYTES = 2060
+_KEYFRAME_BYTES_PER_SIDE_PX = 4.0
+# The frames after a keyframe follow a target down to some 300 bits and 0.0045 bit a pixel each: 67 kbps at 1280x720
+# and 15 fps.
 _FRAME_FLOOR_BITS = 300
 _FRAME_FLOOR_BITS_PER_PX = 0.0045
 
@@ -59,8 +63,13 @@ class EncoderSettings:
 
 
 def keyframe_floor_bytes(size: tuple[int, int]) -> int:
-    """What is reserved for the smallest keyframe of a textured picture of ``size`` (width, height)."""
-    return round(_KEYFRAME_FLOOR_BYTES + _KEYFRAME_FLOOR_BYTES_PER_SIDE_PX * math.sqrt(size[0] * size[1]))
+    """The smallest keyframe of a textured picture of ``size`` (width, height)."""
+    return round(_KEYFRAME_FLOOR_BYTES + _KEYFRAME_FLOOR_BYTES_PER_PX * size[0] * size[1])
+
+
+def usual_keyframe_bytes(size: tuple[int, int]) -> int:
+    """What a keyframe of ``size`` (width, height) usually takes at thin rates."""
+    return round(_KEYFRAME_BYTES + _KEYFRAME_BYTES_PER_SIDE_PX * math.sqrt(size[0] * size[1]))
 
 
 def most_keyframe_bytes(size: tuple[int, int], fps: float, base_bps: int) -> int:
@@ -128,5 +137,5 @@ def _vbv_s(fps: float, *, tight: bool = False) -> float:
 
 def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
     """What of the base's rate is not x265's to spend: headers, framing, ``status``, and its debt of keyframes."""
-    debt_bps = 8 * keyframe_floor_bytes(size) / _KEYFRAME_EVERY_S
+    debt_bps = 8 * usual_keyframe_bytes(size) / _KEYFRAME_EVERY_S
     return base_overhead_bps(line_bps, fps=fps, edge_id=edge_id) + debt_bps

@@ -8,7 +8,7 @@ soon as it fits the budget's window. A scheduled one may wait ``scheduled_patien
 from __future__ import annotations
 
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeState
-from hvt_edge.video.encoder_settings import keyframe_floor_bytes
+from hvt_edge.video.encoder_settings import usual_keyframe_bytes
 
 __all__ = ["KeyframePlan", "keyframe_interval_s"]
 
@@ -74,4 +74,4 @@ def keyframe_interval_s(size: tuple[int, int], base_bps: int) -> float:
     something request theirs anyhow; the schedule only lets a viewer jump within a recording. So its bytes
     are held to half a percent of the stream.
     """
-    return min(60.0, max(10.0, 8 * keyframe_floor_bytes(size) / (_KEYFRAME_SHARE * base_bps)))
+    return min(60.0, max(10.0, 8 * usual_keyframe_bytes(size) / (_KEYFRAME_SHARE * base_bps)))

@@ -22,9 +22,9 @@ from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, shown
 from hvt_edge.video.encoder_settings import (
     encoder_settings,
-    keyframe_floor_bytes,
     keyframe_total_bps,
     payload_bps,
+    usual_keyframe_bytes,
 )
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
@@ -130,7 +130,7 @@ def _least_fps(config: EdgeConfig, size: tuple[int, int]) -> float:
     """The lowest rate of coded frames that is chosen; a thin link may enforce less."""
     if not config.measures:
         return LEAST_FPS
-    keyframes_fps = config.budget_bps / (8 * keyframe_floor_bytes(size))
+    keyframes_fps = config.budget_bps / (8 * usual_keyframe_bytes(size))
     return max(LEAST_FPS, min(_AUTO_LEAST_FPS, keyframes_fps))
 
 

@@ -20,7 +20,7 @@ from hvt_common.values import AccessUnit, Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import BASE_PEAK
 from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES
-from hvt_edge.video.encoder_settings import keyframe_floor_bytes
+from hvt_edge.video.encoder_settings import usual_keyframe_bytes
 from hvt_edge.video.encoders.contract import Encoder
 
 __all__ = ["Allowed", "Measured", "allowed", "headroom_of", "line_bytes", "measure", "run_frames"]
@@ -74,7 +74,7 @@ def allowed(*, size: tuple[int, int], fps: float, total_bps: int, base_bps: int,
         window_bytes=int(min(BASE_PEAK * share_bytes, total_bps * window_s / 8)),
         window_frames=max(1, round(window_s * fps)),
         window_s=window_s,
-        keyframe_bytes=int(max(_MOST_KEYFRAME_SHARE * share_bytes, 1.5 * keyframe_floor_bytes(size))),
+        keyframe_bytes=int(max(_MOST_KEYFRAME_SHARE * share_bytes, 1.5 * usual_keyframe_bytes(size))),
     )
 
 
