@@ -202,6 +202,21 @@ class Tracks:
     started: npt.NDArray[np.bool_]
     """(N,) True where the track was created, or found again after being lost, at this very frame."""
 
+    @classmethod
+    def none(cls, frame_index: int) -> Tracks:
+        """No track at this frame."""
+        none = np.empty(0, np.int64)
+        return cls(
+            frame_index=frame_index,
+            ids=none,
+            boxes_xyxy_px=np.empty((0, 4), np.float32),
+            confidences=np.empty(0, np.float32),
+            class_ids=np.empty(0, np.int32),
+            born_frames=none,
+            seen_frames=none,
+            started=np.empty(0, np.bool_),
+        )
+
     def __len__(self) -> int:
         return len(self.ids)
 

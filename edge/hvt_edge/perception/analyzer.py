@@ -154,17 +154,7 @@ class Analyzer:
             self._decode(one.frame_index, one)
         picture = None if unit is None else self._decode(frame.index, unit)
         self.detected_ns = None
-        none = np.empty(0, np.int64)
-        tracks = Tracks(
-            frame_index=frame.index,
-            ids=none,
-            boxes_xyxy_px=np.empty((0, 4), np.float32),
-            confidences=np.empty(0, np.float32),
-            class_ids=np.empty(0, np.int32),
-            born_frames=none,
-            seen_frames=none,
-            started=np.empty(0, np.bool_),
-        )
+        tracks = Tracks.none(frame.index)
         return AnalyzedFrame(frame, picture, tracks, detected=False, tracked=False)
 
     def _analyze(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool) -> AnalyzedFrame:

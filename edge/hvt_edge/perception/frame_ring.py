@@ -7,12 +7,15 @@ frames are kept further apart, evenly, so that the ring reaches as far back as a
 
 Frames that were coded are preferred: with them stands what the base shows, which a still has to beat. Of the others
 only the newest is kept, and one in so long where the video stands still.
+
+Frames come here once they were analyzed, which on a slow machine takes seconds, and not all are. So the newest that
+the camera gave is held beside them, without tracks: it is what "now" means where no track is asked for.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -81,13 +84,18 @@ class RingFrame:
 
 
 class FrameRing:
-    """One thread adds, others look; time is the frames' own."""
+    """One thread adds, one captures, others look; time is the frames' own.
+
+    Who wants a ``tracked`` frame gets one that was analyzed.
+    """
 
     def __init__(self, settings: RingSettings = RingSettings()) -> None:
         self._settings = settings
         self._frames: list[RingFrame] = []
         """Oldest first; all but the newest, and the newest that was coded, are packed and lie on the grid that
         `_spacing_ns` makes."""
+        self._captured: RingFrame | None = None
+        """The newest from the camera, analyzed or not."""
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -98,19 +106,25 @@ class FrameRing:
         """Memory of the pixels, source and base, without the newest's."""
         return sum(one.pixels.nbytes + one.base_bytes for one in self._frames[:-1])
 
-    @property
-    def newest(self) -> RingFrame | None:
-        """The frame added last; None before the first, or where none is kept."""
+    def newest(self, *, tracked: bool = True) -> RingFrame | None:
+        """The newest of all; None before the first, or where none is kept."""
         with self._lock:
-            return self._frames[-1] if self._frames else None
+            frames = self._held(tracked=tracked)
+            return frames[-1] if frames else None
 
-    @property
-    def newest_coded(self) -> RingFrame | None:
+    def newest_coded(self, *, tracked: bool = True) -> RingFrame | None:
         """The newest frame that was coded; the newest of all where that is much newer, or none was."""
         with self._lock:
-            if not self._frames:
-                return None
-            return self._nearest(lambda one: self._frames[-1].capture_ns - one.capture_ns)
+            frames = self._held(tracked=tracked)
+            return _nearest(frames, lambda one: frames[-1].capture_ns - one.capture_ns) if frames else None
+
+    def capture(self, frame: Frame) -> None:
+        """The camera gave a frame, newer than all before."""
+        height, width = frame.source_bgr.shape[:2]
+        if self._settings.max_bytes:
+            self._captured = RingFrame(
+                frame.index, frame.capture_ns, (width, height), frame.source_bgr, Tracks.none(frame.index)
+            )
 
     def add(self, frame: Frame, tracks: Tracks, *, base: YuvPicture | Image | None = None) -> None:
         """Keep a frame, newer than all before; let go of what there is no more room or time for."""
@@ -131,30 +145,36 @@ class FrameRing:
             frames.append(newest)
             self._let_go(frame.capture_ns - self._settings.max_age_ns)
 
-    def near_time(self, capture_ns: int) -> RingFrame | None:
+    def near_time(self, capture_ns: int, *, tracked: bool = True) -> RingFrame | None:
         """The frame kept that was taken nearest to this time; None where that is further back than the ring goes."""
         with self._lock:
-            if not self._frames or capture_ns < self._reach_ns():
+            frames = self._held(tracked=tracked)
+            if not frames or capture_ns < _reach_ns(frames):
                 return None
-            return self._nearest(lambda one: abs(one.capture_ns - capture_ns))
+            return _nearest(frames, lambda one: abs(one.capture_ns - capture_ns))
 
-    def near_index(self, frame_index: int) -> RingFrame | None:
+    def near_index(self, frame_index: int, *, tracked: bool = True) -> RingFrame | None:
         """The frame kept whose index is nearest; None where that is further back than the ring goes, or to come."""
         with self._lock:
-            if not self._frames or not self._frames[0].frame_index <= frame_index <= self.last_index:
+            frames = self._held(tracked=tracked)
+            if not frames or not frames[0].frame_index <= frame_index <= self._last_index:
                 return None
-            near = min(self._frames, key=lambda one: abs(one.frame_index - frame_index))
-            return self._nearest(lambda one: abs(one.capture_ns - near.capture_ns))
+            near = min(frames, key=lambda one: abs(one.frame_index - frame_index))
+            return _nearest(frames, lambda one: abs(one.capture_ns - near.capture_ns))
+
+    def _held(self, *, tracked: bool) -> Sequence[RingFrame]:
+        """All that may be asked for, oldest first."""
+        newest, frames = self._captured, self._frames
+        near = (
+            bool(frames) and newest is not None and newest.capture_ns - frames[-1].capture_ns <= _UNCODED_NS
+        )
+        return frames if tracked or near or newest is None else [*frames, newest]
 
     @property
-    def last_index(self) -> int:
-        """Of the newest frame; -1 before the first."""
-        return self._frames[-1].frame_index if self._frames else -1
-
-    def _nearest(self, distance_ns: Callable[[RingFrame], int]) -> RingFrame:
-        """The nearest of the frames that were coded, or of all where none of these is near."""
-        coded = [one for one in self._frames if one.base is not None and distance_ns(one) <= _UNCODED_NS]
-        return min(coded or self._frames, key=distance_ns)
+    def _last_index(self) -> int:
+        """Of the newest frame from the camera."""
+        newest = (self._captured, *self._frames[-1:])
+        return max(one.frame_index for one in newest if one is not None)
 
     def _stands_for(self, uncoded: RingFrame) -> bool:
         """Whether the frame before it is near, and was coded."""
@@ -177,14 +197,21 @@ class FrameRing:
     def _gap_ns(self, newer: RingFrame) -> int:
         return newer.capture_ns - self._frames[-1].capture_ns
 
-    def _reach_ns(self) -> int:
-        """Half a gap before the oldest: what was asked for lies nearer to it than to one that is gone."""
-        first = self._frames[0].capture_ns
-        gap_ns = self._frames[1].capture_ns - first if len(self._frames) > 1 else 0
-        return first - gap_ns // 2
-
     def _let_go(self, oldest_ns: int) -> None:
         while len(self._frames) > 1 and (
             self.size_bytes > self._settings.max_bytes or self._frames[0].capture_ns < oldest_ns
         ):
             self._frames.pop(0)
+
+
+def _nearest(frames: Sequence[RingFrame], distance_ns: Callable[[RingFrame], int]) -> RingFrame:
+    """The nearest of the frames that were coded, or of all where none of these is near."""
+    coded = [one for one in frames if one.base is not None and distance_ns(one) <= _UNCODED_NS]
+    return min(coded or frames, key=distance_ns)
+
+
+def _reach_ns(frames: Sequence[RingFrame]) -> int:
+    """Half a gap before the oldest: what was asked for lies nearer to it than to one that is gone."""
+    first = frames[0].capture_ns
+    gap_ns = frames[1].capture_ns - first if len(frames) > 1 else 0
+    return first - gap_ns // 2

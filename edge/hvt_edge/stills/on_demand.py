@@ -160,7 +160,7 @@ class OnDemand:
 
     def tracks(self) -> tuple[int, tuple[TrackNow, ...], int]:
         """The newest frame's index, its tracks by id, of too many the most confident, and how many there are."""
-        newest = self.ring.newest
+        newest = self.ring.newest()
         if newest is None:
             raise RefusedError("there is no frame yet, or none is kept (--ring)")
         self._want_tracks(newest.capture_ns)

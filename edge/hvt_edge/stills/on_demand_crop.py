@@ -44,24 +44,27 @@ class OnDemandRequest:
 def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
     """The frame that is requested, or the nearest in the ring; raises `RefusedError` where it is gone or to come.
 
-    The newest means the newest that was coded, unless the track is not in it.
+    The newest means the newest that was coded, unless the track is not in it. A track is in frames that were analyzed
+    alone; anything else may be asked for of the newest from the camera too.
     """
-    newest = ring.newest
-    if newest is None:
+    tracked = request.track_id is not None
+    newest, newest_kept = ring.newest(tracked=False), ring.newest(tracked=tracked)
+    if newest is None or newest_kept is None:
         raise RefusedError("there is no frame yet, or none is kept (--ring)")
     if request.frame_index is not None:
         if request.frame_index > newest.frame_index:
             raise RefusedError(
                 f"frame {request.frame_index} is yet to come: the newest is {newest.frame_index}"
             )
-        frame, wanted = ring.near_index(request.frame_index), f"frame {request.frame_index}"
+        index = min(request.frame_index, newest_kept.frame_index)
+        frame, wanted = ring.near_index(index, tracked=tracked), f"frame {request.frame_index}"
     elif not request.ago_ms:
-        coded = ring.newest_coded
-        lacks = coded is None or (request.track_id is not None and request.track_id not in coded.tracks.ids)
-        return newest if lacks or coded is None else coded
+        coded = ring.newest_coded(tracked=tracked)
+        lacks = coded is None or (tracked and request.track_id not in coded.tracks.ids)
+        return newest_kept if lacks or coded is None else coded
     else:
         ago_ms = request.ago_ms
-        frame = ring.near_time(newest.capture_ns - ago_ms * 1_000_000)
+        frame = ring.near_time(newest.capture_ns - ago_ms * 1_000_000, tracked=tracked)
         wanted = f"the frame of {ago_ms / 1000:g} s ago"
     if frame is None:
         raise RefusedError(f"{wanted} is not held: frames go back {ring.reach_s():.1f} s")

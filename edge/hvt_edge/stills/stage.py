@@ -72,6 +72,11 @@ class StillStage:
         """Whether one that a ground requested is pending."""
         return self.outbox.on_demand is not None
 
+    def capture(self, frame: Frame) -> None:
+        """The camera gave a frame, which may never be analyzed: a ground may ask for a still of it."""
+        if self.chooser.on_demand is not None:
+            self.chooser.on_demand.ring.capture(frame)
+
     def analyze(
         self,
         frame: Frame,

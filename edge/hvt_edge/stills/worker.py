@@ -85,6 +85,7 @@ class StillWorker:
 
     def take(self, frame: Frame, unit: AccessUnit | None, *, late: bool = False) -> bool:
         """Queue one frame, in order, with its access unit if it has one; False where it is skipped."""
+        self.stage.capture(frame)
         # All frames of a source have one size, so a bound in bytes is a bound in frames.
         fitting = self.max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
         self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))

@@ -266,14 +266,14 @@ class Pipeline:
         """Our tracker's list at a frame: as it was, or moved on from the newest frame."""
         own = self._own
         if own is None:
-            return _nothing(frame_index)
+            return Tracks.none(frame_index)
         if frame_index > own.frame_index:
             ahead = self._parts.tracker.extrapolated(frame_index=frame_index)
             boxes = ahead.boxes_xyxy_px.astype(np.float64)
             moved = self._parts.path.carry(boxes, start=own.frame_index, end=frame_index)
             return replace(ahead, boxes_xyxy_px=moved.astype(np.float32))
         before = self._parts.fusion.own_at(frame_index)
-        return _nothing(frame_index) if before is None else replace(before, frame_index=frame_index)
+        return Tracks.none(frame_index) if before is None else replace(before, frame_index=frame_index)
 
     def _capture_ns(self, frame_index: int) -> int:
         return self._picture_ns + round((frame_index - self._now.picture_index) * self._frame_ns)
@@ -328,17 +328,3 @@ def _areas(boxes: Boxes) -> npt.NDArray[np.float32]:
 
 def _of(words: tuple[T, ...], rows: npt.NDArray[np.intp]) -> tuple[T, ...]:
     return tuple(words[row] for row in rows.tolist())
-
-
-def _nothing(frame_index: int) -> Tracks:
-    none = np.empty(0, np.int64)
-    return Tracks(
-        frame_index=frame_index,
-        ids=none,
-        boxes_xyxy_px=np.empty((0, 4), np.float32),
-        confidences=np.empty(0, np.float32),
-        class_ids=np.empty(0, np.int32),
-        born_frames=none,
-        seen_frames=none,
-        started=np.empty(0, np.bool_),
-    )

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from hvt_common.values import Frame
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.stills.on_demand_crop import OnDemandRequest, RefusedError, frame_for
 from media.clips import START_NS
 from rigs.flight import tracks_at
 
@@ -65,9 +66,9 @@ def test_its_bounds_hold_and_the_newest_is_always_there(count, max_bytes, age_s,
         assert ring.size_bytes == 300 * max(0, len(ring) - 1) <= max_bytes
         assert ring.reach_s() <= age_s + 1e-9
         if max_bytes:
-            assert ring.newest.frame_index == index
+            assert ring.newest().frame_index == index
         else:
-            assert ring.newest is None
+            assert ring.newest() is None
 
 
 def test_the_newest_is_the_sources_own_and_the_tracks_are_those_of_the_frame():
@@ -75,7 +76,7 @@ def test_the_newest_is_the_sources_own_and_the_tracks_are_those_of_the_frame():
     ring = FrameRing()
     ring.add(frame(0), tracks_at(0, {7: (1.0, 1.0, 5.0, 5.0)}))
     ring.add(frame(1, picture=PICTURE), tracks_at(1, {7: (2.0, 1.0, 6.0, 5.0)}))
-    assert ring.newest.source_bgr is PICTURE
+    assert ring.newest().source_bgr is PICTURE
     assert ring.near_index(0).tracks.boxes_xyxy_px.tolist() == [[1, 1, 5, 5]]
 
 
@@ -96,7 +97,40 @@ def test_a_frame_of_before_is_what_the_camera_saw(size, error):
 def test_a_frame_that_is_gone_or_to_come_is_not_replaced_by_another():
     """The operator would be shown another moment than he asked for, and not know."""
     ring = filled(FrameRing(RingSettings(max_age_ns=SECOND_NS)), 60)
-    newest_ns = ring.newest.capture_ns
+    newest_ns = ring.newest().capture_ns
     assert ring.near_index(60) is None
     assert ring.near_time(newest_ns - 2 * SECOND_NS) is None
     assert ring.near_time(newest_ns - SECOND_NS).frame_index == 44
+
+
+def test_now_is_the_newest_frame_from_the_camera_and_a_track_is_where_it_was_analyzed():
+    """On a slow machine a closer look at "now" would show what was there seconds ago."""
+    ring = FrameRing()
+    ring.capture(frame(0))
+    assert ring.newest(tracked=False).frame_index == 0
+    assert ring.newest() is None
+    filled(ring, 10)
+    ring.capture(frame(12))
+    assert frame_for(OnDemandRequest(), ring).frame_index == 9, (
+        "the analyzed frame is near: there is a base to beat"
+    )
+    ring.capture(frame(60))
+    for asked, index in (
+        (OnDemandRequest(), 60),
+        (OnDemandRequest(ago_ms=3000), 9),
+        (OnDemandRequest(ago_ms=500), 60),
+    ):
+        assert frame_for(asked, ring).frame_index == index
+    assert frame_for(OnDemandRequest(frame_index=50), ring).frame_index == 60
+    for asked in (OnDemandRequest(track_id=1), OnDemandRequest(track_id=1, frame_index=55)):
+        assert frame_for(asked, ring).frame_index == 9
+    with pytest.raises(RefusedError, match="frame 61 is yet to come: the newest is 60"):
+        frame_for(OnDemandRequest(frame_index=61), ring)
+
+
+def test_without_a_ring_nothing_is_kept_of_the_newest_frame_either():
+    """Whoever wants no pictures kept would have one kept."""
+    ring = FrameRing(RingSettings(max_bytes=0))
+    ring.capture(frame(0))
+    with pytest.raises(RefusedError, match="none is kept"):
+        frame_for(OnDemandRequest(), ring)

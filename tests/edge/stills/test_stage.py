@@ -282,7 +282,9 @@ def requested_beside(rig: Rig, blocking: Blocking) -> None:
             worker.take(frame, unit)
         eventually(blocking.began.is_set, within_s=20, what="the other work has begun")
         before = len(rig.out.stills)
-        on_demand.request(OnDemandRequest(box_xywh_px=(40, 40, 96, 64)))
+        worker.take(FRAMES[-1], None, late=True)
+        _, frame_index = on_demand.request(OnDemandRequest(box_xywh_px=(40, 40, 96, 64)))
+        assert frame_index == FRAMES[-1].index, "what the camera sees now, which nobody has analyzed"
         eventually(lambda: len(rig.out.stills) > before, within_s=20, what="the requested still is there")
         assert not blocking.released.is_set()
         assert rig.out.stills[-1][0].reason == "asked"
