@@ -96,6 +96,11 @@ _TIDY = """
 DELETE FROM object WHERE kind = 'info' AND session <> ?
 AND session NOT IN (SELECT session FROM object WHERE kind <> 'info')
 """
+_TOO_OLD = """
+SELECT id, session, kind, number FROM object WHERE kind <> 'info' AND capture_ns < ? ORDER BY capture_ns
+LIMIT (SELECT count(*) FROM object WHERE kind <> 'info') / 2
+"""
+# Never all at once: where the ages are wrong after all, half is still there.
 _PARTS = "SELECT frame_index, capture_ns, keyframe, data, crc FROM part WHERE object = ? ORDER BY rowid"
 _ENTRY = "SELECT id, session, kind, number, rank, span_ns FROM here"
 
@@ -104,8 +109,9 @@ class Store:
     """The objects of this session and of those before it, in bounded space. For one thread; any may read the counts.
 
     The folder is made when something is stored for the first time; ``max_bytes`` counts the file and its log.
-    ``info()`` is this session's `Info`, packed. What was captured before ``oldest_ns`` is dropped by `enter`; that is
-    of ``clock``, as capture times are, Unix nanoseconds. ``since_boot()`` is the boot and its nanoseconds.
+    ``info()`` is this session's `Info`, packed. What was captured before ``oldest_ns`` is dropped by `enter`, though
+    never more than half of all; that is of ``clock``, as capture times are, Unix nanoseconds. ``since_boot()`` is the
+    boot and its nanoseconds.
     Every method raises `OSError` where the disk refuses, and can be called again.
     """
 
@@ -384,12 +390,11 @@ class Store:
         with contextlib.suppress(sqlite3.OperationalError):
             db.executescript(_ADOPT)
             self._move_times(db)
-            too_old = "FROM object WHERE kind <> 'info' AND capture_ns < ?"
-            dropped = db.execute(f"SELECT session, kind, number {too_old}", (self._oldest_ns,)).fetchall()
-            db.execute(f"DELETE {too_old}", (self._oldest_ns,))
+            dropped = db.execute(_TOO_OLD, (self._oldest_ns,)).fetchall()
+            db.executemany("DELETE FROM object WHERE id = ?", [row[:1] for row in dropped])
             if dropped:
                 named = ", ".join(
-                    f"{kind} {number} of session {session}" for session, kind, number in dropped[:5]
+                    f"{kind} {number} of session {session}" for _, session, kind, number in dropped[:5]
                 )
                 more = ", …" if len(dropped) > 5 else ""
                 _log.warning(

@@ -169,17 +169,29 @@ def test_what_is_too_old_is_dropped_at_the_start(tmp_path, caplog):
         add_stills(folder, {1: 1.0}, capture_ns=START_NS)
         add_units(folder, UNITS[:5])
     with opened(tmp_path, at_s=(100, 100)) as folder:
-        add_stills(folder, {2: 1.0}, capture_ns=START_NS + 100 * S)
+        add_stills(folder, {2: 1.0, 3: 0.5}, capture_ns=START_NS + 100 * S)
     with (
         caplog.at_level(logging.WARNING),
         opened(tmp_path, session_id=8, oldest_ns=START_NS + 50 * S, at_s=(110, 110)) as folder,
     ):
-        assert numbers(folder.best_stills()) == [2]
+        assert numbers(folder.best_stills()) == [2, 3]
         assert folder.segments == 0
     (said,) = caplog.messages
     assert said.startswith("2 stills and stretches of video")
     assert "--store-age" in said
     assert "still 1 of session 0000000000000007" in said
+
+
+def test_never_is_all_dropped_at_once(tmp_path, caplog):
+    """Where the ages are wrong after all, a whole flight would be gone without a look."""
+    with opened(tmp_path) as folder:
+        for number in range(5):
+            add_stills(folder, {number: 1.0}, capture_ns=START_NS + number * S)
+    for session_id, left in ((8, {2, 3, 4}), (9, {3, 4}), (10, {4}), (11, {4})):
+        at = {"oldest_ns": START_NS + 50 * S, "at_s": (100, 100)}
+        with opened(tmp_path, session_id=session_id, **at) as folder:
+            assert set(numbers(folder.best_stills())) == left
+    assert len(caplog.messages) == 3
 
 
 HOUR_S = 3600
