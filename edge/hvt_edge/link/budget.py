@@ -28,7 +28,7 @@ pose and status by one of their own (`metadata_fits`).
 from __future__ import annotations
 
 import math
-from bisect import insort
+from bisect import bisect
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -88,8 +88,10 @@ class RollingBudget:
 
     def __init__(self, settings: BudgetSettings) -> None:
         self._total = settings.total_bps * settings.window_ns / 8 / SECOND_NS
+        self._sent: list[tuple[int, int, int]] = []
+        """(time, line bytes, total then), in order of time."""
         self._events: list[tuple[int, int]] = []
-        """(time, line bytes), in order of time."""
+        """(time, line bytes as they count under the present total), in the same order."""
         self._base_events: deque[tuple[int, int]] = deque()
         self._lent: deque[tuple[int, float]] = deque()
         """(time, bytes that a still took of what the base had left)."""
@@ -130,12 +132,14 @@ class RollingBudget:
     def set_total(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
         """Another total from now on. The base stream's rate may stay above it until x265 is opened anew.
 
-        What went out under the former total still counts: after a step down, messages wait until the window has room.
+        What went out under a higher total counts for its share of a window then. So each window stays within the
+        highest total of its time, and none is full for a whole ``window_ns`` after the link has fallen.
         """
         settings = self._settings
         self._refill(now_ns)
         self._settings = replace(settings, total_bps=total_bps)
         self._total = total_bps * settings.window_ns / 8 / SECOND_NS
+        self._events = [(at_ns, self._counted(size, then_bps)) for at_ns, size, then_bps in self._sent]
         if (base_bps, fps) != (settings.base_bps, settings.fps):
             self.set_base(base_bps, fps, now_ns=now_ns)
         self._cap = self._settings.still_bps * settings.carry_s / 8
@@ -335,11 +339,17 @@ class RollingBudget:
         return bool(free + self.base_step_bytes >= keyframe_bytes)
 
     def _record(self, line_bytes: int, now_ns: int) -> None:
-        insort(self._events, (now_ns, line_bytes))
+        sent = (now_ns, line_bytes, self._settings.total_bps)
+        index = bisect(self._sent, sent)
+        self._sent.insert(index, sent)
+        self._events.insert(index, sent[:2])
         # Twice the window before whoever asks: a still may be asked about while a base message waits for later.
         oldest_ns = min(now_ns, self._query_ns or now_ns) - 2 * self._settings.window_ns
         while self._events[0][0] <= oldest_ns:
-            del self._events[0]
+            del self._events[0], self._sent[0]
+
+    def _counted(self, line_bytes: int, then_bps: int) -> int:
+        return math.ceil(line_bytes * min(1.0, self._settings.total_bps / then_bps))
 
     def _note_query(self, now_ns: int) -> None:
         self._query_ns = max(now_ns, self._query_ns or now_ns)

@@ -33,7 +33,8 @@ _START_NS, _START_HOLD_NS = SECOND_NS // 2, 2 * SECOND_NS
 """So much goes out from a keyframe on before the first report; then it is waited for, so long. A thin link that is
 overrun at once does not let the ground ask what the session is. Who never reports gets everything after that."""
 _FORGET_NS = 15 * SECOND_NS
-"""A receiver so long silent has left, where Zenoh still has the link: its lease is shorter."""
+"""A receiver so long silent has left, where Zenoh still has the link: its lease is shorter. Who else is there gets
+video at the least rate, since behind a router the link may be gone all the same."""
 _MEMORY_NS = 15 * SECOND_NS
 """So long, to twice as long, the shortest round trip counts."""
 _MOST_RECORDS = 1024
@@ -307,21 +308,20 @@ class Pacer:
 
     # What may go
 
-    def admits_base(self, now_ns: int) -> bool:
-        """Whether a frame may be encoded and sent now."""
+    def admits_base(self, now_ns: int, *, coding_ns: int = 0) -> bool:
+        """Whether a frame may be encoded now, and sent ``coding_ns`` later."""
         with self._lock:
             if self._reported_ns is None:
                 return self._may_start(now_ns)
             if now_ns - self._reported_ns > _FORGET_NS and self._linked:
                 self._leave()
-                self._controller.forget_silence()
                 return True
             self._give_up(now_ns, self._reported_ns)
             if now_ns - self._reported_ns > _SILENCE_NS:
                 # Stored frames have the former rate: they would stand before live video when the link is back.
                 carries_ns = 8 * SECOND_NS * self._last_bytes // self.rate_bps
                 return now_ns - self._last_sent_ns >= max(_PROBE_NS, carries_ns)
-            return self._is_open(now_ns, _MOST_BACKLOG_NS)
+            return self._is_open(now_ns, _MOST_BACKLOG_NS + coding_ns)
 
     def holds(self, now_ns: int) -> bool:
         """Whether it is the link that leaves no room for a frame now, and not the budget's own rate."""

@@ -283,12 +283,6 @@ class RateController:
         self._last_ns = now_ns
         return self.rate_bps
 
-    def forget_silence(self) -> None:
-        """It was the receiver that left, not the link: the rate is what it was before."""
-        if self._silent:
-            self._silent = False
-            self._rate, self._curve_ns = max(self._rate, self._cubic_max), self._plateau_ns
-
     def forget_path(self) -> None:
         """The receiver or the transport is another: delays of before say nothing."""
         self._least = LeastDelay(self._settings.memory_ns)

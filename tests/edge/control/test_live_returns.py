@@ -74,6 +74,17 @@ def test_live_video_is_back_after_a_fall_of_the_link(budget, fps, falls_to):
     assert flight.longest_hole(known + 10, 60) <= 1.5
 
 
+@pytest.mark.parametrize("window", [5, 60])
+@pytest.mark.parametrize(("budget", "fps"), [(300_000, 2), (800_000, 15)])
+def test_a_long_window_keeps_live_video_away_no_longer(budget, fps, window):
+    """What the link carried before it fell would fill the window for all its seconds at the lower rate."""
+    given = largest(budget, fps, video_share=0.85, method="M6") | {"window": window}
+    silent = SteppedLink(((0, 1.3 * budget), (12, 0), (16, 1.3 * budget)), loses=True)
+    assert flown(LiveFlight(silent, **given), 30).back_after(16) <= BACK_S
+    fallen = flown(LiveFlight(SteppedLink(((0, 1.3 * budget), (12, 0.3 * budget))), **given), 30)
+    assert fallen.longest_hole(fallen.drained(14), 30) <= BACK_S
+
+
 @pytest.mark.parametrize(("budget", "fps"), [(2_000_000, 2), (800_000, 3)])
 def test_what_is_stored_does_not_stand_before_live_video(tmp_path, budget, fps):
     """With a store the link would come back full of large frames, sent to find out whether it is back."""
