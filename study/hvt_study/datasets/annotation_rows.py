@@ -1,9 +1,13 @@
-"""Annotations and detections as lines of numbers between commas. What is wrong is said with the file and the line."""
+"""Annotations and detections as lines of numbers between commas. What is wrong is said with the file and the line.
+
+A line that is wrong costs a dataset itself and no more; of results that are to be judged it ends the reading.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +18,8 @@ from hvt_common.errors import UserError
 from hvt_common.inference.labels import decoded
 
 __all__ = ["LAST_FRAME", "Rows", "read_rows"]
+
+_log = logging.getLogger(__name__)
 
 LAST_FRAME = 10_000_000
 """Over 90 hours at 30 fps; a higher frame number is a mistake."""
@@ -35,6 +41,8 @@ class Rows:
     """(N,) line in the file, from 1."""
     text: tuple[str, ...]
     """N lines."""
+    of_dataset: bool = False
+    """A line that is wrong is left out."""
 
     def __len__(self) -> int:
         return len(self.table)
@@ -45,12 +53,23 @@ class Rows:
             return np.full(len(self), -1.0)
         return np.asarray(self.table[:, self.columns.index(column)])
 
-    def check(self, good: npt.NDArray[np.bool_], *, accepted: str) -> None:
-        """Name the first row that is not good; `UserError`."""
-        for row in np.flatnonzero(~good)[:1]:
-            line = self.text[row]
-            shown = line if len(line) <= _SHOWN_CHARS else line[:_SHOWN_CHARS] + "…"
-            raise UserError(f"{self.path}, line {self.lines[row]} is {shown!r}; accepted is {accepted}")
+    def only(self, good: npt.NDArray[np.bool_], *, accepted: str) -> Rows:
+        """The rows that are good. What is left out of a dataset is counted, and its first row named in the log.
+
+        `UserError` names it where none is good, or these rows are of no dataset.
+        """
+        if good.all():
+            return self
+        row = int(np.flatnonzero(~good)[0])
+        line = self.text[row]
+        shown = line if len(line) <= _SHOWN_CHARS else line[:_SHOWN_CHARS] + "…"
+        said = f"{self.path}, line {self.lines[row]} is {shown!r}; accepted is {accepted}"
+        if not (self.of_dataset and good.any()):
+            raise UserError(said)
+        _log.warning("%d of %d lines are left out; the first: %s", (~good).sum(), len(good), said)
+        kept = np.flatnonzero(good)
+        text = tuple(self.text[row] for row in kept.tolist())
+        return replace(self, table=self.table[kept], lines=self.lines[kept], text=text)
 
     def boxes(self, *, origin: float = 0.0) -> npt.NDArray[np.float32]:
         """(N, 4) float32 x1 y1 x2 y2 from ``x,y,w,h``; ``origin`` is the first pixel's number."""
@@ -58,7 +77,7 @@ class Rows:
         return np.stack([x, y, x + self["w"], y + self["h"]], axis=1).astype(np.float32)
 
 
-def read_rows(path: Path, *, columns: str, least: int, frames: bool = True) -> Rows:
+def read_rows(path: Path, *, columns: str, least: int, frames: bool = True, of_dataset: bool = False) -> Rows:
     """Read a file of which the columns are called so; further ones, blank lines and a comma at the end are no matter.
 
     Args:
@@ -66,6 +85,7 @@ def read_rows(path: Path, *, columns: str, least: int, frames: bool = True) -> R
         columns: names between commas.
         least: how many of them every line must have; all lines have as many as the first.
         frames: whether the first one is a frame number.
+        of_dataset: a line that is not so is left out, as long as there are others.
 
     Raises:
         UserError: names the file that cannot be read, or the first line that is not so.
@@ -87,9 +107,8 @@ def read_rows(path: Path, *, columns: str, least: int, frames: bool = True) -> R
         with np.errstate(invalid="ignore"):
             whole = (table[:, 0] % 1 == 0) & (table[:, 0] >= 0) & (table[:, 0] <= LAST_FRAME)
         good = np.logical_and(good, whole)
-    rows = Rows(path, table, names[:count], np.array([number for number, _ in numbered], np.int64), lines)
-    rows.check(good, accepted=wanted)
-    return rows
+    numbers = np.array([number for number, _ in numbered], np.int64)
+    return Rows(path, table, names[:count], numbers, lines, of_dataset).only(good, accepted=wanted)
 
 
 def _text(path: Path) -> str:

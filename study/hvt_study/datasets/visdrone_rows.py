@@ -42,21 +42,22 @@ class VisDroneRows:
 
 
 def read_image_rows(path: Path) -> VisDroneRows:
-    """Of one image; `UserError` names the line that is wrong."""
-    return _meant(read_rows(path, columns=_OBJECT, least=6, frames=False))
+    """Of one image; what is wrong is left out. `UserError` where all is."""
+    return _meant(read_rows(path, columns=_OBJECT, least=6, frames=False, of_dataset=True))
 
 
 def read_video_rows(path: Path) -> VisDroneRows:
-    """Of one sequence; `UserError` names the line that is wrong."""
-    return _meant(read_rows(path, columns=f"frame,id,{_OBJECT}", least=10))
+    """Of one sequence; what is wrong is left out. `UserError` where all is."""
+    return _meant(read_rows(path, columns=f"frame,id,{_OBJECT}", least=10, of_dataset=True))
 
 
 def _meant(rows: Rows) -> VisDroneRows:
-    category = rows["category"]
-    known = np.isin(category, np.arange(_OTHERS + 1))
-    rows.check(
-        known, accepted=f"a category from 0 to {_OTHERS} in column {rows.columns.index('category') + 1}"
+    column = rows.columns.index("category") + 1
+    rows = rows.only(
+        np.isin(rows["category"], np.arange(_OTHERS + 1)),
+        accepted=f"a category from 0 to {_OTHERS} in column {column}",
     )
+    category = rows["category"]
     judged = (category >= 1) & (category <= len(VISDRONE_NAMES)) & (rows["score"] != 0)
     frames = rows["frame"] if "frame" in rows.columns else np.zeros(len(rows))
     return VisDroneRows(

@@ -43,6 +43,9 @@ class Unmoved:
 
     latest_tracks, pending, any_requested = None, 0, False
 
+    def capture(self, frame):
+        """Nobody asks for a still of it."""
+
     def is_used(self, capture_ns):
         """Somebody looks at what comes of it."""
         return True

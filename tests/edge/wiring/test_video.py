@@ -53,9 +53,9 @@ def test_a_size_that_is_given_holds(flags, size):
 @pytest.mark.parametrize(
     ("flags", "size"),
     [
-        ("--method M0 --fps 2 --budget 60kbps", (1280, 720)),
-        ("--method M0 --fps 2 --budget 48kbps", (960, 540)),
-        ("--method M0 --fps 2 --budget 31kbps", (320, 180)),
+        ("--method M0 --fps 2 --budget 40kbps", (1280, 720)),
+        ("--method M0 --fps 2 --budget 30kbps", (960, 540)),
+        ("--method M0 --fps 2 --budget 13kbps", (320, 180)),
         ("--method M0 --fps 2 --budget 12kbps", (320, 180)),  # and is refused
         ("--profile M0-best --budget 31kbps", (320, 180)),
     ],

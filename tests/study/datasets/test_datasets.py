@@ -140,12 +140,17 @@ def test_a_sequence_travels_to_other_processes(tmp_path):
         ("\n\n1,7,0,0,9,9,1,x,0,0", 4),
     ],
 )
-def test_a_bad_annotation_is_named_with_file_and_line(tmp_path, row, line):
-    """In forty thousand lines nobody finds it otherwise."""
+def test_a_bad_annotation_costs_itself_and_is_named_with_file_and_line(tmp_path, row, line, caplog):
+    """One of forty thousand lines would end the study, or be nothing without a word."""
     write_visdrone(tmp_path, "a", rows=f"1,1,0,0,9,9,1,4,0,0\n{row}\n")
+    (sequence,) = open_dataset(f"visdrone:{tmp_path}")
+    assert sequence.labels(0).class_names == ("car",)
+    file = tmp_path / "annotations" / "a.txt"
+    assert f"1 of 2 lines are left out; the first: {file}, line {line} is" in caplog.text
+    file.write_text(f"\n{row}\n")
     with pytest.raises(UserError) as caught:
         open_dataset(f"visdrone:{tmp_path}")
-    assert f"{tmp_path / 'annotations' / 'a.txt'}, line {line} is" in str(caught.value)
+    assert f"{file}, line {line if line == 2 else 4} is" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -366,7 +371,7 @@ def test_mot_of_others(tmp_path):
         ({"info": "[Sequence]\nframeRate=25\nseqLength=9\n"}, "says seqLength=9 and has 6 images"),
         ({"info": "[Sequence]\nframeRate=25\nimDir=frames\n"}, "no folder frames"),
         ({"rows": "1,1,1,1,9,9,1,99,1\n"}, "line 1 is '1,1,1,1,9,9,1,99,1'"),
-        ({"rows": "1,1,1,1,9,9,1,1,1\n1,2,1,1,9,9,1,4.5,1\n"}, "line 2 is .* a class from 1 to 13"),
+        ({"rows": "1,1,1,1,9,9,1,4.5,1\n"}, "line 1 is .* a class from 1 to 13"),
     ],
 )
 def test_a_bad_mot_sequence_is_one_sentence(tmp_path, named, said):
@@ -374,6 +379,15 @@ def test_a_bad_mot_sequence_is_one_sentence(tmp_path, named, said):
     write_mot(tmp_path / "a", **named)
     with pytest.raises(UserError, match=said):
         open_dataset(f"mot:{tmp_path}")
+
+
+def test_a_bad_mot_line_costs_itself(tmp_path, caplog):
+    """A class that a tool has made up would end the study."""
+    write_mot(tmp_path / "a", rows="1,1,1,1,9,9,1,1,1\n1,2,1,1,9,9,1,4.5,1\n1,x\n")
+    (sequence,) = open_dataset(f"mot:{tmp_path}")
+    assert len(sequence.labels(0)) == 1
+    assert "line 2 is" in caplog.text
+    assert "line 3 is" in caplog.text
 
 
 def _write_video(path, count, *, fps):

@@ -81,10 +81,10 @@ def mot_table(
     truth: Path, names: Path, size: tuple[int, int], beside: tuple[int, ...] = _BESIDE
 ) -> LabelTable:
     """All labels of a sequence; ``names`` may be missing, and ``beside`` are then classes that are not asked for."""
-    rows = read_rows(truth, columns=_COLUMNS, least=7)
+    rows = read_rows(truth, columns=_COLUMNS, least=7, of_dataset=True)
     own = names.is_file()
     class_names = read_labels(names) if own else _NAMES
-    kinds = _kinds(rows, len(class_names) if own else _HIGHEST, own=own)
+    rows, kinds = _kinds(rows, len(class_names) if own else _HIGHEST, own=own)
     judged = rows["counts"] != 0
     passed = ~judged
     if not own:
@@ -130,7 +130,9 @@ def read_truth_rows(truth: Path, names: Names[str]) -> TruthRows:
         known = names[0] if len(names) == 1 else _NAMES[0]
         words = (known,) * len(rows)
     else:
-        rows.check(np.isin(rows["class"], np.arange(1, len(names) + 1)), accepted=_class_text(len(names)))
+        rows = rows.only(
+            np.isin(rows["class"], np.arange(1, len(names) + 1)), accepted=_class_text(len(names))
+        )
         words = tuple(names[int(kind) - 1] for kind in rows["class"].tolist())
     judged = rows["counts"] != 0
     if not classless:
@@ -143,13 +145,13 @@ def _class_text(highest: int) -> str:
     return f"a class from 1 to {highest} in column 8"
 
 
-def _kinds(rows: Rows, highest: int, *, own: bool) -> npt.NDArray[np.int64]:
-    """Class from 1 on."""
+def _kinds(rows: Rows, highest: int, *, own: bool) -> tuple[Rows, npt.NDArray[np.int64]]:
+    """The rows whose class is known, and their classes from 1 on."""
     if not own and _in_the_world(rows):
-        return np.full(len(rows), _PEDESTRIAN, np.int64)
-    kinds = np.where(rows["class"] == -1, _PEDESTRIAN, rows["class"])
-    rows.check(np.isin(kinds, np.arange(1, highest + 1)), accepted=_class_text(highest))
-    return kinds.astype(np.int64)
+        return rows, np.full(len(rows), _PEDESTRIAN, np.int64)
+    known = np.isin(rows["class"], [-1, *range(1, highest + 1)])
+    rows = rows.only(known, accepted=_class_text(highest))
+    return rows, np.where(rows["class"] == -1, _PEDESTRIAN, rows["class"]).astype(np.int64)
 
 
 def _in_the_world(rows: Rows) -> bool:

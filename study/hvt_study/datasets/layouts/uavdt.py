@@ -64,10 +64,12 @@ def open_uavdt(root: Path, options: Options) -> Mapping[str, Callable[[], Sequen
 
 def uavdt_table(whole: Path, ignore: Path, size: tuple[int, int]) -> LabelTable:
     """All labels of a sequence; ``whole`` may be a ``_gt.txt``, and ``ignore`` may be missing."""
-    rows = read_rows(whole, columns="frame,id,x,y,w,h,out-of-view,occlusion,category", least=9)
+    rows = read_rows(
+        whole, columns="frame,id,x,y,w,h,out-of-view,occlusion,category", least=9, of_dataset=True
+    )
     plain = not whole.name.endswith("_gt_whole.txt")
     if not plain:
-        rows.check(
+        rows = rows.only(
             np.isin(rows["category"], (1, 2, 3)), accepted="a category of 1 car, 2 truck or 3 bus in column 9"
         )
     return LabelTable.of(
@@ -113,7 +115,7 @@ def _regions(path: Path) -> Regions:
     if not path.is_file():  # some copies of the dataset come without
         empty = np.empty(0, np.int64)
         return Regions(empty, np.empty((0, 4), np.float32), empty.astype(np.bool_))
-    rows = read_rows(path, columns="frame,id,x,y,w,h", least=6)
+    rows = read_rows(path, columns="frame,id,x,y,w,h", least=6, of_dataset=True)
     return Regions(rows["frame"].astype(np.int64), rows.boxes(), np.ones(len(rows), np.bool_))
 
 
