@@ -48,20 +48,20 @@ def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
     alone; anything else may be asked for of the newest from the camera too.
     """
     tracked = request.track_id is not None
-    newest, newest_kept = ring.newest(tracked=False), ring.newest(tracked=tracked)
-    if newest is None or newest_kept is None:
+    newest, newest_held = ring.newest(tracked=False), ring.newest(tracked=tracked)
+    if newest is None or newest_held is None:
         raise RefusedError("there is no frame yet, or none is kept (--ring)")
     if request.frame_index is not None:
         if request.frame_index > newest.frame_index:
             raise RefusedError(
                 f"frame {request.frame_index} is yet to come: the newest is {newest.frame_index}"
             )
-        index = min(request.frame_index, newest_kept.frame_index)
+        index = min(request.frame_index, newest_held.frame_index)
         frame, wanted = ring.near_index(index, tracked=tracked), f"frame {request.frame_index}"
     elif not request.ago_ms:
         coded = ring.newest_coded(tracked=tracked)
         lacks = coded is None or (tracked and request.track_id not in coded.tracks.ids)
-        return newest_kept if lacks or coded is None else coded
+        return newest_held if lacks or coded is None else coded
     else:
         ago_ms = request.ago_ms
         frame = ring.near_time(newest.capture_ns - ago_ms * 1_000_000, tracked=tracked)

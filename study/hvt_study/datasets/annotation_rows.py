@@ -67,9 +67,9 @@ class Rows:
         if not (self.of_dataset and good.any()):
             raise UserError(said)
         _log.warning("%d of %d lines are left out; the first: %s", (~good).sum(), len(good), said)
-        kept = np.flatnonzero(good)
-        text = tuple(self.text[row] for row in kept.tolist())
-        return replace(self, table=self.table[kept], lines=self.lines[kept], text=text)
+        good_rows = np.flatnonzero(good)
+        text = tuple(self.text[row] for row in good_rows.tolist())
+        return replace(self, table=self.table[good_rows], lines=self.lines[good_rows], text=text)
 
     def boxes(self, *, origin: float = 0.0) -> npt.NDArray[np.float32]:
         """(N, 4) float32 x1 y1 x2 y2 from ``x,y,w,h``; ``origin`` is the first pixel's number."""
