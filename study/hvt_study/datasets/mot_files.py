@@ -47,10 +47,10 @@ def read_detections(path: Path) -> MotRows:
     """The same of a file of detections, whose scores are probabilities, and of which all or none have ids."""
     rows = read_rows(path, columns=_COLUMNS, least=7)
     score, ids = rows["score"], rows["id"]
-    rows.check((score >= 0) & (score <= 1), accepted="a score from 0 to 1 in column 7")
+    rows.only((score >= 0) & (score <= 1), accepted="a score from 0 to 1 in column 7")
     if len(rows):
         with_id = ids[0] >= 0
-        rows.check(
+        rows.only(
             (ids >= 0) == with_id,
             accepted=f"{'an id' if with_id else '-1'} in column 2, as in the first line",
         )
