@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import stat
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from hvt_common.errors import NotYetError, UserError
+from hvt_common.values import Image
+from hvt_edge.source.decoding.levels import Stretch
+from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.live import Shot, SignalLost
 
 __all__ = ["CameraGrabber"]
@@ -20,15 +26,18 @@ _REQUESTED_SIZE = (1920, 1080)
 """Requested of the camera, which takes the nearest it has. Stills live on the pixels beyond the base size."""
 
 _READ_MS = 2000
+_Y16 = cv2.VideoWriter.fourcc(*"Y16 ")
 
 
 class CameraGrabber:
     """One V4L2 device: ``path`` is /dev/videoN, ``fps`` is requested of the camera."""
 
-    notes = None
-
     def __init__(self, path: str, *, fps: float) -> None:
         self.name = path
+        self.notes = Notes(path)
+        self._deep = False
+        """It gives sixteen bits of grey."""
+        self._stretch = Stretch(self.notes)
         self._fps = fps
         self._capture: cv2.VideoCapture | None = None
         self._ahead_ns = 0
@@ -44,7 +53,7 @@ class CameraGrabber:
         number = re.fullmatch(r"video(\d+)", path.resolve().name)
         if number is None or not stat.S_ISCHR(path.stat().st_mode):
             raise UserError(f"camera {self.name} is no video device; accepted is /dev/videoN")
-        capture = _quietly_opened(int(number[1]))
+        capture = opened_capture(int(number[1]))
         if not capture.isOpened():
             kind = NotYetError if os.access(path, os.R_OK | os.W_OK) else UserError
             raise kind(f"camera {self.name} cannot be opened: it is no V4L2 camera, in use, or not permitted")
@@ -54,6 +63,10 @@ class CameraGrabber:
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, _REQUESTED_SIZE[1])
         capture.set(cv2.CAP_PROP_FPS, self._fps)
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        # OpenCV would keep the upper eight of sixteen bits, in which a warm body is one level above the rest.
+        self._deep = round(capture.get(cv2.CAP_PROP_FOURCC)) == _Y16
+        if self._deep:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         self._capture = capture
         self._ahead_ns = time.time_ns() - time.monotonic_ns()
 
@@ -71,11 +84,14 @@ class CameraGrabber:
         if capture is None or not capture.grab():
             raise SignalLost("the camera delivers no frame")
 
-        def image() -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+        def image() -> Image:
             decoded, image = capture.retrieve()
             if not decoded:
                 raise SignalLost("the camera's frame cannot be decoded")
-            return np.asarray(image, np.uint8)
+            if not self._deep:
+                return np.asarray(image, np.uint8)
+            shape = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+            return self._stretch.bgr(_levels(image, shape), at_s=time.monotonic())
 
         # The driver stamps its buffers by the monotonic clock; where it does not, this is 0.
         buffer_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
@@ -88,7 +104,16 @@ class CameraGrabber:
             self._capture = None
 
 
-def _quietly_opened(number: int) -> cv2.VideoCapture:
+def _levels(raw: npt.NDArray[Any], shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
+    """Sixteen-bit levels out of what OpenCV does not convert: the levels, or their bytes in a row."""
+    count = 2 * math.prod(shape)
+    data = np.ascontiguousarray(raw).view(np.uint8).reshape(-1)
+    if data.size < count:
+        raise SignalLost("the camera's frame is cut off")
+    return data[:count].view("<u2").astype(np.uint16, copy=False).reshape(shape)
+
+
+def opened_capture(number: int) -> cv2.VideoCapture:
     """The capture, opened or not, without OpenCV's own lines on stderr."""
     timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
     level = cv2.utils.logging.getLogLevel()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 from hvt_common.units import SECOND_NS
 
 __all__ = ["CameraClock"]
@@ -13,6 +15,11 @@ _MEMORY_NS = 60 * SECOND_NS
 
 _STEP_NS = SECOND_NS
 """From one frame to the next no delay changes by so much."""
+_MOST_BEHIND_NS = 2 * SECOND_NS
+"""Who is later than that, step by step, has another idea of a second: stamps of 25 a second on 24 frames."""
+_RECENT = 32
+"""Frames whose delays tell how unevenly they come."""
+_MOST_JITTER_NS = SECOND_NS // 4
 
 
 class CameraClock:
@@ -28,17 +35,27 @@ class CameraClock:
         self._delay_ns: int | None = None
         self._since_ns = 0
         self._last_ns = 0
+        self._recent: deque[int] = deque(maxlen=_RECENT)
+        """Delays of the newest frames."""
+
+    @property
+    def jitter_ns(self) -> int:
+        """By how much some frames of late came later than others: they come in bursts. At most a quarter second."""
+        return min(_MOST_JITTER_NS, max(self._recent, default=0) - min(self._recent, default=0))
 
     def capture_ns(self, camera_ns: int | None, *, now_ns: int) -> int:
         """When the frame that has just come was taken; ``camera_ns`` is None where the camera does not say."""
         taken_ns = now_ns if camera_ns is None else camera_ns + self._ahead_ns(now_ns - camera_ns, now_ns)
         self._last_ns = max(self._last_ns + 1, min(taken_ns, now_ns))
+        self._recent.append(now_ns - self._last_ns)
         return self._last_ns
 
     def _ahead_ns(self, delay_ns: int, now_ns: int) -> int:
         """The correction of the camera's time."""
         if self._delay_ns is not None and abs(delay_ns - self._delay_ns) > _STEP_NS:
             self._least_ns = self._former_ns = None  # one of the two clocks was set
+        elif self._least_ns is not None and delay_ns - self._least_ns > _MOST_BEHIND_NS:
+            self._least_ns = self._former_ns = None
         self._delay_ns = delay_ns
         if self._least_ns is None or now_ns - self._since_ns > _MEMORY_NS:
             self._former_ns, self._least_ns, self._since_ns = self._least_ns, delay_ns, now_ns

@@ -26,7 +26,7 @@ from hvt_edge.source.camera_stream import (
 )
 from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit
 from hvt_edge.source.live import SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
-from hvt_edge.source.stream import StreamGrabber, camera_time_ns
+from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped
 
 __all__ = ["CodedLiveSource", "CodedStreamGrabber"]
 
@@ -51,11 +51,12 @@ class CodedStreamGrabber(StreamGrabber):
 
 
 def _packets(container: Any, stream: Any, decoder: CameraDecoder) -> Iterator[Shot]:
+    stamped = is_stamped(container)
     for packet in container.demux(stream):
         if packet.size:
             at_s = None if packet.pts is None else float(packet.pts * packet.time_base)
             taken = CameraPacket(bytes(packet), at_s, decoder)
-            yield Shot(partial(_picture, taken), camera_time_ns(packet), taken)
+            yield Shot(partial(_picture, taken), camera_time_ns(packet, stamped=stamped), taken)
 
 
 def _picture(packet: CameraPacket) -> Image:
@@ -149,7 +150,7 @@ class CodedLiveSource(LiveSource):
             self.missed += self._skips
             self.unreadable += not self._skips
 
-    def _take(self, shot: Shot, capture_ns: int) -> None:
+    def _take(self, shot: Shot, capture_ns: int, *, jitter_ns: int) -> None:  # noqa: ARG002 - each has its place
         packet = shot.packet
         assert packet is not None, "a CodedStreamGrabber gives no other"
         with self._news:

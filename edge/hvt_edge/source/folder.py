@@ -16,7 +16,7 @@ from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_common.values import Fit, Frame, Image
 from hvt_edge.source.contract import BaseSize, Source
-from hvt_edge.source.decoding.levels import DEEP_GREY, Stretch
+from hvt_edge.source.decoding.levels import Stretch
 from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
@@ -125,8 +125,7 @@ class _Reader:
     """Reads one folder, whose deep grey is a sensor's levels (`Stretch`)."""
 
     def __init__(self, notes: Notes) -> None:
-        self._notes = notes
-        self._stretch = Stretch()
+        self._stretch = Stretch(notes)
 
     def bgr(self, file: Path, *, at_s: float) -> Image | None:
         """The image as BGR, 8 bits; None if it cannot be read or decoded. ``at_s`` is when it is shown."""
@@ -136,7 +135,6 @@ class _Reader:
                 return None
             image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
             if image is not None and image.itemsize > 1 and image.ndim == 2:
-                self._notes(DEEP_GREY.format(bits=8 * image.itemsize))
                 return self._stretch.bgr(image, at_s=at_s)
             # All else as OpenCV takes it: without transparency, in 8 bits, turned as its EXIF data say.
             image = cv2.imdecode(data, cv2.IMREAD_COLOR)

@@ -1,9 +1,13 @@
-"""Sources that cannot be paused: a reader thread holds only the latest frame of a camera or a network stream."""
+"""What cannot be paused: a reader thread that keeps the latest frame of a camera or a network stream.
+
+Where frames come in bursts, as over UDP through a radio, it keeps those of one burst.
+"""
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,6 +31,8 @@ _log = logging.getLogger(__name__)
 _FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS
 _JOIN_S = 1.5
 _IDLE_S = 1.0
+_MOST_PENDING = 8
+"""Frames of a burst that are kept."""
 SOURCE_PART = "source"
 """Its name as a failed part."""
 
@@ -122,7 +128,8 @@ class LiveSource(Source):
         self.view = self._resizer.view
         self._pause = RetryPause(_FIRST_WAIT_NS, _LONGEST_WAIT_NS)
         self._news = threading.Condition()
-        self._latest: tuple[int, Image] | None = None
+        self._pending: deque[tuple[int, Image]] = deque()
+        """(when taken, picture), the latest last: of a burst all, else one."""
         self._gate = Gate(self.fps)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-source", daemon=True)
@@ -137,8 +144,8 @@ class LiveSource(Source):
         index = 0
         while index != self._limit:
             with self._news:
-                self._news.wait_for(lambda: self._latest or self._stop.is_set(), _IDLE_S)
-                item, self._latest = self._latest, None
+                self._news.wait_for(lambda: self._pending or self._stop.is_set(), _IDLE_S)
+                item = self._pending.popleft() if self._pending else None
             if self._stop.is_set():
                 return
             if item is None:
@@ -146,6 +153,11 @@ class LiveSource(Source):
                 continue
             yield self._resizer.frame(item[1], index=index, capture_ns=item[0])
             index += 1
+
+    @property
+    def pending(self) -> int:
+        """Frames that have come and were not taken."""
+        return len(self._pending)
 
     def close(self) -> None:
         """Stop the reader and join it; it answers within its read timeout."""
@@ -172,7 +184,7 @@ class LiveSource(Source):
                 try:
                     shot = self._grabber.grab()
                     capture_ns = camera_clock.capture_ns(shot.camera_ns, now_ns=self._clock())
-                    self._take(shot, capture_ns)
+                    self._take(shot, capture_ns, jitter_ns=camera_clock.jitter_ns)
                 except Exception as error:  # noqa: BLE001 - a driver or a decoder raises what it likes
                     self._recover(error)
                     camera_clock = CameraClock()
@@ -180,16 +192,18 @@ class LiveSource(Source):
             self._grabber.close()
             self._end()
 
-    def _take(self, shot: Shot, capture_ns: int) -> None:
-        """A frame has come (the reader's thread)."""
+    def _take(self, shot: Shot, capture_ns: int, *, jitter_ns: int) -> None:
+        """A frame has come (the reader's thread); those of the last ``jitter_ns`` may have come with it."""
         if not self._gate.accept(capture_ns):
             self.missed += shot.missed
             self.passed_over += 1
             return
         image = shot.image()
         with self._news:
-            self.missed += (self._latest is not None) + shot.missed
-            self._latest = (capture_ns, image)
+            together = [one for one in self._pending if one[0] >= capture_ns - jitter_ns]
+            together = together[1 - _MOST_PENDING :]
+            self.missed += len(self._pending) - len(together) + shot.missed
+            self._pending = deque([*together, (capture_ns, image)])
             self._news.notify_all()
         self._failures.works(SOURCE_PART)
 

@@ -14,12 +14,13 @@ import av.error
 
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
+from hvt_common.units import SECOND_NS
 from hvt_edge.source.decoding.container import cause_of, choose_stream
 from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.live import Shot, SignalLost
 
-__all__ = ["LIVE_SCHEMES", "StreamGrabber", "camera_time_ns"]
+__all__ = ["LIVE_SCHEMES", "StreamGrabber", "camera_time_ns", "is_stamped"]
 
 LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "http", "https", "udp", "rtp", "tcp", "srt"})
 
@@ -34,11 +35,15 @@ _NEVER = (
     *(av.error.ProtocolNotFoundError, av.error.InvalidDataError, av.error.PermissionError, ValueError),
 )
 """Whatever else refuses a stream may be a camera or a server that starts after us."""
+_STAMPED = frozenset({"mpegts", "rtsp", "rtp", "sdp", "flv"})
+"""Formats whose time stamps are the sender's; of pictures in a row FFmpeg invents them."""
 _OPTIONS = {
     "rtsp_transport": "tcp",  # over UDP a camera's keyframes lose packets on the first busy switch
     "fflags": "nobuffer",
     "flags": "low_delay",
     "analyzeduration": "2000000",
+    "buffer_size": "4194304",  # of a UDP socket, where the system allows so much (net.core.rmem_max)
+    "reorder_queue_size": "500",  # FFmpeg's own, which `nobuffer` takes away; a datagram that is late is waited for
 }
 
 
@@ -114,6 +119,11 @@ class StreamGrabber:
         return _decoded(container, stream, self._pictures)
 
 
+def is_stamped(container: Any) -> bool:
+    """Whether its time stamps are the sender's."""
+    return not _STAMPED.isdisjoint(container.format.name.split(","))
+
+
 def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
     """Frames, each with its time by the camera's clock.
 
@@ -121,9 +131,9 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
     FFmpeg's error where nothing else has come for ten seconds.
     """
     times: dict[Fraction, int] = {}
-    whole_s = time.monotonic()
+    whole_s, stamped = time.monotonic(), is_stamped(container)
     for packet in container.demux(stream):
-        camera_ns = camera_time_ns(packet)
+        camera_ns = camera_time_ns(packet, stamped=stamped)
         if packet.pts is not None and camera_ns is not None:
             times[packet.pts * packet.time_base] = camera_ns
         try:
@@ -144,11 +154,17 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
             times.clear()
 
 
-def camera_time_ns(packet: av.Packet[Any]) -> int | None:
-    """When it was taken, where RTCP sender reports tell the camera's time (RFC 3550, 6.4.1). Unix nanoseconds."""
-    if not packet.has_sidedata("prft"):
+def camera_time_ns(packet: av.Packet[Any], *, stamped: bool) -> int | None:
+    """When it was taken by a clock of the camera's, in nanoseconds; None where nothing tells.
+
+    Where RTCP sender reports tell the camera's time (RFC 3550, 6.4.1) it is Unix time; of the stream's own time
+    stamps, where it is ``stamped``, only the differences count.
+    """
+    if packet.has_sidedata("prft"):
+        return 1000 * int.from_bytes(bytes(packet.get_sidedata("prft"))[:8], "little")
+    if not stamped or packet.pts is None or packet.time_base is None:
         return None
-    return 1000 * int.from_bytes(bytes(packet.get_sidedata("prft"))[:8], "little")
+    return round(packet.pts * packet.time_base * SECOND_NS)
 
 
 def _open(url: str, *, open_s: float) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from functools import partial
 from itertools import pairwise
@@ -12,7 +13,7 @@ import pytest
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_edge.source.camera_clock import CameraClock
-from hvt_edge.source.live import LiveSource, Shot
+from hvt_edge.source.live import LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
 from programs.rtsp_camera import RtspCamera
 
@@ -166,3 +167,58 @@ def raising_pictures(grab):
         return Shot(image)
 
     return late
+
+
+class Bursts:
+    """A camera whose frames, 30 a second by its stamps, come three at a time."""
+
+    name, notes = "cam", None
+
+    def __init__(self) -> None:
+        self.given, self.now_ns = 0, 1_000 * SECOND_NS
+        self.come, self.wanted = threading.Semaphore(0), threading.Semaphore(1)
+
+    def open(self) -> None:
+        """It is open."""
+
+    restart = close = open  # noqa: A003 - the method above
+
+    def grab(self) -> Shot:
+        """The next; before the first of a burst, once it is wanted."""
+        if self.given % 3 == 1:  # the source asks for one before it begins
+            if self.given > 1:
+                self.come.release()
+            if not self.wanted.acquire(timeout=60):
+                raise SignalLost("nobody wants more")
+            self.now_ns += SECOND_NS // 10
+        self.given += 1
+        return Shot(partial(np.zeros, (48, 64, 3), np.uint8), self.given * SECOND_NS // 30)
+
+
+def test_frames_that_come_in_bursts_are_all_taken_at_the_times_of_their_stamps():
+    """Over UDP through a radio two of three frames would be lost, and the others seem to stand and leap."""
+    camera, times = Bursts(), []
+    with LiveSource(
+        camera, size=lambda size: size, fps=30, fit="letterbox", clock=lambda: camera.now_ns
+    ) as source:
+        steps = source.steps(start_ns=0)
+        for _ in range(6):
+            assert camera.come.acquire(timeout=60), "three have come"
+            while source.pending:
+                times.append(next(steps).capture_ns)
+            camera.wanted.release()
+        camera.wanted.release(100)
+    steady = times[-12:]
+    assert len(times) >= 6 * 3 - 3
+    assert all(abs(later - earlier - SECOND_NS // 30) < MS for earlier, later in pairwise(steady))
+
+
+def test_stamps_that_count_another_second_are_not_believed_for_long():
+    """FFmpeg's 25 a second of a camera that makes 20: each minute would be twelve seconds behind."""
+    clock = CameraClock()
+    late = [
+        now_ns - clock.capture_ns(number * SECOND_NS // 25, now_ns=now_ns)
+        for number in range(2000)
+        for now_ns in (SECOND_NS * 1000 + number * SECOND_NS // 20,)
+    ]
+    assert max(late) <= 2.1 * SECOND_NS

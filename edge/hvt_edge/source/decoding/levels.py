@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,8 @@ import numpy.typing as npt
 
 from hvt_common.values import Image
 
-__all__ = ["DEEP_GREY", "Stretch"]
+__all__ = ["Stretch"]
 
-DEEP_GREY = (
-    "its {bits}-bit grey is a sensor's: stretched between the percentiles 0.5 and 99.5, slowly over time"
-)
-"""The note of it."""
 _LOW_PCT, _HIGH_PCT = 0.5, 99.5
 _LEAST_SPAN = 64
 """Sensor levels: a wall of one temperature is not to become noise from black to white."""
@@ -29,17 +26,23 @@ _EACH = 4
 
 
 class Stretch:
-    """Between its percentiles 0.5 and 99.5, which follow the scene with a time constant of three seconds."""
+    """Between its percentiles 0.5 and 99.5, which follow the scene with a time constant of three seconds.
 
-    def __init__(self) -> None:
+    ``note`` is told the first levels.
+    """
+
+    def __init__(self, note: Callable[[str], None]) -> None:
+        self._note = note
         self._range: tuple[float, float] | None = None
         self._at_s = 0.0
 
-    def bgr(self, levels: npt.NDArray[Any], *, at_s: float) -> Image:
+    def bgr(self, levels: npt.NDArray[Any], *, at_s: float, bits: int = 0) -> Image:
         """(height, width) numbers as (height, width, 3) uint8; ``at_s`` is the picture's time in seconds.
 
-        What is not finite, as where a sensor saw nothing, is black.
+        What is not finite, as where a sensor saw nothing, is black. ``bits`` are those of the source, where the array
+        has more.
         """
+        first, bits = self._range is None, bits or 8 * levels.itemsize
         least: float = _LEAST_SPAN
         if np.issubdtype(levels.dtype, np.floating):
             finite = levels[np.isfinite(levels)]
@@ -48,6 +51,11 @@ class Stretch:
         low, high = self._settle(np.percentile(levels[::_EACH, ::_EACH], (_LOW_PCT, _HIGH_PCT)), at_s)
         missing = max(0.0, least - (high - low)) / 2
         low, high = low - missing, high + missing
+        if first:
+            self._note(
+                f"its {bits}-bit grey is a sensor's: levels {low:.5g} to {high:.5g} are stretched to black and "
+                f"white, the percentiles {_LOW_PCT} and {_HIGH_PCT}, which follow the scene slowly"
+            )
         scaled = (levels.astype(np.float32) - np.float32(low)) * np.float32(255 / (high - low))
         return np.repeat(np.clip(np.rint(scaled), 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
 

@@ -13,7 +13,7 @@ from av.filter import Graph
 from av.video.reformatter import ColorPrimaries, Colorspace, ColorTrc, Interpolation, VideoReformatter
 
 from hvt_common.values import Image
-from hvt_edge.source.decoding.levels import DEEP_GREY, Stretch
+from hvt_edge.source.decoding.levels import Stretch
 from hvt_edge.source.decoding.notes import Notes
 
 __all__ = ["Pictures", "matrix_of", "turn_of"]
@@ -51,7 +51,7 @@ class Pictures:
         self._say = notes
         self._reformatter = VideoReformatter()
         """Kept: the table of an HDR picture takes seconds to make."""
-        self._stretch = Stretch()
+        self._stretch = Stretch(notes)
         self._aspect = Fraction(1)
         self._graph: Graph | None = None
         self._shape: tuple[int, int, str] | None = None
@@ -101,11 +101,11 @@ class Pictures:
         wide, high = self._square(frame)
         name, components = frame.format.name, frame.format.components
         if name.startswith("gray") and not name.startswith("grayf") and components[0].bits > _DEEP_BITS:
-            self._say(DEEP_GREY.format(bits=components[0].bits))
             levels = self._reformatter.reformat(
                 frame, width=wide, height=high, format="gray16le"
             ).to_ndarray()
-            return self._stretch.bgr(np.asarray(levels, np.uint16), at_s=frame.time or 0.0)
+            bits = components[0].bits
+            return self._stretch.bgr(np.asarray(levels, np.uint16), at_s=frame.time or 0.0, bits=bits)
         more: dict[str, Any] = {}
         if not frame.format.is_rgb and not name.startswith("gray"):
             if frame.colorspace not in _CONVERTED:
