@@ -106,10 +106,14 @@ def test_a_height_that_makes_no_sense_is_one_sentence(picture, height):
         open_camera(f"still:{picture}{height}", fps=15)
 
 
-def test_a_bad_annotation_is_named_with_its_line(picture):
-    """A table of another layout would give nonsense."""
+def test_a_bad_annotation_is_named_with_its_line(picture, caplog):
+    """One bad line would end a whole set; a table of another layout would give nonsense."""
     picture.with_suffix(".txt").write_text("1,2,3,4,1,4,0,0\n1;2;3\n")
-    with pytest.raises(UserError, match="line 2"):
+    VirtualCamera(picture)
+    assert "1 of 2 lines are left out; the first:" in caplog.text
+    assert "line 2 is '1;2;3'" in caplog.text
+    picture.with_suffix(".txt").write_text("1;2;3\n")
+    with pytest.raises(UserError, match="line 1"):
         VirtualCamera(picture)
 
 
