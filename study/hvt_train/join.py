@@ -24,6 +24,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES
 from hvt_common.inference.labels import metadata_labels
 from hvt_train.learning.halve import halve
+from hvt_train.learning.unfold import unfold_stem
 
 __all__ = ["PREFIX", "join"]
 
@@ -207,6 +208,7 @@ def _levels_of(model: onnx.ModelProto, path: Path, *, opset: int) -> tuple[onnx.
     """The graph up to its three levels (1, 85, rows, columns), all names with `PREFIX`; the names of the levels."""
     converted = version_converter.convert_version(model, opset)
     graph = compose.add_prefix(converted, PREFIX).graph
+    unfold_stem(graph, f"{PREFIX}images")
     joined = {node.output[0]: node for node in graph.node if node.op_type == "Concat"}
     levels = [name for name, node in joined.items() if _is_level(node, graph)]
     if len(levels) != len(_STRIDES):

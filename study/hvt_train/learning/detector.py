@@ -18,7 +18,7 @@ class Conv(nn.Sequential):
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> None:
         super().__init__(
-            nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False),
+            nn.Conv2d(inputs, outputs, kernel, stride, (kernel - 1) // 2, groups=groups, bias=False),
             nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.03),
             nn.SiLU(inplace=True),
         )
@@ -104,7 +104,7 @@ class DetectorNet(nn.Module):
     def __init__(self, classes: int) -> None:
         super().__init__()
         self.classes = classes
-        self.stem = Conv(12, 16, 3)
+        self.stem = Conv(3, 16, 6, 2)
         self.stages = nn.ModuleList(
             [
                 nn.Sequential(Separable(16, 32, 2), CrossStage(32, 32, 1, residual=True)),
@@ -121,7 +121,7 @@ class DetectorNet(nn.Module):
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """Maps of strides 8, 16, 32."""
-        x = self.stages[0](self.stem(_space_to_depth(images)))
+        x = self.stages[0](self.stem(images))
         fine = self.stages[1](x)
         middle = self.stages[2](fine)
         coarse = self.narrow[0](self.stages[3](middle))
@@ -151,12 +151,6 @@ class ExportedDetector(nn.Module):
         score = (objectness * best).clamp(1e-6, 1 - 1e-6)
         true = (self.slope * (score / (1 - score)).log() + self.shift).sigmoid()
         return torch.cat([rows[..., :4], (true / best).clamp(max=1.0), classes], dim=2)
-
-
-def _space_to_depth(images: Tensor) -> Tensor:
-    """Each 2x2 square of pixels becomes four times the channels: (N, 3, H, W) to (N, 12, H/2, W/2)."""
-    rows = [images[..., y::2, x::2] for x in (0, 1) for y in (0, 1)]
-    return torch.cat(rows, dim=1)
 
 
 def _doubled(x: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from onnx import numpy_helper
 from torch import Tensor, nn
 
 from hvt_train.learning.detector import DetectorNet
+from hvt_train.learning.unfold import unfolded
 
 __all__ = ["load_onnx"]
 
@@ -84,6 +85,9 @@ def _weights(graph: onnx.GraphProto) -> list[tuple[np.ndarray, np.ndarray]]:
     for node in graph.node:
         if node.op_type == "Cast" and node.input[0] in values:
             values[node.output[0]] = values[node.input[0]]
+    for name, value in values.items():
+        if value.shape[1:] == (12, 3, 3):
+            values[name] = unfolded(value)
     return [
         (values[node.input[1]], values[node.input[2]])
         for node in graph.node
