@@ -22,8 +22,6 @@ from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 
-__all__ = ["RouterConfig", "main"]
-
 PROGRAM = "hvt-router"
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

@@ -36,8 +36,6 @@ from media.third_party import install
 from programs.processes import Link, Running, eventually
 from programs.small_disk import small_disk
 
-__all__ = ["Loss", "main"]
-
 BUILD = Path("build")
 _CALM_S, _LOST_S, _FLIES_S = 12.0, 15.0, 10.0
 """Before the first loss, of each loss, and after each return."""

@@ -10,8 +10,6 @@ import numpy.typing as npt
 
 from hvt_common.values import Image
 
-__all__ = ["Affine", "CameraMotion"]
-
 Affine = npt.NDArray[np.float64]
 """(2, 3) float64: ``current = affine[:, :2] @ previous + affine[:, 2]``, both in pixels of the full image."""
 

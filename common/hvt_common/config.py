@@ -26,27 +26,6 @@ from hvt_common.errors import UserError, check_not_read
 from hvt_common.redaction import Redaction
 from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse_share, parse_size
 
-__all__ = [
-    "AUTO",
-    "BITRATE",
-    "BYTES",
-    "DURATION",
-    "PATH",
-    "SHARE",
-    "SIZE",
-    "TEXT",
-    "Group",
-    "Loaded",
-    "SettingType",
-    "choice",
-    "integer",
-    "load",
-    "number",
-    "or_auto",
-    "settings_words",
-    "to_toml",
-]
-
 _Config = TypeVar("_Config")
 
 

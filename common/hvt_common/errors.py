@@ -17,18 +17,6 @@ from typing import NoReturn
 
 from hvt_common.redaction import Redaction
 
-__all__ = [
-    "FlightError",
-    "NotYetError",
-    "Parser",
-    "UserError",
-    "check_not_read",
-    "exit_with_sentence",
-    "listening_trouble",
-    "may_come",
-    "needs_extra",
-]
-
 _MAY_COME = frozenset(
     {
         *(errno.EADDRNOTAVAIL, errno.EADDRINUSE, errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH),

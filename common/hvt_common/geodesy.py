@@ -11,8 +11,6 @@ import numpy.typing as npt
 
 from hvt_common.values import Orientation, Pose
 
-__all__ = ["between", "metres_per_degree", "moved", "turned_deg"]
-
 _EQUATOR_M = 6_378_137.0
 _ECCENTRICITY2 = 6.69437999014e-3
 """First eccentricity of WGS 84 squared (NGA.STND.0036)."""

@@ -9,20 +9,6 @@ from fractions import Fraction
 
 from hvt_common.errors import UserError
 
-__all__ = [
-    "SECOND_NS",
-    "Limit",
-    "bitrate_text",
-    "exact_rate",
-    "parse_bitrate",
-    "parse_bytes",
-    "parse_duration_s",
-    "parse_limit",
-    "parse_share",
-    "parse_size",
-    "shown_text",
-]
-
 SECOND_NS = 1_000_000_000
 _NUMBER = r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)"
 _BITRATE = re.compile(_NUMBER + r"\s*(bps|bit/s|kbps|kbit/s|k|Mbps|Mbit/s|M)?", re.IGNORECASE)

@@ -16,23 +16,6 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-__all__ = [
-    "AccessUnit",
-    "Boxes",
-    "CameraUnit",
-    "Detections",
-    "Fit",
-    "Frame",
-    "Image",
-    "Orientation",
-    "Pose",
-    "Posterior",
-    "Still",
-    "Tracks",
-    "View",
-    "iou",
-]
-
 Boxes = npt.NDArray[np.float32]
 """(N, 4) float32, x1 y1 x2 y2; the name says the space (``boxes_base_px``, ``boxes_source_px``)."""
 

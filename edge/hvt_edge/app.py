@@ -51,8 +51,6 @@ from hvt_edge.wiring import (
 )
 from hvt_edge.world import World
 
-__all__ = ["Edge"]
-
 _GOODBYE_S = 1.5
 _STUCK_S = 5.0
 """A loop that has not turned for so long, and two frames longer, hangs."""

@@ -14,8 +14,6 @@ from hvt_common.runtime.log import START_LOGGER, start_log
 from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
 from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
 
-__all__ = ["main", "program"]
-
 _DESCRIPTION = (
     "Publish a camera or clip over Zenoh: a low-bitrate HEVC base stream, and sharp stills of what matters, "
     "within a hard bit budget. hvt-edge doctor [SETTINGS] checks what a flight needs; hvt-edge status tells how "

@@ -44,19 +44,6 @@ from hvt_edge.video.encoders.registry import PASSTHROUGH, X265, check_encoder
 from hvt_edge.video.preset import SLOWEST
 from hvt_edge.video.share import FIRST_SHARE
 
-__all__ = [
-    "DEFAULT_SIZE",
-    "LEAST_FPS",
-    "EdgeConfig",
-    "check",
-    "check_rate",
-    "least_budget_bps",
-    "note_on_share",
-    "stream_text",
-    "with_profile",
-]
-
-
 DEFAULT_FPS = 15.0
 DEFAULT_SIZE = (1280, 720)
 _LEAST_WINDOW_S, _MOST_WINDOW_S = 0.5, MOST_WINDOW_NS / 1e9

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-__all__ = ["PROFILES", "REGIMES", "Regime"]
-
 _TRACKS = {"candidates": "source", "tiles": "auto", "send_tracks": True}
 _THIN = {
     "method": "M6",

@@ -26,8 +26,6 @@ from hvt_edge.health.state import EdgeState, LinkState
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.point import Levers, LoopClock, Operating
 
-__all__ = ["InfoReporter", "StatusReporter", "status_text"]
-
 _PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
 _LEVERS_REST = 10
 _LATE_NS = 2 * SECOND_NS

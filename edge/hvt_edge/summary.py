@@ -14,9 +14,6 @@ from hvt_common.units import bitrate_text
 from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.loop.cpu import Cores
 
-__all__ = ["in_vain", "summary", "table", "title"]
-
-
 _RATES = (
     *("base_bytes", "roi_bytes", "backlog_bytes", "meta_bytes", "overhead_bytes"),
     *("total_bps", "base_bps", "roi_bps"),

@@ -22,8 +22,6 @@ from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.opening import Source, open_source, shown
 from hvt_edge.wiring import base_size, make_detector, make_link_settings, warm_up_for
 
-__all__ = ["World"]
-
 
 class World:
     """The real one."""

@@ -49,8 +49,6 @@ from hvt_ground.wiring import (
 if TYPE_CHECKING:
     from hvt_ground.web import WebPage
 
-__all__ = ["Ground"]
-
 _POLL_S = 0.1
 _STATUS_EVERY_POLLS = 10
 _STUCK_S = 5.0

@@ -14,8 +14,6 @@ from hvt_common.runtime.log import start_log
 from hvt_common.runtime.plug_ins import the_one
 from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
 
-__all__ = ["main", "program"]
-
 _DESCRIPTION = """Receive what edges publish over Zenoh: decode, detect, track, refine classes by
 the stills, and record all of it for the Rerun viewer.
 

@@ -17,8 +17,6 @@ from hvt_common.runtime.log import LOG_FORMATS
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import Limit, parse_limit
 
-__all__ = ["DEFAULT_PAGE", "DETECTOR", "MOTION", "NONE", "GroundConfig", "check"]
-
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
 LEAST_LOG_BYTES = 20_000_000
 """Twice the largest message that there is, and room for a flight between."""

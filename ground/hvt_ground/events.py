@@ -15,20 +15,6 @@ import numpy.typing as npt
 from hvt_common.protocol.messages import RoiHeader
 from hvt_common.values import Boxes, Image, Pose, View
 
-__all__ = [
-    "Event",
-    "MessageTiming",
-    "Notice",
-    "Origin",
-    "Overlay",
-    "Places",
-    "PoseUpdate",
-    "Refinement",
-    "StillsRead",
-    "Traffic",
-    "VideoSample",
-]
-
 Origin = Literal["base", "edge", "edge+base", "still"]
 """Who knows of a track: the ground's own tracker on the base stream, the edge's report, both, or (``still``) nobody
 but a still in which it was found."""

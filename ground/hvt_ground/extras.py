@@ -23,8 +23,6 @@ if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no reco
     from hvt_ground.recordings.recorded import Recorded
     from hvt_ground.sinks import Outputs, SinkWriter
 
-__all__ = ["Extra", "Flight", "NewFile", "OpenSinks", "Opening", "all_extras", "checked", "config_class"]
-
 _GROUP = "hvt.ground"
 _BROUGHT_BY = {"cot": "cot", "cot-types": "cot", "mcap": "mcap", "ts": "ground"}
 """Settings of the extras that come with HVT, and the package to install for each."""

@@ -13,8 +13,6 @@ from hvt_common.runtime.prometheus import Counter, Gauge, Table, exposition, of_
 from hvt_common.units import SECOND_NS
 from hvt_ground.state import GroundState, SessionState
 
-__all__ = ["metrics_text"]
-
 _LINKS = ("waiting", "up", "thin", "lost", "ended")
 _OTHER = "other"
 """A word of the edge's that is none of these: each new one would be a series for ever."""

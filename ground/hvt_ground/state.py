@@ -20,8 +20,6 @@ from hvt_ground.link.group import Elsewhere, GroundGroup
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 
-__all__ = ["EdgeState", "GroundState", "LinkState", "StateMaker"]
-
 LinkState = Literal["waiting", "up", "thin", "lost", "ended"]
 """``waiting`` for a keyframe to begin with; ``up``; ``thin``: the edge leaves frames out that the link does not
 carry; ``lost``: nothing has come for `LOST_S`; ``ended``: the edge said so, or stayed away."""

@@ -15,8 +15,6 @@ from hvt_ground.sinks import QueuedSink, Sink
 from hvt_ground.sinks.tracks_table import utc_text
 from hvt_ground.state import EdgeState, GroundState
 
-__all__ = ["completed", "status_text", "summary", "table"]
-
 
 def status_text(state: GroundState) -> str:
     """The status line: the traffic of each edge now, and the failed parts; empty without any."""

@@ -18,8 +18,6 @@ from pathlib import Path
 from lab.conformance.schema import PATH
 from lab.conformance.vectors import FOLDER
 
-__all__ = ["MUTANTS", "Mutant", "built", "main", "survivors"]
-
 READER = Path(__file__).with_name("reader.ts")
 _DRIVER = Path(__file__).with_name("mutants.js")
 

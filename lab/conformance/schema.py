@@ -36,8 +36,6 @@ from hvt_common.protocol.messages.envelope import DEEPEST, Nested
 from hvt_common.protocol.messages.fields import REFUSED_CHARACTERS, Kind, ListOf
 from hvt_common.protocol.messages.track_boxes import MOST_BOXES, MOST_CLASSES
 
-__all__ = ["MESSAGES", "PATH", "nested_of", "schema"]
-
 PATH = Path(__file__).resolve().parents[2] / "docs" / "wire.json"
 MESSAGES: tuple[type[Message], ...] = (
     BaseHeader,

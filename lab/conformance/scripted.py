@@ -11,8 +11,6 @@ from hvt_common.protocol.messages.exp_golomb import BitWriter
 from hvt_common.protocol.messages.range_coder import Context, Encoder, NumberContexts
 from hvt_common.protocol.messages.track_boxes import CodedTrack
 
-__all__ = ["pose_changes", "track_sessions", "whole_pose", "written"]
-
 _FREE = {"MOST_BOXES": 1 << 20, "MOST_CLASSES": 1 << 20, "U32": 1 << 40, "_COARSEST": 20}
 """The limits that a step may break here, so that it is written to its end."""
 

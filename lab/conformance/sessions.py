@@ -21,8 +21,6 @@ from hvt_common.protocol.messages.track_boxes import CodedTrack, read_tracks
 from hvt_common.values import Orientation, Pose, Tracks
 from lab.conformance.scripted import Step, pose_changes, track_sessions, whole_pose, written
 
-__all__ = ["poses", "track_steps"]
-
 _LONG = 100
 _TRACK = (
     "id",

@@ -24,8 +24,6 @@ from hvt_common.video.still_codecs.h264_intra import split_payload
 from hvt_common.video.still_codecs.h264_syntax import coded_slice, parameter_sets, verbatim_picture
 from hvt_common.video.still_codecs.yuv420 import Planar, padded_size, to_planar
 
-__all__ = ["FILE", "main", "still_cases", "vectors"]
-
 FILE = Path(__file__).resolve().parents[2] / "docs" / "conformance" / "stills.json"
 _BASE = (64, 48)
 _PLAIN = {"jpeg": (2, 24), "webp": (2, 24), "avif": (2, 24), "jxl": (2, 24)}

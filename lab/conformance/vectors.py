@@ -38,8 +38,6 @@ from lab.conformance.sessions import poses, track_steps
 from lab.conformance.stills import still_cases
 from rigs.messages import BASE, EXAMPLES, INFO, REQUEST, ROI
 
-__all__ = ["FOLDER", "files", "main", "schema_text"]
-
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "conformance"
 _PAYLOADS: Mapping[type[Message], bytes] = {BaseHeader: b"an access unit", RoiHeader: b"a still"}
 _WITH_NESTED = {"RoiHeader": ("also", 16), "ControlAnswer": ("tracks", 6), "Feedback": ("stills", 19)}

@@ -13,8 +13,6 @@ from tempfile import mkdtemp
 
 from lab.fuzz.mutate import Bytes, Mutator
 
-__all__ = ["CannotStartError", "Target", "checked_seeds", "raw_bytes", "scratch"]
-
 
 def raw_bytes(data: bytes, rng: Random, raw: Bytes) -> bytes:
     """The input has no structure that a mutation should keep."""

@@ -14,8 +14,6 @@ from hvt_ground.sinks.message_log import MessageLog, read_log
 from lab.fuzz.contract import Target, scratch
 from rigs import messages
 
-__all__ = ["TARGETS"]
-
 _TABLE = (
     b"time_s,latitude_deg,longitude_deg,height_m,camera_yaw_deg,camera_pitch_deg,hfov_deg\n"
     b"0,48.1,11.5,120,90,-45,60\n1.5,48.1001,11.5002,121,91.5,-44,60\n"

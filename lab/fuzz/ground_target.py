@@ -20,8 +20,6 @@ from lab.fuzz.contract import Target, scratch
 from lab.fuzz.mutate import Bytes, changed_values, joined, parted, with_checksum
 from rigs.flight import Flight, Port, pipeline_of
 
-__all__ = ["TARGETS"]
-
 _CHANNELS = ("base", "roi", "tracks", "status", "backlog")
 _ATTACHED = ("base", "roi", "backlog")
 _PACES = ("realtime", "lockstep")

@@ -41,8 +41,6 @@ from lab.fuzz.mutate import Bytes, changed_values, each_part, joined, parted, pl
 from rigs import messages
 from rigs.flight import tracks_at
 
-__all__ = ["ROI", "TARGETS", "feedback"]
-
 _NOW = 1_790_000_000_000_000_000
 
 ROI = replace(messages.ROI, flags=int(Flags.STORED), parameters={})

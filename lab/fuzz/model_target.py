@@ -11,8 +11,6 @@ from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from lab.fuzz.contract import Target, scratch
 from media.onnx_models import colour_classifier, constant_model
 
-__all__ = ["TARGETS"]
-
 
 def _model(data: bytes) -> None:
     path = scratch() / "m.onnx"

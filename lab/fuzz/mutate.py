@@ -12,8 +12,6 @@ from typing import Any
 
 import msgpack
 
-__all__ = ["Bytes", "Mutator", "changed_values", "each_part", "plain"]
-
 Bytes = Callable[[bytes], bytes]
 Mutator = Callable[[bytes, Random, Bytes], bytes]
 """(input, dice, mutator of plain bytes) → input."""

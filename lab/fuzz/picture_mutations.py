@@ -9,8 +9,6 @@ from hvt_common.video.still_codecs import StillError
 from hvt_common.video.still_codecs.plugins.avif import av1_data, av1_size, avif_file
 from lab.fuzz.mutate import Bytes, Mutator
 
-__all__ = ["inside"]
-
 _Change = Callable[[bytes, Random, Bytes], bytes]
 
 

@@ -25,8 +25,6 @@ from media.clips import framed, smooth_pictures
 from media.crops import textured, washed_out
 from media.hevc_pictures import coded_picture
 
-__all__ = ["CODECS", "TARGETS"]
-
 CODECS = ("jpeg", "webp", "avif", "jxl", "h264-intra", "residual")
 _SIZES = ((56, 40), (16, 16), (117, 50), (200, 9))
 _VIEW = View.fitted((640, 360), (320, 192), fit="letterbox")

@@ -19,8 +19,6 @@ from lab.fuzz.message_targets import REQUESTS, feedback
 from lab.fuzz.mutate import changed_values, each_part, joined, parted
 from rigs.command_rig import SESSION, Rig
 
-__all__ = ["TARGETS"]
-
 _MS = 1_000_000
 _STEP = struct.Struct("<BbbH")
 """A base message: session and flags, sequence and frame index against what the last one said, milliseconds."""

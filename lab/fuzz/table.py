@@ -14,8 +14,6 @@ from lab.fuzz import (
 )
 from lab.fuzz.contract import Target
 
-__all__ = ["PLANTED", "TARGETS"]
-
 
 def _planted(data: bytes) -> None:
     parse_key(data.decode("latin-1"))

@@ -19,8 +19,6 @@ from hvt_fleet.pki.roster import GroundMember, Roster, RouterMember
 from hvt_ground.config import GroundConfig
 from lab.fuzz.contract import Target, scratch
 
-__all__ = ["TARGETS"]
-
 
 def _file(data: bytes, name: str) -> Path:
     path = scratch() / name

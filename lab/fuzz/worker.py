@@ -26,8 +26,6 @@ with atheris.instrument_imports(include=["hvt_common", "hvt_edge", "hvt_ground"]
     from lab.fuzz.contract import Target, checked_seeds
     from lab.fuzz.table import TARGETS
 
-__all__: list[str] = []
-
 _WARM_UP = 200
 """Inputs in which tables are filled and libraries loaded; memory is judged afterwards."""
 _WRITE_EVERY_S = 1.0

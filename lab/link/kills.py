@@ -37,18 +37,6 @@ from media.pictures import write_scene
 from programs.processes import eventually, free_ports
 from programs.rrd import Recording
 
-__all__ = [
-    "BARS",
-    "Trial",
-    "Verdict",
-    "in_matroska",
-    "in_recording",
-    "plan",
-    "rows_of",
-    "run_all",
-    "run_trial",
-]
-
 Victim = Literal["edge", "ground"]
 
 FPS = 10

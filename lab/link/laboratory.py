@@ -24,8 +24,6 @@ from lab.link.started import Started
 from lab.link.timeline import Script
 from programs.processes import eventually, free_ports
 
-__all__ = ["CARRIERS", "Carrier", "Run", "run"]
-
 Carrier = Literal["relay", "netns", "tun"]
 CARRIERS: tuple[Carrier, ...] = ("relay", "netns", "tun")
 

@@ -9,8 +9,6 @@ import av
 from hvt_common.errors import UserError
 from hvt_scene import Scene
 
-__all__ = ["demo_clip", "looped"]
-
 _SIZE = (1280, 720)
 _FPS = 15
 

@@ -18,15 +18,6 @@ from hvt_common.errors import UserError
 from hvt_common.units import parse_bitrate, parse_duration_s, parse_share
 from lab.link.timeline import LinkState, Phase, Script
 
-__all__ = [
-    "SCENARIOS",
-    "Length",
-    "Scenario",
-    "Transport",
-    "load_scenario",
-    "scenario_names",
-]
-
 SCENARIOS = Path(__file__).parent / "scenarios"
 Length = Literal["short", "full"]
 Transport = Literal["tcp", "udp"]

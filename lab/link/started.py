@@ -9,8 +9,6 @@ from typing import Any, Self
 
 from programs.processes import Running
 
-__all__ = ["Started"]
-
 _END_S = 25.0
 
 

@@ -7,8 +7,6 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-__all__ = ["LinkState", "Phase", "Script"]
-
 
 @dataclass(frozen=True, slots=True)
 class LinkState:

@@ -33,8 +33,6 @@ from hvt_scene.view.project import (
 from hvt_scene.world.layout import Layout, plan
 from hvt_scene.world.traffic import set_in_motion
 
-__all__ = ["Scene"]
-
 _ORIGIN_DEG = (52.0, 13.0)
 _GROUND_M = 40.0
 _MARGIN_PX = 2

@@ -13,8 +13,6 @@ import numpy.typing as npt
 from hvt_common.units import exact_rate
 from hvt_common.values import Boxes, View
 
-__all__ = ["CodeInView", "Truth", "TruthSource", "frame_times", "write_truth"]
-
 
 @dataclass(frozen=True, slots=True)
 class Truth:

@@ -10,8 +10,6 @@ from importlib import import_module
 from hvt_common.errors import Parser, exit_with_sentence, needs_extra
 from hvt_study.commands import COMMANDS, RENAMED
 
-__all__ = ["main"]
-
 _PROGRAM = "hvt-study"
 _INTERRUPTED = 130
 

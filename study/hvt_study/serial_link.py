@@ -17,8 +17,6 @@ import numpy as np
 
 from hvt_common.units import SECOND_NS
 
-__all__ = ["Arrival", "LinkReport", "SerialLink"]
-
 _T = TypeVar("_T")
 
 

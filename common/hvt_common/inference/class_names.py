@@ -15,18 +15,6 @@ import tomllib
 from collections.abc import Sequence
 from importlib.resources import files
 
-__all__ = [
-    "COCO_NAMES",
-    "IMAGENET_NAMES",
-    "MOVING",
-    "VISDRONE_NAMES",
-    "group_of",
-    "is_imagenet",
-    "is_nothing",
-    "kind_of",
-    "same_kind",
-]
-
 MOVING = "moving"
 """The class of any moving object."""
 

@@ -37,8 +37,6 @@ from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_m
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Image, Posterior
 
-__all__ = ["Classifier", "OnnxClassifier", "open_classifier"]
-
 _log = logging.getLogger(__name__)
 
 _IMAGENET_CLASSES = 1000

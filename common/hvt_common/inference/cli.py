@@ -23,8 +23,6 @@ from hvt_common.inference.store import (
 from hvt_common.inference.store.manifest import ModelEntry
 from hvt_common.inference.store.store import Store, file_digest
 
-__all__ = ["main"]
-
 _PROGRAM = "hvt-models"
 _INTERRUPTED = 130
 _SHOWN_CLASSES = 12

@@ -26,16 +26,6 @@ from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names,
 from hvt_common.inference.store import model_names, resolve_model
 from hvt_common.values import Detections, Image
 
-__all__ = [
-    "MOTION",
-    "USUAL_CONFIDENCE",
-    "Detector",
-    "OnnxDetector",
-    "detect_every",
-    "open_detector",
-    "warm_up",
-]
-
 _log = logging.getLogger(__name__)
 
 MOTION = "motion"

@@ -14,8 +14,6 @@ from hvt_common.inference.motion import MotionDetector
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.values import Detections, Image
 
-__all__ = ["FewFoundHint"]
-
 _log = logging.getLogger(__name__)
 _RUNS = 45
 """Detections on pictures: 15 s at the defaults (15 fps, every fifth frame)."""

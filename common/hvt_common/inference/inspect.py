@@ -18,8 +18,6 @@ from hvt_common.inference.runtimes.ir_file import files_of, is_ir
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, Port, open_model
 from hvt_common.inference.runtimes.onnx_file import opset_versions
 
-__all__ = ["ModelReport", "inspect_model"]
-
 _ROUNDS = 9
 _TIME_LIMIT_S = 3.0
 _FREE_SIZE = (640, 384)

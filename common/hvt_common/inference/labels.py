@@ -14,18 +14,6 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
 from hvt_common.inference.store import known_classes
 
-__all__ = [
-    "KNOWN_LABELS",
-    "MAX_LABELS",
-    "MAX_LABEL_CHARS",
-    "class_labels",
-    "decoded",
-    "first_synonym",
-    "metadata_labels",
-    "numbered_names",
-    "read_labels",
-]
-
 KNOWN_LABELS: Mapping[str, tuple[str, ...]] = {"coco": COCO_NAMES, "visdrone": VISDRONE_NAMES}
 """Names that stand for a file. A number of classes alone never means one of these."""
 

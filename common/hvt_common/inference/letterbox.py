@@ -12,8 +12,6 @@ import numpy.typing as npt
 from hvt_common.inference.preparation import Preparation
 from hvt_common.values import Boxes, Image
 
-__all__ = ["Anchor", "Letterbox", "Letterboxer", "as_bgr"]
-
 Anchor = Literal["top-left", "centre", "stretch"]
 """Where the resized image lies on the network's input; ``stretch`` fills it, whatever becomes of the shape."""
 

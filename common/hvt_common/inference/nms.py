@@ -12,8 +12,6 @@ import numpy.typing as npt
 
 from hvt_common.values import Boxes
 
-__all__ = ["MAX_CANDIDATES", "MAX_DETECTIONS", "components", "suppress"]
-
 MAX_CANDIDATES = 8192
 """At most so many of the most confident boxes are compared, so that no image costs more than a tenth of a second."""
 MAX_DETECTIONS = 1000

@@ -10,8 +10,6 @@ import numpy as np
 
 from hvt_common.errors import UserError
 
-__all__ = ["Preparation", "prepared_as"]
-
 
 @dataclass(frozen=True, slots=True)
 class Preparation:

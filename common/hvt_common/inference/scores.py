@@ -13,8 +13,6 @@ from hvt_common.inference.runtimes.onnx_file import onnx_metadata
 from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
 from hvt_common.inference.store import resolve_model
 
-__all__ = ["declared_class_names", "default_confidence", "is_calibrated", "uncalibrated"]
-
 _CONFIDENCE = "hvt.confidence"
 _CALIBRATION = "hvt.calibration"
 _LEAST_CONFIDENCE = 0.01

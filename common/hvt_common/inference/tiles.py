@@ -20,17 +20,6 @@ from hvt_common.values import Boxes, Detections, Image
 if TYPE_CHECKING:
     from hvt_common.inference.detect import Detector
 
-__all__ = [
-    "MOST_RUNS",
-    "Grid",
-    "TiledDetector",
-    "auto_grid",
-    "detect_whole",
-    "parse_tiles",
-    "tile_boxes",
-    "tiled",
-]
-
 Grid = tuple[int, int]
 """(columns, rows)."""
 

@@ -14,23 +14,6 @@ from types import MappingProxyType
 
 from hvt_common.errors import UserError
 
-__all__ = [
-    "DELIVERIES",
-    "GROUP_ROOT",
-    "MAX_PAYLOAD_BYTES",
-    "MSGPACK_ENCODING",
-    "ROOT",
-    "Channel",
-    "Delivery",
-    "Direction",
-    "EdgeKeys",
-    "GroupKeys",
-    "check_edge_pattern",
-    "matches",
-    "parse_key",
-    "selector",
-]
-
 MAX_PAYLOAD_BYTES = 4 * 2**20
 """No access unit and no still is larger; a larger payload is refused unread."""
 

@@ -6,9 +6,6 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-__all__ = ["ClockOffset"]
-
-
 _DRIFT_PPM = 500
 """The most that two clocks drift apart (RFC 5905: NTP corrects 500 ppm)."""
 _ROUNDING_NS = 1_000_000

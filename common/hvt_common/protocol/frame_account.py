@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal, Self, get_args
 
-__all__ = ["FRAME_GROUPS", "FrameAccount", "FrameGroup"]
-
 FrameGroup = Literal[
     "sent",
     "nobody_listened",

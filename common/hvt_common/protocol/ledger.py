@@ -13,17 +13,6 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal
 
-__all__ = [
-    "MOST_WINDOW_NS",
-    "STANDARD_ENCODINGS",
-    "Account",
-    "Ledger",
-    "LedgerSummary",
-    "StillOutcome",
-    "WindowRates",
-    "overhead_bytes",
-]
-
 StillOutcome = Literal["sent", "deferred", "dropped", "received"]
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["STILL_WORDS", "counts_text", "still_words"]
-
 STILL_WORDS: Mapping[str, str] = MappingProxyType(
     {
         # Why the edge sent it.

@@ -22,8 +22,6 @@ from rich.text import Text
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
 
-__all__ = ["Finding", "check_clock", "check_folder", "check_port", "print_findings", "run_checks"]
-
 State = Literal["ok", "unknown", "warning", "wrong"]
 _STYLES: Mapping[State, str] = {"ok": "green", "unknown": "cyan", "warning": "yellow", "wrong": "bold red"}
 

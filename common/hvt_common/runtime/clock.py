@@ -10,8 +10,6 @@ from functools import cache
 from pathlib import Path
 from uuid import uuid4
 
-__all__ = ["Moment", "SteadyClock", "boot_id", "since_boot_ns", "unwitnessed_ns"]
-
 _log = logging.getLogger(__name__)
 
 _CHECK_INTERVAL_NS = 1_000_000_000

@@ -13,8 +13,6 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import Redaction
 from hvt_common.units import SECOND_NS
 
-__all__ = ["Awaited", "FailedPart", "Failure", "Failures", "Retried", "RetryPause", "reason_of"]
-
 _log = logging.getLogger(__name__)
 
 _Part = TypeVar("_Part")

@@ -23,8 +23,6 @@ from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.runtime.host_names import host_and_port, names_this_machine, requested_host
 from hvt_common.units import SECOND_NS
 
-__all__ = ["Answer", "HealthServer", "State", "state_answers"]
-
 _METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 """The media type of Prometheus' text format."""
 

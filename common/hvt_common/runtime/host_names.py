@@ -13,8 +13,6 @@ from urllib.parse import urlsplit
 
 from hvt_common.errors import UserError
 
-__all__ = ["host_and_port", "is_group", "is_loopback", "names_this_machine", "requested_host"]
-
 
 def is_loopback(host: str) -> bool:
     """Whether only this machine reaches it: `localhost`, or an address of loopback and nothing like one."""

@@ -19,8 +19,6 @@ from hvt_common.redaction import Redaction
 from hvt_common.runtime import failures
 from hvt_common.units import shown_text
 
-__all__ = ["LOG_FORMATS", "START_LOGGER", "STATUS_LOGGER", "Log", "log_fields", "start_log"]
-
 LOG_FORMATS = ("text", "json")
 STATUS_LOGGER = "hvt.status"
 """Of the lines that are a status line else; in JSON only."""

@@ -9,8 +9,6 @@ from typing import Any
 
 from hvt_common.errors import UserError
 
-__all__ = ["installed", "loaded", "origin", "the_one"]
-
 
 @cache  # unknown names come from the network too, and a search of all packages takes tens of milliseconds
 def installed(group: str) -> dict[str, tuple[EntryPoint, ...]]:

@@ -22,20 +22,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NoReturn, Self, TypeVar
 
-__all__ = [
-    "NETWORK_NICENESS",
-    "STOP_SIGNALS",
-    "NewThreads",
-    "join_threads_at_exit",
-    "leave",
-    "limit_malloc_arenas",
-    "lower_priority",
-    "notify_systemd",
-    "put_video_first",
-    "stop_on_signals",
-    "with_lower_priority",
-]
-
 T = TypeVar("T")
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

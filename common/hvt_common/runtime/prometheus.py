@@ -9,8 +9,6 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-__all__ = ["Counter", "Gauge", "Table", "exposition", "of_table", "seconds"]
-
 Gauge, Counter = GaugeMetricFamily, CounterMetricFamily
 
 _State = TypeVar("_State")

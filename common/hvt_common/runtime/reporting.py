@@ -21,8 +21,6 @@ from hvt_common.errors import FlightError, NotYetError, UserError, check_not_rea
 from hvt_common.runtime.log import STATUS_LOGGER
 from hvt_common.units import shown_text
 
-__all__ = ["StatusLine", "check_writable", "print_table", "say", "write_json"]
-
 _PLAIN_EVERY = 5
 
 

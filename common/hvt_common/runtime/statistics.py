@@ -7,8 +7,6 @@ from collections.abc import Iterable
 
 import numpy as np
 
-__all__ = ["DistinctIds", "LatencyStats"]
-
 _LOWEST_MS = 0.01
 _HIGHEST_MS = 1e6
 _LOG_RATIO = math.log(1.01)

@@ -18,8 +18,6 @@ from rich.table import Table
 from hvt_common.errors import FlightError, Parser
 from hvt_common.runtime.reporting import say
 
-__all__ = ["StatusCommand"]
-
 _PATIENCE_S = 5.0
 _MOST_BYTES = 16 * 2**20
 

@@ -6,8 +6,6 @@ import lap
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["assign", "grown", "overlaps", "pair"]
-
 _Floats = npt.NDArray[np.float64]
 _Indices = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]

@@ -25,8 +25,6 @@ from hvt_common.tracking.association import grown, overlaps, pair
 from hvt_common.tracking.track_table import LOST, TRACKED, UNCONFIRMED, TrackerInput, TrackTable
 from hvt_common.values import Detections, Image, Tracks
 
-__all__ = ["ByteTracker", "TrackerSettings", "weak_confidence"]
-
 _Floats = npt.NDArray[np.float64]
 _Indices = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]

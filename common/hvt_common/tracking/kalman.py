@@ -22,21 +22,6 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-__all__ = [
-    "COV_PV",
-    "POSITION",
-    "VAR_P",
-    "VAR_V",
-    "VELOCITY",
-    "States",
-    "boxes_of",
-    "correct",
-    "initiate",
-    "measure",
-    "predict",
-    "warp",
-]
-
 States = npt.NDArray[np.float64]
 """(N, 5, 4) float64: position, velocity and the three parts of each coordinate's 2x2 covariance."""
 

@@ -17,8 +17,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["EDGE_ONLY_CONFIDENCE", "Recall"]
-
 EDGE_ONLY_CONFIDENCE: Final = 0.6
 """An edge-only object is listed from this confidence on. Below it one in two was real on drawn scenes, and hardly any
 on real labelled pictures. A ground's object as sure as this counts as real."""

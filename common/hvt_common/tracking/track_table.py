@@ -12,8 +12,6 @@ import numpy.typing as npt
 from hvt_common.tracking import kalman
 from hvt_common.values import Detections
 
-__all__ = ["LOST", "TRACKED", "UNCONFIRMED", "TrackTable", "TrackerInput"]
-
 _Floats = npt.NDArray[np.float64]
 _Indices = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]

@@ -20,8 +20,6 @@ from hvt_common.protocol.messages import Info, WireError
 from hvt_common.transport.session import query
 from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
 
-__all__ = ["living_edge", "refuse_duplicate_edge"]
-
 _log = logging.getLogger(__name__)
 
 _ANSWER_S = 1.0

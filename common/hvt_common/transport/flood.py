@@ -10,8 +10,6 @@ from collections.abc import Hashable
 
 from hvt_common.units import SECOND_NS
 
-__all__ = ["FloodWatch", "TokenBucket"]
-
 _AGAIN_NS = 60 * SECOND_NS
 """Between two warnings: a flood is not to fill the log."""
 

@@ -7,8 +7,6 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
-__all__ = ["CAPACITY_BYTES", "Inbox", "Received", "ReceivedQueue"]
-
 CAPACITY_BYTES = 64 * 2**20
 """The size limit of one inbox: minutes of a base stream, and sixteen of the largest messages there are."""
 

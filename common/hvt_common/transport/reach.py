@@ -12,8 +12,6 @@ from hvt_common.transport.doctor.diagnose import visit
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 
-__all__ = ["check_link"]
-
 _PATIENCE_S = 3.0
 _SAMPLE_S = 0.1
 

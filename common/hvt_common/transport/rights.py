@@ -12,8 +12,6 @@ from typing import Any
 
 import zenoh
 
-__all__ = ["Rights"]
-
 
 @dataclass(frozen=True, slots=True)
 class Rights:

@@ -16,15 +16,6 @@ from hvt_common.runtime.host_names import is_loopback
 if TYPE_CHECKING:
     import zenoh
 
-__all__ = [
-    "DEFAULT_ENDPOINT",
-    "LinkSettings",
-    "configure",
-    "connect_endpoints",
-    "key_pair",
-    "without_build_paths",
-]
-
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 _MAX_CONFIG_BYTES = 1_000_000

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["LONG_START", "PARAMETER_SETS", "is_keyframe", "nal_kind", "nal_units", "parameter_sets"]
-
 _START_CODE = re.compile(rb"\x00\x00\x01")
 LONG_START = b"\0\0\0\1"
 """The start code of a parameter set, and of the first unit of a picture."""

@@ -16,8 +16,6 @@ from hvt_common.values import Image, View
 from hvt_common.video.exact_crop import exact_base_crop
 from hvt_common.video.hevc import YuvPicture
 
-__all__ = ["MAX_REQUESTED_SIDE_PX", "MAX_SIDE_PX", "base_crop", "coded_size", "resampled"]
-
 MAX_SIDE_PX = 512
 """A longer crop is coded smaller: an object that fills 512 pixels needs no more to be classified."""
 MAX_REQUESTED_SIDE_PX = 2048

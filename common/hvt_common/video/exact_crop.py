@@ -12,8 +12,6 @@ import numpy.typing as npt
 
 from hvt_common.values import Image, View
 
-__all__ = ["exact_base_crop"]
-
 _ONE = 65536
 """A pixel, in the positions of samples."""
 _PHASES = 32

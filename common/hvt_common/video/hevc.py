@@ -13,8 +13,6 @@ from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoRef
 
 from hvt_common.values import Image
 
-__all__ = ["MAX_PICTURE_PX", "MAX_SIDE_PX", "UNBIASED", "BaseDecoder", "YuvPicture"]
-
 UNBIASED = (
     Interpolation.AREA
     | Interpolation.ACCURATE_RND

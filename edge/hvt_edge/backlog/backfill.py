@@ -18,8 +18,6 @@ from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import Entry
 
-__all__ = ["Backfill", "Chunk"]
-
 _log = logging.getLogger(__name__)
 
 _PATIENCE_NS = 2 * SECOND_NS

@@ -41,8 +41,6 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.entry import Entry, OpenSegment, entry_of, moved_rank, worth
 
-__all__ = ["FILE_NAME", "Store"]
-
 _log = logging.getLogger(__name__)
 
 FILE_NAME = "backlog.sqlite"

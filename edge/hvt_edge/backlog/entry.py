@@ -10,8 +10,6 @@ from hvt_common.protocol.messages import MAX_BACKLOG_BYTES, BacklogKind, ObjectK
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 
-__all__ = ["FIRST_STORED", "MOST_UNIT_BYTES", "SEGMENT_NS", "Entry", "OpenSegment", "moved_rank", "worth"]
-
 FIRST_STORED = 2**31
 """Stills that are stored for later have numbers of their own: those that are sent have no holes then."""
 SEGMENT_NS = 10 * SECOND_NS

@@ -14,8 +14,6 @@ from dataclasses import dataclass, field
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogStill, ObjectKey
 from hvt_common.values import AccessUnit
 
-__all__ = ["EndSegment", "Intake", "IntakeStill", "News"]
-
 _MOST_ACKNOWLEDGED_RANGES = 64
 """Limit for all grounds together, the newest of each object; one report names 16."""
 

@@ -12,8 +12,6 @@ from collections import deque
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 
-__all__ = ["SILENCE_NS", "BaseInFlight", "Outage"]
-
 _MS = 1_000_000
 SILENCE_NS = 1_500 * _MS
 """Three reports in a row that did not come."""

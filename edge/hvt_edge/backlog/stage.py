@@ -26,8 +26,6 @@ from hvt_edge.backlog.outage import SILENCE_NS, BaseInFlight, Outage
 from hvt_edge.backlog.worker import ChunkAllowance, StoreNumbers, StoreWorker
 from hvt_edge.operating.keyframes import KeyframeRequests
 
-__all__ = ["BacklogLink", "BacklogStage", "State"]
-
 _STEADY_NS = 2 * SECOND_NS
 """The link is back for so long before stored objects are sent: the picture comes first."""
 _PROBE_NS = SECOND_NS

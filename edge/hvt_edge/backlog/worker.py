@@ -24,8 +24,6 @@ from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import MOST_UNIT_BYTES, Entry
 from hvt_edge.backlog.intake import EndSegment, Intake, IntakeStill, News
 
-__all__ = ["ChunkAllowance", "ChunkThread", "StoreNumbers", "StoreWorker"]
-
 _log = logging.getLogger(__name__)
 
 _PART, _SENDING_PART = "store", "backlog"

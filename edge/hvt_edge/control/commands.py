@@ -27,8 +27,6 @@ from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser
 from hvt_edge.video.share import FIRST_SHARE
 
-__all__ = ["Commands"]
-
 _MOST_REQUESTS = 32
 """In a second, from all grounds together."""
 _REST_NS = 2 * SECOND_NS

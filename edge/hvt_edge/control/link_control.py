@@ -22,8 +22,6 @@ from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.sending import StillSender
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 
-__all__ = ["LinkControl", "wait_for_ground"]
-
 _PART = "reports"
 _MOST_WAIT_NS = 100_000_000
 """A frame that would wait longer for the budget's window, and longer than half the time to the camera's next, is left

@@ -48,8 +48,6 @@ from hvt_edge.wiring import (
 )
 from hvt_edge.world import World
 
-__all__ = ["run"]
-
 _DESCRIPTION = (
     "Check what a flight with these settings needs; takes the settings of hvt-edge. --json is for programs."
 )

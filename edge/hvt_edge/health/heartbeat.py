@@ -12,8 +12,6 @@ from hvt_common.runtime.process import notify_systemd
 from hvt_common.units import SECOND_NS
 from hvt_edge.health.state import EdgeState, Phase, StateMaker
 
-__all__ = ["Heartbeat"]
-
 
 class Heartbeat:
     """Beats in the frame loop; ``clock`` is wall time, in lockstep too."""

@@ -11,8 +11,6 @@ from hvt_common.runtime.prometheus import Counter, Gauge, Table, exposition, of_
 from hvt_common.units import SECOND_NS
 from hvt_edge.health.state import BacklogState, EdgeState
 
-__all__ = ["metrics_text"]
-
 _GAUGES: Table[EdgeState] = {
     "hvt_budget_bits_per_second": ("The edge's budget.", lambda one: one.operating.budget_bps),
     "hvt_edge_allowed_bits_per_second": ("What may be sent now.", lambda one: one.operating.allowed_bps),

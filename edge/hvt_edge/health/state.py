@@ -33,17 +33,6 @@ from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.operating.point import Levers, LoopClock, Operating
 from hvt_edge.stills.stage import StillStage
 
-__all__ = [
-    "BacklogState",
-    "EdgeState",
-    "Frames",
-    "LinkState",
-    "OperatingState",
-    "Phase",
-    "StateMaker",
-    "lacks",
-]
-
 _LEAST_OLD_S = 1.0
 """Boxes that are younger are not called old."""
 

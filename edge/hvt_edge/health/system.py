@@ -6,8 +6,6 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["SystemReading", "read_system"]
-
 _ZONES = "sys/class/thermal/thermal_zone*/temp"
 _WIRELESS = "proc/net/wireless"
 _HEAD_LINES = 2

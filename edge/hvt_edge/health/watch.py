@@ -11,8 +11,6 @@ from hvt_common.protocol.still_words import counts_text
 from hvt_common.runtime.status_command import StatusCommand
 from hvt_common.units import SECOND_NS, bitrate_text
 
-__all__ = ["run"]
-
 
 def run(argv: Sequence[str]) -> int:
     """Print it once, or each second; `FlightError` where no edge answers."""

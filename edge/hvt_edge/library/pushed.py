@@ -24,8 +24,6 @@ from hvt_edge.source.live import LiveSource, Shot, SignalLost
 from hvt_edge.wiring import base_size
 from hvt_edge.world import World
 
-__all__ = ["PushedEdge", "open_edge"]
-
 _NAME = "pushed frames"
 _PATIENCE_S = 5.0
 """A program that pushes nothing for so long is said to be away, as a camera is."""

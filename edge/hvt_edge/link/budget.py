@@ -39,8 +39,6 @@ import numpy.typing as npt
 from hvt_common.units import SECOND_NS
 from hvt_edge.link.loan import MOST_SHARE, VideoLoan
 
-__all__ = ["BASE_PEAK", "BudgetSettings", "RollingBudget"]
-
 _MEMORY_WINDOWS = 5
 """How many windows of the base's recent behaviour the forecast looks back on."""
 _FORECASTS = 30

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from hvt_common.protocol.messages import AlsoShown, PackedMessage, RoiHeader, fitted_text
 from hvt_common.values import Still
 
-__all__ = ["StillEnvelope"]
-
 _PLAIN_ENCODING = "application/octet-stream"
 """The encoding of formats that only HVT reads; one byte on the wire."""
 _OWN_TYPES = "application/vnd.hvt."

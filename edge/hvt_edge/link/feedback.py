@@ -9,8 +9,6 @@ from hvt_common.protocol.messages import StillResult
 from hvt_edge.link.receivers import Report
 from hvt_edge.perception.detected import Detected
 
-__all__ = ["FeedbackInbox"]
-
 _MAX_RESULTS = 1024
 
 

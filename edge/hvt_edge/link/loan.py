@@ -11,8 +11,6 @@ from __future__ import annotations
 
 from collections import deque
 
-__all__ = ["MOST_SHARE", "VideoLoan"]
-
 MOST_SHARE = 0.8
 """Share of a window for requested stills; the rest is for status, tracks, pose and the remaining video."""
 _PATIENCE = 2

@@ -5,8 +5,6 @@ from __future__ import annotations
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
 
-__all__ = ["BASE_ATTACHMENT_BYTES", "STATUS_BYTES", "base_overhead_bps"]
-
 BASE_ATTACHMENT_BYTES = 48
 """The largest `BaseHeader`."""
 STATUS_BYTES = 320

@@ -16,8 +16,6 @@ from hvt_common.units import SECOND_NS
 from hvt_edge.link.rate_control import LeastDelay, Progress, RateController
 from hvt_edge.link.receivers import Report
 
-__all__ = ["Flight", "Pacer"]
-
 _MS = 1_000_000
 _MOST_BACKLOG_NS = 250 * _MS
 _STILL_BACKLOG_NS = 50 * _MS

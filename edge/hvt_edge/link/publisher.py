@@ -28,8 +28,6 @@ from hvt_common.transport.session import declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_edge.link.transmitter import Outlet
 
-__all__ = ["EdgeLink", "EdgeListener", "ZenohLink"]
-
 _log = logging.getLogger(__name__)
 
 _SPOKEN = (WIRE_VERSION,)

@@ -21,15 +21,6 @@ from dataclasses import dataclass, replace
 
 from hvt_common.units import SECOND_NS
 
-__all__ = [
-    "LeastDelay",
-    "LossCount",
-    "Progress",
-    "RateController",
-    "RateSettings",
-    "ReconfigurationTrigger",
-]
-
 _MS = 1_000_000
 _ABSURD_NS = 60 * SECOND_NS
 """A delay that differs by so much is a clock that was set, not a queue."""

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 
 from hvt_common.protocol.messages import Feedback
 
-__all__ = ["PrimaryReceiver", "Report"]
-
 _OTHER_RECEIVER_NS = 1_000_000_000
 _MISSED = 3
 """Base messages: one or two may be lost, or reported a moment later than by another."""

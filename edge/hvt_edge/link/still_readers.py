@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 from hvt_common.protocol.messages import InfoRequest
 
-__all__ = ["StillReaders"]
-
 _log = logging.getLogger(__name__)
 
 _FORGET_NS = 60_000_000_000

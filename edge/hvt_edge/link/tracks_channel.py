@@ -14,8 +14,6 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Tracks
 from hvt_edge.perception.analyzer import AnalyzedFrame
 
-__all__ = ["TrackReportSettings", "TrackReporter", "TrackSender"]
-
 _EARLY: Final = 0.95
 """Steps come a little early or late: one that is due nearly is due."""
 

@@ -42,8 +42,6 @@ from hvt_edge.link.envelope import StillEnvelope
 from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES
 from hvt_edge.link.pacer import Pacer
 
-__all__ = ["STILL_ATTACHMENT_BYTES", "Outlet", "Transmitter"]
-
 STILL_ATTACHMENT_BYTES = 100
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
 `Transmitter.still_allowance_bytes` of one that is counts its own header."""

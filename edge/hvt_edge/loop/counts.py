@@ -12,8 +12,6 @@ from hvt_edge.loop.cpu import CpuMeter
 from hvt_edge.source.contract import Source
 from hvt_edge.video.frame_decision import Action, FrameDecision
 
-__all__ = ["FrameCounts"]
-
 
 @dataclass(slots=True)
 class FrameCounts:

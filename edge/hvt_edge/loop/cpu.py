@@ -7,8 +7,6 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Cores", "CpuMeter", "processors"]
-
 _STAT = Path("/proc/stat")
 _MOST_SHORT = 600
 _IDLE = (3, 4)

@@ -25,8 +25,6 @@ from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.video.passthrough import VideoStage
 
-__all__ = ["LockstepPace"]
-
 _AHEAD_S = 1.0
 """The edge's lead over the ground, in media time: reports of the ground count so much later."""
 _GROUND_GONE_S = 20.0

@@ -6,8 +6,6 @@ from typing import Final
 
 from hvt_common.units import SECOND_NS
 
-__all__ = ["PerceptionRest"]
-
 _FIRST_NS: Final = SECOND_NS // 8
 _LONGEST_NS: Final = SECOND_NS // 2
 """If video goes on losing frames whatever perception does, boxes are still made twice a second."""

@@ -18,8 +18,6 @@ from hvt_edge.stills.stage import StillStage
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.passthrough import VideoStage
 
-__all__ = ["RealtimePace"]
-
 _MOST_GAP_NS = SECOND_NS // 4
 """Of a clip that cannot be read in time so much is left out in a row, and no more, of its own time and of time as it
 passes: else nothing would be shown."""

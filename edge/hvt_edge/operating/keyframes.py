@@ -13,8 +13,6 @@ from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS
 
-__all__ = ["KeyframeRequests", "KeyframeSettings", "KeyframeState"]
-
 _MOST_RECEIVERS = 16
 """Whose losses are remembered: ids cost a sender nothing."""
 

@@ -21,8 +21,6 @@ from dataclasses import dataclass
 from hvt_common.units import SECOND_NS
 from hvt_edge.operating.point import Levers, Operating
 
-__all__ = ["LeverControl", "LeverSettings", "Measured"]
-
 
 @dataclass(frozen=True, slots=True)
 class Measured:

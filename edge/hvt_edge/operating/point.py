@@ -12,8 +12,6 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-__all__ = ["Levers", "LoopClock", "Operating", "OperatingPoint", "base_rate_bps"]
-
 
 @dataclass(frozen=True, slots=True)
 class Levers:

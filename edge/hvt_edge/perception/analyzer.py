@@ -14,8 +14,6 @@ from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 
-__all__ = ["AnalyzedFrame", "Analyzer", "AnalyzerSettings", "FailingDetector"]
-
 
 @dataclass(frozen=True, slots=True)
 class AnalyzerSettings:

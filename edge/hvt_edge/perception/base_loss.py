@@ -14,8 +14,6 @@ import numpy as np
 
 from hvt_common.values import Image
 
-__all__ = ["MOST_PSNR_DB", "BaseLoss", "measure_loss"]
-
 MOST_PSNR_DB = 99.0
 """Said of identical crops, where the formula has no finite value."""
 _BT601 = np.array([[0.114, 0.587, 0.299]], np.float32)

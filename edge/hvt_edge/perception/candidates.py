@@ -17,8 +17,6 @@ from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop, coded_size
 from hvt_edge.perception.base_loss import BaseLoss, measure_loss
 from hvt_edge.perception.crop import PADDING, crop_box
 
-__all__ = ["Candidate", "ClassPosterior", "TrackMemory", "sharpness"]
-
 Box = tuple[float, float, float, float]
 
 _BORDER_PX = 2.0

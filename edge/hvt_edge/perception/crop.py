@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["MIN_SIDE_PX", "PADDING", "crop_box"]
-
 PADDING = 0.15
 """Share of the box's width and height that is added on each side (the pilot's setting)."""
 MIN_SIDE_PX = 8

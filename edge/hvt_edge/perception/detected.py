@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS
 
-__all__ = ["Detected", "GroundDifference"]
-
 _MOST_OPEN = 32
 """Comparisons that wait for a report: half a minute of them."""
 _LEAST_WORTH = 0.5

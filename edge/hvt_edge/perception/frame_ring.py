@@ -26,8 +26,6 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, Image, Tracks
 from hvt_common.video.hevc import YuvPicture
 
-__all__ = ["FrameRing", "RingFrame", "RingSettings"]
-
 _UNCODED_NS = 6 * SECOND_NS // 10
 """A frame that was coded stands for one that was not, so near: at two a second there is one."""
 

@@ -10,8 +10,6 @@ from hvt_common.inference.tiles import detect_whole
 from hvt_common.runtime.failures import Failures, Retried, RetryPause
 from hvt_common.values import Detections, Image
 
-__all__ = ["GuardedDetector", "OpenedOnUse"]
-
 
 class OpenedOnUse:
     """A detector that is opened when it is first used, for who may never use it; its class names are known."""

@@ -16,8 +16,6 @@ import numpy.typing as npt
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
 
-__all__ = ["SceneChange"]
-
 _Thumbnail = npt.NDArray[np.float32]
 
 _HALFWAY_PX: Final = (320, 180)

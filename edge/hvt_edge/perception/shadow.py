@@ -40,8 +40,6 @@ from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.detected import Detected, GroundDifference
 from hvt_edge.perception.scene_change import SceneChange
 
-__all__ = ["UNMEASURED", "Shadow", "ShadowGround", "ShadowSettings"]
-
 _LEAST_MORE = 0.5
 """Least difference between the ground's number of objects and the edge's."""
 _BASE_NAMES = 1 / 3

@@ -6,8 +6,6 @@ from typing import Final
 
 from hvt_common.values import AccessUnit
 
-__all__ = ["SkippedUnits"]
-
 _MOST_BYTES: Final = 2 * 2**20
 
 

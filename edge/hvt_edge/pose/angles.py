@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["compass_deg", "euler_deg"]
-
 _UPRIGHT = 0.99999
 """Sine of a pitch within 0.3 degrees of straight up or down, where yaw and roll turn about the same axis."""
 

@@ -6,8 +6,6 @@ from typing import Protocol
 
 from hvt_common.values import Pose
 
-__all__ = ["PoseSource"]
-
 
 class PoseSource(Protocol):
     """Opened once; closed with the edge."""

@@ -25,8 +25,6 @@ from hvt_edge.pose.angles import compass_deg
 from hvt_edge.pose.subtitles import subtitle_rows
 from hvt_edge.pose.table import PoseTable
 
-__all__ = ["COLUMNS", "read_poses"]
-
 _log = logging.getLogger(__name__)
 
 COLUMNS = (

@@ -8,8 +8,6 @@ from hvt_common.errors import UserError
 from hvt_common.values import Orientation, Pose
 from hvt_edge.pose.angles import compass_deg
 
-__all__ = ["FixedPose"]
-
 _ACCEPTED = (
     "give fixed:LAT,LON,HEIGHT,AZIMUTH,TILT: degrees, metres above the ground, degrees clockwise from north, degrees "
     "up from the horizon (-90 is straight down)"

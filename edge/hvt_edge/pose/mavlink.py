@@ -20,8 +20,6 @@ from hvt_edge.pose.angles import compass_deg, euler_deg
 from hvt_edge.pose.mavlink_frames import FrameParser
 from hvt_edge.pose.mavlink_transport import Address, Connection
 
-__all__ = ["MavlinkPose"]
-
 _log = logging.getLogger(__name__)
 
 _OLD_NS, _OLD_FIX_NS = 2 * SECOND_NS, 10 * SECOND_NS

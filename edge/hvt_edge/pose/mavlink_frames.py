@@ -6,8 +6,6 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega
 
-__all__ = ["MAX_FRAME_BYTES", "FrameParser"]
-
 MAX_FRAME_BYTES = 280
 """Header, 255 bytes of payload, checksum and signature of MAVLink 2."""
 

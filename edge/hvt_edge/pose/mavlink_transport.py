@@ -17,8 +17,6 @@ import serial  # type: ignore[import-untyped]
 
 from hvt_common.errors import UserError, may_come
 
-__all__ = ["Address", "Connection"]
-
 _log = logging.getLogger(__name__)
 
 _ACCEPTED = "give mavlink:udpin:HOST:PORT, mavlink:tcp:HOST:PORT or mavlink:/dev/DEVICE[,BAUD]"

@@ -12,8 +12,6 @@ from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.units import SECOND_NS
 from hvt_edge.pose.contract import PoseSource
 
-__all__ = ["PoseSender", "PoseStage"]
-
 _MOST_BPS: Final = 300
 """Payload bits a second."""
 _EARLY: Final = 0.97

@@ -6,8 +6,6 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-__all__ = ["subtitle_rows"]
-
 _FULL_FRAME_MM = 36.0
 """Width of the picture that 35 mm equivalent focal lengths are said for."""
 _OVERSHOT_DEG = 92.0

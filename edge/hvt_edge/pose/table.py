@@ -10,8 +10,6 @@ from hvt_common.geodesy import between
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
 
-__all__ = ["PoseTable"]
-
 _BEYOND_NS = SECOND_NS
 """So long before the first pose and after the last one they are still taken."""
 

@@ -20,8 +20,6 @@ from hvt_edge.source.decoding.levels import Stretch
 from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.live import Shot, SignalLost
 
-__all__ = ["CameraGrabber"]
-
 _REQUESTED_SIZE = (1920, 1080)
 """Requested of the camera, which takes the nearest it has. Stills live on the pixels beyond the base size."""
 

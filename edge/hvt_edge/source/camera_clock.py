@@ -6,8 +6,6 @@ from collections import deque
 
 from hvt_common.units import SECOND_NS
 
-__all__ = ["CameraClock"]
-
 _MOST_DELAY_NS = 5 * SECOND_NS
 """A frame that seems older when it comes shows that the camera's clock is not set as ours is."""
 _MEMORY_NS = 60 * SECOND_NS

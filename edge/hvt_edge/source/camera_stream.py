@@ -18,17 +18,6 @@ from hvt_edge.source.camera_units import CameraUnits
 from hvt_edge.source.contract import BaseSize, SeenUnit, check_shape
 from hvt_edge.source.decoding.pictures import matrix_of, turn_of
 
-__all__ = [
-    "LONG_STEP_S",
-    "REENCODE",
-    "CameraDecoder",
-    "check_picture",
-    "check_stream",
-    "open_units",
-    "rate_of",
-    "without_jumps",
-]
-
 REENCODE = "re-encode it with --encoder x265"
 _FORMATS = frozenset({"yuv420p", "yuvj420p"})
 """4:2:0 in 8 bits; the second is FFmpeg's name for the same in full range."""

@@ -10,8 +10,6 @@ from __future__ import annotations
 from hvt_common.values import CameraUnit
 from hvt_common.video.annex_b import LONG_START, PARAMETER_SETS, is_keyframe, nal_kind, nal_units
 
-__all__ = ["CameraUnits"]
-
 _HVCC_HEADER_BYTES = 22
 _FIRST_OF_PICTURE = 0x80
 """``first_slice_segment_in_pic_flag``, the first bit of a slice's header (H.265, clause 7.3.6.1)."""

@@ -28,8 +28,6 @@ from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit
 from hvt_edge.source.live import SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
 from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped
 
-__all__ = ["CodedLiveSource", "CodedStreamGrabber"]
-
 _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
 """A camera is surveyed before the flight until its second keyframe, within these."""
 _QUEUE_S, _LEAST_QUEUED, _MOST_QUEUED_BYTES = 1.0, 8, 8 * 2**20

@@ -29,8 +29,6 @@ from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.decoding.timeline import Stamps, Timeline
 from hvt_edge.source.resample import Resizer
 
-__all__ = ["CodedVideoSource"]
-
 _log = logging.getLogger(__name__)
 
 _MOST_SURVEY_S, _MOST_SURVEYED = 600.0, 40_000

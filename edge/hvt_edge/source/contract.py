@@ -12,8 +12,6 @@ from typing import Self
 from hvt_common.errors import UserError
 from hvt_common.values import Frame, View
 
-__all__ = ["BaseSize", "CameraStream", "SeenUnit", "Source", "check_shape", "size_within"]
-
 BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
 """(width, height) of the base frames, or how they follow from those of the source."""
 

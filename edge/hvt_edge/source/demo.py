@@ -26,16 +26,6 @@ from hvt_common.values import Fit, Frame, Image, Pose, View
 from hvt_edge.source.contract import BaseSize, Source
 from hvt_edge.source.resample import Resizer, capture_time_ns
 
-__all__ = [
-    "SCENE_WORDS",
-    "DemoSource",
-    "DrawnScene",
-    "check_truth",
-    "demo_scene",
-    "is_demo",
-    "write_truth_of",
-]
-
 _END_S = 5.0
 _POSES_PER_S = 5
 SCENE_WORDS: Mapping[str, tuple[str, Any]] = {"codes": ("codes", True), "4k": ("size", (3840, 2160))}

@@ -20,8 +20,6 @@ from hvt_edge.source.decoding.levels import Stretch
 from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
-__all__ = ["FolderSource", "sequence_files"]
-
 _log = logging.getLogger(__name__)
 
 _MOSTLY = 0.5

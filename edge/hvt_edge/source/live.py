@@ -24,8 +24,6 @@ from hvt_edge.source.contract import BaseSize, Source
 from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.resample import Gate, Resizer
 
-__all__ = ["SOURCE_PART", "CameraPacket", "Grabber", "LiveSource", "Shot", "SignalLost", "closing_on"]
-
 _log = logging.getLogger(__name__)
 
 _FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS

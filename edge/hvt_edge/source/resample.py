@@ -20,15 +20,6 @@ from hvt_common.values import CameraUnit, Fit, Frame, Image, View
 from hvt_edge.source.contract import BaseSize
 from hvt_edge.source.decoding.condition import PictureCondition
 
-__all__ = [
-    "Gate",
-    "Resizer",
-    "base_frame_count",
-    "capture_time_ns",
-    "hold",
-    "into_canvas",
-]
-
 _log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")

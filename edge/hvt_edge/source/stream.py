@@ -20,8 +20,6 @@ from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.live import Shot, SignalLost
 
-__all__ = ["LIVE_SCHEMES", "StreamGrabber", "camera_time_ns", "is_stamped"]
-
 LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "http", "https", "udp", "rtp", "tcp", "srt"})
 
 _OPEN_S = 10.0

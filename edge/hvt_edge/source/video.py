@@ -29,8 +29,6 @@ from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.decoding.timeline import Stamps
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
-__all__ = ["VideoSource"]
-
 
 class VideoSource(Source):
     """A clip by presentation time; the first frame that decodes is its zero. Every decodable frame is played."""

@@ -18,16 +18,6 @@ from hvt_edge.perception.crop import crop_box
 from hvt_edge.stills.policy.base import Request
 from hvt_edge.stills.policy.cost import CostEstimate
 
-__all__ = [
-    "Alternative",
-    "CropJob",
-    "crop_of",
-    "expected_bytes",
-    "inner_box",
-    "size_parameters",
-    "union_crop",
-]
-
 Box = tuple[float, float, float, float]
 Crop = tuple[int, int, int, int]
 Place = tuple[slice, slice]

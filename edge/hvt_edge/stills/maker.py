@@ -32,8 +32,6 @@ from hvt_edge.perception.crop import PADDING
 from hvt_edge.stills.crop_job import Alternative, CropJob, crop_of, inner_box, size_parameters, union_crop
 from hvt_edge.stills.policy.base import Request
 
-__all__ = ["Allowance", "NoStill", "StillMaker"]
-
 Allowance = Callable[[Still], int]
 """How many payload bytes a still with this header may take now; the header's own data does not count."""
 

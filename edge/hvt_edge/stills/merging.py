@@ -18,8 +18,6 @@ from hvt_edge.perception.crop import crop_box
 from hvt_edge.stills.policy.base import Request
 from hvt_edge.stills.policy.cost import CostEstimate
 
-__all__ = ["ALSO_BYTES", "MOST_ALSO", "group"]
-
 ALSO_BYTES = 17.0
 """Bytes of the header for each further track: its id and its box in eighths of a pixel."""
 MOST_ALSO = 15

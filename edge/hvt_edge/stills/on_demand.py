@@ -36,8 +36,6 @@ from hvt_edge.stills.outbox import Outbox, OutboxStill
 from hvt_edge.stills.policy.cost import CostModel
 from hvt_edge.stills.requested_coding import Capacity, CodedRequest, NothingCloser, code_requested
 
-__all__ = ["REQUEST_PARAMETER", "OnDemand", "OnDemandStill", "RequestedLine"]
-
 REQUEST_PARAMETER = "ask"
 """The parameter that carries its number."""
 

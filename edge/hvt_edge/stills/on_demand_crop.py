@@ -13,8 +13,6 @@ from hvt_edge.perception.frame_ring import FrameRing, RingFrame
 from hvt_edge.stills.crop_job import CropJob, crop_of, size_parameters
 from hvt_edge.stills.maker import StillMaker
 
-__all__ = ["ON_DEMAND", "OnDemandRequest", "RefusedError", "box_of", "crop_job_for", "frame_for"]
-
 ON_DEMAND = "asked"
 """The reason that such a still carries on the wire and in the ledger."""
 

@@ -15,8 +15,6 @@ from hvt_edge.link.envelope import StillEnvelope
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.policy.base import Request
 
-__all__ = ["AGAIN", "Outbox", "OutboxSettings", "OutboxStill", "StillState"]
-
 AGAIN = "again"
 """The reason of a still whose crop was sent before, and the parameter that names the sequence of the first."""
 _MIB = 2**20

@@ -20,8 +20,6 @@ from hvt_common.values import Image, Still
 from hvt_common.video.still_codecs import CodedCrop, StillCodec
 from hvt_edge.stills.crop_job import CropJob, size_parameters
 
-__all__ = ["Capacity", "CodedRequest", "NothingCloser", "code_requested"]
-
 _PLAIN_GAIN_DB = 2.0
 """A still that is closer to the source than the base by so much shows plainly more."""
 _LEAST_GAIN_DB = 0.3

@@ -22,8 +22,6 @@ from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, Method, Request, S
 from hvt_edge.stills.policy.cost import CostModel
 from hvt_edge.stills.suppression import Gate, Suppression
 
-__all__ = ["Chooser", "ChooserSettings", "Coded"]
-
 Coded = Generator[OutboxStill, None, None]
 """Stills that are coded and may go. Closing it gives other threads their turn."""
 

@@ -11,8 +11,6 @@ from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import Allowance, NoStill, StillMaker
 from hvt_edge.stills.outbox import AGAIN, Outbox, OutboxStill
 
-__all__ = ["StillSender"]
-
 
 @dataclass(eq=False)
 class StillSender:

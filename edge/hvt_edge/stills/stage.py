@@ -21,8 +21,6 @@ from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser, Coded
 from hvt_edge.stills.sending import StillSender
 
-__all__ = ["StillStage"]
-
 _ALL = Levers()
 
 

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from hvt_edge.perception.base_loss import BaseLoss
 from hvt_edge.perception.candidates import Candidate
 
-__all__ = ["Gate", "Suppression"]
-
 
 @dataclass(frozen=True, slots=True)
 class Suppression:

@@ -22,8 +22,6 @@ from hvt_edge.perception.detected import Detected
 from hvt_edge.perception.skipped_units import SkippedUnits
 from hvt_edge.stills.stage import StillStage
 
-__all__ = ["MAX_QUEUE_BYTES", "StillWorker"]
-
 _log = logging.getLogger(__name__)
 
 _PART, _REQUESTED_PART = "stills", "requested stills"

@@ -7,20 +7,6 @@ from dataclasses import dataclass
 
 from hvt_edge.link.overhead import base_overhead_bps
 
-__all__ = [
-    "PRESETS",
-    "VBV_S",
-    "EncoderSettings",
-    "encoder_settings",
-    "keyframe_floor_bytes",
-    "keyframe_total_bps",
-    "least_base_bps",
-    "minimum_bps",
-    "most_keyframe_bytes",
-    "payload_bps",
-    "usual_keyframe_bytes",
-]
-
 PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium")
 VBV_S = 0.15
 """Depth of the VBV buffer in seconds of the base rate."""

@@ -8,8 +8,6 @@ from enum import Enum
 from hvt_common.protocol.frame_account import FrameGroup
 from hvt_edge.backlog.stage import State
 
-__all__ = ["Action", "FrameDecision", "FrameInputs", "decide"]
-
 
 class Action(Enum):
     """The action for a source frame."""

@@ -13,8 +13,6 @@ from collections.abc import Callable
 
 from hvt_edge.video.rate_model import SPARING, QuantiserBand, better_decimation
 
-__all__ = ["FrameSkip", "LimitedFrameSkip", "MeasuredFrameSkip"]
-
 
 class FrameSkip:
     """Each ``decimation``-th source frame. Where one was missed, the next is coded in its place."""

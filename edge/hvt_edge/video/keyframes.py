@@ -10,8 +10,6 @@ from __future__ import annotations
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeState
 from hvt_edge.video.encoder_settings import usual_keyframe_bytes
 
-__all__ = ["KeyframePlan", "keyframe_interval_s"]
-
 _KEYFRAME_SHARE = 0.005
 
 

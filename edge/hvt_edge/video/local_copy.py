@@ -23,8 +23,6 @@ import av.error
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.values import AccessUnit
 
-__all__ = ["LocalCopy"]
-
 _log = logging.getLogger(__name__)
 
 _PART = "local copy"

@@ -22,8 +22,6 @@ from hvt_edge.video.frame_decision import Action, FrameDecision
 from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.stage import BaseStage
 
-__all__ = ["PassthroughStage", "UnitInputs", "VideoStage", "decide_unit"]
-
 _PART = "passthrough"
 _PATIENCE_NS = SECOND_NS // 2
 """A unit waits so long for its room: a large keyframe leaves none for a moment, and a waiting unit is not lost."""

@@ -16,8 +16,6 @@ from typing import Final
 from hvt_common.units import SECOND_NS
 from hvt_edge.operating.point import Operating
 
-__all__ = ["SLOWEST", "PresetChoice", "PresetControl", "Spent", "choose_preset", "share_of"]
-
 _log = logging.getLogger(__name__)
 
 SLOWEST: Final = "veryfast"

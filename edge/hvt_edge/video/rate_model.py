@@ -13,18 +13,6 @@ from dataclasses import dataclass
 
 from hvt_common.errors import UserError
 
-__all__ = [
-    "LEAST_SIDE_PX",
-    "PROMPT",
-    "SIZES",
-    "SPARING",
-    "QuantiserBand",
-    "better_decimation",
-    "choose_base",
-    "most_decimation",
-    "sizes_of",
-]
-
 SIZES = ((1280, 720), (960, 540), (640, 360), (480, 270), (320, 180))
 """The ladder of ``--size auto`` for a source of 16:9; others keep its areas and their own aspect ratio. It ends where
 x265 still codes 15 frames a second on two cores; ``--size`` may ask for more."""

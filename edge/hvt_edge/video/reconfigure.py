@@ -18,8 +18,6 @@ from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.preset import PresetControl
 from hvt_edge.video.share import FIRST_SHARE, Split
 
-__all__ = ["EncoderReconfiguration", "OpenEncoder", "ReconfigurationSettings"]
-
 _WORTH = 0.04
 """At a keyframe that comes anyway, a base rate that is off by less is left as it is."""
 

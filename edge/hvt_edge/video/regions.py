@@ -22,8 +22,6 @@ from av.filter import Graph
 
 from hvt_common.values import Boxes, Tracks
 
-__all__ = ["BLOCK_PX", "MOST_REGIONS", "Region", "RegionTagger", "TrackRegions"]
-
 BLOCK_PX = 16
 """libx265 keeps one offset for each block of 16x16 luma pixels; a region takes all blocks that it touches."""
 MOST_REGIONS = 96

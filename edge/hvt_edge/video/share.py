@@ -18,8 +18,6 @@ from hvt_edge.stills.policy.m6 import ExpectedGain
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
-__all__ = ["FIRST_SHARE", "Split", "SplitSettings"]
-
 FIRST_SHARE = 0.85
 """Of the budget, for the base, until the scene is known: between what served best on a car park (0.9) and on small
 objects (0.8) at 200 kbps."""

@@ -24,8 +24,6 @@ from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.regions import TrackRegions
 
-__all__ = ["BaseStage"]
-
 _PART, _SIZE_PART = "encoder", "video"
 _MOST_FAILURES, _FAILURES_NS = 3, 10 * SECOND_NS
 _CODING_MEMORY = 4

@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterable
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.video.encoders.contract import Encoder
 
-__all__ = ["trial_frames", "trial_quantiser"]
-
 _TRIAL_S = 0.85
 """The time of two comparisons of the shadow ground."""
 _LAST = 3

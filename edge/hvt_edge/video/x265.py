@@ -40,8 +40,6 @@ from hvt_common.video.hevc import UNBIASED
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.regions import Region, RegionTagger
 
-__all__ = ["BaseEncoder", "EncoderSettings", "encoder_context", "mean_qp_of", "yuv_picture"]
-
 _QP_TO_LAMBDA = 118
 _WITHOUT_AQ = ("ultrafast", "superfast")
 """Presets without adaptive quantisation, where x265 ignores regions: a trace of it makes them count."""

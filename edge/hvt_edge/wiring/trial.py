@@ -26,8 +26,6 @@ from hvt_edge.wiring.link import SPARSE_SHARE, lever_settings
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.video import first_decimation, make_encoder, scene
 
-__all__ = ["Beginning", "try_scene"]
-
 _FINE = 33.5
 """Of `trial_quantiser`: below it all frames are coded. Measured as `PROMPT` was."""
 _MOST_NS = 3 * SECOND_NS

@@ -21,8 +21,6 @@ from hvt_ground.extras import all_extras
 from hvt_ground.recordings.recorded import Recorded, read_recordings
 from hvt_ground.wiring import make_surfaces
 
-__all__ = ["run"]
-
 _FOLDERS: dict[str, Callable[[Recorded, Path], None]] = {"coco": write_coco, "stills": write_stills}
 _SUFFIXES = {"mot": ".txt"}
 """The suffixes other than the kind's own name."""

@@ -23,8 +23,6 @@ from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.palette import class_colour
 from hvt_ground.sinks.tracks_table import utc_text
 
-__all__ = ["write_geojson", "write_kml"]
-
 _EVERY_NS: Final = SECOND_NS
 _ELLIPSE_CORNERS: Final = 24
 _KML: Final = "http://www.opengis.net/kml/2.2"

@@ -15,8 +15,6 @@ from hvt_ground.events import Overlay
 from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.tracks_table import utc_text
 
-__all__ = ["STILL_COLUMNS", "write_coco", "write_stills"]
-
 STILL_COLUMNS = ("file", "base_file", "frame", "capture_utc", "caption")
 """``base_file`` shows what the base stream had there, empty where the recording does not say; ``frame`` is the one,
 from 1, at which the still was known; ``caption`` what it did, as under the pair on the screen."""

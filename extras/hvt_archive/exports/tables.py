@@ -13,8 +13,6 @@ import pyarrow.parquet as pq
 from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.tracks_table import COLUMNS, track_rows
 
-__all__ = ["write_csv", "write_mot", "write_parquet"]
-
 _BATCH_ROWS = 100_000
 _TYPES = {
     "frame": pa.int64(),

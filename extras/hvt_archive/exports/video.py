@@ -21,8 +21,6 @@ from hvt_ground.events import Overlay, VideoSample
 from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.palette import class_colour
 
-__all__ = ["CONTAINERS", "pictures", "write_video"]
-
 CONTAINERS = {"mp4": "mp4", "mkv": "matroska", "ts": "mpegts"}
 """libavformat's names of the containers."""
 _TIME_BASE = Fraction(1, 1000)

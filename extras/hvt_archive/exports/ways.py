@@ -10,8 +10,6 @@ from typing import Any, Final
 
 from hvt_common.geodesy import turned_deg
 
-__all__ = ["Fix", "line", "parts_of"]
-
 _DIGITS: Final = 7
 """Digits of degrees: a centimetre."""
 

@@ -13,8 +13,6 @@ import av.error
 from hvt_common.errors import UserError
 from hvt_ground.sinks.line_file import claim_name
 
-__all__ = ["whole_file", "whole_folder"]
-
 
 @contextmanager
 def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:

@@ -42,8 +42,6 @@ from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.status import completed, summary, table
 from hvt_ground.wiring import SessionFactory, check_outputs, make_record_folder
 
-__all__ = ["messages_in", "run"]
-
 _Messages = Callable[[], Iterator[Received]]
 """All that was received, from the beginning."""
 _OF_A_LINK = (

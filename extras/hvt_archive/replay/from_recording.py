@@ -18,8 +18,6 @@ from hvt_common.video.annex_b import parameter_sets
 from hvt_ground.events import PoseUpdate, VideoSample
 from hvt_ground.recordings.recorded import Recorded, RecordedStill
 
-__all__ = ["messages_of"]
-
 _OF_EVERY_POSE = 0
 """Each report stands by itself, so that none is lost with another."""
 

@@ -19,8 +19,6 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from hvt_common.errors import UserError
 
-__all__ = ["CA_DAYS", "MACHINE_DAYS", "Authority"]
-
 CA_DAYS = 3650
 MACHINE_DAYS = 825
 """The longest that common TLS libraries accept for a server."""

@@ -17,8 +17,6 @@ from hvt_fleet.pki.zenoh_files import KEYS_FOLDER, edge_file, ground_file, route
 if TYPE_CHECKING:
     from hvt_fleet.pki.authority import Authority
 
-__all__ = ["run"]
-
 _DIR = Path("hvt-keys")
 
 

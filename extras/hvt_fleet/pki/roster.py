@@ -9,8 +9,6 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import EdgeKeys, check_edge_pattern, matches
 
-__all__ = ["GroundMember", "Roster", "RouterMember"]
-
 _FILE = "fleet.json"
 _RESERVED = ("ca", "fleet")
 """Names of files that are the fleet's own."""

@@ -16,8 +16,6 @@ from hvt_common.protocol.channels import DELIVERIES, GROUP_ROOT, ROOT, Channel, 
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
 from hvt_fleet.pki.roster import GroundMember, Roster, RouterMember
 
-__all__ = ["KEYS_FOLDER", "edge_file", "ground_file", "router_file"]
-
 KEYS_FOLDER = "/etc/hvt/tls"
 """The default folder of the files on the machines."""
 

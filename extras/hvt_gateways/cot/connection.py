@@ -32,8 +32,6 @@ from hvt_common.errors import UserError
 from hvt_common.runtime.host_names import is_group
 from hvt_gateways.cot.event import CotMessage
 
-__all__ = ["VARIABLES", "CotConnection", "check_connection"]
-
 _log = logging.getLogger(__name__)
 
 VARIABLES: Final = (

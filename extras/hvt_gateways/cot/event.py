@@ -14,8 +14,6 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 from hvt_ground.sinks.tracks_table import utc_text
 
-__all__ = ["UNKNOWN_M", "CotEvent", "CotMessage", "Motion", "Parent", "Point", "Sensor", "plain"]
-
 UNKNOWN_M: Final = 9_999_999.0
 """The schema's value for an unknown height or error."""
 _DECLARATION: Final = b'<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'

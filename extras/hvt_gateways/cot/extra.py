@@ -17,8 +17,6 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 from hvt_ground.sinks import Outputs
 
-__all__ = ["CotExtra"]
-
 _GATEWAYS = Group("gateways", rare=True)
 
 

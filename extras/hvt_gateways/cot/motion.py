@@ -10,8 +10,6 @@ from hvt_common.geodesy import metres_per_degree, turned_deg
 from hvt_common.units import SECOND_NS
 from hvt_gateways.cot.event import Motion
 
-__all__ = ["MotionTrail", "metres_between"]
-
 _WINDOW_NS: Final = 10 * SECOND_NS
 _LEAST_NS: Final = SECOND_NS
 _MOST_PLACES: Final = 16

@@ -22,8 +22,6 @@ from hvt_gateways.cot.type_table import TypeTable
 from hvt_ground.events import Event, MessageTiming, Overlay, PoseUpdate, Refinement
 from hvt_ground.sinks.contract import Sink
 
-__all__ = ["SessionReporter", "StillAddress", "no_address", "placed_tracks", "sensor_of"]
-
 _log = logging.getLogger(__name__)
 
 T = TypeVar("T")

@@ -19,8 +19,6 @@ from typing import Final
 from hvt_common.units import SECOND_NS
 from hvt_gateways.cot.motion import Place, metres_between
 
-__all__ = ["STALE_NS", "PlacedTrack", "Reported", "TrackSchedule"]
-
 STALE_NS: Final = 5 * SECOND_NS
 """After so long without another report a receiver takes an object for lost."""
 _MOVED_NS: Final = SECOND_NS

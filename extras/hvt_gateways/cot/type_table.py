@@ -14,8 +14,6 @@ from typing import Any, Final
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import kind_of
 
-__all__ = ["TypeTable", "default_types", "read_types"]
-
 _TYPE: Final = re.compile(r"[A-Za-z0-9]+(-[A-Za-z0-9]+)*")
 _MOST_TYPE: Final = 64
 _MOST_NAME: Final = 128

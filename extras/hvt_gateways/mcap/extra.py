@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from hvt_gateways.mcap.file import McapFile
     from hvt_ground.recordings.recorded import Recorded
 
-__all__ = ["McapExtra"]
-
 
 @dataclass(frozen=True)
 class McapOptions:

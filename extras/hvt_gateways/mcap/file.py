@@ -34,8 +34,6 @@ from hvt_ground.sinks.line_file import check_there
 from hvt_ground.sinks.palette import Rgb, class_colour
 from hvt_ground.sinks.rerun.stills.pairs import event_text, still_picture
 
-__all__ = ["McapFile"]
-
 _CHUNK_BYTES = 256 * 1024
 """The most that a kill loses: a chunk is written once it is full."""
 _LATEST_NS = (1 << 63) - 1

@@ -22,8 +22,6 @@ from hvt_common.runtime.host_names import is_group
 from hvt_common.runtime.reporting import check_writable
 from hvt_ground.sinks.line_file import check_there
 
-__all__ = ["Address", "Addresses", "Datagrams", "Output", "StreamFile", "check_destination", "destination"]
-
 _log = logging.getLogger(__name__)
 
 _ACCEPTED: Final = "give FILE.ts, a folder that is there, udp://HOST:PORT or srt://HOST:PORT"

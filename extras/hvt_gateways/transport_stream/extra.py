@@ -15,8 +15,6 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 from hvt_ground.sinks import Outputs
 
-__all__ = ["TransportStreamExtra"]
-
 
 @dataclass(frozen=True)
 class TransportStreamOptions:

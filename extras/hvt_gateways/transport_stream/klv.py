@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-__all__ = ["ber_length", "ber_oid", "imapb", "item", "packet", "signed", "unsigned", "whole"]
-
 _SHORT = 128
 """BER lengths and identifiers below take one byte (ITU-T X.690, 8.1.3)."""
 

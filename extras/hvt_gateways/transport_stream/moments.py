@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Overlay
 
-__all__ = ["Moment", "Moments"]
-
 _HOLD_NS = SECOND_NS
 """Perception that is later than this is not waited for."""
 _MOST = 64

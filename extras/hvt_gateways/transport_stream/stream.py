@@ -37,8 +37,6 @@ from hvt_ground.sinks.decodable import DecodableRun
 if TYPE_CHECKING:
     from hvt_ground.recordings.recorded import Recorded
 
-__all__ = ["TransportStream", "live_stream", "stream_file", "write_recorded"]
-
 _BUFFER_BYTES: Final = 24 * 7 * 188
 """A buffer of whole datagrams of whole packets."""
 _DELAY_US: Final = "200000"

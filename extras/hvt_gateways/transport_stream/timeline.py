@@ -7,8 +7,6 @@ from typing import Final
 
 from hvt_common.units import SECOND_NS
 
-__all__ = ["TIME_BASE", "Timeline"]
-
 TIME_BASE: Final = Fraction(1, 90_000)
 """ISO/IEC 13818-1, 2.4.3.7."""
 _LONGEST_S: Final = 3600

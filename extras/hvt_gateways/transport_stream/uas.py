@@ -18,8 +18,6 @@ from hvt_ground.events import Overlay
 from hvt_ground.geolocation.footprint import Footprint, fields_of_view, footprint
 from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
 
-__all__ = ["KEY", "Platform", "sensor_angles", "uas_local_set"]
-
 KEY: Final = bytes.fromhex("060e2b34020b01010e01030101000000")
 _VERSION: Final = 16
 _WGS_84: Final = b"Geodetic WGS84"

@@ -15,8 +15,6 @@ from hvt_common.geodesy import turned_deg
 from hvt_gateways.transport_stream.klv import ber_length, ber_oid, imapb, item, whole
 from hvt_ground.events import Overlay
 
-__all__ = ["MOST_BYTES", "vmti_local_set"]
-
 MOST_BYTES: Final = 48 * 1024
 """Limit of all targets: a PES packet holds 64 kB."""
 _SYSTEM: Final = b"HVT"

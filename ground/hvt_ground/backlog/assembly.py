@@ -31,8 +31,6 @@ from hvt_common.protocol.messages import (
 )
 from hvt_ground.perception.stills.decode import ReceivedStill
 
-__all__ = ["BacklogAssembly", "BacklogContent", "backlog_content"]
-
 _MAX_UNREPORTED = 512
 _MAX_REFUSALS = 256
 _PATIENCE = 3

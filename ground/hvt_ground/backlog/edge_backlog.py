@@ -28,8 +28,6 @@ from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job, PerceptionWorker
 
-__all__ = ["EdgeBacklog"]
-
 _log = logging.getLogger(__name__)
 
 _MOST_INFOS = 64

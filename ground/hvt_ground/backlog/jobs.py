@@ -17,8 +17,6 @@ from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job, PerceptionWorker
 from hvt_ground.sinks import Receipt
 
-__all__ = ["Destination", "StillJob", "VideoJob"]
-
 _Pictures = Iterator[tuple[BacklogUnit, Image | None] | None]
 
 

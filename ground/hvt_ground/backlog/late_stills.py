@@ -11,8 +11,6 @@ import numpy as np
 from hvt_common.values import iou
 from hvt_ground.events import Event, Overlay, Refinement
 
-__all__ = ["LateStills"]
-
 _LEAST_IOU = 0.4
 _MOST = 512
 

@@ -26,8 +26,6 @@ from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 
-__all__ = ["FIRST_TRACK_ID", "BacklogPerception", "StretchTracker"]
-
 FIRST_TRACK_ID = 1_000_001
 """Id of the first track in stored video: these tracks are others than those of the live stream."""
 

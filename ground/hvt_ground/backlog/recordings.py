@@ -18,8 +18,6 @@ from hvt_ground.events import Event, Notice, Refinement
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.sinks import QueuedSink
 
-__all__ = ["MOST_FILES", "MOST_OPEN", "BacklogRecording", "BacklogRecordings"]
-
 MOST_OPEN = 4
 MOST_FILES = 32
 _OPEN_S = 0.5

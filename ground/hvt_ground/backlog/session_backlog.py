@@ -19,8 +19,6 @@ from hvt_ground.link.sequence_window import SequenceWindow, StillSequenceWindow
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.sinks import QueuedSink, Receipt
 
-__all__ = ["BacklogTotals", "SessionBacklog"]
-
 _LONGEST_S = 1.0
 """For so long one frame counts as video, where the next was left out."""
 

@@ -14,8 +14,6 @@ from hvt_common.protocol.messages import BacklogUnit
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
 
-__all__ = ["BacklogVideo"]
-
 _MOST_GOP_BYTES = 2 * 2**20
 _GAPS = 4
 

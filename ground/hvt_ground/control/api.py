@@ -45,8 +45,6 @@ from hvt_common.values import Image
 from hvt_common.video.still_codecs import StillError
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
 
-__all__ = ["EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge", "RequestedStill"]
-
 _ANSWER_S = 2.0
 _POLL_S = 0.3
 _OUTCOME_S = 0.5

@@ -13,8 +13,6 @@ from hvt_common.runtime.reporting import say
 from hvt_common.units import bitrate_text, parse_bitrate, parse_duration_s
 from hvt_ground.control.api import EdgeClient, RemoteEdge, RequestedStill, check_suffix
 
-__all__ = ["COMMANDS", "run"]
-
 _TIMEOUT_S = 15.0
 
 

@@ -11,8 +11,6 @@ from hvt_common.protocol.still_words import counts_text
 from hvt_common.runtime.status_command import StatusCommand
 from hvt_common.units import SECOND_NS, bitrate_text
 
-__all__ = ["run"]
-
 _COLUMNS = ("edge", "link", "of budget", "delay p95", "picture", "stills", "tracks", "does not work")
 _FRESH_S = 3.0
 """A pose comes about once a second: of an older one is said how old it is."""

@@ -28,8 +28,6 @@ from hvt_ground.extras import all_extras, checked, config_class
 from hvt_ground.perception.models import Models
 from hvt_ground.wiring import make_link_settings
 
-__all__ = ["run"]
-
 _DESCRIPTION = (
     "Check what a ground with these settings needs; takes the settings of hvt-ground. --json is for programs."
 )

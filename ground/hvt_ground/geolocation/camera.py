@@ -16,8 +16,6 @@ from hvt_common.values import Boxes, Pose, View
 from hvt_ground.events import Places
 from hvt_ground.geolocation.surface import FLAT_GROUND, Points, Rays, Surface
 
-__all__ = ["ground_points", "places_of_boxes"]
-
 _CHI2_95: Final = 5.991
 """Chi-square of two degrees of freedom: the ellipse that holds 95 % (Abramowitz and Stegun, 26.4.9)."""
 _FIELD_ERROR: Final = 0.02

@@ -25,8 +25,6 @@ from hvt_common.errors import UserError
 from hvt_common.geodesy import metres_per_degree, turned_deg
 from hvt_ground.geolocation.surface import Points
 
-__all__ = ["TILE_M", "ElevationModel", "ModelError", "Tile"]
-
 TILE_M: Final = 15_000.0
 """Half the side of the part in memory."""
 _MOST_SIDE: Final = 3000

@@ -12,8 +12,6 @@ from hvt_common.values import Pose, View
 from hvt_ground.geolocation.camera import ground_points
 from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
 
-__all__ = ["Footprint", "fields_of_view", "footprint"]
-
 Place = tuple[float, float]
 """Latitude and longitude, degrees, WGS 84."""
 

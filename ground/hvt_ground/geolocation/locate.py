@@ -12,8 +12,6 @@ from hvt_ground.geolocation.camera import places_of_boxes
 from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
 from hvt_ground.geolocation.trail import STALE_S, PoseTrail
 
-__all__ = ["Geolocation"]
-
 
 class Geolocation:
     """Takes poses in one thread, and overlays in another: these by the poses that `use` was told of."""

@@ -10,8 +10,6 @@ import numpy.typing as npt
 
 from hvt_common.values import Pose
 
-__all__ = ["FLAT_GROUND", "LEAST_DEPRESSION_DEG", "FlatGround", "Points", "Rays", "Surface"]
-
 Points = npt.NDArray[np.float64]
 """(N, 2): pixels, or metres north and east."""
 Rays = npt.NDArray[np.float64]

@@ -15,8 +15,6 @@ from hvt_common.values import Pose
 from hvt_ground.geolocation.elevation import TILE_M, ElevationModel, ModelError, Tile
 from hvt_ground.geolocation.surface import LEAST_DEPRESSION_DEG, Points, Rays
 
-__all__ = ["Terrain"]
-
 _log = logging.getLogger(__name__)
 
 _REACH_M: Final = 10_000.0

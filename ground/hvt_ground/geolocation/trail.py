@@ -11,8 +11,6 @@ from hvt_common.geodesy import between, metres_per_degree, turned_deg
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
 
-__all__ = ["STALE_S", "PoseTrail"]
-
 STALE_S: Final = 10.0
 """A pose this old is none."""
 _MOST_POSES: Final = 64

@@ -25,8 +25,6 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
 from hvt_ground.extras import checked, config_class
 
-__all__ = ["Listening", "Picture", "Received", "listen"]
-
 _MOST_QUEUED, MOST_QUEUED_BYTES = 32, 128 * 2**20
 """Events, of which each may be a picture, and their pixels."""
 _POLL_S = 0.2

@@ -25,8 +25,6 @@ import zenoh
 
 from hvt_common.protocol.channels import GroupKeys
 
-__all__ = ["Elsewhere", "GroundGroup", "member_name", "owner_of"]
-
 _log = logging.getLogger(__name__)
 
 _JOIN_S = 1.5

@@ -8,8 +8,6 @@ from hvt_common.protocol.messages import PoseReport, RoiHeader, Status
 from hvt_common.units import SECOND_NS
 from hvt_ground.link.packets import Packet
 
-__all__ = ["DuplicatePublishers", "PreSessionBuffer"]
-
 _MOST_STILLS = _MOST_POSES = 16
 _AGAIN_NS = 60 * SECOND_NS
 """Between two warnings: sessions' ids cost a forger nothing, and a log is not to fill."""

@@ -8,8 +8,6 @@ from hvt_common.protocol.messages import BacklogHeader, PoseReport, RoiHeader, S
 from hvt_common.transport.inbox import Received
 from hvt_ground.link.reassemble import Arrival
 
-__all__ = ["BasePacket", "Packet"]
-
 
 @dataclass(frozen=True, slots=True)
 class BasePacket:

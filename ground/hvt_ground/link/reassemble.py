@@ -32,8 +32,6 @@ from typing import Literal
 
 from hvt_common.protocol.messages import BaseHeader
 
-__all__ = ["Arrival", "Reassembler", "StreamCounters", "Verdict"]
-
 Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
 """What to do with an access unit. skip: fresh, but a unit before it is lost, or no keyframe has come yet;
 stale: older than what was given up or shown; foreign: of a session that is not the present one; implausible:

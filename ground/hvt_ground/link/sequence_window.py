@@ -6,8 +6,6 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterable
 
-__all__ = ["SequenceWindow", "StillSequenceWindow"]
-
 _PAGE_BITS = 12
 _MOST_SENT = 512
 """Stills whose second copy is still known for one: those of the last seconds."""

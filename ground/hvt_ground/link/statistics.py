@@ -30,8 +30,6 @@ from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, MessageTiming, Traffic
 
-__all__ = ["REPORT_LINE_BYTES", "LinkMeasurement", "ReceptionStatistics", "SessionAccount", "Uptime"]
-
 _MS = 1_000_000
 REPORT_LINE_BYTES = 180
 """Line bytes of a report without results."""

@@ -17,8 +17,6 @@ import numpy as np
 from hvt_common.values import Image, Tracks
 from hvt_common.video.hevc import YuvPicture
 
-__all__ = ["History", "as_bgr"]
-
 DEFAULT_MAX_BYTES = 96 * 1024 * 1024
 
 

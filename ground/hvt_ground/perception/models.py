@@ -18,8 +18,6 @@ from hvt_ground.perception.retried import RetriedClassifier, RetriedDetector
 from hvt_ground.perception.stills.vocabulary import check_common
 from hvt_ground.perception.turns import Turns
 
-__all__ = ["ModelSet", "Models", "stills_calibrated", "track_confidence"]
-
 _log = logging.getLogger(__name__)
 
 _USUAL_SIZE = (1280, 720)

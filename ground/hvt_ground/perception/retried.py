@@ -10,8 +10,6 @@ from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.runtime.failures import Failures, Retried, RetryPause
 from hvt_common.values import Detections, Image, Posterior
 
-__all__ = ["RetriedClassifier", "RetriedDetector"]
-
 
 class RetriedDetector(Retried[Detector]):
     """Finds nothing while its model fails; ``hint`` may say that it finds little."""

@@ -9,8 +9,6 @@ from __future__ import annotations
 import threading
 import time
 
-__all__ = ["Turns"]
-
 _ABSENT_S = 5.0
 """Whoever has not asked for so long is new when it comes again: it has nothing to catch up."""
 

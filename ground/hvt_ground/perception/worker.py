@@ -19,8 +19,6 @@ from hvt_common.runtime.process import lower_priority
 from hvt_common.values import Tracks
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 
-__all__ = ["Analyze", "Job", "LockstepWorker", "PerceptionWorker", "Read", "RealtimeWorker", "Step"]
-
 _log = logging.getLogger(__name__)
 
 _MOST_PICTURES, _MOST_PICTURE_BYTES = 12, 48 * 2**20

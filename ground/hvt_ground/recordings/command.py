@@ -17,8 +17,6 @@ from hvt_ground.recordings.database import read_index
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.sinks.tracks_table import utc_text
 
-__all__ = ["run"]
-
 _HEAD = ("file", "edge", "begin (UTC)", "length", "MB", "frames", "stills", "tracks by class")
 
 

@@ -17,8 +17,6 @@ from hvt_common.runtime.clock import Moment, unwitnessed_ns
 from hvt_common.units import SECOND_NS
 from hvt_ground.recordings.row import RecordingRow
 
-__all__ = ["INDEX", "Index", "read_index"]
-
 _log = logging.getLogger(__name__)
 
 INDEX = "recordings.sqlite"

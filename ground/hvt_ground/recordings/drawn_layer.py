@@ -10,8 +10,6 @@ from hvt_ground.events import Origin
 from hvt_ground.recordings.spool import SpooledRows, Timed
 from hvt_ground.sinks.rerun.overlays import ORIGINS
 
-__all__ = ["TRACK_COMPONENTS", "DrawnBox", "DrawnLayer"]
-
 TRACK_COMPONENTS = frozenset(
     {"centers", "half_sizes", "track_id", "class_before", "class_ids", "confidence_pct", "origin"}
 )

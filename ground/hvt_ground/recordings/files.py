@@ -21,8 +21,6 @@ from hvt_ground.recordings.row import FileAccount, RecordingRow
 from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages
 from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 
-__all__ = ["SCRATCH", "claimed", "described", "is_claimed", "remove_video"]
-
 SCRATCH = ".part"
 """Ends the name of a copy that is being made of a recording."""
 _SPARE_BYTES = 2 * 2**20

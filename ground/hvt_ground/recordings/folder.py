@@ -23,8 +23,6 @@ from hvt_ground.recordings.retention import Retention, due
 from hvt_ground.recordings.row import RecordingRow, is_own_name
 from hvt_ground.sinks import QueuedSink
 
-__all__ = ["IndexWriter", "RecordingsFolder"]
-
 _log = logging.getLogger(__name__)
 
 _POLL_S = 60.0

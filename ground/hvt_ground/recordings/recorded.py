@@ -45,8 +45,6 @@ from hvt_ground.sinks.rerun.blueprint import (
 from hvt_ground.sinks.rerun.map_rows import pose_of
 from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages
 
-__all__ = ["Recorded", "RecordedStill", "read_recordings"]
-
 _log = logging.getLogger(__name__)
 
 _LAYERS = {TRACKS: "Boxes2D", REPORTED: "Ellipses2D", REFINED: "Boxes2D", DOUBTED: "Boxes2D"}

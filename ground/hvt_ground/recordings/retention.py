@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from hvt_common.units import SECOND_NS, Limit
 from hvt_ground.recordings.row import RecordingRow, begun_ns
 
-__all__ = ["Due", "Retention", "due"]
-
 _CLOCK_SET_NS = 1_577_836_800 * SECOND_NS
 """2020: a name of before was given before the machine knew the time, and nobody knows how old the file is."""
 _TRUSTED_SHARE = 1 / 4

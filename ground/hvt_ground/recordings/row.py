@@ -12,8 +12,6 @@ from typing import Any
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 
-__all__ = ["FileAccount", "RecordingRow", "begun_ns", "is_own_name"]
-
 _OWN = re.compile(r"hvt-.+-(\d{8}-\d{6})(-\d+|-backlog)*\.rrd")
 _MOST_REMEMBERED = 4096
 """Tracks and stills that are known again; one that comes back after so many others counts twice."""

@@ -26,8 +26,6 @@ from hvt_ground.sinks.line_file import claim_name
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.recording_file import RecordingFile
 
-__all__ = ["SessionFiles"]
-
 _REPORT_S = 10.0
 _SMALL_BYTES, _MOST_SMALL = 128 * 2**10, 8
 """A file costs 190 kB beside what came. Where less than this has come, the next begins only so often in a session, or

@@ -16,8 +16,6 @@ import numpy as np
 
 from hvt_common.errors import UserError
 
-__all__ = ["Mapped", "Spool", "SpooledRows", "Timed"]
-
 _BUFFER_BYTES = 2**18
 Item = TypeVar("Item")
 Made = TypeVar("Made")

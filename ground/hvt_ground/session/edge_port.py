@@ -28,8 +28,6 @@ from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.transport.session import declare_publisher, query_later
 
-__all__ = ["EdgePort", "InfoAnswer"]
-
 _log = logging.getLogger(__name__)
 
 _INBOX_MESSAGES = 1024

@@ -34,8 +34,6 @@ from hvt_ground.session.receiver import Receiver
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 
-__all__ = ["EdgeSessions", "EdgeThread"]
-
 _log = logging.getLogger(__name__)
 
 _INFO_TRIES = 3

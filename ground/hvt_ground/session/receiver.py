@@ -24,8 +24,6 @@ from hvt_ground.link.packets import BasePacket, Packet
 from hvt_ground.link.reassemble import Arrival, Reassembler, StreamCounters
 from hvt_ground.link.statistics import Uptime
 
-__all__ = ["Receiver"]
-
 _log = logging.getLogger(__name__)
 
 _SILENT_NS = 2_000_000_000

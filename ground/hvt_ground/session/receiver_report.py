@@ -11,8 +11,6 @@ from hvt_common.protocol.messages import MAX_ACKNOWLEDGED_RANGES, Feedback, Stil
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.link.statistics import LinkMeasurement
 
-__all__ = ["ReceiverReports"]
-
 _MOST_DELAY_MS = 3_600_000.0
 _MOST_OBJECTS = 65_535
 

@@ -46,8 +46,6 @@ from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session_log import Level, SessionLog
 from hvt_ground.sinks import QueuedSink, Sink
 
-__all__ = ["GroundSession", "WorkerFactory"]
-
 _MILLION = 1_000_000
 _ANEW_NS = 5 * SECOND_NS
 """What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""

@@ -9,8 +9,6 @@ from hvt_common.transport.flood import TokenBucket
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Notice
 
-__all__ = ["Level", "SessionLog"]
-
 Level = Literal["info", "warning", "error"]
 
 _BURST, _EVERY_NS = 60, SECOND_NS

@@ -19,8 +19,6 @@ from hvt_ground.link.group import GroundGroup
 from hvt_ground.perception.stills.decode import readable_codecs
 from hvt_ground.session.edge_port import EdgePort
 
-__all__ = ["MAX_EDGES", "GroundLink"]
-
 _log = logging.getLogger(__name__)
 
 MAX_EDGES = 64

@@ -9,8 +9,6 @@ from typing import Protocol, TypeVar
 from hvt_common.transport.inbox import Received
 from hvt_ground.events import Overlay, Refinement, VideoSample
 
-__all__ = ["Sink", "SinkWriter", "is_stored", "size_bytes"]
-
 T_contra = TypeVar("T_contra", contravariant=True)
 
 _SMALL_BYTES = 512

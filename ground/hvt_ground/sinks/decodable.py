@@ -5,8 +5,6 @@ from __future__ import annotations
 from hvt_common.video.annex_b import parameter_sets
 from hvt_ground.events import VideoSample
 
-__all__ = ["DecodableRun"]
-
 
 class DecodableRun:
     """Begins at a keyframe; each keyframe has its parameter sets, which a reader that joins there needs."""

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 
-__all__ = ["LineFile", "check_there", "claim_name", "has_nothing"]
-
 
 def check_there(file: int, path: Path) -> None:
     """Raise `FileNotFoundError` where the open file has been removed: what is written to it would be in none."""

@@ -24,8 +24,6 @@ from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, Info, WireError
 from hvt_common.transport.inbox import Received
 from hvt_ground.sinks.line_file import check_there
 
-__all__ = ["MessageLog", "read_log"]
-
 _MAGIC = b"HVTLOG\x00\x01"
 _HEAD = struct.Struct("<II")
 _MOST_BYTES = MAX_PAYLOAD_BYTES + 2**17

@@ -10,19 +10,6 @@ import re
 import zlib
 from functools import lru_cache
 
-__all__ = [
-    "AMBER",
-    "BASE_LINE",
-    "BUDGET_LINE",
-    "GREY",
-    "STILL_LINE",
-    "TOTAL_LINE",
-    "VERMILLION",
-    "Rgb",
-    "class_colour",
-    "dimmed",
-]
-
 Rgb = tuple[int, int, int]
 """Red, green, blue, 0…255."""
 

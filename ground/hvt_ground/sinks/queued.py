@@ -14,8 +14,6 @@ from typing import Any, Generic, TypeVar
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_ground.sinks.contract import SinkWriter, is_stored, size_bytes
 
-__all__ = ["Outputs", "QueuedSink", "Receipt"]
-
 _log = logging.getLogger(__name__)
 
 T = TypeVar("T")

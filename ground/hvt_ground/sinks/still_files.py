@@ -16,8 +16,6 @@ from hvt_common.errors import UserError
 from hvt_ground.events import Event, Refinement
 from hvt_ground.sinks.line_file import LineFile
 
-__all__ = ["COLUMNS", "StillFiles", "picture_of"]
-
 COLUMNS = (
     *("file", "frame", "known_frame", "still", "track", "edge_track", "x", "y", "w", "h"),
     *("class_before", "class_after", "confidence", "reason"),

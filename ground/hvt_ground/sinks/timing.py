@@ -22,8 +22,6 @@ from hvt_ground.events import Event, MessageTiming, StillsRead
 from hvt_ground.sinks.contract import Sink
 from hvt_ground.sinks.line_file import LineFile
 
-__all__ = ["COLUMNS", "SessionTiming", "timing_table"]
-
 COLUMNS = (
     "kind",
     "sequence",

@@ -15,8 +15,6 @@ from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, Overlay, Places
 from hvt_ground.sinks.line_file import LineFile
 
-__all__ = ["COLUMNS", "TrackTable", "track_rows", "utc_text"]
-
 COLUMNS = (
     *("frame", "capture_utc", "id", "x", "y", "w", "h", "confidence"),
     *("base_class", "class", "refined", "origin", "late", "doubted"),

@@ -23,8 +23,6 @@ import platformdirs
 from hvt_common.errors import UserError
 from hvt_common.runtime.host_names import is_loopback, requested_host
 
-__all__ = ["HEADERS", "ROLE_HEADER", "Access", "Role", "cookie_name", "own_tokens"]
-
 Role = Literal["viewer", "operator"]
 
 ROLE_HEADER = "X-HVT-Role"

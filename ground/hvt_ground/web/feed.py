@@ -20,8 +20,6 @@ from hvt_ground.state import EdgeState, GroundState, SessionState
 from hvt_ground.web.pictures import Pictures, jpeg
 from hvt_ground.web.viewers import EdgePage, Hub, text
 
-__all__ = ["SessionFeed", "state_loads", "state_message", "still_name"]
-
 _LATE_NS = 300_000_000
 """So far behind the link, pictures are decoded and not coded again until it has caught up."""
 _TOO_LATE_NS = 3_000_000_000

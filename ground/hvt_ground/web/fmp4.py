@@ -18,8 +18,6 @@ from typing import Literal
 
 from hvt_common.video.annex_b import nal_units
 
-__all__ = ["Codec", "Fragment", "Muxer", "Start"]
-
 Codec = Literal["h264", "hevc"]
 
 _TIMESCALE = 90_000

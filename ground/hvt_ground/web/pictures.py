@@ -23,8 +23,6 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import VideoSample
 from hvt_ground.web.fmp4 import Codec, Fragment, Muxer, Start
 
-__all__ = ["RUNGS", "THUMBNAIL", "Made", "Pictures", "Rung", "jpeg"]
-
 Rung = Literal["hevc", "h264", "jpeg", "thumbnail"]
 RUNGS: tuple[Rung, ...] = ("hevc", "h264", "jpeg")
 """Best first."""

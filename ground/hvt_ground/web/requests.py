@@ -14,8 +14,6 @@ from hvt_common.protocol.messages import Info
 from hvt_ground.control import EdgeClient, RefusedError
 from hvt_ground.web.pictures import jpeg
 
-__all__ = ["BadRequestError", "BusyError", "EdgeRequests"]
-
 _MOST_AT_ONCE = 4
 _LEAST_SIDE_PX = 16
 _STILL_S = 10.0

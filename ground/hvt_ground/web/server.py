@@ -34,8 +34,6 @@ from hvt_ground.web.requests import EdgeRequests
 from hvt_ground.web.site import MOST_MESSAGE_BYTES, make_site
 from hvt_ground.web.viewers import EdgePage, Hub
 
-__all__ = ["WebPage"]
-
 _MOST_CONNECTIONS = 256
 MOST_OPEN = _MOST_CONNECTIONS + 64
 """With those that are told that it is too many, or are in the middle of TLS."""

@@ -25,8 +25,6 @@ from hvt_ground.web.pictures import RUNGS
 from hvt_ground.web.requests import BadRequestError, BusyError, EdgeRequests
 from hvt_ground.web.viewers import Hub, Viewer, packed, text
 
-__all__ = ["MOST_MESSAGE_BYTES", "make_site"]
-
 MOST_MESSAGE_BYTES = 4096
 _MOST_VIEWERS = 64
 _MOST_MESSAGES_A_S = 30

@@ -15,8 +15,6 @@ from typing import Any
 from hvt_ground.web.fmp4 import Fragment, Start
 from hvt_ground.web.pictures import RUNGS, THUMBNAIL, Made, Rung
 
-__all__ = ["EdgePage", "Hub", "StillPictures", "Viewer", "packed", "text"]
-
 _MOST_QUEUED = 400
 _MOST_QUEUED_BYTES = 4 * 2**20
 """Of a viewer; above, it loses pictures up to the next keyframe."""

@@ -13,8 +13,6 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.extras import all_extras
 from hvt_ground.sinks.line_file import claim_name
 
-__all__ = ["backlog_path", "check_outputs", "free_path", "make_record_folder", "output_path"]
-
 
 def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
     """Refuse files that cannot be written, or are read (``reads``, too), before anything is received; `UserError`."""

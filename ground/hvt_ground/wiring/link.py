@@ -5,8 +5,6 @@ from __future__ import annotations
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_ground.config import GroundConfig
 
-__all__ = ["make_link_settings"]
-
 
 def make_link_settings(config: GroundConfig) -> LinkSettings:
     """How the ground takes part in Zenoh."""

@@ -20,8 +20,6 @@ from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetect
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 
-__all__ = ["make_backlog_perception", "make_pipeline"]
-
 
 def make_pipeline(
     config: GroundConfig, models: Models, *, info: Info, emit: Callable[[Event], None]

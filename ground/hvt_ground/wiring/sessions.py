@@ -39,8 +39,6 @@ from hvt_ground.wiring.terrain import make_surfaces
 if TYPE_CHECKING:  # who serves no page needs no web server
     from hvt_ground.web import WebPage
 
-__all__ = ["OpenSink", "SessionFactory"]
-
 S = TypeVar("S", bound=SinkWriter[Any])
 
 OpenSink = Callable[[Info], Callable[[], SinkWriter[Event]]]

@@ -9,8 +9,6 @@ from pathlib import Path
 from hvt_common.errors import needs_extra
 from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
 
-__all__ = ["make_surfaces"]
-
 
 def make_surfaces(terrain: Path | None) -> Callable[[str], Surface]:
     """What makes the ground of one flight, by the name of whose it is.

@@ -25,8 +25,6 @@ from dataclasses import dataclass
 
 from lab.link.timeline import Script
 
-__all__ = ["DATAGRAM_HEADER_BYTES", "SEGMENT_BYTES", "SEGMENT_HEADER_BYTES", "Pipe", "Segment", "Stream"]
-
 SEGMENT_BYTES = 1448
 """Payload of a TCP segment on Ethernet with timestamps."""
 SEGMENT_HEADER_BYTES = 52

@@ -35,8 +35,6 @@ from lab.link.carriers.pipe import (
 from lab.link.script import LENGTHS, load_scenario
 from lab.link.timeline import Script
 
-__all__ = ["Protocol", "Relay"]
-
 _log = logging.getLogger(__name__)
 
 Protocol = Literal["tcp", "udp"]

@@ -16,8 +16,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import ClassVar, Self
 
-__all__ = ["EDGE_HOST", "GROUND_HOST", "Sides", "UnavailableError", "command", "congestion_control"]
-
 EDGE_HOST = "10.98.0.1"
 GROUND_HOST = "10.98.0.2"
 _CONGESTION_CONTROL = Path("/proc/sys/net/ipv4/tcp_congestion_control")

@@ -11,8 +11,6 @@ from typing import Self
 
 from lab.link.carriers.sides import UnavailableError, command
 
-__all__ = ["Star"]
-
 _ROUTER = "router"
 
 

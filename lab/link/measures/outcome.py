@@ -16,8 +16,6 @@ from lab.link.measures.store_left import StoreLeft
 from lab.link.measures.timing import Arrival
 from lab.link.timeline import Script
 
-__all__ = ["ALWAYS", "SOAK", "WARM", "Outcome", "measures", "rate_over_time", "rows"]
-
 _RESOURCES: Mapping[str, Callable[[Sample], float]] = {
     "memory MB": lambda sample: sample.resident_mb,
     "descriptors": lambda sample: sample.descriptors,

@@ -12,8 +12,6 @@ from matplotlib.figure import Figure
 from lab.link.measures.outcome import Outcome, rate_over_time
 from lab.link.measures.timing import Arrival
 
-__all__ = ["draw"]
-
 # Okabe and Ito: readable with any colour vision, and here also by line and marker.
 _LINK, _BASE, _STILLS, _DARK = "#000000", "#0072B2", "#D55E00", "#BBBBBB"
 _COLUMNS = 3

@@ -14,8 +14,6 @@ from typing import Self
 import numpy as np
 import psutil
 
-__all__ = ["WARM_UP", "ResourceSampler", "Sample", "more_at_the_end", "slope_mb_per_hour"]
-
 _EVERY_S = 0.25
 _MOST_SAMPLES = 20_000
 WARM_UP = 0.4

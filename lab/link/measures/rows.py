@@ -11,8 +11,6 @@ from typing import Any
 
 from rich.table import Table
 
-__all__ = ["holds", "row", "save", "table"]
-
 _COLUMNS = ("scenario", "measure", "value", "bar", "holds")
 
 

@@ -10,8 +10,6 @@ from hvt_common.protocol.messages import BacklogKind, parse_backlog_units
 from hvt_edge.backlog.disk import FILE_NAME, Store
 from hvt_edge.backlog.entry import Entry
 
-__all__ = ["StoreLeft", "store_left"]
-
 
 @dataclass(frozen=True, slots=True)
 class StoreLeft:

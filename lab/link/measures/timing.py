@@ -6,8 +6,6 @@ import csv
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Arrival", "read_timing"]
-
 
 @dataclass(frozen=True, slots=True)
 class Arrival:

@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["OUTLINE_POINTS", "SPRITE_M_PER_PX", "Canvas", "Colour", "Points", "Sprite", "shade"]
-
 SPRITE_M_PER_PX = 0.02
 """Resolution of a freshly drawn sprite; coarser levels are averaged from it."""
 

@@ -11,8 +11,6 @@ from hvt_scene.view.project import Floats
 from hvt_scene.world.layout import Parked
 from hvt_scene.world.traffic import SAMPLES_HZ, Mover
 
-__all__ = ["Cast"]
-
 
 class Cast:
     """Everybody, as parallel arrays: those who move first, then what stands still. Index i has the id i + 1.

@@ -15,8 +15,6 @@ import numpy.typing as npt
 
 from hvt_scene.drawing.canvas import SPRITE_M_PER_PX, Colour, Points, Sprite
 
-__all__ = ["ALPHABET", "CODE_LENGTH", "HEIGHTS_PX", "RoofCode", "draw_code", "paint_code"]
-
 CODE_LENGTH = 4
 HEIGHTS_PX = (5.0, 14.0)
 """Height of the characters in pixels of the source, least and greatest, at the camera's mean altitude."""

@@ -10,8 +10,6 @@ from hvt_scene.appearance import Appearance
 from hvt_scene.view.project import Floats
 from hvt_scene.world.layout import MAIN_HALF_M, SIDE_HALF_M, WORLD_M, Layout, Tree
 
-__all__ = ["CANOPY_SPAN", "Grove"]
-
 CANOPY_SPAN = 2.1
 """Width of a canopy picture in radii of its tree."""
 

@@ -13,8 +13,6 @@ from hvt_scene.appearance import Appearance, Bgr
 from hvt_scene.drawing.foliage import CANOPY_SPAN
 from hvt_scene.world.layout import MAIN_HALF_M, PAVEMENT_M, SIDE_HALF_M, WORLD_M, Building, Layout, Rect, Tree
 
-__all__ = ["Ground", "paint_ground"]
-
 _Rng = np.random.Generator
 _SHIFT = 4
 _WHITE: Bgr = (214.0, 218.0, 220.0)

@@ -14,8 +14,6 @@ import numpy as np
 
 from hvt_scene.drawing.canvas import Canvas, Colour, Points, Sprite, shade
 
-__all__ = ["CLASS_NAMES", "draw_vehicle"]
-
 CLASS_NAMES = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
 
 _GLASS: Colour = (52.0, 44.0, 38.0)

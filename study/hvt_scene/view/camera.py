@@ -10,8 +10,6 @@ import numpy.typing as npt
 
 from hvt_scene.appearance import Appearance
 
-__all__ = ["Camera", "CameraPlace", "Matrix"]
-
 _FOCAL_WIDTHS = 1.2
 """Focal length, picture widths."""
 

@@ -9,8 +9,6 @@ import numpy.typing as npt
 from hvt_scene.view.camera import Matrix
 from hvt_scene.view.project import Floats, bounds
 
-__all__ = ["Bgra", "blend", "darken"]
-
 Bgra = npt.NDArray[np.uint8]
 """(h, w, 4) uint8, premultiplied by alpha; in a frame the fourth channel means nothing."""
 

@@ -10,8 +10,6 @@ import numpy.typing as npt
 
 from hvt_scene.view.camera import Matrix
 
-__all__ = ["Floats", "bounds", "near_frame", "project", "sprite_matrix", "tangents", "to_centres", "turns"]
-
 Floats = npt.NDArray[np.float64]
 
 

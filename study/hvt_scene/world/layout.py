@@ -9,8 +9,6 @@ import numpy as np
 
 from hvt_scene.appearance import Appearance
 
-__all__ = ["WORLD_M", "Building", "Layout", "Parked", "Rect", "Tree", "plan"]
-
 WORLD_M = (270.0, 136.0)
 """Size of the world: x to the east, y to the south, origin in the north-west corner."""
 

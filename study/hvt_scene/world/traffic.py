@@ -11,8 +11,6 @@ import numpy.typing as npt
 from hvt_scene.appearance import Appearance
 from hvt_scene.world.layout import MAIN_HALF_M, PAVEMENT_M, SIDE_HALF_M, WORLD_M, Layout
 
-__all__ = ["SAMPLES_HZ", "Mover", "set_in_motion"]
-
 SAMPLES_HZ = 20
 """Positions are computed at this rate and interpolated between."""
 

@@ -28,8 +28,6 @@ from hvt_common.values import Detections, Image
 from hvt_study.cache.code_digest import code_digest
 from hvt_study.cache.results import CacheError, file_digest
 
-__all__ = ["CachedDetector"]
-
 _log = logging.getLogger(__name__)
 _PACKAGES = ("numpy", "opencv-python-headless", "onnxruntime", "onnxruntime-gpu", "openvino")
 """Those that may have a say in an answer, as far as they are installed."""

@@ -8,8 +8,6 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-__all__ = ["code_digest", "flight_code", "tree_digest"]
-
 _FLYING = ("hvt_common", "hvt_edge", "hvt_ground", "hvt_study")
 _BESIDE = ("hvt_study/commands", "hvt_study/report")
 """Has no say in a flight or in its figures."""

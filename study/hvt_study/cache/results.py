@@ -15,8 +15,6 @@ from typing import Any
 
 from hvt_common.errors import UserError
 
-__all__ = ["CacheError", "ResultCache", "content_key", "file_digest"]
-
 _log = logging.getLogger(__name__)
 _CHUNK_BYTES = 1 << 20
 

@@ -31,18 +31,6 @@ from hvt_study.runs.joint_classes import joint_classes
 from hvt_study.runs.methods import METHODS, Kind, chosen_methods, chosen_names
 from hvt_study.runs.spec import ModelChoice
 
-__all__ = [
-    "add_accounting",
-    "add_plan_arguments",
-    "add_pool_arguments",
-    "jobs_of",
-    "make_out",
-    "open_pool",
-    "open_sequences",
-    "parse_rates",
-    "study_plan",
-]
-
 _LEAST_FRAMES = 30
 _LEAST_KBPS, _MOST_KBPS = 20.0, 100_000.0
 _MOST_JOBS = 256

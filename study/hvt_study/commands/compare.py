@@ -21,9 +21,6 @@ from hvt_study.report.figures.compare_plot import plot
 from hvt_study.runs.methods import chosen_names
 from hvt_study.runs.spec import ModelChoice
 
-__all__ = ["add_arguments", "print_result", "print_verdicts", "run"]
-
-
 _CLIPS = "a video, a folder of images, a MOTChallenge sequence (img1/, gt/gt.txt), demo, or still:PICTURE"
 _LEAST_FRAMES = 30
 _HEADS = ("named", "halves", "false", "class", "all", "base", "still", "track", "fps", "p95", "CPU")

@@ -12,8 +12,6 @@ from rich.table import Table
 from hvt_study.demo.compared import Compared, compare_flown
 from hvt_study.demo.picture import write_picture
 
-__all__ = ["add_arguments", "run"]
-
 _WIDTH = 100
 
 

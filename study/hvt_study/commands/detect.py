@@ -34,8 +34,6 @@ from hvt_study.metrics.operating_point import right_boxes
 from hvt_study.metrics.picture_score import VEHICLES, above, as_one, picture_score
 from hvt_study.report.figures.sheet import Finding, write_sheet
 
-__all__ = ["add_arguments", "detected", "print_score", "run"]
-
 _LEAST_CONFIDENCE = 0.01
 """Average precision needs the whole curve."""
 _VEHICLE = "vehicle"

@@ -16,8 +16,6 @@ from hvt_study.commands.arguments import (
 )
 from hvt_study.matrix.estimate import Estimate, estimate, time_of_a_frame
 
-__all__ = ["add_arguments", "hours_in_words", "run"]
-
 _MANY_JOBS = 16
 
 

@@ -11,8 +11,6 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-__all__ = ["RunProgress", "time_left_s"]
-
 _LINE_EVERY_S = 60
 _FIRST_LINE_S = 2
 """What cannot be done at all says so sooner."""

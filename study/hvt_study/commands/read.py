@@ -21,8 +21,6 @@ from hvt_study.reading.sheet import write_sheet
 from hvt_study.runs.methods import chosen_names
 from hvt_study.runs.spec import ModelChoice
 
-__all__ = ["add_arguments", "print_result", "run"]
-
 _LEAST_FRAMES = 30
 _WIDTH = 100
 

@@ -11,8 +11,6 @@ from hvt_study.commands.arguments import add_accounting
 from hvt_study.report.join import join_studies
 from hvt_study.report.write import write_report
 
-__all__ = ["add_arguments", "run"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The study's folder, or several that are to be one."""

@@ -31,8 +31,6 @@ from hvt_study.report.example.store import load_example, save_example
 from hvt_study.report.write import write_report
 from hvt_study.runs.execute import run_spec
 
-__all__ = ["add_arguments", "run"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What to compare, and where it is done and written."""

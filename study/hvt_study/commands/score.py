@@ -14,9 +14,6 @@ from hvt_common.units import parse_size
 from hvt_scene import Scene
 from hvt_study.metrics.track_table_score import Score, read_tracks, read_truth, score
 
-__all__ = ["add_arguments", "run"]
-
-
 _ROWS = (
     ("found (recall at IoU 0.5)", "recall"),
     ("class right, of those found (top-1)", "top1"),

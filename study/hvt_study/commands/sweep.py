@@ -19,8 +19,6 @@ from hvt_edge.source.opening import open_source
 from hvt_edge.source.video import VideoSource
 from hvt_study.matrix.sweep import COLUMNS, RawDetections, SweepRow, detect_clip, read_csv, sweep
 
-__all__ = ["add_arguments", "run"]
-
 _ANY_SIZE = (64, 64)  # of base frames, which the sweep does not look at
 
 _USUAL = {"detect_every": 5, "confidence": 0.25, "nms_iou": 0.45}

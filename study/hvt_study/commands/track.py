@@ -14,8 +14,6 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_study.datasets.annotation_rows import LAST_FRAME
 from hvt_study.datasets.mot_files import detections_by_frame, read_detections, rows_of_tracks, write_mot
 
-__all__ = ["add_arguments", "run"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Files, frame rate, and the options of the authors' program by their names there."""

@@ -37,8 +37,6 @@ from hvt_study.metrics.frames import LabelledFrame
 from hvt_study.metrics.judged import judged
 from hvt_study.metrics.picture_score import above, picture_score
 
-__all__ = ["add_arguments", "run"]
-
 _INSTALL = "torch onnx"
 _CURVE = 0.01
 _USUAL_CONFIDENCE = 0.25

@@ -22,8 +22,6 @@ from hvt_study.commands.arguments import (
 from hvt_study.commands.progress import RunProgress
 from hvt_study.matrix.tune import Tuned, split, tunable, tune
 
-__all__ = ["add_arguments", "run"]
-
 _MOST_TRIALS = 100_000
 _HIGHEST_SEED = 2**32 - 1
 

@@ -17,8 +17,6 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.labels import decoded
 
-__all__ = ["LAST_FRAME", "Rows", "read_rows"]
-
 _log = logging.getLogger(__name__)
 
 LAST_FRAME = 10_000_000

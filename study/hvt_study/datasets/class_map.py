@@ -15,8 +15,6 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import MOVING, kind_of
 from hvt_common.inference.labels import first_synonym
 
-__all__ = ["ClassMap", "map_classes", "of_kinds"]
-
 _VEHICLE = "vehicle"
 _VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
 """What a dataset means that calls all of them so."""

@@ -21,8 +21,6 @@ from hvt_edge.source.opening import open_source
 from hvt_edge.source.resample import Resizer, capture_time_ns
 from hvt_study.datasets.virtual_camera import SCHEME, open_camera
 
-__all__ = ["NOMINAL_FPS", "Clip", "FrameSource", "stage_clip", "staged_bytes"]
-
 NOMINAL_FPS = 15.0
 """Frames of a clip a second: the ground's list is judged at each of them, coded or not."""
 _ANY_SIZE = (64, 64)  # of base frames, which are made for each flight anew

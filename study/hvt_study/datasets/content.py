@@ -9,8 +9,6 @@ from pathlib import Path
 from hvt_edge.source.folder import sequence_files
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["content_hash"]
-
 _CHUNK_BYTES = 1 << 20
 
 

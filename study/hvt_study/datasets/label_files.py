@@ -24,21 +24,6 @@ from hvt_common.errors import UserError
 from hvt_common.inference.labels import decoded, numbered_names, read_labels
 from hvt_edge.source.folder import sequence_files
 
-__all__ = [
-    "LOOKED_IN",
-    "Folders",
-    "VocFile",
-    "check_strange",
-    "class_file",
-    "coco_files",
-    "keypoint_columns",
-    "label_file",
-    "pictures_below",
-    "read_class_file",
-    "read_text",
-    "read_voc",
-]
-
 LOOKED_IN = (
     "labels/, annotations/, Annotations/, beside the pictures, and COCO's JSON in annotations/ and beside"
 )

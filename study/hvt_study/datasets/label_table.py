@@ -14,8 +14,6 @@ import numpy.typing as npt
 from hvt_common.values import Boxes
 from hvt_study.datasets.labels import FrameLabels, covered_share, inside_frame
 
-__all__ = ["LabelTable", "Regions", "TableLabels", "file_stamp"]
-
 _COVERED = 0.5
 """An object with so much of it in regions of which nothing is known does not count, as in VisDrone's toolkit."""
 

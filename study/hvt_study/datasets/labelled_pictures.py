@@ -45,8 +45,6 @@ from hvt_study.datasets.layouts.visdrone import table_of
 from hvt_study.datasets.visdrone_rows import read_image_rows
 from hvt_study.datasets.yolo_labels import IGNORED, YOLO_COLUMNS, labels_of, read_yolo, yolo_names
 
-__all__ = ["LabelledPicture", "doubts_of", "find_pictures", "read_image"]
-
 _TRUTH = "gt/gt.txt"
 _YAML = (".yaml", ".yml")
 _SAME_SHAPE = 0.01

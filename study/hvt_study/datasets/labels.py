@@ -11,8 +11,6 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.values import Boxes
 
-__all__ = ["NO_ID", "FrameLabels", "LabelDoubts", "covered_share", "inside_frame", "no_boxes"]
-
 _NOTICED_PX = 0.01
 """Rows that end nearer to the edge are as exact as their digits."""
 NO_ID = -1

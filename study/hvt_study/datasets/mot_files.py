@@ -13,8 +13,6 @@ from hvt_common.errors import UserError
 from hvt_common.values import Detections, Tracks
 from hvt_study.datasets.annotation_rows import Rows, read_rows
 
-__all__ = ["MotRows", "detections_by_frame", "read_detections", "read_mot", "rows_of_tracks", "write_mot"]
-
 _COLUMNS = "frame,id,x,y,w,h,score"
 
 

@@ -26,8 +26,6 @@ from hvt_edge.source.resample import Resizer
 from hvt_study.datasets.labels import NO_ID, FrameLabels, inside_frame
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["CONFIDENCE", "ReferenceLabels", "reference_labels", "with_labels"]
-
 CONFIDENCE = 0.25
 """From which a detection is a label."""
 

@@ -33,16 +33,6 @@ from hvt_study.datasets.labels import FrameLabels, LabelDoubts, covered_share
 from hvt_study.datasets.visdrone_rows import read_image_rows
 from hvt_study.datasets.yolo_labels import IGNORED, read_yolo, yolo_names
 
-__all__ = [
-    "SCHEME",
-    "USUAL_VIEW",
-    "Annotations",
-    "VirtualCamera",
-    "annotation_file",
-    "open_camera",
-    "read_annotations",
-]
-
 SCHEME = "still:"
 """``still:FILE`` is a virtual camera over that picture, ``still:FILE@1.5`` one that sees 1.5 times its height."""
 

@@ -17,8 +17,6 @@ from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes
 from hvt_study.datasets.annotation_rows import Rows, read_rows
 
-__all__ = ["VisDroneRows", "read_image_rows", "read_video_rows"]
-
 _OBJECT = "x,y,w,h,score,category,truncation,occlusion"
 _REGION, _OTHERS = 0, 11
 

@@ -13,8 +13,6 @@ from hvt_common.errors import UserError
 from hvt_study.datasets.label_files import class_file, read_class_file, read_text
 from hvt_study.datasets.labels import NO_ID, FrameLabels, LabelDoubts
 
-__all__ = ["IGNORED", "YOLO_COLUMNS", "labels_of", "read_yolo", "yolo_names"]
-
 IGNORED = frozenset({"difficult", "dontcare", "ignore", "ignored"})
 """Classes (any case) whose boxes count neither for nor against."""
 YOLO_COLUMNS = 5

@@ -20,8 +20,6 @@ from hvt_study.metrics.track_table_score import Labelled, Score, score
 from hvt_study.reading.reader import CodeReader
 from hvt_study.reading.score import Code, codes_to_read
 
-__all__ = ["Compared", "compare_flown"]
-
 _LEAST_VISIBLE = 0.5
 """An object of which less is to be seen is not judged."""
 _PAIRS = 6

@@ -17,8 +17,6 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.recordings.recorded import read_recordings
 from hvt_study.metrics.track_table_score import Labelled, read_tracks
 
-__all__ = ["Flown", "FlownStill", "read_flown"]
-
 
 @dataclass(frozen=True, slots=True)
 class FlownStill:

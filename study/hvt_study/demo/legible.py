@@ -13,8 +13,6 @@ from hvt_study.demo.flown import Flown, FlownStill
 from hvt_study.reading.reader import CodeReader, code_crop
 from hvt_study.reading.score import LEAST_VISIBLE, Code
 
-__all__ = ["Legible", "Shown", "code_pictures", "read_codes_of", "stills_with_codes"]
-
 _PICTURES = 6
 """Of the base stream in which a code is read, spread over the time that it is whole in view: reading takes time."""
 _INSIDE_SHARE = 0.98

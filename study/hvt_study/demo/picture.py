@@ -15,8 +15,6 @@ from hvt_common.values import Image
 from hvt_study.metrics.judged import LEAST_IOU, matched_rows
 from hvt_study.metrics.track_table_score import Labelled
 
-__all__ = ["Pair", "Panel", "write_picture"]
-
 _Colour = tuple[int, int, int]
 
 _PANEL_PX = (640, 360)

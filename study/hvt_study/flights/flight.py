@@ -45,8 +45,6 @@ from hvt_study.flights.flight_link import START_NS, FlightInbox, FlightOutlet, M
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.serial_link import LinkReport, SerialLink
 
-__all__ = ["Flight", "FlightPlan", "FlightReport", "coded_frames", "dry_run", "fly"]
-
 _SESSION = 1 << 40  # as many bytes on the wire as a random one
 
 

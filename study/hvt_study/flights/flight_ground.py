@@ -38,8 +38,6 @@ from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.serial_link import Arrival, SerialLink
 
-__all__ = ["FlightObserver", "GroundSide", "InlineExecutor", "SharedModels"]
-
 _MOST_RESULTS = 1024
 _RECEIVER = 1 << 40  # as many bytes on the wire as a random one
 _T = TypeVar("_T")

@@ -16,8 +16,6 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.perception.detected import Detected
 from hvt_study.serial_link import SerialLink
 
-__all__ = ["START_NS", "FlightInbox", "FlightOutlet", "MediaClock"]
-
 START_NS = 1_700_000_000_000_000_000
 
 

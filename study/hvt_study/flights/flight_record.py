@@ -27,8 +27,6 @@ from hvt_study.metrics.proxy import score_entropy_nats
 from hvt_study.metrics.stills import Opinion, RefinedObject, StillArrival
 from hvt_study.serial_link import Arrival
 
-__all__ = ["FlightRecord", "Watch"]
-
 _SAME_OBJECT_IOU = 0.4
 """As re-detection asks of a detection at an object's place."""
 

@@ -7,8 +7,6 @@ from typing import Any, get_args
 
 from hvt_study.metrics.bits import Accounting
 
-__all__ = ["ACCOUNTINGS", "in_accounting"]
-
 ACCOUNTINGS: tuple[Accounting, ...] = get_args(Accounting)
 _RATES = (
     "total_bps",

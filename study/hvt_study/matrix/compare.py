@@ -25,8 +25,6 @@ from hvt_study.runs.execute import FLIGHTS, run_spec
 from hvt_study.runs.methods import METHODS
 from hvt_study.runs.spec import ModelChoice, RunSpec
 
-__all__ = ["COMPARED", "ComparePlan", "CompareResult", "CompareRow", "Missing", "compare"]
-
 COMPARED: Mapping[str, tuple[str, str]] = {
     "M0": ("M0", ""),
     "M0-fps": ("M0-fps", ""),

@@ -17,8 +17,6 @@ from hvt_study.cache.results import content_key
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.matrix.plan import StudyPlan
 
-__all__ = ["check_parameters", "staying"]
-
 RunRow = Mapping[str, Any]
 _CONDITIONS = ("dataset", "sequence", "regime", "budget_bps", "labels", "size", "max_frames", "detect_every")
 _SAME_TOTAL = 1e-4

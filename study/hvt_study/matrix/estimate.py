@@ -15,8 +15,6 @@ from hvt_study.runs.execute import run_spec
 from hvt_study.runs.methods import METHODS, Kind, Method
 from hvt_study.runs.run_context import open_run_context
 
-__all__ = ["Estimate", "estimate", "time_of_a_frame"]
-
 _TRIAL_FRAMES = 30
 _USUAL_WEIGHTS = 2.2
 """Times that video is coded without a ground until its total is right; measured on drone_carpark and the demo."""

@@ -13,8 +13,6 @@ from hvt_edge.profiles import REGIMES
 from hvt_study.runs.methods import METHODS, Kind, Method
 from hvt_study.runs.spec import ModelChoice, RunSpec, Target
 
-__all__ = ["Regime", "StudyPlan", "first_runs", "matched_runs", "parse_regimes", "spec_of"]
-
 
 @dataclass(frozen=True, slots=True)
 class Regime:

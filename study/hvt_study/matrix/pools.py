@@ -16,8 +16,6 @@ import cv2
 
 from hvt_common.errors import UserError
 
-__all__ = ["dask_pool", "local_pool"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

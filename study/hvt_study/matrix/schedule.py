@@ -16,8 +16,6 @@ from hvt_study.runs.match_total import grid_target
 from hvt_study.runs.methods import Kind
 from hvt_study.runs.spec import RunSpec
 
-__all__ = ["Pool", "RunRow", "in_order", "run_all"]
-
 RunRow = dict[str, Any]
 
 

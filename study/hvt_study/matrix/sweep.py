@@ -17,8 +17,6 @@ from hvt_common.inference.detect import Detector
 from hvt_edge.source.opening import Source
 from hvt_edge.stills.policy.selectors import SELECTORS, select
 
-__all__ = ["COLUMNS", "RawDetections", "SweepRow", "detect_clip", "read_csv", "sweep"]
-
 COLUMNS = ("policy", "selected", "ratio", "frame_coverage")
 _INPUT_COLUMNS = ("frame", "x1", "y1", "x2", "y2", "conf", "class")
 

@@ -25,8 +25,6 @@ from hvt_study.matrix.tuning import tuning_texts
 from hvt_study.runs.execute import run_spec
 from hvt_study.runs.methods import METHODS as FLOWN
 
-__all__ = ["HeldOut", "Tuned", "split", "tunable", "tune"]
-
 _REACH = 4.0
 """A parameter is looked for between its default over this and its default times this, on a logarithmic scale."""
 

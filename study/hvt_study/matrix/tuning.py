@@ -11,8 +11,6 @@ from hvt_common.errors import UserError
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
 from hvt_study.runs.methods import METHODS as FLOWN
 
-__all__ = ["tuned_methods", "tuning_texts"]
-
 _ACCEPTED = (
     "give METHOD:KEY=VALUE, such as M5:small_weight=0.5, or the tune.json that hvt-study tune has written"
 )

@@ -14,8 +14,6 @@ from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.datasets.virtual_camera import SCHEME
 from hvt_study.matrix.compare import ComparePlan, CompareResult, CompareRow
 
-__all__ = ["NOISE", "SIMPLEST_FIRST", "Verdict", "command_of", "verdicts"]
-
 NOISE = 0.01
 """Two figures that differ by less are alike."""
 SIMPLEST_FIRST: Mapping[str, tuple[str, ...]] = MappingProxyType(

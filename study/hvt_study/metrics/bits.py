@@ -16,8 +16,6 @@ from hvt_common.protocol.channels import Channel
 from hvt_study.metrics.frames import NO_ID
 from hvt_study.metrics.stills import RefinedObject, StillArrival
 
-__all__ = ["Accounting", "BitSplit", "StillCounts", "bit_split", "still_counts"]
-
 Accounting: TypeAlias = Literal["span", "pilot"]
 
 

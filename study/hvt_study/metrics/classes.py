@@ -23,8 +23,6 @@ from sklearn.metrics import f1_score
 from hvt_study.metrics.frames import LabelledFrames
 from hvt_study.metrics.judged import LEAST_IOU, LIMITS_PX2, SIZES, Judged, Size, judged, matched_rows, of_size
 
-__all__ = ["ClassCounts", "ClassScore", "class_score"]
-
 _NOBODY = -1
 """Stands for the class of what has no partner."""
 

@@ -24,8 +24,6 @@ from faster_coco_eval.core.faster_eval_api import COCOeval_faster
 from hvt_study.metrics.frames import LabelledFrames
 from hvt_study.metrics.judged import LARGEST_PX2, LIMITS_PX2, SIZES, Judged, Size, judged
 
-__all__ = ["AveragePrecision", "DetectionScore", "detection_score"]
-
 _MOST_BOXES: Final = 500
 _Precision = npt.NDArray[np.float64]
 

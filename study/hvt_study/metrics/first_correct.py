@@ -19,8 +19,6 @@ from scipy.stats import CensoredData, ecdf
 from hvt_study.metrics.frames import NO_ID, LabelledFrames
 from hvt_study.metrics.judged import LEAST_IOU, Judged, judged, matched_rows
 
-__all__ = ["FirstCorrect", "first_correct"]
-
 
 @dataclass(frozen=True, slots=True)
 class FirstCorrect:

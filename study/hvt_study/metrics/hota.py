@@ -17,8 +17,6 @@ from scipy.optimize import linear_sum_assignment
 
 from hvt_common.values import iou
 
-__all__ = ["ALPHAS", "Hota", "IdBoxes", "hota"]
-
 ALPHAS: Final = np.arange(0.05, 0.99, 0.05)
 """(19,) least IoU of a match; HOTA is the mean over them (section 3.4 of the paper)."""
 

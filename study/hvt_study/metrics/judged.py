@@ -26,18 +26,6 @@ from hvt_common.values import Boxes, iou
 from hvt_study.datasets.labels import FrameLabels, covered_share
 from hvt_study.metrics.frames import FrameView, LabelledFrames, rows_of
 
-__all__ = [
-    "LARGEST_PX2",
-    "LEAST_IOU",
-    "LIMITS_PX2",
-    "SIZES",
-    "Judged",
-    "Size",
-    "judged",
-    "matched_rows",
-    "of_size",
-]
-
 LEAST_IOU = 0.5
 
 Floats = npt.NDArray[np.floating[Any]]

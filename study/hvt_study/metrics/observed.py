@@ -13,15 +13,6 @@ from hvt_common.values import Boxes
 from hvt_study.metrics.frames import FrameLabels, FrameView, LabelledFrame
 from hvt_study.metrics.stills import RefinedObject, StillArrival
 
-__all__ = [
-    "ObservedFrame",
-    "arrivals",
-    "detected_frames",
-    "refined_frames",
-    "refined_objects",
-    "shown_times_s",
-]
-
 
 def _no_boxes() -> Boxes:
     return np.empty((0, 4), np.float32)

@@ -17,8 +17,6 @@ import numpy.typing as npt
 
 from hvt_study.metrics.judged import Judged, matched_rows
 
-__all__ = ["BINS", "OperatingPoint", "calibration_error", "operating_point", "right_boxes"]
-
 BINS = 15
 
 

@@ -15,8 +15,6 @@ from hvt_study.metrics.frames import LabelledFrame
 from hvt_study.metrics.judged import Judged
 from hvt_study.metrics.operating_point import OperatingPoint, calibration_error, operating_point, right_boxes
 
-__all__ = ["VEHICLES", "above", "as_one", "picture_score"]
-
 _VEHICLE = "vehicle"
 VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
 """Kinds that `as_one` takes for one."""

@@ -26,8 +26,6 @@ import numpy as np
 
 from hvt_study.metrics.stills import Opinion, RefinedObject
 
-__all__ = ["SMALL_SHARE", "Proxies", "ProxyScore", "proxies", "score_entropy_nats"]
-
 SMALL_SHARE = 0.015
 
 

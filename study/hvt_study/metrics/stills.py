@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Opinion", "RefinedObject", "StillArrival", "still_delays_ms"]
-
 
 @dataclass(frozen=True, slots=True)
 class StillArrival:

@@ -20,8 +20,6 @@ from hvt_study.datasets.layouts.mot import read_truth_rows
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.frames import NO_ID, FrameLabels, FrameView, LabelledFrame
 
-__all__ = ["Labelled", "Score", "read_tracks", "read_truth", "score"]
-
 _log = logging.getLogger(__name__)
 _MOST_HELD, _LEAST_GAPS = 15, 10
 """Frames; and so many distances have to be known before any counts as usual."""

@@ -25,8 +25,6 @@ from hvt_study.metrics.frames import NO_ID, LabelledFrames
 from hvt_study.metrics.hota import Hota, IdBoxes, hota
 from hvt_study.metrics.judged import LEAST_IOU, judged, matched_rows
 
-__all__ = ["Continuity", "TrackingScore", "compare_tracks", "continuity", "tracking_score"]
-
 _COUNTS: Final = {
     "num_objects": "objects",
     "num_misses": "misses",

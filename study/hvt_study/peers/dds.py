@@ -32,8 +32,6 @@ from hvt_study.peers.dds_line import Line
 from hvt_study.peers.dds_settings import DdsSettings
 from hvt_study.serial_link import LinkReport
 
-__all__ = ["DdsSettings", "fly_dds"]
-
 _START_NS = 1_700_000_000_000_000_000
 _LONGEST_TAIL_S = 30
 """How long after the clip the last second pass may take."""

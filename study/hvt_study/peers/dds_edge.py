@@ -22,8 +22,6 @@ from hvt_study.peers.dds_regions import Blocks, block_grid, pasted
 from hvt_study.peers.dds_request import RegionRequest
 from hvt_study.peers.dds_settings import DdsSettings
 
-__all__ = ["DdsEdge", "PassRates", "most_stored", "pass_rates"]
-
 _KEYFRAME_DEBT_S = 10
 """x265 never takes back what the first keyframe costs beyond a frame's share: so much media time pays for it."""
 _BLACK_FRAME_BYTES = 100

@@ -23,8 +23,6 @@ from hvt_study.peers.dds_regions import Blocks, combined, pasted, requested_bloc
 from hvt_study.peers.dds_request import RegionRequest
 from hvt_study.peers.dds_settings import DdsSettings
 
-__all__ = ["DdsGround"]
-
 
 @dataclass(slots=True)
 class _Held:

@@ -16,8 +16,6 @@ from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import RollingBudget
 from hvt_study.serial_link import Arrival, SerialLink
 
-__all__ = ["HEADER_BYTES", "Line", "UnitMessage", "header_bps"]
-
 HEADER_BYTES = 48
 """What a `BaseHeader` takes at most."""
 _SESSION = 1 << 40  # as many bytes on the wire as a random one

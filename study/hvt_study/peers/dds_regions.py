@@ -14,17 +14,6 @@ from hvt_common.inference.nms import suppress
 from hvt_common.values import Boxes, Detections, Image, iou
 from hvt_study.peers.dds_settings import DdsSettings
 
-__all__ = [
-    "Blocks",
-    "block_grid",
-    "combined",
-    "merged",
-    "pasted",
-    "pixel_mask",
-    "requested_blocks",
-    "requested_boxes",
-]
-
 Blocks = npt.NDArray[np.bool_]
 """(rows, columns): which blocks of ``align_px`` are asked for; those at the right and lower rim may be cut."""
 

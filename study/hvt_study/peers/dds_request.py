@@ -14,8 +14,6 @@ import numpy as np
 
 from hvt_study.peers.dds_regions import Blocks
 
-__all__ = ["RegionRequest"]
-
 _HEAD = struct.Struct(">IB")
 _LEVEL = 9
 

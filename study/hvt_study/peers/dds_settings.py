@@ -10,8 +10,6 @@ from hvt_common.errors import UserError
 from hvt_edge.video.encoder_settings import PRESETS
 from hvt_study.datasets.clip import NOMINAL_FPS
 
-__all__ = ["RATES", "DdsSettings"]
-
 RATES = (NOMINAL_FPS, 7.5, 5.0, 3.0, 2.0)
 """Those that the study's video-only methods choose from too."""
 _LEAST_BITS_PER_PX = 0.1

@@ -21,8 +21,6 @@ from hvt_study.reading.reader import CodeReader
 from hvt_study.reading.score import ChannelScore, Code, Evidence, channel_score
 from hvt_study.runs.spec import ModelChoice, RunSpec
 
-__all__ = ["READ_METHODS", "ReadPlan", "ReadResult", "ReadRow", "compare_codes"]
-
 READ_METHODS: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
     "source": ("", "", ()),
     "M0": ("M0", "jpeg", ()),

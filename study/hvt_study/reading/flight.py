@@ -32,8 +32,6 @@ from hvt_study.runs.spec import RunSpec
 from hvt_study.runs.video_shape import VideoShape
 from hvt_study.serial_link import SerialLink
 
-__all__ = ["ReadFlight", "Readings"]
-
 _EVERY_FRAMES = 5  # of the source, as of the base
 
 

@@ -22,8 +22,6 @@ from hvt_scene import CodeInView
 from hvt_study.reading.reader import CodeReader, code_crop
 from hvt_study.reading.score import LEAST_VISIBLE, Code, Evidence
 
-__all__ = ["CHANNELS", "Channel", "CodeObserver"]
-
 Channel = Literal["base", "stills", "composite"]
 CHANNELS: tuple[Channel, ...] = ("base", "stills", "composite")
 """What is read: base pictures alone, stills alone, and stills laid over the base picture at the source's size."""

@@ -15,8 +15,6 @@ from hvt_common.errors import needs_extra
 from hvt_common.values import Image
 from hvt_common.video.base_crop import resampled
 
-__all__ = ["CodeReader", "Reading", "code_crop"]
-
 _HEIGHT_PX = 48  # of a line of text, as the network takes it
 _WIDTH_PX = 192
 _MARGIN = 0.15

@@ -11,8 +11,6 @@ from hvt_scene import CodeInView
 from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.reading.reader import Reading
 
-__all__ = ["LEAST_VISIBLE", "ChannelScore", "Code", "Evidence", "channel_score", "codes_to_read"]
-
 LEAST_VISIBLE = 0.95
 """A code of which less is in the frame and under no crown cannot be asked for at that moment."""
 _LEAST_FRAMES = 15

@@ -13,8 +13,6 @@ from hvt_study.reading.compared import ReadResult, ReadRow
 from hvt_study.reading.observer import Channel
 from hvt_study.reading.score import Evidence
 
-__all__ = ["write_sheet"]
-
 _ROWS = 10
 _CELL_PX = (196, 60)
 _TEXT_PX = 20

@@ -12,8 +12,6 @@ from hvt_study.report.data.metric_names import METRICS, written
 from hvt_study.report.data.pairs import Pair, pairs
 from hvt_study.report.figures.pair_figures import difference_figures
 
-__all__ = ["DECIDES", "REFERENCES", "answer", "forests"]
-
 DECIDES = "named_f1"
 """The figure by which methods are held against video."""
 REFERENCES = ("M0", "M0-fps", "M0-best", "R0")

@@ -17,8 +17,6 @@ from hvt_study.report.data.arms import settings
 from hvt_study.report.data.table_file import RESULTS, SWEEP, read_results, write_results
 from hvt_study.report.example.store import load_example, save_example
 
-__all__ = ["join_studies"]
-
 
 def join_studies(folders: Sequence[Path], out: Path) -> None:
     """Write one table of all their runs into ``out``; of a run that several have the first counts.

@@ -29,8 +29,6 @@ from hvt_study.report.tables.arm_tables import (
 from hvt_study.report.tables.matrix_table import matrix_table
 from hvt_study.report.tables.pair_tables import differences_table, equal_table
 
-__all__ = ["make_report"]
-
 _MATRICES = ("named_f1", "map_50", "hota")
 
 

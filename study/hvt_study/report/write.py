@@ -16,8 +16,6 @@ from hvt_study.report.make import make_report
 from hvt_study.report.pages.render import FIGURES, html_page, markdown_page
 from hvt_study.report.tables.sweep_table import sweep_table
 
-__all__ = ["write_report"]
-
 _OURS = re.compile(
     r"(?:(?:answer|timeline|(?:differences|equal-quality|utility|codecs)-\d+)(?:-[A-Za-z0-9.-]+)?\.(?:svg|pdf)"
     r"|crop-\d+-(?:source|base|still)\.png)"

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal
 
-__all__ = ["COLUMNS", "Column"]
-
 Type = Literal["text", "int", "real", "yes"]
 
 

@@ -24,8 +24,6 @@ from hvt_study.runs.scoring import figures
 from hvt_study.runs.spec import RunSpec
 from hvt_study.runs.video_shape import VideoShape, competing_sizes, search_shape
 
-__all__ = ["FLIGHTS", "run_spec"]
-
 RunRow = dict[str, Any]
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)

@@ -10,8 +10,6 @@ from collections.abc import Collection
 from hvt_common.inference.labels import first_synonym
 from hvt_study.datasets.class_map import ClassMap, map_classes
 
-__all__ = ["joint_classes"]
-
 
 def joint_classes(
     detector_names: Collection[str], reader_names: Collection[str] | None, class_set: Collection[str]

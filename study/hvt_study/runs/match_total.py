@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 from hvt_study.runs.spec import MATCH_TOLERANCE
 
-__all__ = ["Matched", "first_budget", "grid_target", "match", "within"]
-
 _STEP = 1.01
 _CLOSE = 0.003
 """Of the target on the grid: with half a step it stays within one per cent of the real one."""

@@ -32,8 +32,6 @@ from hvt_study.datasets.sequence import Sequence
 from hvt_study.runs.joint_classes import joint_classes
 from hvt_study.runs.spec import ModelChoice, RunSpec
 
-__all__ = ["Materials", "open_materials", "software_versions"]
-
 _PACKAGES = (
     *("numpy", "scipy", "opencv-python-headless", "av", "pillow", "pillow-jxl-plugin", "msgpack"),
     *("onnxruntime", "onnxruntime-gpu", "openvino"),

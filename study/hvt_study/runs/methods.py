@@ -9,8 +9,6 @@ from types import MappingProxyType
 
 from hvt_common.errors import UserError
 
-__all__ = ["DDS", "METHODS", "Kind", "Method", "chosen_methods", "chosen_names"]
-
 DDS = "DDS"
 """The server-driven peer (`hvt_study.peers.dds`)."""
 

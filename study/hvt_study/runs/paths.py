@@ -8,8 +8,6 @@ from pathlib import Path
 
 from hvt_study.runs.spec import RunSpec
 
-__all__ = ["located"]
-
 _WITHOUT_PATH = frozenset({"demo"})
 
 

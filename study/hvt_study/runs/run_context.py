@@ -25,8 +25,6 @@ from hvt_study.datasets.sequence import Sequence
 from hvt_study.runs.materials import Materials, open_materials
 from hvt_study.runs.spec import RunSpec
 
-__all__ = ["RunContext", "open_run_context"]
-
 _OPEN_FILES = Path("/proc/self/fd")
 
 

@@ -23,8 +23,6 @@ from hvt_study.runs.run_context import RunContext
 from hvt_study.runs.spec import RunSpec
 from hvt_study.runs.video_shape import VideoShape
 
-__all__ = ["dry_run_bps", "edge_flags", "flight_plan", "flown", "settings"]
-
 
 def edge_flags(spec: RunSpec, *, budget_bps: int, shape: VideoShape) -> tuple[str, ...]:
     """What ``hvt-edge`` is started with, but for the source; a peer's settings in words of its own."""

@@ -25,8 +25,6 @@ from hvt_study.metrics.stills import still_delays_ms
 from hvt_study.metrics.tracking import continuity, tracking_score
 from hvt_study.runs.run_context import RunContext
 
-__all__ = ["figures"]
-
 _DIGITS = 6
 _SAYS_OF_ONE = {
     *("recall", "recall_half_1", "recall_half_2", "top1_before", "top1", "top1_half_1", "top1_half_2"),

@@ -7,8 +7,6 @@ import json
 from dataclasses import asdict, dataclass, field
 from typing import Literal
 
-__all__ = ["MATCH_TOLERANCE", "ModelChoice", "RunSpec", "Target"]
-
 MATCH_TOLERANCE = 0.01
 """A run that is to match another's total may miss it by so much, and is marked failed beyond."""
 

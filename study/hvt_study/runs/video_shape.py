@@ -13,8 +13,6 @@ from typing import Any, Protocol, Self, TypeVar
 
 from hvt_edge.source.contract import size_within
 
-__all__ = ["VideoShape", "competing_sizes", "search_shape"]
-
 _BOXES = ((640, 360), (960, 540), (1280, 720), (1920, 1080), (2560, 1440), (3840, 2160))
 """(width, height) into which the source is fitted for the sizes that are tried."""
 _ALIKE = 0.15

@@ -10,8 +10,6 @@ import numpy as np
 
 from hvt_common.video.still_codecs import BaseMissingError, CodedCrop
 
-__all__ = ["Hopeless", "StandIn"]
-
 
 @dataclass(frozen=True, slots=True)
 class StandIn:

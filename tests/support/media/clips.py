@@ -10,8 +10,6 @@ import numpy as np
 
 from hvt_common.values import Frame
 
-__all__ = ["START_NS", "framed", "hard_pictures", "real_pictures", "smooth_pictures"]
-
 START_NS = 1_790_000_000_000_000_000
 
 

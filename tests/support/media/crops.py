@@ -5,8 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-__all__ = ["textured", "washed_out"]
-
 
 def textured(width: int, height: int, *, seed: int = 0) -> np.ndarray:
     """Soft colours with fine grain and a few sharp edges: (height, width, 3) uint8, BGR."""

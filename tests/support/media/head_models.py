@@ -16,8 +16,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 from media.onnx_models import cells
 
-__all__ = ["COLOURS", "FAMILIES", "SQUARES", "Graph", "family_model", "picture"]
-
 COLOURS = ((1, 0, 0), (0, 0, 1))
 """(red, green, blue) of class 0 and 1."""
 SQUARES = ((64, 32, 160, 96), (192, 96, 288, 160))

@@ -11,8 +11,6 @@ import numpy as np
 from hvt_common.video.annex_b import nal_kind, nal_units
 from media.clips import smooth_pictures
 
-__all__ = ["SIZE", "packets_of", "pictures_of", "write_clip"]
-
 SIZE = (320, 192)
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".hevc": "hevc", ".ts": "mpegts"}
 

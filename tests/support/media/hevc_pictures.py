@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from hvt_common.video.still_codecs.bits import BitWriter, escaped
 
-__all__ = ["coded_picture"]
-
 _CHROMA_QP_OFFSET = 2
 
 _START = b"\x00\x00\x00\x01"

@@ -15,8 +15,6 @@ from klvdata.klvparser import KLVParser
 from klvdata.misb0601 import UASLocalMetadataSet
 from klvdata.setparser import SetParser
 
-__all__ = ["KlvPacket", "ReadStream", "Target", "packets_of", "read_stream"]
-
 
 @UASLocalMetadataSet.add_parser
 class _Vmti(SetParser):

@@ -9,8 +9,6 @@ import av
 import numpy as np
 from av.video.codeccontext import VideoCodecContext
 
-__all__ = ["FPS", "SIZE", "STEP_PX", "moving_square"]
-
 SIZE, FPS, STEP_PX = (320, 192), 15, 4
 
 

@@ -11,8 +11,6 @@ import av
 import cv2
 import numpy as np
 
-__all__ = ["disc", "number_of", "numbered", "patch", "write_numbered"]
-
 _BITS = 10
 
 

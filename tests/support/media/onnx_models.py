@@ -14,17 +14,6 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-__all__ = [
-    "STRIDES",
-    "cells",
-    "colour_classifier",
-    "colour_detector",
-    "constant_model",
-    "failing_in_the_light",
-    "save",
-    "slow_detector",
-]
-
 STRIDES = (8, 16, 32)
 
 Shape = Sequence[int | str | None]

@@ -7,8 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-__all__ = ["write_scene"]
-
 WIDTH, HEIGHT = 960, 540
 _THINGS = 6
 

@@ -11,8 +11,6 @@ import numpy as np
 
 from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
 
-__all__ = ["START_NS", "STEP_NS", "coded", "drawn_frames", "moving_boxes", "session"]
-
 START_NS = 1_790_000_000_000_000_000
 STEP_NS = 66_666_667
 

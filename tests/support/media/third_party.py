@@ -6,8 +6,6 @@ import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["BLOBS", "ENCODERS", "PIXELS", "install"]
-
 PIXELS = '''
 """Zlib-packed pixels: a codec that knows nothing of HVT but the contract."""
 

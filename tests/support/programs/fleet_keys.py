@@ -14,8 +14,6 @@ from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_fleet.pki.authority import Authority
 from hvt_fleet.pki.command import run
 
-__all__ = ["EXPIRED", "Fleet"]
-
 EXPIRED = dt.datetime.now(dt.UTC) - dt.timedelta(days=1000)
 """Keys made then have ended since."""
 

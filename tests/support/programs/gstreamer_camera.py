@@ -10,8 +10,6 @@ import subprocess
 from types import TracebackType
 from typing import Self
 
-__all__ = ["GStreamerCamera", "lacking"]
-
 SIZE, FPS = (320, 240), 25
 _PYTHON = "/usr/bin/python3"
 """The system's, which has the bindings; a virtual environment does not."""

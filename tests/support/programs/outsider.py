@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import zenoh
 
-__all__ = ["Message", "Tap", "answer", "joined"]
-
 
 @dataclass(frozen=True)
 class Message:

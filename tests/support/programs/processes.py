@@ -17,8 +17,6 @@ from typing import Any, Self
 
 from hvt_common.protocol.frame_account import FRAME_GROUPS, FrameAccount
 
-__all__ = ["Link", "Running", "eventually", "free_ports"]
-
 START_S = 60.0
 """How long a process may take to get going on a busy machine."""
 _POLL_S = 0.01

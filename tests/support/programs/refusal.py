@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["checked", "snapshot"]
-
 
 def snapshot(folder: Path) -> set[tuple[Path, int, int]]:
     """Every file and folder below, with size and time of change; compiled modules are Python's own."""

@@ -11,8 +11,6 @@ from typing import Any
 
 from rerun.chunk import Chunk, RrdReader
 
-__all__ = ["ReadBox", "Recording"]
-
 STATIC = -(1 << 62)
 
 

@@ -17,8 +17,6 @@ import numpy as np
 
 from hvt_common.video.annex_b import PARAMETER_SETS, nal_kind, nal_units
 
-__all__ = ["RtspCamera"]
-
 SIZE = (320, 240)
 _FPS = 25
 _NTP_EPOCH_S = 2_208_988_800

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["small_disk"]
-
 
 @contextmanager
 def small_disk(folder: Path, *, size: str = "1m") -> Iterator[Path]:

@@ -12,8 +12,6 @@ import sys
 import time
 from pathlib import Path
 
-__all__ = ["run"]
-
 
 def run(module: str, step_s: float) -> int:
     """The program's exit code."""

@@ -17,8 +17,6 @@ from hvt_common.protocol.messages import (
 from hvt_common.transport.inbox import Received
 from rigs.flight import Flight
 
-__all__ = ["chunks", "info_object", "still_object", "video_object"]
-
 
 def still_object(flight: Flight, index: int, sequence: int, **changes) -> bytes:
     """A still of the red square in a frame."""

@@ -22,8 +22,6 @@ from hvt_edge.source.contract import Source
 from hvt_edge.world import World
 from media.clips import START_NS
 
-__all__ = ["LookFlight", "RequestedLook"]
-
 
 class _StandingClock(SteadyClock):
     """In lockstep the source alone says what time it is."""

@@ -21,8 +21,6 @@ from hvt_common.values import View, iou
 from hvt_scene import Scene
 from programs.processes import Link, free_ports
 
-__all__ = ["FPS", "FRAMES", "SCENE", "VIEW", "DrawnFlight", "fly", "fly_into_all_sinks", "off_m", "receiving"]
-
 FPS, FRAMES, SEED = 15, 75, 3
 SCENE = Scene(SEED)
 SIZE = (640, 360)

@@ -36,18 +36,6 @@ from hvt_ground.perception.stills.vocabulary import Vocabulary
 from hvt_ground.perception.turns import Turns
 from media.clips import START_NS, framed, smooth_pictures
 
-__all__ = [
-    "CLASSES",
-    "Flight",
-    "Port",
-    "RedSquares",
-    "SameAnswer",
-    "grainy_pictures",
-    "pipeline_of",
-    "square_box",
-    "tracks_at",
-]
-
 SIZE = (320, 192)
 CLASSES = ("car", "bus")
 _ids = itertools.count(1000)

@@ -7,8 +7,6 @@ import sys
 from types import FunctionType, ModuleType
 from typing import Any
 
-__all__ = ["footprint_bytes"]
-
 
 def footprint_bytes(root: Any) -> int:
     """Of the object and all that it refers to; classes, functions and modules are not its own."""

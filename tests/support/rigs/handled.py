@@ -7,8 +7,6 @@ import threading
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_ground.session.edge_sessions import EdgeThread
 
-__all__ = ["WatchedInbox", "check", "end"]
-
 
 class WatchedInbox(Inbox):
     """An edge's inbox with one thread that takes: it has done with an item when it asks for the next."""

@@ -50,8 +50,6 @@ from media.clips import START_NS, framed, smooth_pictures
 from rigs.kept import INFO, S, opened
 from rigs.messages import feedback
 
-__all__ = ["FRAMES", "SIZE", "STILL", "Ground", "Out", "Rig", "link_of"]
-
 SIZE = (320, 192)
 FRAMES = framed(smooth_pictures(210, size=SIZE))
 STILL = Still(

@@ -12,8 +12,6 @@ from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
 from rigs.flight import Flight
 
-__all__ = ["INFO", "UNITS", "S", "add_stills", "add_units", "coded", "opened", "packed_still", "shifted"]
-
 SIZE = (320, 192)
 S = 1_000_000_000
 INFO = Flight(1).info()

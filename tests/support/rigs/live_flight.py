@@ -43,8 +43,6 @@ from hvt_edge.wiring.video import first_decimation, make_frame_skip, reconfigura
 from rigs.kept import INFO
 from rigs.messages import feedback
 
-__all__ = ["LiveFlight", "SteppedLink"]
-
 _WAY_NS = SECOND_NS // 50
 _REPORT_NS, _IDLE_REPORT_NS = SECOND_NS // 8, SECOND_NS // 2
 _PIXELS = np.zeros((8, 8, 3), np.uint8)

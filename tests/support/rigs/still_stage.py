@@ -20,8 +20,6 @@ from hvt_edge.stills.sending import StillSender
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.stills.suppression import Suppression
 
-__all__ = ["make_still_stage"]
-
 
 def make_still_stage(
     transmitter: Transmitter,

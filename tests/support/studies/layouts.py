@@ -8,8 +8,6 @@ import cv2
 
 from media.clips import smooth_pictures
 
-__all__ = ["SIZE", "square_xywh", "write_images", "write_mot", "write_uavdt", "write_visdrone"]
-
 SIZE = (160, 96)
 
 

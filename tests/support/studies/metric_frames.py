@@ -8,8 +8,6 @@ from hvt_study.datasets.labels import NO_ID, FrameLabels
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.frames import FrameView
 
-__all__ = ["labels", "list_f1", "square", "view"]
-
 
 def square(x, y=0, side=10):
     """x1 y1 x2 y2 of a square."""

@@ -9,8 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-__all__ = ["HIT_CLASSES", "write_hit", "write_yolo"]
-
 HIT_CLASSES = ("Person", "Car", "Bicycle", "OtherVehicle", "DontCare")
 
 

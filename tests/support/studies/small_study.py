@@ -16,22 +16,6 @@ from hvt_study.report.data.table_file import read_results
 from media.onnx_models import colour_detector
 from programs.processes import eventually
 
-__all__ = [
-    "FRAMES",
-    "PATIENT_S",
-    "REGIME",
-    "SIZE",
-    "arguments",
-    "detector",
-    "entries",
-    "flights",
-    "said",
-    "study",
-    "table",
-    "until",
-    "write_scene",
-]
-
 PATIENT_S = 200.0
 """How long a study may take on a busy machine."""
 SIZE = (160, 96)

@@ -7,8 +7,6 @@ from hvt_common.inference.heads.contract import Head
 from hvt_common.inference.heads.kinds import KINDS, Kind, Match
 from hvt_common.inference.heads.trial import Trial
 
-__all__ = ["HEAD_NAMES", "check_head_name", "choose_head"]
-
 HEAD_NAMES = tuple(KINDS)
 """The values of ``--head``."""
 _RT_DETR = ("rt-detr-rows", "rt-detr")

@@ -13,8 +13,6 @@ from hvt_common.inference.letterbox import Anchor
 from hvt_common.inference.preparation import Preparation
 from hvt_common.values import Boxes
 
-__all__ = ["Array", "Decoder", "Head", "HeadOutput"]
-
 Array = npt.NDArray[np.float32]
 
 

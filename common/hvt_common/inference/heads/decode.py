@@ -16,19 +16,6 @@ import numpy.typing as npt
 from hvt_common.inference.heads.contract import Array, HeadOutput
 from hvt_common.values import Boxes
 
-__all__ = [
-    "MOST_RELATIVE",
-    "Corners",
-    "Dense",
-    "Form",
-    "Listed",
-    "Parallel",
-    "PerQuery",
-    "YoloxCells",
-    "cell_grid",
-    "rows_of",
-]
-
 MOST_RELATIVE = 1.5
 """Boxes up to here are shares of the input: those of networks end at 1, or a little beyond."""
 

@@ -15,8 +15,6 @@ from hvt_common.inference.heads.decode import MOST_RELATIVE
 if TYPE_CHECKING:  # the runtimes take a while to import, and a list of heads needs none
     from hvt_common.inference.runtimes.model import Port
 
-__all__ = ["Trial", "anchor_count", "are_probabilities", "are_scores", "are_whole", "trial_pictures"]
-
 _BLOCK_PX = 32
 _PADDING = -1
 

@@ -9,8 +9,6 @@ from xml.etree import ElementTree as ET
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.onnx_file import MAX_MODEL_BYTES
 
-__all__ = ["check_ir_file", "files_of", "ir_metadata", "is_ir"]
-
 _MAX_XML_BYTES = 64 << 20
 _FIRST_BYTES = 512
 

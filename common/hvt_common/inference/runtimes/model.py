@@ -31,8 +31,6 @@ from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_op
 from hvt_common.inference.runtimes.providers import ONNXRUNTIME_PROVIDERS, ProviderChoice, choose_provider
 from hvt_common.runtime.process import lower_priority
 
-__all__ = ["ModelSettings", "OnnxModel", "Port", "open_model"]
-
 _T = TypeVar("_T")
 
 _log = logging.getLogger(__name__)

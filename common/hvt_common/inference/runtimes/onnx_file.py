@@ -15,8 +15,6 @@ from types import MappingProxyType
 
 from hvt_common.errors import UserError
 
-__all__ = ["MAX_MODEL_BYTES", "check_onnx_file", "onnx_metadata", "onnx_version", "opset_versions"]
-
 MAX_MODEL_BYTES = 1 << 30
 """1 GiB: the largest detectors are a fifth of it, and protobuf itself stops at 2 GiB."""
 

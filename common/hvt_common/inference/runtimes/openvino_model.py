@@ -18,8 +18,6 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.providers import OpenVinoCpu
 
-__all__ = ["OpenVinoRunner", "find_openvino"]
-
 _MAX_SHAPES = 4
 _Port = tuple[str, tuple[int | None, ...], np.dtype[Any] | None]
 

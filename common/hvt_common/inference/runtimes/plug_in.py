@@ -19,8 +19,6 @@ from hvt_common.inference.nms import MAX_DETECTIONS
 from hvt_common.runtime.plug_ins import installed, loaded, origin, the_one
 from hvt_common.values import Detections, Image
 
-__all__ = ["PlugInDetector", "plug_in_names", "plug_in_of"]
-
 _GROUP = "hvt.detectors"
 _WHAT = "detector"
 _TRIAL = (256, 320, 3)

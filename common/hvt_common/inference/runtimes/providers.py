@@ -21,8 +21,6 @@ from dataclasses import dataclass
 
 from hvt_common.errors import UserError
 
-__all__ = ["ONNXRUNTIME_PROVIDERS", "PROVIDERS", "OpenVinoCpu", "ProviderChoice", "choose_provider"]
-
 PROVIDERS = ("auto", "cpu", "cuda", "tensorrt", "openvino", "coreml")
 
 ONNXRUNTIME_PROVIDERS: Mapping[str, tuple[str, ...]] = {

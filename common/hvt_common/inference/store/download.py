@@ -18,8 +18,6 @@ from typing import BinaryIO, cast
 from hvt_common import __version__
 from hvt_common.errors import UserError
 
-__all__ = ["DownloadError", "download"]
-
 Progress = Callable[[int], None]
 """Gets the bytes that are there so far; they may become fewer when a server starts over."""
 

@@ -16,8 +16,6 @@ from urllib.parse import urlsplit
 
 from hvt_common.errors import UserError
 
-__all__ = ["MAX_SIZE_BYTES", "ModelEntry", "builtin_manifest", "check_digest", "check_name", "parse_manifest"]
-
 MAX_SIZE_BYTES = 1 << 30
 """1 GiB, as much as a model may have when it is opened."""
 

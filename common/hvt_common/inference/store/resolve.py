@@ -15,15 +15,6 @@ from hvt_common.errors import UserError
 from hvt_common.inference.store.manifest import builtin_manifest
 from hvt_common.inference.store.store import Store, file_digest
 
-__all__ = [
-    "EMBEDDED_CLASSIFIER",
-    "EMBEDDED_DETECTOR",
-    "embedded_models",
-    "known_classes",
-    "model_names",
-    "resolve_model",
-]
-
 EMBEDDED_DETECTOR = "aerial-nano"
 """Finds vehicles and people from straight above or aslant."""
 EMBEDDED_CLASSIFIER = "aerial-cls"

@@ -25,8 +25,6 @@ from hvt_common.inference.store.manifest import (
     parse_manifest,
 )
 
-__all__ = ["Store", "cache_folder", "file_digest"]
-
 _CHUNK_BYTES = 1 << 20
 _ADDED = "added.toml"
 

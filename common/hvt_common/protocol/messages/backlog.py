@@ -29,21 +29,6 @@ from hvt_common.protocol.messages.fields import (
     wire_field,
 )
 
-__all__ = [
-    "MAX_ACKNOWLEDGED_RANGES",
-    "MAX_BACKLOG_BYTES",
-    "AcknowledgedRange",
-    "BacklogHeader",
-    "BacklogKind",
-    "BacklogStill",
-    "BacklogUnit",
-    "ObjectKey",
-    "pack_backlog_still",
-    "pack_backlog_units",
-    "parse_backlog_still",
-    "parse_backlog_units",
-]
-
 MAX_BACKLOG_BYTES = MAX_PAYLOAD_BYTES
 """Of one object: ten seconds of video at 3 Mbps."""
 MAX_ACKNOWLEDGED_RANGES = 16

@@ -24,20 +24,6 @@ from hvt_common.protocol.messages.fields import (
     wire_field,
 )
 
-__all__ = [
-    "MAX_MISSING_STILLS",
-    "MAX_STILL_CODECS",
-    "MAX_STILL_RESULTS",
-    "MAX_TRACKS_NOW",
-    "Command",
-    "ControlAnswer",
-    "ControlRequest",
-    "Feedback",
-    "InfoRequest",
-    "StillResult",
-    "TrackNow",
-]
-
 MAX_STILL_RESULTS = 32
 MAX_MISSING_STILLS = 32
 """How many one report names; of more, the newest."""

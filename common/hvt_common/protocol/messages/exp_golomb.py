@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from hvt_common.protocol.messages.fields import WireError
 
-__all__ = ["BitReader", "BitWriter"]
-
 _MOST_ZEROS = 40
 """No number that is sent here needs more."""
 

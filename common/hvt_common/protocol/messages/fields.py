@@ -13,30 +13,6 @@ from collections.abc import Sized
 from dataclasses import MISSING, dataclass, field
 from typing import Any
 
-__all__ = [
-    "I63",
-    "REFUSED_CHARACTERS",
-    "U32",
-    "U64",
-    "Blob",
-    "Box",
-    "Flag",
-    "Int",
-    "Kind",
-    "ListOf",
-    "MapOf",
-    "OneOf",
-    "Real",
-    "Scalar",
-    "Scaled",
-    "Text",
-    "TupleOf",
-    "WireError",
-    "described",
-    "fitted_text",
-    "wire_field",
-]
-
 U32 = 2**32 - 1
 U64 = 2**64 - 1
 I63 = 2**63 - 1

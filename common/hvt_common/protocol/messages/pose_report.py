@@ -15,8 +15,6 @@ from hvt_common.protocol.messages.exp_golomb import BitReader, BitWriter
 from hvt_common.protocol.messages.fields import I63, U32, Blob, Int, WireError, wire_field
 from hvt_common.values import Orientation, Pose
 
-__all__ = ["PoseDecoder", "PoseEncoder", "PoseReport"]
-
 _MOST_BYTES: Final = 48
 _MILLION: Final = 1_000_000
 _NUMBERS: Final = 16

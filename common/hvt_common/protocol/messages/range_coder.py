@@ -13,8 +13,6 @@ from typing import Final
 
 from hvt_common.protocol.messages.fields import WireError
 
-__all__ = ["Coder", "Context", "Decoder", "Encoder", "NumberContexts"]
-
 _ONE: Final = 1 << 16
 _SLOWEST: Final = 30
 _TOP: Final = 1 << 24

@@ -28,8 +28,6 @@ from hvt_common.protocol.messages.fields import (
 )
 from hvt_common.values import View
 
-__all__ = ["MOST_FAILED_PARTS", "FailedPart", "Health", "Info", "Status", "fitted_class_names"]
-
 _TIME = Int(0, I63)
 _COUNT = Int(0, 2**53 - 1)
 _BPS = Int(0, 2**53 - 1)

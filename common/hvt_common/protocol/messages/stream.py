@@ -22,8 +22,6 @@ from hvt_common.protocol.messages.fields import (
     wire_field,
 )
 
-__all__ = ["MAX_ALSO", "AlsoShown", "BaseHeader", "Flags", "RoiHeader"]
-
 MAX_ALSO = 15
 """How many further tracks one still may name."""
 

@@ -18,16 +18,6 @@ from typing import Final
 from hvt_common.protocol.messages.fields import U32, WireError
 from hvt_common.protocol.messages.range_coder import Coder, Context, Decoder, Encoder, NumberContexts
 
-__all__ = [
-    "CONFIDENCE_STEPS",
-    "MOST_BOXES",
-    "MOST_CLASSES",
-    "PER_PX",
-    "CodedTrack",
-    "read_tracks",
-    "write_tracks",
-]
-
 MOST_BOXES: Final = 1024
 """Limit of one step."""
 MOST_CLASSES: Final = 2048

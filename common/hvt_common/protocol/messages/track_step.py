@@ -29,8 +29,6 @@ from hvt_common.protocol.messages.track_boxes import (
 )
 from hvt_common.values import Tracks
 
-__all__ = ["MOST_BOXES", "TrackStep", "TrackStepDecoder", "TrackStepEncoder"]
-
 _MOST_BOX_BYTES: Final = 16_000
 _EARLY: Final = 0.95
 """Steps come a little early or late: one that is due nearly is due."""

@@ -21,8 +21,6 @@ import zenoh
 from hvt_common.errors import UserError
 from hvt_common.transport.zenoh_config import connect_endpoints
 
-__all__ = ["NO_CHECK_TIME", "Certificate", "KeyPair", "TlsFiles", "check_own_keys", "dated", "plain_key_only"]
-
 _log = logging.getLogger(__name__)
 
 NO_CHECK_TIME = ssl.VerifyFlags(0x200000)

@@ -25,8 +25,6 @@ from hvt_common.transport.doctor.strangers import Strangers, listening_ports
 from hvt_common.transport.rights import Rights
 from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
 
-__all__ = ["PATIENCE_S", "LinkWatch", "control_unanswered", "visit"]
-
 _log = logging.getLogger(__name__)
 
 _CHECK_S, _STRANGERS_S = 1.0, 0.1

@@ -22,8 +22,6 @@ from hvt_common.transport.doctor.certificate import (
     plain_key_only,
 )
 
-__all__ = ["why_no_link"]
-
 _STEP_S = 3.0
 """Longest wait for a connection, and again for each answer."""
 _ALERT_S = 1.0

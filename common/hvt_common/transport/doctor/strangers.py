@@ -14,8 +14,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-__all__ = ["Strangers", "listening_ports"]
-
 _TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
 _LISTEN = "0A"
 _TIMES, _WITHIN_S = 3, 600.0

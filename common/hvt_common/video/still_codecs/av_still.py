@@ -17,8 +17,6 @@ from av.video.codeccontext import VideoCodecContext
 from hvt_common.video.still_codecs.contract import StillError
 from hvt_common.video.still_codecs.yuv420 import Planar
 
-__all__ = ["decoded", "encoded"]
-
 
 def encoded(pictures: Sequence[Planar], *, encoder: str, options: Mapping[str, str]) -> list[bytes]:
     """Each picture's access unit (Annex B), from an encoder without delay."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["BitReader", "BitWriter", "escaped", "unescaped"]
-
 _NEEDS_ESCAPE = re.compile(rb"\x00\x00(?=[\x00-\x03])")
 
 

@@ -20,19 +20,6 @@ from typing import Protocol
 
 from hvt_common.values import Image
 
-__all__ = [
-    "MAX_QP",
-    "NO_PARAMETERS",
-    "BaseMissingError",
-    "CodedCrop",
-    "IntraCodec",
-    "Parameters",
-    "StillCodec",
-    "StillError",
-    "on_ladder",
-    "qp_of",
-]
-
 MAX_QP = 51
 
 Parameters = Mapping[str, int | float | str]

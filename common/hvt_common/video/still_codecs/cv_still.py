@@ -10,8 +10,6 @@ import numpy as np
 from hvt_common.values import Image
 from hvt_common.video.still_codecs.contract import StillError
 
-__all__ = ["imdecoded", "imencoded", "lacking"]
-
 
 def lacking(ending: str) -> str | None:
     """Why this OpenCV cannot code pictures of that file ending, or None where it can."""

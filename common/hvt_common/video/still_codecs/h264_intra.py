@@ -13,8 +13,6 @@ from hvt_common.video.still_codecs.h264_syntax import (
 )
 from hvt_common.video.still_codecs.yuv420 import padded_size, to_bgr, to_planar
 
-__all__ = ["H264IntraCodec", "split_payload", "x264_options"]
-
 _SMALL_PX = 128 * 128
 """Most crops; see `x264_options`."""
 

@@ -14,8 +14,6 @@ from hvt_common.video.annex_b import nal_units
 from hvt_common.video.still_codecs.bits import BitReader, BitWriter, escaped, unescaped
 from hvt_common.video.still_codecs.yuv420 import BLOCK_PX, Planar
 
-__all__ = ["CHROMA_QP_OFFSET", "cabac_data", "coded_slice", "parameter_sets", "verbatim_picture"]
-
 CHROMA_QP_OFFSET = 4
 """Colour is coded a little coarser: 3 % fewer bytes at equal luma error."""
 

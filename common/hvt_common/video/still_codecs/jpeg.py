@@ -10,8 +10,6 @@ from hvt_common.values import Image
 from hvt_common.video.still_codecs.contract import IntraCodec, StillError
 from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded
 
-__all__ = ["JpegCodec", "jpeg_size"]
-
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
 # Baseline and extended sequential Huffman. Progressive (C2) is refused: every scan runs over the whole picture, so
 # a few kilobytes can buy minutes of decoding; on crops of this size it is also 18 % larger.

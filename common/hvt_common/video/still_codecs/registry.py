@@ -19,8 +19,6 @@ from hvt_common.errors import UserError
 from hvt_common.runtime.plug_ins import installed, loaded, origin, the_one
 from hvt_common.video.still_codecs.contract import StillCodec
 
-__all__ = ["GROUP", "still_codec", "still_codec_names"]
-
 GROUP = "hvt.still_codecs"
 """The entry points' group."""
 _WHAT = "still codec"

@@ -40,8 +40,6 @@ from hvt_common.video.still_codecs.yuv420 import (
     to_planar,
 )
 
-__all__ = ["CHECKSUM", "ResidualCodec"]
-
 CHECKSUM = "b"
 """The parameter with the CRC-32 of the reference picture: the base crop's planes Y, Cb and Cr, whole blocks."""
 

@@ -14,8 +14,6 @@ import numpy as np
 from hvt_common.values import Image
 from hvt_common.video.still_codecs.contract import CodedCrop, StillCodec
 
-__all__ = ["best_fitting", "psnr_y_db", "smallest_reaching"]
-
 _BT601_BGR = np.array([[0.114, 0.587, 0.299]], np.float32)
 
 

@@ -15,8 +15,6 @@ import numpy.typing as npt
 
 from hvt_common.values import Image
 
-__all__ = ["BLOCK_PX", "Planar", "difference_bgr", "filled_outside", "padded_size", "to_bgr", "to_planar"]
-
 BLOCK_PX = 16
 """A macroblock of H.264; a multiple of HEVC's smallest block."""
 

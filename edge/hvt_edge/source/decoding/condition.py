@@ -7,8 +7,6 @@ import numpy as np
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
 
-__all__ = ["PictureCondition"]
-
 _LONG_NS = 10 * SECOND_NS
 _BLACK = 24
 """The highest level of a picture in which nobody sees anything."""

@@ -20,19 +20,6 @@ from hvt_common.errors import UserError
 from hvt_common.redaction import redacted
 from hvt_edge.source.decoding.timeline import LONG_PAUSE_S, LONG_STEP_S, Stamps, Timeline, presented, surveyed
 
-__all__ = [
-    "cause_of",
-    "choose_stream",
-    "decoded",
-    "is_local",
-    "name_of",
-    "open_video",
-    "said_rate",
-    "shown_times",
-    "survey",
-    "without_stamps",
-]
-
 _log = logging.getLogger(__name__)
 
 _TEXT_CODECS = frozenset({"ansi", "bintext", "xbin", "idf"})

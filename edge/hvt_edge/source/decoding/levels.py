@@ -11,8 +11,6 @@ import numpy.typing as npt
 
 from hvt_common.values import Image
 
-__all__ = ["Stretch"]
-
 _LOW_PCT, _HIGH_PCT = 0.5, 99.5
 _LEAST_SPAN = 64
 """Sensor levels: a wall of one temperature is not to become noise from black to white."""

@@ -6,8 +6,6 @@ import logging
 
 from hvt_common.runtime.log import START_LOGGER
 
-__all__ = ["Notes"]
-
 
 class Notes:
     """Takes sentences; ``name`` is their subject, as it may be printed."""

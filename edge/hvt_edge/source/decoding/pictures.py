@@ -16,8 +16,6 @@ from hvt_common.values import Image
 from hvt_edge.source.decoding.levels import Stretch
 from hvt_edge.source.decoding.notes import Notes
 
-__all__ = ["Pictures", "matrix_of", "turn_of"]
-
 _UNTAGGED_SD_PX = 576
 """A picture that says no colour matrix is BT.601 with at most so many lines, else BT.709: as players take it."""
 _DEEP_BITS = 10

@@ -9,8 +9,6 @@ from fractions import Fraction
 from itertools import pairwise
 from statistics import median
 
-__all__ = ["LONG_PAUSE_S", "LONG_STEP_S", "Stamps", "Timeline", "presented", "surveyed"]
-
 LONG_STEP_S = Fraction(10)
 """A step of more than this, and than three usual ones, is a jump where a container may have some (MPEG-TS)."""
 LONG_PAUSE_S = Fraction(3600)

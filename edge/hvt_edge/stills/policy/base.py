@@ -14,8 +14,6 @@ from hvt_edge.stills.policy.cost import CostEstimate
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
-__all__ = ["STILL_OVERHEAD_BYTES", "Method", "Request", "Step", "ranked"]
-
 STILL_OVERHEAD_BYTES = 180.0
 """With the usual names: 91 of header and 83 of framing and TCP for JPEG, 18 more for a residual's parameters."""
 

@@ -16,8 +16,6 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
-__all__ = ["CostEstimate", "CostModel"]
-
 _PRIOR_FIXED_BYTES = 640.0
 _PRIOR_BYTES_PER_PX = 0.12
 _PRIOR_MEAN_BYTES = 1500.0

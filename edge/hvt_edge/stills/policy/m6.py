@@ -22,8 +22,6 @@ from hvt_edge.stills.policy.base import Request, Step, ranked
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
-__all__ = ["ExpectedGain"]
-
 _SIDE_PX = 32.0
 """The size at which ``size_weight`` adds nothing."""
 _MOST_WEIGHT = 1000.0

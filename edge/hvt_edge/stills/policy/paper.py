@@ -16,8 +16,6 @@ from hvt_edge.stills.policy.base import Request, Step, ranked
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
-__all__ = ["OnStart", "Periodic", "Small", "TracksFirst", "Uncertain", "Utility", "VideoOnly"]
-
 
 @dataclass(frozen=True, slots=True)
 class VideoOnly:

@@ -23,8 +23,6 @@ from hvt_edge.stills.policy.paper import (
 )
 from hvt_edge.stills.policy.selectors import SELECTORS, SelectorMethod
 
-__all__ = ["METHODS", "MethodEntry", "method", "tuning"]
-
 
 @dataclass(frozen=True, slots=True)
 class MethodEntry:

@@ -20,8 +20,6 @@ from hvt_edge.stills.policy.base import Request, Step
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
-__all__ = ["SELECTORS", "Selector", "SelectorMethod", "select"]
-
 _ROAD_USERS = ("car", "truck", "bus", "person")
 
 

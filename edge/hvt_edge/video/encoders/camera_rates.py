@@ -21,8 +21,6 @@ from hvt_edge.operating.point import Operating
 from hvt_edge.video.encoders.qualification import line_bytes
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 
-__all__ = ["CameraRates", "FullestWindow", "LeastLink", "needed_bps"]
-
 _MARGIN = 1.1
 """The flight has a fuller window than was seen, and ``status`` goes beside."""
 _MEMORY_NS = 30 * SECOND_NS

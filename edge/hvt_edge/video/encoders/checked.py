@@ -10,8 +10,6 @@ from hvt_common.video.annex_b import is_keyframe, parameter_sets
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.regions import Region
 
-__all__ = ["CheckedEncoder"]
-
 
 class CheckedEncoder:
     """Itself an `Encoder`; `ValueError` for a unit that no ground could use. Without regions."""

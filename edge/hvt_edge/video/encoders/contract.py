@@ -11,8 +11,6 @@ from hvt_edge.video.encoder_settings import EncoderSettings
 if TYPE_CHECKING:
     from hvt_edge.video.regions import Region
 
-__all__ = ["Encoder", "MakeEncoder"]
-
 
 class Encoder(Protocol):
     """Turns frames into HEVC access units, one for each, at once, and never more bits than it was opened for.

@@ -17,8 +17,6 @@ from hvt_edge.video.encoders.hardware_rows import HardwareRow
 from hvt_edge.video.regions import Region
 from hvt_edge.video.x265 import encoder_context, mean_qp_of, yuv_picture
 
-__all__ = ["HardwareEncoder"]
-
 _BT709, _LIMITED = 1, 1
 """Of ITU-T H.273, and of FFmpeg's AVColorRange."""
 _GOP_FRAMES = 60_000

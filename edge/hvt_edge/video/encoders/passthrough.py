@@ -13,8 +13,6 @@ from hvt_edge.video.encoders.camera_rates import FullestWindow
 from hvt_edge.video.encoders.qualification import Allowed, Measured, line_bytes
 from hvt_edge.video.regions import Region
 
-__all__ = ["Passthrough", "about_keyframes", "check_camera", "measure_camera", "unit_of"]
-
 _LONG_KEYFRAMES_S = 4.0
 """A ground that joins, or has lost something, waits so long for a picture: it is told of at the start."""
 

@@ -23,8 +23,6 @@ from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES
 from hvt_edge.video.encoder_settings import usual_keyframe_bytes
 from hvt_edge.video.encoders.contract import Encoder
 
-__all__ = ["Allowed", "Measured", "allowed", "headroom_of", "line_bytes", "measure", "run_frames"]
-
 _RUN_S = 3.0
 _MOST_WINDOW_S = 1.5
 """A longer window is not measured: half of the run would be its first keyframe."""

@@ -12,8 +12,6 @@ from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.encoders.hardware_rows import HARDWARE
 
-__all__ = ["GROUP", "PASSTHROUGH", "X265", "check_encoder", "encoder_names", "open_encoder"]
-
 GROUP = "hvt.encoders"
 """The entry points' group."""
 X265 = "x265"

@@ -9,8 +9,6 @@ import numpy.typing as npt
 
 from hvt_common.camera_motion import Affine
 
-__all__ = ["CameraPath"]
-
 _MOST_CACHED = 256
 
 _Floats = npt.NDArray[np.float64]

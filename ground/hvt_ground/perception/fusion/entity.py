@@ -11,8 +11,6 @@ import numpy.typing as npt
 from hvt_ground.events import Origin
 from hvt_ground.perception.fusion.camera_path import CameraPath
 
-__all__ = ["Entity", "Observation", "Vote"]
-
 _Floats = npt.NDArray[np.float64]
 
 _NEW_VELOCITY = 0.6

@@ -11,8 +11,6 @@ from hvt_common.tracking.recall import EDGE_ONLY_CONFIDENCE, Recall
 from hvt_common.values import Tracks, iou
 from hvt_ground.perception.fusion.entity import Entity
 
-__all__ = ["MissedDetections"]
-
 NEAR_IOU = 0.1
 """A box of the edge that overlaps ours by so much is no miss: of a small object two boxes overlap little."""
 LET_GO_STEPS = 6

@@ -14,8 +14,6 @@ from hvt_ground.events import Origin
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.entity import Entity, Observation
 
-__all__ = ["FusedTracks", "FusionRules", "list_entities", "reported_boxes"]
-
 _Floats = npt.NDArray[np.float64]
 
 

@@ -19,8 +19,6 @@ from hvt_common.values import Image, View
 from hvt_common.video.base_crop import resampled
 from hvt_ground.perception.stills.decode import DecodedStill
 
-__all__ = ["Patch", "composite", "patch_of"]
-
 _FEATHER_PX = 1.5
 """Width of the seam in pixels of the result. A detector takes a hard edge for a contour."""
 

@@ -12,8 +12,6 @@ from hvt_common.video.base_crop import MAX_REQUESTED_SIDE_PX, base_crop
 from hvt_common.video.hevc import YuvPicture
 from hvt_common.video.still_codecs import BaseMissingError, StillError, still_codec, still_codec_names
 
-__all__ = ["Box", "DecodedStill", "ReceivedStill", "decode_still", "needs_base", "readable_codecs"]
-
 _MOST_BASE_PX = 32
 """Limit of a side for one pixel of a still: a stranger's `Info` may say any scale, and each of them costs memory."""
 

@@ -25,8 +25,6 @@ import numpy.typing as npt
 from hvt_common.tracking.association import assign
 from hvt_common.values import Boxes, Tracks, iou
 
-__all__ = ["Matcher", "StillToMatch", "TrackMatch"]
-
 KNOWN_BONUS = 0.10
 OTHERS_PENALTY = 0.25
 CLASS_BONUS = 0.05

@@ -31,8 +31,6 @@ from hvt_common.inference.class_names import MOVING
 from hvt_common.values import Posterior
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 
-__all__ = ["BASE_WEIGHT", "MARGIN", "PROBABILITY_FLOOR", "SURE", "ClassEstimate", "TrackPosterior"]
-
 PROBABILITY_FLOOR = 1e-4
 BASE_WEIGHT = 1.0
 MARGIN = 0.2

@@ -11,8 +11,6 @@ import numpy.typing as npt
 from hvt_common.values import Image, Posterior
 from hvt_ground.perception.stills.decode import Box, DecodedStill, ReceivedStill
 
-__all__ = ["Outcome", "ResolvedStill", "ShownClasses", "StillContext", "StillSeen"]
-
 Outcome = Literal["matched", "superseded", "no track", "ambiguous", "frame lost", "late", "overflow", "ended"]
 """What became of a still:
 

@@ -20,8 +20,6 @@ from hvt_ground.perception.stills.decode import ReceivedStill, decode_still, nee
 from hvt_ground.perception.stills.refine import Refiner, ResolvedStill, StillContext, StillSeen
 from hvt_ground.perception.stills.vocabulary import Vocabulary, Vote
 
-__all__ = ["Progress", "StillStage"]
-
 SAME_DB, OTHER_DB = 38.0, 26.0
 """Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
 _MOST_SPOILT, _SPOILT_FRAMES = 32, 150

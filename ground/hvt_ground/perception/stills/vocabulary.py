@@ -25,8 +25,6 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import MOVING, group_of, is_imagenet, is_nothing, kind_of
 from hvt_common.values import Posterior
 
-__all__ = ["LEAST_SIDE_PX", "Vocabulary", "Vote", "check_common"]
-
 LEAST_SIDE_PX = 24
 """The shorter side of an object, source pixels, from which a network of ImageNet has a vote."""
 _SOME = 6

@@ -10,29 +10,6 @@ import rerun.blueprint as rrb
 from hvt_ground.sinks.rerun.labels import LEGEND_POINTS, points
 from hvt_ground.sinks.rerun.stills.gallery import CANVAS
 
-__all__ = [
-    "BITRATE",
-    "DOUBTED",
-    "EVENTS",
-    "LABELS",
-    "LATENCY",
-    "LEGEND",
-    "MAP_CAMERA",
-    "MAP_TRACKS",
-    "OVERFLOW",
-    "PATCHES",
-    "REFINED",
-    "REPORTED",
-    "SESSION",
-    "STILLS",
-    "STILL_MESSAGES",
-    "TRACKS",
-    "TRACK_COUNT",
-    "VIDEO",
-    "comparison",
-    "screen",
-]
-
 VIDEO = "/base/video"
 TRACKS = "/base/tracks"
 REFINED = "/base/refined"

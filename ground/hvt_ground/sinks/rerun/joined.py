@@ -17,8 +17,6 @@ from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.blueprint import comparison
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
-__all__ = ["join_recordings", "main"]
-
 _FLUSH_S = 10.0
 
 

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["LEGEND_POINTS", "Label", "Word", "place_labels", "place_legend", "points"]
-
 LEGEND_POINTS = 34.0
 """Height of the legend below the picture."""
 _POINTS_WIDE = 900.0

@@ -29,8 +29,6 @@ from hvt_ground.sinks.rerun.sdk import (
     viewer_program,
 )
 
-__all__ = ["LiveRecording", "LiveView", "free_port", "listening", "started_viewer"]
-
 _log = logging.getLogger(__name__)
 
 _HOST = "127.0.0.1"

@@ -16,8 +16,6 @@ from hvt_ground.sinks.palette import class_colour
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.tables import MapPoints, TableRow, packed
 
-__all__ = ["MapRows", "pose_numbers", "pose_of"]
-
 _EVERY_NS: Final = SECOND_NS
 _POINT_BYTES, _POSE_BYTES = 24, 90
 _PLAIN: Final = tuple(

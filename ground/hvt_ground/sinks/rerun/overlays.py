@@ -23,21 +23,6 @@ import numpy.typing as npt
 from hvt_ground.events import Origin, Overlay
 from hvt_ground.sinks.rerun.labels import Label, Word, place_labels
 
-__all__ = [
-    "BRIGHTNESS",
-    "CENTRE_STEP_PX",
-    "HALF_SIZE_STEP_PX",
-    "LAYERS",
-    "ORIGINS",
-    "REPORTED_MARK",
-    "BacklogOverlays",
-    "Identity",
-    "Layer",
-    "LayerUpdate",
-    "OverlayEncoder",
-    "confidence_text",
-]
-
 CENTRE_STEP_PX = 0.75
 HALF_SIZE_STEP_PX = 1.0
 CONFIDENCE_STEP_PCT = 5

@@ -42,8 +42,6 @@ from hvt_ground.sinks.rerun.static_data import session_chunk, static_chunks
 from hvt_ground.sinks.rerun.stills.rows import StillRows
 from hvt_ground.sinks.rerun.tables import CodedIdentity, LogText, SizeLimit, TableRow
 
-__all__ = ["Recorder", "RecorderSettings"]
-
 log = logging.getLogger(__name__)
 
 ON_DEMAND = "asked"

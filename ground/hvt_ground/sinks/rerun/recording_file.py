@@ -16,8 +16,6 @@ from hvt_ground.sinks.rerun.rrd_file import RrdFile
 from hvt_ground.sinks.rerun.static_data import class_chunk, legend_chunk
 from hvt_ground.sinks.rerun.tables import TABLE_BYTES, SizeLimit, Table, TableRow
 
-__all__ = ["RecordingFile"]
-
 _CLASS_BYTES = 40
 """Cost of a class each time that names and colours are written: they go with the next compaction."""
 

@@ -32,8 +32,6 @@ from hvt_common.errors import UserError
 from hvt_ground.sinks.line_file import check_there, has_nothing
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
-__all__ = ["RrdFile", "copy_whole_messages"]
-
 _log = logging.getLogger(__name__)
 
 _STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation

@@ -21,8 +21,6 @@ from hvt_common.errors import UserError, check_not_read, exit_with_sentence
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.live_view import free_port, started_viewer
 
-__all__ = ["main", "screenshot"]
-
 _START_S = 30.0
 _MENU_PX = 37
 

@@ -28,17 +28,6 @@ import rerun_bindings as bindings
 
 from hvt_common.errors import UserError
 
-__all__ = [
-    "RecordingId",
-    "leave_out_pandas",
-    "new_recording",
-    "releasing_recordings",
-    "send_blueprint",
-    "viewer_environment",
-    "viewer_program",
-]
-
-
 _list_of_recordings = threading.RLock()
 
 

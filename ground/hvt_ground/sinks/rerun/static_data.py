@@ -24,8 +24,6 @@ from hvt_ground.sinks.rerun.overlays import BRIGHTNESS, REPORTED_MARK
 from hvt_ground.sinks.rerun.stills.gallery import SLOTS
 from hvt_ground.sinks.rerun.tables import static_chunk
 
-__all__ = ["class_chunk", "legend_chunk", "session_chunk", "static_chunks"]
-
 _BITRATE = (
     ("total", TOTAL_LINE, 1.5),
     ("base", BASE_LINE, 2.0),

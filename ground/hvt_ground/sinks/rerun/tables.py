@@ -16,22 +16,6 @@ from rerun.chunk import Chunk
 from hvt_ground.sinks.palette import Rgb
 from hvt_ground.sinks.rerun.stills.gallery import Placement
 
-__all__ = [
-    "COLUMNS",
-    "FIXED_BYTES",
-    "TABLE_BYTES",
-    "Caption",
-    "CodedIdentity",
-    "LogText",
-    "MapPoints",
-    "PlacedJpeg",
-    "SizeLimit",
-    "Table",
-    "TableRow",
-    "packed",
-    "static_chunk",
-]
-
 _LATEST_NS = 2**63 - 1
 FIXED_BYTES = 77_000
 """About the cost of the blueprint and the static values."""

@@ -17,8 +17,6 @@ from hvt_study.datasets.layouts.image_sequence import image_size
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["open_clips"]
-
 _NAMED = (
     ".mp4 .m4v .mov .mkv .webm .avi .wmv .flv .ts .mts .m2ts .mpg .mpeg .3gp .ogv "
     ".y4m .h264 .264 .h265 .265 .hevc .ivf .mxf"

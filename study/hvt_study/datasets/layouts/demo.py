@@ -19,8 +19,6 @@ from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.options import parse_numbers
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["DemoCodes", "DemoLabels", "open_demo"]
-
 _SIZE = (1920, 1080)
 _LEAST_VISIBLE = 0.5
 """An object of which less is to be seen is not judged."""

@@ -18,8 +18,6 @@ from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.label_table import LabelTable, TableLabels
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["ImageSequence", "find_folders", "image_size"]
-
 
 @dataclass(frozen=True, slots=True)
 class ImageSequence:

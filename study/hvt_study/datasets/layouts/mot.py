@@ -39,8 +39,6 @@ from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folder
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["TruthRows", "mot_table", "open_mot", "read_truth_rows"]
-
 _INFO = "seqinfo.ini"
 _TRUTH = "gt/gt.txt"
 _PICTURES = "img1"

@@ -12,8 +12,6 @@ from urllib.parse import parse_qsl
 
 from hvt_common.errors import UserError
 
-__all__ = ["Options", "parse_numbers", "split_options"]
-
 _MOST_SEEDS = 10_000
 _HIGHEST_SEED = 2**32 - 1
 

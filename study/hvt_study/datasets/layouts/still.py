@@ -22,8 +22,6 @@ from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, USUAL_VIEW, VirtualCamera, annotation_file
 
-__all__ = ["StillLabels", "open_stills"]
-
 
 @dataclass(frozen=True, slots=True)
 class StillLabels:

@@ -29,8 +29,6 @@ from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folder
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["open_uavdt", "uavdt_table"]
-
 _FPS = 30.0
 _NAMES = ("car", "truck", "bus")
 _VEHICLE = "vehicle"

@@ -22,8 +22,6 @@ from hvt_study.datasets.layouts.uavdt import open_uavdt
 from hvt_study.datasets.layouts.visdrone import open_visdrone
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["DATASETS", "open_dataset", "open_datasets"]
-
 _Found = Mapping[str, Callable[[], Sequence]]
 """By name, each opened when called."""
 _Layout = Callable[[Path, Options], _Found]

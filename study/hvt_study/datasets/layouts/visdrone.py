@@ -22,8 +22,6 @@ from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import Sequence
 from hvt_study.datasets.visdrone_rows import VisDroneRows, read_video_rows
 
-__all__ = ["open_visdrone", "table_of", "visdrone_table"]
-
 _FPS = 30.0
 """The dataset does not say; its drones filmed at 24 to 30."""
 _COLUMNS = "frame,id,x,y,w,h,score,category,truncation,occlusion"

@@ -11,20 +11,6 @@ from hvt_common.errors import UserError
 from hvt_study.report.data.conditions import USUAL, Conditions, conditions_of, how_they_differ, tune_of
 from hvt_study.runs.methods import METHODS, Kind
 
-__all__ = [
-    "Arm",
-    "BySequence",
-    "Models",
-    "RunRow",
-    "Setting",
-    "counts",
-    "is_video",
-    "place",
-    "sequence_of",
-    "settings",
-    "values",
-]
-
 RunRow: TypeAlias = Mapping[str, Any]
 """Of ``results.parquet``."""
 BySequence: TypeAlias = Mapping[str, RunRow]

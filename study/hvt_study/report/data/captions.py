@@ -6,8 +6,6 @@ from hvt_study.metrics.bits import Accounting
 from hvt_study.report.data.arms import Setting, place
 from hvt_study.report.data.intervals import ENOUGH
 
-__all__ = ["INTERVALS", "same_sequences", "time_of", "under"]
-
 INTERVALS = f"95 % bootstrap interval over sequences (from {ENOUGH} on)"
 """How means are bracketed."""
 _LABELS = {

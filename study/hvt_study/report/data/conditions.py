@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-__all__ = ["USUAL", "Conditions", "conditions_of", "how_they_differ", "tune_of"]
-
 
 @dataclass(frozen=True, slots=True, order=True)
 class Conditions:

@@ -8,22 +8,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeAlias
 
-__all__ = [
-    "Cell",
-    "Drawing",
-    "Head",
-    "Part",
-    "Picture",
-    "PictureRow",
-    "Pictures",
-    "Report",
-    "Section",
-    "Table",
-    "breaks_between",
-    "numbered",
-    "words",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class Head:

@@ -15,8 +15,6 @@ from statistics import median_low
 
 from hvt_study.report.data.arms import Arm, Setting, values
 
-__all__ = ["EqualQuality", "equal_quality", "needed_bps"]
-
 
 @dataclass(frozen=True, slots=True)
 class EqualQuality:

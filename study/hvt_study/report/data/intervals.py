@@ -16,8 +16,6 @@ from statistics import median_low
 import numpy as np
 from scipy.stats import bootstrap
 
-__all__ = ["ENOUGH", "Interval", "interval_of", "mean_of", "median_of"]
-
 ENOUGH = 5
 """Sequences from which an interval is shown and a verdict drawn. Of two or three the percentile interval is all but
 their range, and leaves out 0 in a quarter or half of all cases in which there is no effect."""

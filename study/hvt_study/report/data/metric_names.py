@@ -10,8 +10,6 @@ from hvt_study.report.data.captions import time_of
 from hvt_study.report.data.intervals import Interval
 from hvt_study.runs.columns import COLUMNS, Column
 
-__all__ = ["METRICS", "NOTHING", "definition", "number", "written"]
-
 NOTHING = "\N{EN DASH}"
 """Stands where a run has no such figure."""
 _MINUS = "\N{MINUS SIGN}"

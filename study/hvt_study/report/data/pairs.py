@@ -10,8 +10,6 @@ import numpy as np
 from hvt_study.report.data.arms import Arm, BySequence, Setting, values
 from hvt_study.report.data.intervals import Interval, interval_of
 
-__all__ = ["Pair", "pairs"]
-
 
 @dataclass(frozen=True, slots=True)
 class Pair:

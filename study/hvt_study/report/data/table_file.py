@@ -14,8 +14,6 @@ import pyarrow.parquet as pq
 from hvt_common.errors import UserError
 from hvt_study.runs.columns import COLUMNS, Column
 
-__all__ = ["RESULTS", "SCHEMA", "SWEEP", "read_results", "write_results"]
-
 RESULTS = "results.parquet"
 SWEEP = "sweep.csv"
 """In a study's folder."""

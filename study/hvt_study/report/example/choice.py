@@ -9,18 +9,6 @@ from dataclasses import dataclass
 from hvt_study.report.data.arms import Arm, BySequence, RunRow, Setting, is_video, settings, values
 from hvt_study.report.data.pairs import Pair, pairs
 
-__all__ = [
-    "PERCENTILES",
-    "Choice",
-    "CropExample",
-    "Example",
-    "Lane",
-    "Timeline",
-    "Word",
-    "choose_run",
-    "percentile_rows",
-]
-
 PERCENTILES = (10, 50, 90)
 """Of the gain in PSNR: the stills that are shown."""
 _GAIN = "named_f1"

@@ -37,8 +37,6 @@ from hvt_study.runs.spec import RunSpec
 from hvt_study.runs.video_shape import VideoShape
 from hvt_study.serial_link import Arrival
 
-__all__ = ["example_of", "fly_again"]
-
 _MOST_STILLS = 2000
 """Of which the pixels are kept."""
 _MOST_LANES = 14

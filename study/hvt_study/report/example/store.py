@@ -16,8 +16,6 @@ from hvt_common.runtime.reporting import write_json
 from hvt_common.values import Image
 from hvt_study.report.example.choice import CropExample, Example, Lane, Timeline, Word
 
-__all__ = ["enlarged", "load_example", "png_of", "save_example"]
-
 _FOLDER = "example"
 _FILE = "example.json"
 _PICTURES = ("source", "base", "still")

@@ -10,8 +10,6 @@ from matplotlib.figure import Figure
 
 from hvt_study.matrix.compare import COMPARED, CompareResult, CompareRow
 
-__all__ = ["STYLES", "plot"]
-
 # Okabe and Ito's palette, told apart by every kind of colour vision; markers and dashes tell the rest apart in grey.
 STYLES = {
     "M0": ("#000000", "o", "--"),

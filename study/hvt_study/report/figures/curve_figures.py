@@ -15,8 +15,6 @@ from hvt_study.report.data.intervals import interval_of, mean_of
 from hvt_study.report.data.metric_names import METRICS
 from hvt_study.report.figures.drawing import drawn, fill_of, mark_of, plain_axes, rate_axis, style_of
 
-__all__ = ["codec_figure", "utility_figure"]
-
 _UTILITY = ("named_f1", "top1_all", "map_50")
 _CODEC = ("named_f1", "confidence_gain", "stills_per_min")
 _LEGEND_COLUMNS = 6

@@ -15,20 +15,6 @@ from matplotlib.figure import Figure
 from hvt_study.report.data.arms import Arm
 from hvt_study.report.data.document import Drawing
 
-__all__ = [
-    "GREY",
-    "INK",
-    "PALETTE",
-    "WIDTH_IN",
-    "Style",
-    "drawn",
-    "fill_of",
-    "mark_of",
-    "plain_axes",
-    "rate_axis",
-    "style_of",
-]
-
 WIDTH_IN = 7.2
 """Of a page of two columns."""
 INK = "#000000"

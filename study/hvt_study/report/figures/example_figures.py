@@ -13,8 +13,6 @@ from hvt_study.report.example.choice import CropExample, Example, Lane, Timeline
 from hvt_study.report.example.store import enlarged
 from hvt_study.report.figures.drawing import GREY, INK, PALETTE, drawn, plain_axes
 
-__all__ = ["crop_pictures", "timeline_figure"]
-
 _LANE_IN = 0.18
 _LEAST_PX = 360
 """Of the longer side of a crop in files: 3 cm at 300 dots an inch."""

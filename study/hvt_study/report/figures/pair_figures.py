@@ -19,8 +19,6 @@ from hvt_study.report.data.metric_names import METRICS
 from hvt_study.report.data.pairs import Pair
 from hvt_study.report.figures.drawing import GREY, INK, drawn, mark_of, plain_axes, style_of
 
-__all__ = ["difference_figures", "equal_figures"]
-
 _ROW_IN = 0.19
 _DOT = 9.0
 _LEFT, _RIGHT = r"$\leftarrow$", r"$\rightarrow$"

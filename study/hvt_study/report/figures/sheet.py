@@ -11,8 +11,6 @@ import numpy as np
 
 from hvt_common.values import Image
 
-__all__ = ["Finding", "write_sheet"]
-
 _CELL_PX, _TEXT_PX = 150, 18
 _COLUMNS, _ROWS = 8, 5
 _CONTEXT = 2.5

@@ -16,8 +16,6 @@ from markupsafe import Markup
 
 from hvt_study.report.data.document import Drawing, Report, numbered
 
-__all__ = ["FIGURES", "html_page", "inline_svg", "markdown_page"]
-
 FIGURES = "figures"
 """Folder of figures, beside the Markdown page."""
 _ID = re.compile(r'\bid="([^"]+)"')

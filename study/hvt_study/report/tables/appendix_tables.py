@@ -8,8 +8,6 @@ from hvt_study.report.data.arms import RunRow, counts, place
 from hvt_study.report.data.document import Cell, Table, breaks_between, words
 from hvt_study.report.data.metric_names import METRICS, NOTHING, definition
 
-__all__ = ["failed_table", "metrics_table"]
-
 
 def metrics_table(accounting: str) -> Table:
     """What each figure is, where rates are of this accounting."""

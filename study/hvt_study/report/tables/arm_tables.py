@@ -11,8 +11,6 @@ from hvt_study.report.data.document import Cell, Head, Table, breaks_between, wo
 from hvt_study.report.data.intervals import interval_of, mean_of, median_of
 from hvt_study.report.data.metric_names import METRICS, NOTHING, definition, written
 
-__all__ = ["named_table", "pilot_table", "proxy_table", "seen_table", "size_table", "spent_table"]
-
 _SPENT = (
     *("total_bps", "base_bps", "roi_bps", "track_bps", "other_bps", "back_bps", "fps", "stills_per_min"),
     *("mean_still_bytes", "tracks_refined", "delay_p50_ms", "delay_p95_ms", "still_delay_p50_ms"),

@@ -13,8 +13,6 @@ from hvt_study.report.data.intervals import interval_of
 from hvt_study.report.data.metric_names import METRICS, NOTHING, definition, written
 from hvt_study.runs.methods import METHODS
 
-__all__ = ["matrix_table"]
-
 
 def matrix_table(setting: Setting, column: str) -> Table | None:
     """A row a method and codec, a column a regime; None where no run has the figure."""

@@ -13,8 +13,6 @@ from hvt_study.report.data.intervals import ENOUGH
 from hvt_study.report.data.metric_names import METRICS, NOTHING, definition, written
 from hvt_study.report.data.pairs import Pair
 
-__all__ = ["differences_table", "equal_table", "ratio"]
-
 _COMPARED = (
     *("named_f1", "false_per_frame", "map_50", "map_50_95", "f1", "top1", "top1_all", "macro_f1"),
     *("macro_f1_all", "mota", "idf1", "hota"),

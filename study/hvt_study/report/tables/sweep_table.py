@@ -10,8 +10,6 @@ from hvt_common.errors import UserError
 from hvt_study.matrix.sweep import COLUMNS as SWEEP_COLUMNS
 from hvt_study.report.data.document import Cell, Head, Table
 
-__all__ = ["sweep_table"]
-
 _TYPES = {"policy": str, "selected": int, "ratio": float, "frame_coverage": float}
 
 

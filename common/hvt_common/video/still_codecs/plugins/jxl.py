@@ -10,8 +10,6 @@ import numpy as np
 from hvt_common.values import Image
 from hvt_common.video.still_codecs.contract import IntraCodec, StillError, on_ladder
 
-__all__ = ["JxlCodec", "jxl_size"]
-
 _QUALITY = ((1, 1), (5, 2), (20, 27), (35, 50), (50, 63), (65, 71), (80, 81), (90, 88.5), (97, 96), (100, 99))
 """(quality in percent, libjxl's own), at equal Y-PSNR; its 100 is lossless."""
 _PLUGIN = "pillow_jxl"

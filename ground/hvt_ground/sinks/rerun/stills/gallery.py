@@ -9,8 +9,6 @@ from __future__ import annotations
 from bisect import bisect_right, insort
 from dataclasses import dataclass
 
-__all__ = ["CANVAS", "HOLD_S", "SLOTS", "Gallery", "Placement", "frame_of", "placed"]
-
 COLUMNS, ROWS = 2, 4
 SLOTS = COLUMNS * ROWS
 HOLD_S = 1.5

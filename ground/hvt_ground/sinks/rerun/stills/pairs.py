@@ -9,8 +9,6 @@ from hvt_common.values import Image
 from hvt_ground.events import Refinement
 from hvt_ground.sinks.rerun.overlays import confidence_text
 
-__all__ = ["BLANK", "Coded", "base_picture", "caption", "event_text", "still_picture"]
-
 Coded = tuple[bytes, tuple[int, int]]
 """A JPEG and its (width, height) in pixels."""
 

@@ -15,8 +15,6 @@ import numpy.typing as npt
 from hvt_ground.events import Overlay, Refinement
 from hvt_ground.sinks.rerun.stills.gallery import Placement
 
-__all__ = ["FRESH_NS", "PATCHES", "Moved", "Patches"]
-
 PATCHES = 20
 """How many lie on the picture at most. Each is an entity of its own: 2.5 kB of a recording and compaction."""
 

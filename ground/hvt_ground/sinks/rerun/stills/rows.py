@@ -14,8 +14,6 @@ from hvt_ground.sinks.rerun.stills.pairs import BLANK, Coded, base_picture, capt
 from hvt_ground.sinks.rerun.stills.patches import Patches
 from hvt_ground.sinks.rerun.tables import Caption, LogText, PlacedJpeg, SizeLimit, TableRow
 
-__all__ = ["StillRows"]
-
 HIDDEN_CROP_RATIO = 1.15
 """A still that is not shown keeps its base crop while the recording is smaller than this times the bytes received."""
 
