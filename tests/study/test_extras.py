@@ -69,7 +69,7 @@ def done(tmp_path, module, words, without):
             "hvt[study]",
             marks=pytest.mark.nightly,
         ),
-        ("hvt_ground.cli", ("--help",), ("rerun",), "hvt[ground]"),
+        ("hvt_ground.cli", ("--connect", "tcp/127.0.0.1:9"), ("rerun",), "hvt[ground]"),
         (
             "hvt_ground.cli",
             ("--cot", "udp://127.0.0.1:9", "--connect", "tcp/127.0.0.1:9"),

@@ -51,6 +51,9 @@ _SPARE_SHARE = 0.05
 BASE_PEAK = 1.15
 """The fullest window of the base stream over B_v: what the VBV allows, kept also where frames bunch up."""
 
+_WHOLE_NS = 2 * SECOND_NS
+"""A window of at most so long is back within the three seconds in which live video has to be."""
+
 
 @dataclass(frozen=True, slots=True)
 class BudgetSettings:
@@ -130,8 +133,8 @@ class RollingBudget:
     def set_total(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
         """Another total from now on. The base stream's rate may stay above it until x265 is opened anew.
 
-        What went out under a higher total counts for its share of a window then. So each window stays within the
-        highest total of its time, and none is full for a whole ``window_ns`` after the link has fallen.
+        What went out under a higher total still counts: messages wait until the window has room. In a window of more
+        than `_WHOLE_NS` it counts for its share of the window, which would else be full for all its seconds.
         """
         settings = self._settings
         self._refill(now_ns)
@@ -347,6 +350,8 @@ class RollingBudget:
             del self._events[0], self._sent[0]
 
     def _counted(self, line_bytes: int, then_bps: int) -> int:
+        if self._settings.window_ns <= _WHOLE_NS:
+            return line_bytes
         return math.ceil(line_bytes * min(1.0, self._settings.total_bps / then_bps))
 
     def _note_query(self, now_ns: int) -> None:

@@ -188,6 +188,8 @@ class MavlinkPose:
         with self._lock:
             if len(self._newest) > _MOST_KNOWN:
                 self._newest = {key: one for key, one in self._newest.items() if now_ns - one[0] <= _OLD_NS}
+            if name in _FIXES and message.fix_type >= _LEAST_FIX and _has_no_fix(self._of(whose, now_ns)):
+                self._newest.pop((*whose, "GLOBAL_POSITION_INT"), None)  # where it believed to be before
             if len(self._newest) <= _MOST_KNOWN:
                 self._newest[(*whose, name)] = (now_ns, message)
             if name == "GLOBAL_POSITION_INT" and whose != self._vehicle and self._is_better(whose, now_ns):
@@ -222,8 +224,12 @@ def _has_place(known: dict[str, Any]) -> bool:
     place = known.get("GLOBAL_POSITION_INT")
     if place is None or max(abs(place.lat), abs(place.lon)) < _NOWHERE:
         return False
+    return not _has_no_fix(known)
+
+
+def _has_no_fix(known: dict[str, Any]) -> bool:
     fixes = [known[name].fix_type for name in _FIXES if name in known]
-    return not fixes or max(fixes) >= _LEAST_FIX
+    return bool(fixes) and max(fixes) < _LEAST_FIX
 
 
 def _attitude(message: Any) -> Orientation | None:

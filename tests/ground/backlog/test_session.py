@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Self
 
 import av
+import numpy as np
 import pytest
 
 from hvt_common.protocol.ledger import Account, overhead_bytes
@@ -27,6 +28,7 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.transport.inbox import Received
 from hvt_ground.backlog.perception import FIRST_TRACK_ID, BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
+from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job, RealtimeWorker
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
@@ -44,6 +46,7 @@ from rigs.flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_
 from rigs.handled import WatchedInbox, check, end
 
 FIRST_STORED = 2**31
+PICTURE = DecodedFrame(0, 0, 0, np.zeros((8, 8, 3), np.uint8))
 
 
 def wait_for(condition, *, timeout_s: float = 30) -> None:
@@ -811,7 +814,7 @@ def test_a_worker_is_not_idle_while_it_analyzes():
 
     worker = RealtimeWorker(see, lambda *_: None, lambda _stills: None, name="idle")
     try:
-        worker.picture(None)
+        worker.picture(PICTURE)
         assert began.wait(30)
         assert not worker.idle
         may_end.set()
@@ -831,7 +834,7 @@ def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():
         time.sleep(0.03)
         if len(done) < 3:
             pending.append(1)
-            worker.picture(None)  # there is always another
+            worker.picture(PICTURE)  # there is always another
 
     def work():
         for step in range(3):
@@ -842,7 +845,7 @@ def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():
     worker = RealtimeWorker(see, lambda *_: None, lambda _stills: None, name="busy")
     try:
         pending.append(1)
-        worker.picture(None)
+        worker.picture(PICTURE)
         assert worker.submit(Steps(work()))
         wait_for(lambda: len(done) == 3, timeout_s=20)
     finally:

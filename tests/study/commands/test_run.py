@@ -43,7 +43,7 @@ METHODS = ("--methods", "M0,R0,M5,DDS", "--regimes", REGIME)
 def done(scene, tmp_path_factory):
     """A finished study with two budgets, of which nothing can be flown at the second."""
     out = tmp_path_factory.mktemp("done") / "new" / "folder"
-    regimes = ("--methods", "M0,R0,M5,DDS", "--regimes", "60kbps,9kbps")
+    regimes = ("--methods", "M0,R0,M5,DDS", "--regimes", "80kbps,9kbps")
     assert main(["run", *arguments(scene, out, *regimes, "--jobs", "1")]) == 0
     return out
 
@@ -157,7 +157,7 @@ def test_a_second_run_does_nothing_anew(scene, done):
     cache = done / "cache"
     clocks = (done / "results.parquet").read_bytes()
     before = entries(cache)
-    again = ["run", *arguments(scene, done, "--methods", "M0,R0,M5,DDS", "--regimes", "60kbps,9kbps")]
+    again = ["run", *arguments(scene, done, "--methods", "M0,R0,M5,DDS", "--regimes", "80kbps,9kbps")]
     assert main([*again, "--jobs", "1"]) == 0
     assert entries(cache) == before
     assert (done / "results.parquet").read_bytes() == clocks  # to the byte: what was timed is remembered too
@@ -172,7 +172,7 @@ def test_damaged_entries_are_made_again(scene, done, tmp_path):
     broken[0].write_bytes(broken[0].read_bytes()[:-20])
     broken[1].write_bytes(b"")
     broken[2].write_bytes(b"\0" * 40)
-    again = arguments(scene, done, "--methods", "M0,R0,M5,DDS", "--regimes", "60kbps,9kbps", "--jobs", "1")
+    again = arguments(scene, done, "--methods", "M0,R0,M5,DDS", "--regimes", "80kbps,9kbps", "--jobs", "1")
     process = study("run", *again, folder=tmp_path)
     assert process.wait(PATIENT_S) == 0, said(tmp_path)
     words = said(tmp_path)
@@ -197,7 +197,7 @@ def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkey
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command, "run_all", interrupted)
-    words = arguments(scene, out, "--methods", "M0,R0,M5,DDS", "--regimes", "60kbps,9kbps", "--jobs", "1")
+    words = arguments(scene, out, "--methods", "M0,R0,M5,DDS", "--regimes", "80kbps,9kbps", "--jobs", "1")
     assert main(["run", *words]) == 130
     assert {row["key"] for row in table(out)} == {row["key"] for row in before}
     assert len(table(out)) == len(before)

@@ -106,7 +106,7 @@ def test_the_command_flies_what_was_compared(name):
     shape = VideoShape(1.0, (960, 540)) if chosen else VideoShape()
     ours = config_of(["--source", "my clip.mp4", *edge_flags(spec, budget_bps=200_000, shape=shape)])
     own = {"pace", "threads", "profile", "confidence", "detect_every"}
-    own |= {"provider"}  # a study has to repeat, a flight to be quick
+    own |= {"provider", "preset"}  # a study has to repeat, a flight to be quick
     if method.startswith("M0"):
         own |= {"camera_motion"}
     else:

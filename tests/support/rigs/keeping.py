@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -316,6 +317,7 @@ class Rig:
         def turn() -> None:
             nonlocal turns
             turns += 1
+            time.sleep(0.005)  # the clock would run away from the thread that reads what was kept
             self.now_ns += S // 10
             if reports and turns % 4 == 0:
                 self.report()

@@ -19,8 +19,8 @@ from programs.processes import eventually
 PATIENT_S = 200.0
 """How long a study may take on a busy machine."""
 SIZE = (160, 96)
-REGIME = "60kbps"
-"""Twice what this picture needs at the least."""
+REGIME = "80kbps"
+"""So much that the share that DDS spends of it is still what this picture needs at the least."""
 _MAIN = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"  # a shell's background job ignores it
     "from hvt_study.cli import main; raise SystemExit(main())"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import socket
 from pathlib import Path
-from types import SimpleNamespace
 
 import av
 import av.error
@@ -157,7 +156,7 @@ def test_a_group_without_a_route_names_the_remedy(monkeypatch, caplog):
         raise OSError(errno.ENETUNREACH, "Network is unreachable")
 
     stream = Datagrams(Address("udp://239.2.3.1:5600"))
-    stream.close()
-    monkeypatch.setattr(stream, "_socket", SimpleNamespace(sendto=refuse, close=lambda: None))
+    monkeypatch.setattr("socket.socket.sendto", refuse)
     stream.write(bytes(188))
+    stream.close()
     assert "ip route add 224.0.0.0/4 dev INTERFACE" in caplog.text
