@@ -42,7 +42,7 @@ _EDGE = (
         "--budget",
         "300kbps",
     ),
-    *("--edge-id", "uav-1", "--send-tracks", "--no-adapt", "--keyframe-interval", "60s"),
+    *("--edge-id", "uav-1", "--method", "M1", "--send-tracks", "--no-adapt", "--keyframe-interval", "60s"),
 )
 
 

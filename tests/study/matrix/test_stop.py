@@ -23,7 +23,7 @@ def test_a_full_disk_is_one_sentence_and_what_is_finished_stays(scene, tmp_path,
     assert first.wait(PATIENT_S) == 0, said(tmp_path)
     before, rows = entries(out / "cache"), (out / "results.parquet").read_bytes()
     pictures, flight = (_sizes(out / "cache" / folder) for folder in ("detections", "flights"))
-    limit = {"detections": min(pictures), "flights": (max(pictures) + min(flight)) // 2}[full_for]
+    limit = {"detections": min(pictures) // 2, "flights": (max(pictures) + min(flight)) // 2}[full_for]
     full = study(
         "run",
         *arguments(scene, out, "--methods", "M0,R0", "--regimes", REGIME, "--jobs", "1"),
