@@ -192,22 +192,23 @@ FLIGHT = ("--source", "demo", "--fps", "5", "--size", "640x360", "--max-frames",
 
 
 @pytest.mark.nightly
-@pytest.mark.timeout(3600)
-def test_two_hundred_flights_of_two_seconds(tmp_path: Path) -> None:
+@pytest.mark.timeout(1200)
+def test_sixty_flights_of_two_seconds(tmp_path: Path) -> None:
     """The same with real edges, as processes that are started and end."""
+    flights, warm = 60, 20
     with Link(tmp_path) as link:
         ground = link.ground("--record", "recordings", "--detector", "motion", "--classifier", "none")
         before = None
-        for number in range(SESSIONS):
+        for number in range(flights):
             edge = link.edge(*FLIGHT, name=f"edge-{number}")
             assert edge.finish()["frames"] >= 1
-            if number == WARM:
+            if number == warm:
                 before = Use(ground.process.pid)
         assert before is not None
         stays(before, Use(ground.process.pid))
         ground.stop()
         sessions = ground.finish()
-    assert len(sessions) == SESSIONS
+    assert len(sessions) == flights
     assert not any(one["failure"] for one in sessions)
 
 
