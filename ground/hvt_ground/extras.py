@@ -84,9 +84,9 @@ class Extra:
         """Its checks in ``hvt-ground doctor``, by name."""
         return {}
 
-    def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:
-        """Open the parts that all sessions share; return the function that opens the sinks of one."""
-        raise NotImplementedError
+    def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
+        """Open the parts that all sessions share; return the function that opens the sinks of one, here none."""
+        return lambda _flight: ()
 
 
 @cache
