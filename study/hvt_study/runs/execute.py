@@ -68,7 +68,10 @@ class _BrokenError(Exception):
 
 
 class _Flights:
-    """The flights of one run, each done once in the life of the cache; ``here`` has the paths that are opened."""
+    """The flights of one run, each done once in the life of the cache.
+
+    They fly with the paths of ``here``, and are remembered in the words of ``spec``.
+    """
 
     def __init__(self, spec: RunSpec, cache: Path, found: Materials, here: RunSpec) -> None:
         self._spec, self._folder, self._found, self._here = spec, cache, found, here
@@ -128,8 +131,8 @@ class _Flights:
 
     def _flight(self, budget_bps: int, shape: VideoShape) -> RunRow:
         def fly(context: RunContext) -> RunRow:
-            report = _or_refused(lambda: flown(self._spec, context, budget_bps=budget_bps, shape=shape))
-            used = settings(self._spec, context, budget_bps=budget_bps, shape=shape)
+            report = _or_refused(lambda: flown(self._here, context, budget_bps=budget_bps, shape=shape))
+            used = settings(self._here, context, budget_bps=budget_bps, shape=shape, named=self._spec.models)
             wide, high = shape.size or self._spec.size
             return {
                 **figures(report, context),
@@ -150,7 +153,7 @@ class _Flights:
         def dry_run(context: RunContext) -> RunRow:
             return {
                 "bps": _or_refused(
-                    lambda: dry_run_bps(self._spec, context, budget_bps=budget_bps, shape=shape)
+                    lambda: dry_run_bps(self._here, context, budget_bps=budget_bps, shape=shape)
                 )
             }
 
@@ -179,7 +182,7 @@ class _Flights:
 
     def _key(self, what: str, budget_bps: int, shape: VideoShape, *more: Any) -> str:
         spec, found = self._spec, self._found
-        flags = edge_flags(spec, budget_bps=budget_bps, shape=shape)
+        flags = edge_flags(self._here, budget_bps=budget_bps, shape=shape, named=spec.models)
         frames = found.sequence.clip_frames
         said = (asdict(spec.models), spec.detect_every, found.content, found.software)
         return content_key(what, flags, frames, *said, *more)

@@ -20,12 +20,21 @@ from hvt_study.peers.dds import fly_dds
 from hvt_study.peers.dds_settings import DdsSettings
 from hvt_study.runs.methods import METHODS, Kind
 from hvt_study.runs.run_context import RunContext
-from hvt_study.runs.spec import RunSpec
+from hvt_study.runs.spec import ModelChoice, RunSpec
 from hvt_study.runs.video_shape import VideoShape
 
 
-def edge_flags(spec: RunSpec, *, budget_bps: int, shape: VideoShape) -> tuple[str, ...]:
-    """What ``hvt-edge`` is started with, but for the source; a peer's settings in words of its own."""
+def edge_flags(
+    spec: RunSpec, *, budget_bps: int, shape: VideoShape, named: ModelChoice | None = None
+) -> tuple[str, ...]:
+    """The command line of ``hvt-edge`` without its source; a peer's settings in words of its own.
+
+    Args:
+        spec: its paths can be opened from here: the detector's file says its default confidence.
+        budget_bps: the edge's budget, bit/s.
+        shape: frame rate and size of the video.
+        named: how the user named the models, to be used in the result; None: as ``spec`` does.
+    """
     method = METHODS[spec.method]
     if method.kind is Kind.PEER:
         return (
@@ -35,7 +44,14 @@ def edge_flags(spec: RunSpec, *, budget_bps: int, shape: VideoShape) -> tuple[st
             str(_dds_settings(spec, shape.fps)),
         )
     width, height = shape.size or spec.size
-    flags = ["--pace", "lockstep", "--detector", spec.models.edge_detector, "--size", f"{width}x{height}"]
+    flags = [
+        "--pace",
+        "lockstep",
+        "--detector",
+        (named or spec.models).edge_detector,
+        "--size",
+        f"{width}x{height}",
+    ]
     confidence = default_confidence(spec.models.edge_detector)
     flags += ["--budget", f"{budget_bps}bps", "--threads", "1", "--confidence", f"{confidence:g}"]
     flags += ["--provider", spec.models.provider, "--detect-every", f"{spec.detect_every}", *method.flags]
@@ -91,13 +107,18 @@ def dry_run_bps(spec: RunSpec, context: RunContext, *, budget_bps: int, shape: V
     return dry_run(plan, detector=context.edge_detector)
 
 
-def settings(spec: RunSpec, context: RunContext, *, budget_bps: int, shape: VideoShape) -> dict[str, Any]:
-    """All settings of a flight, as JSON holds them."""
+def settings(
+    spec: RunSpec, context: RunContext, *, budget_bps: int, shape: VideoShape, named: ModelChoice
+) -> dict[str, Any]:
+    """All settings of a flight, as JSON holds them, with its models as the user ``named`` them."""
     if METHODS[spec.method].kind is Kind.PEER:
         peer = {**asdict(_dds_settings(spec, shape.fps)), "budget_bps": budget_bps, "size": list(spec.size)}
         return {spec.method: peer}
     plan = flight_plan(spec, context, budget_bps=budget_bps, shape=shape)
-    sides = {"edge": asdict(plan.edge), "ground": asdict(plan.ground)}
+    sides = {
+        "edge": {**asdict(plan.edge), "detector": named.edge_detector},
+        "ground": {**asdict(plan.ground), "detector": named.detector, "classifier": named.classifier},
+    }
     known: dict[str, Any] = json.loads(json.dumps(sides, default=str))
     return known
 
