@@ -143,7 +143,7 @@ TARGETS = (
         _seeds,
         mutate=_changed,
         share=4,
-        short=150,
+        short=100,
         most_bytes=60_000,
         most_growth_mb=128,
     ),

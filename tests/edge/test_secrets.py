@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cv2
+import numpy as np
 import pytest
 
 from hvt_common.runtime.failures import Awaited
@@ -33,7 +35,7 @@ FORMS = {
     "a number": lambda address: ["--source", "demo", "--fps", address],
     "passthrough": lambda address: ["--source", address, "--encoder", "passthrough"],
     "printed": lambda address: ["--source", address, "--print-config"],
-    "pose": lambda address: ["--source", "demo", "--pose", address],
+    "pose": lambda address: ["--source", "{pictures}", "--pose", address],
 }
 
 
@@ -46,9 +48,11 @@ def stopped_at_once(monkeypatch):
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("address", ADDRESSES)
 @pytest.mark.parametrize("form", FORMS)
-def test_no_sentence_has_the_password(free_port, capsys, address, form):
+def test_no_sentence_has_the_password(free_port, tmp_path, capsys, address, form):
     """Who shows an error message to others would give the camera away."""
-    main(FORMS[form](address.format(secret=SECRET, port=free_port)))
+    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((360, 640, 3), np.uint8))
+    wrong = address.format(secret=SECRET, port=free_port)
+    main([word.replace("{pictures}", str(tmp_path)) for word in FORMS[form](wrong)])
     said = "".join(capsys.readouterr())
     assert said
     assert SECRET not in said

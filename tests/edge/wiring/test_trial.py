@@ -87,19 +87,21 @@ def test_a_scene_without_objects_keeps_the_bits_for_video(tmp_path):
     assert beginning.share == config.share
 
 
-def test_no_second_of_a_live_source_is_lost_for_nothing():
+def test_no_second_of_a_live_source_is_lost_for_nothing(tmp_path):
     """With `motion` nothing is compared, and a fixed frame rate is not tried either."""
-    config = settings("demo", "100kbps", "--detector", "motion", "--fps", "15")
-    with open_source("demo", size=(640, 360), fps=15) as source:
+    pictures = str(moving(tmp_path, coarse=60, frames=3))
+    config = settings(pictures, "100kbps", "--detector", "motion", "--fps", "15")
+    with open_source(pictures, size=(640, 360), fps=15) as source:
         source.steps = lambda **_kind: pytest.fail("a frame was taken")
         assert tried(config, source).decimation == 1
 
 
 @pytest.mark.parametrize("flags", [("--profile", "thin"), ("--detector", "motion")])
-def test_nothing_is_measured_where_nothing_depends_on_it(flags):
+def test_nothing_is_measured_where_nothing_depends_on_it(tmp_path, flags):
     """Nor by a detector that remembers the pictures of one stream: there the settings decide alone."""
-    with open_source("demo", size=(640, 360), fps=15) as source:
-        assert tried(settings("demo", "100kbps", *flags), source).shadow.comparisons == 0
+    pictures = str(moving(tmp_path, coarse=60, frames=15))
+    with open_source(pictures, size=(640, 360), fps=15) as source:
+        assert tried(settings(pictures, "100kbps", *flags), source).shadow.comparisons == 0
 
 
 @pytest.mark.parametrize(("most_cores", "preset"), [(1e9, "veryfast"), (1e-9, "ultrafast")])

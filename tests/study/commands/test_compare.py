@@ -78,6 +78,7 @@ def test_a_comparison_end_to_end(tmp_path, capsys):
     assert "M5-jpeg" in said
 
 
+@pytest.mark.nightly
 def test_a_picture_with_labels_is_judged_in_what_it_labels(tmp_path):
     """People on a set that labels none would be called false; a detector that finds them would look worse."""
     for folder in ("images", "labels"):

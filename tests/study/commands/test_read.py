@@ -33,6 +33,7 @@ def test_what_cannot_be_read_is_one_sentence(tmp_path, capsys, arguments, said):
     assert len(text.strip().splitlines()) == 1
 
 
+@pytest.mark.nightly
 def test_reading_end_to_end(tmp_path, capsys):
     """What is a still for? The answer must be the same twice and at equal bits, and no still may hide the base."""
     pytest.importorskip("rapidocr", reason="rapidocr is not installed: hvt[reading]")

@@ -21,6 +21,7 @@ def scene(tmp_path_factory):
     return write_scene(tmp_path_factory.mktemp("scene"), *NAMES)
 
 
+@pytest.mark.nightly
 def test_a_search_is_judged_on_what_it_has_not_seen(scene, tmp_path, capsys):
     """Weights that fit the sequences they were found on would be sold as better ones."""
     chosen = list(tunable("M5"))[:2]
