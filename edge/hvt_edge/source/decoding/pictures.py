@@ -10,6 +10,7 @@ import av
 import av.error
 import numpy as np
 from av.filter import Graph
+from av.sidedata.sidedata import SideDataContainer
 from av.video.reformatter import ColorPrimaries, Colorspace, ColorTrc, Interpolation, VideoReformatter
 
 from hvt_common.values import Image
@@ -170,7 +171,10 @@ def turn_of(frame: av.VideoFrame) -> str:
 
 def _turn_of(frame: av.VideoFrame) -> _Turn:
     """The turn by the display matrix (ISO/IEC 14496-12, 8.3.2)."""
-    said: Any = frame.side_data.get("DISPLAYMATRIX")
+    # Not `frame.side_data`: that holds the frame which holds it, and each picture would stay until Python looks for
+    # such circles, a hundred megabytes later.
+    container: Any = SideDataContainer
+    said = container(frame).get("DISPLAYMATRIX")
     if said is None:
         return False, False, False
     matrix = np.frombuffer(bytes(said), np.int32)

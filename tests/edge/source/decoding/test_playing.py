@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import shutil
 import threading
@@ -193,6 +194,21 @@ def test_a_picture_is_turned_and_mirrored_as_it_says(tmp_path, degrees, mirror):
     blue, green, red = picture[round(high / 2 + way[1]), round(wide / 2 + way[0])]
     assert red > 150
     assert max(int(blue), int(green)) < 60
+
+
+def test_a_picture_that_nobody_needs_is_let_go_at_once(tmp_path):
+    """Garbage that waits for Python's collector is a hundred megabytes of pictures."""
+    clip = write_numbered(tmp_path / "a.mp4", 4, setup=lambda stream: stream.set_display_rotation(90))
+    gc.collect()
+    gc.disable()
+    try:
+        _, pictures = play(clip)
+        frames = [one for one in gc.get_objects() if isinstance(one, av.VideoFrame)]
+        waiting = [one for one in frames if one.format is not None]  # else it is empty, for a decoder to fill
+    finally:
+        gc.enable()
+    assert len(pictures) == 4
+    assert not waiting
 
 
 def test_interlaced_film_has_no_combs(tmp_path):
