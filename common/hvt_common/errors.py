@@ -51,6 +51,11 @@ def may_come(error: OSError) -> bool:
     return isinstance(error, socket.gaierror | TimeoutError) or error.errno in _MAY_COME
 
 
+def absent(path: Path) -> type[UserError]:
+    """The error of a file that is not there: a folder that does not exist may be of a disk that is mounted later."""
+    return UserError if path.absolute().parent.is_dir() else NotYetError
+
+
 def listening_trouble(error: OSError) -> str:
     """Why an address and its port cannot be listened on, and the remedy: the end of a sentence."""
     if error.errno == errno.EADDRNOTAVAIL:

@@ -258,6 +258,15 @@ def test_a_file_that_cannot_be_written(edge, flag, path):
     assert f"{flag} {path}" in edge(flag, path, code=1 if path.startswith("missing/") else 2)
 
 
+@pytest.mark.parametrize(
+    ("flag", "file"), [("--detector", "m.onnx"), ("--detector", "m.xml"), ("--pose", "p.csv")]
+)
+def test_an_input_of_a_disk_that_is_not_mounted_yet_is_tried_again(edge, flag, file):
+    """A supervisor would never start the edge again once the disk with its model is there."""
+    assert f"missing/{file}" in edge(flag, f"missing/{file}", code=1)
+    assert file in edge(flag, file)
+
+
 def test_a_failed_start_leaves_an_old_summary_as_it_was(edge, here):
     """The result of yesterday would be gone."""
     Path("s.json").write_text("yesterday")

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, absent
 from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
 from hvt_common.inference.store import known_classes
 
@@ -89,7 +89,7 @@ def decoded(content: bytes) -> str:
 def _read_text(path: Path) -> str:
     if not path.is_file():
         state = "is not a file" if path.exists() else "does not exist"
-        raise UserError(f"labels file {path} {state}; a text file with one class name a line is expected")
+        raise absent(path)(f"labels file {path} {state}; a text file with one class name a line is expected")
     try:
         with path.open("rb") as file:
             content = file.read(_MAX_FILE_BYTES + 1)

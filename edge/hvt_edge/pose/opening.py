@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from hvt_common.errors import UserError, needs_extra
+from hvt_common.errors import absent, needs_extra
 from hvt_edge.pose.contract import PoseSource
 from hvt_edge.pose.files import read_poses
 from hvt_edge.pose.fixed import FixedPose
@@ -30,7 +30,7 @@ def open_pose(spec: str, *, hfov_deg: float | None, clock: Callable[[], int]) ->
     except OSError as error:  # a name that is too long, or a folder that others may not read
         found, reason = False, f" ({error.strerror})"
     if not found:
-        raise UserError(
+        raise absent(Path(spec))(
             f"--pose {spec:.200} is no file{reason}; accepted is FILE.csv, FILE.srt (DJI), FILE.gpx, "
             "fixed:LAT,LON,HEIGHT,AZIMUTH,TILT, mavlink:udpin:HOST:PORT, or demo with --source demo"
         )

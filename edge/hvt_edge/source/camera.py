@@ -7,6 +7,7 @@ import os
 import re
 import stat
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,18 +29,22 @@ _Y16 = cv2.VideoWriter.fourcc(*"Y16 ")
 
 
 class CameraGrabber:
-    """One V4L2 device: ``path`` is /dev/videoN, ``fps`` is requested of the camera."""
+    """One V4L2 device: ``path`` is /dev/videoN, ``fps`` is requested of the camera.
 
-    def __init__(self, path: str, *, fps: float) -> None:
+    ``clock`` is that of the source's other times: a wall clock that was set since would say another time.
+    """
+
+    def __init__(self, path: str, *, fps: float, clock: Callable[[], int]) -> None:
         self.name = path
         self.notes = Notes(path)
         self._deep = False
         """It gives sixteen bits of grey."""
         self._stretch = Stretch(self.notes)
         self._fps = fps
+        self._clock = clock
         self._capture: cv2.VideoCapture | None = None
         self._ahead_ns = 0
-        """Of Unix time before the monotonic clock, when the device was opened."""
+        """Of ``clock`` before the monotonic clock, when the device was opened."""
 
     def open(self) -> None:
         """Open the device. Raises `UserError` if it is missing, no camera, busy or not permitted."""
@@ -66,7 +71,7 @@ class CameraGrabber:
         if self._deep:
             capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         self._capture = capture
-        self._ahead_ns = time.time_ns() - time.monotonic_ns()
+        self._ahead_ns = self._clock() - time.monotonic_ns()
 
     def restart(self) -> None:
         """Open again after `SignalLost`."""

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import HIDDEN, redacted
+from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Fit
 from hvt_edge.source.camera import CameraGrabber
@@ -55,6 +56,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     Raises `UserError` if nothing usable is there, or size or rate are impossible.
     """
     check_shape(size=size, fps=fps, source_fps=source_fps)
+    clock = clock or SteadyClock()
     if coded:
         _check_coded(spec)
     if is_demo(spec):
@@ -74,9 +76,9 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
             return live(stream)
         stream.close()
     elif spec.startswith("/dev/"):
-        return live(CameraGrabber(spec, fps=fps))
+        return live(CameraGrabber(spec, fps=fps, clock=clock))
     else:
-        _check_there(spec, scheme)
+        _check_there(spec, scheme, growing=growing)
     if coded:
         return CodedVideoSource(
             spec, size=size, fit=fit, max_frames=max_frames, source_fps=source_fps, growing=growing
@@ -88,13 +90,17 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     )
 
 
-def _check_there(spec: str, scheme: str) -> None:
-    """Raise `UserError` for a scheme that is not known, or a file or folder that does not exist."""
+def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
+    """Raise `UserError` for a scheme that is not known, or a file or folder that does not exist.
+
+    A file that another program writes may be yet to come: `NotYetError`.
+    """
     if scheme:
         known = scheme if re.fullmatch(r"[a-z][a-z0-9+.-]{0,15}", scheme) else HIDDEN
         raise UserError(f"source {shown(spec)!r} has the unknown scheme {known!r}; accepted is {_ACCEPTED}")
     if not _is_there(spec):
-        raise UserError(f"source {shown(spec)!r} does not exist; accepted is {_ACCEPTED}")
+        kind = NotYetError if growing else UserError
+        raise kind(f"source {shown(spec)!r} does not exist; accepted is {_ACCEPTED}")
 
 
 def shown(spec: str) -> str:

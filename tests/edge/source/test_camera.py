@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import time
+
 import cv2
 import numpy as np
 import pytest
 
+from hvt_common.runtime.clock import SteadyClock
 from hvt_edge.source import camera
 from hvt_edge.source.camera import CameraGrabber
+from hvt_edge.source.camera_clock import CameraClock
 
 LEVELS = np.full((48, 64), 29_900, np.uint16)
 LEVELS[20:30, 20:30] = 30_200
@@ -47,13 +51,18 @@ class Thermal:
         ) if converts else self.raw
 
 
+def stand_in(monkeypatch, tmp_path, capture):
+    """The device that OpenCV opens."""
+    monkeypatch.setattr(camera, "opened_capture", lambda _number: capture)
+    monkeypatch.setattr(camera.stat, "S_ISCHR", lambda _mode: True)
+    (tmp_path / "video0").touch()
+
+
 @pytest.mark.parametrize("raw", [LEVELS, LEVELS.view(np.uint8).reshape(1, -1)], ids=["levels", "bytes"])
 def test_a_warm_body_is_seen_by_a_thermal_camera(monkeypatch, tmp_path, raw):
     """It would be one level of 255 above the rest: nobody sees it, and no network."""
-    monkeypatch.setattr(camera, "opened_capture", lambda _number: Thermal(raw))
-    monkeypatch.setattr(camera.stat, "S_ISCHR", lambda _mode: True)
-    (tmp_path / "video0").touch()
-    grabber = CameraGrabber(str(tmp_path / "video0"), fps=9)
+    stand_in(monkeypatch, tmp_path, Thermal(raw))
+    grabber = CameraGrabber(str(tmp_path / "video0"), fps=9, clock=SteadyClock())
     grabber.open()
     picture = grabber.grab().image()
     assert picture.shape == (48, 64, 3)
@@ -62,3 +71,19 @@ def test_a_warm_body_is_seen_by_a_thermal_camera(monkeypatch, tmp_path, raw):
     assert said.startswith(
         "its 16-bit grey is a sensor's: levels 29900 to 30200 are stretched to black and white"
     )
+
+
+def test_a_clock_that_was_set_back_makes_no_picture_old(monkeypatch, tmp_path):
+    """Every picture of a camera that is opened after it would be as old as the step, for the rest of the flight."""
+    clock = SteadyClock(
+        wall_ns=lambda: time.time_ns() + 3 * 10**9
+    )  # set back by three seconds since the start
+    thermal = Thermal(LEVELS)
+    stand_in(monkeypatch, tmp_path, thermal)
+    grabber = CameraGrabber(str(tmp_path / "video0"), fps=9, clock=clock)
+    grabber.open()
+    taken_ns = clock()
+    thermal.properties[cv2.CAP_PROP_POS_MSEC] = time.monotonic_ns() / 1e6
+    camera_ns = grabber.grab().camera_ns
+    assert camera_ns is not None
+    assert abs(CameraClock().capture_ns(camera_ns, now_ns=clock()) - taken_ns) < 10**9

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from av.video.reformatter import Interpolation
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.clock import SteadyClock
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.folder import sequence_files
@@ -588,3 +588,9 @@ def test_impossible_rates_are_refused(fps):
     """A rate of nought would divide by it."""
     assert "fps" in refused("demo", fps=fps)
     assert "source-fps" in refused("demo", source_fps=-1.0)
+
+
+def test_a_file_that_another_program_will_write_is_waited_for(tmp_path):
+    """An edge that starts before the recorder would end with code 2, and no supervisor starts it again."""
+    with pytest.raises(NotYetError, match="does not exist"):
+        open_source(str(tmp_path / "growing.ts"), size=(320, 180), fps=15, fit="letterbox", growing=True)

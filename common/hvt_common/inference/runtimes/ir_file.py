@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, absent
 from hvt_common.inference.runtimes.onnx_file import MAX_MODEL_BYTES
 
 _MAX_XML_BYTES = 64 << 20
@@ -27,7 +27,7 @@ def check_ir_file(path: Path) -> None:
     """Raise `UserError` in one sentence if it is certainly no IR, or not a whole one."""
     if not path.is_file():
         state = "is not a file" if path.exists() else "does not exist"
-        raise UserError(f"model {path} {state}; an OpenVINO .xml with its .bin is expected")
+        raise absent(path)(f"model {path} {state}; an OpenVINO .xml with its .bin is expected")
     _, weights = files_of(path)
     if not weights.is_file():
         raise UserError(f"model {path} has no {weights.name} beside it; OpenVINO keeps the weights there")

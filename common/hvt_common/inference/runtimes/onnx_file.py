@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, absent
 
 MAX_MODEL_BYTES = 1 << 30
 """1 GiB: the largest detectors are a fifth of it, and protobuf itself stops at 2 GiB."""
@@ -51,7 +51,7 @@ _Bytes = bytes | mmap.mmap
 def check_onnx_file(path: Path) -> None:
     """Raise `UserError` in one sentence if it is certainly no ONNX model, or not a whole one."""
     if not path.exists():
-        raise UserError(f"model {path} does not exist; an ONNX file is expected")
+        raise absent(path)(f"model {path} does not exist; an ONNX file is expected")
     if not path.is_file():
         raise UserError(f"model {path} is not a file; an ONNX file is expected")
     try:

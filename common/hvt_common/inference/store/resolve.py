@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, absent
 from hvt_common.inference.store.manifest import builtin_manifest
 from hvt_common.inference.store.store import Store, file_digest
 
@@ -73,7 +73,7 @@ def resolve_model(
 def _file(spec: str, *, role: str) -> Path:
     path = Path(spec).expanduser()
     if not path.exists():
-        raise UserError(
+        raise absent(path)(
             f"{role} {spec} does not exist: give an ONNX file, or a name that 'hvt-models list' shows"
         )
     return path
