@@ -15,14 +15,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-import onnxruntime as ort
-from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.ir_file import ir_metadata, is_ir
@@ -30,6 +29,9 @@ from hvt_common.inference.runtimes.onnx_file import check_onnx_file, onnx_versio
 from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
 from hvt_common.inference.runtimes.providers import ONNXRUNTIME_PROVIDERS, ProviderChoice, choose_provider
 from hvt_common.runtime.process import lower_priority
+
+if TYPE_CHECKING:
+    import onnxruntime as ort
 
 _T = TypeVar("_T")
 
@@ -44,6 +46,8 @@ _MOST_CHARS = 300
 _TRIAL_SIDE = 256
 _TRIALS = 5
 _WORTH_SHARE = 0.8
+LIGHT_BYTES = 8_000_000
+"""A smaller file is a light network: the embedded ones, YOLOX-nano. OpenVINO alone takes more memory than it."""
 
 _ELEMENT_TYPES: Mapping[str, npt.DTypeLike] = {
     "tensor(float)": np.float32,
@@ -53,22 +57,24 @@ _ELEMENT_TYPES: Mapping[str, npt.DTypeLike] = {
     "tensor(int32)": np.int32,
     "tensor(int64)": np.int64,
 }
-_ORT_ERRORS: tuple[type[Exception], ...] = tuple(
-    getattr(ort_errors, name)
-    for name in (
-        "EPFail",
-        "EngineError",
-        "Fail",
-        "InvalidArgument",
-        "InvalidGraph",
-        "InvalidProtobuf",
-        "ModelLoaded",
-        "NoModel",
-        "NoSuchFile",
-        "NotImplemented",
-        "RuntimeException",
-    )
+_ORT_ERRORS = (
+    *("EPFail", "EngineError", "Fail", "InvalidArgument", "InvalidGraph", "InvalidProtobuf", "ModelLoaded"),
+    *("NoModel", "NoSuchFile", "NotImplemented", "RuntimeException"),
 )
+
+
+def _onnxruntime() -> ModuleType:
+    """Loaded with the first model: 20 MB that a flight of video alone does without."""
+    import onnxruntime  # noqa: PLC0415
+
+    module: ModuleType = onnxruntime
+    return module
+
+
+@cache
+def _ort_errors() -> tuple[type[Exception], ...]:
+    errors = _onnxruntime().capi.onnxruntime_pybind11_state
+    return tuple(getattr(errors, name) for name in _ORT_ERRORS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +199,7 @@ class _OnnxRuntimeRunner:
         feeds = dict(zip(self._input_names, (feed, *more), strict=False))
         try:
             outputs: list[npt.NDArray[Any]] = self._session.run(self._output_names, feeds)
-        except _ORT_ERRORS as error:
+        except _ort_errors() as error:
             shape = "x".join(map(str, feed.shape))
             raise UserError(
                 f"model {self._path} does not run on a {shape} input: {_reason(error)}"
@@ -211,7 +217,10 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
     if is_ir(path):
         return _open_ir(path, settings)
     choice = choose_provider(
-        settings.provider, onnxruntime=ort.get_available_providers(), openvino=find_openvino
+        settings.provider,
+        onnxruntime=_onnxruntime().get_available_providers(),
+        openvino=find_openvino,
+        light=path.is_file() and path.stat().st_size < LIGHT_BYTES,
     )
     check_onnx_file(path)
     try:
@@ -318,22 +327,25 @@ def _described(
 def _session(
     path: Path, settings: ModelSettings, providers: tuple[str, ...], *, optimised: bool = True
 ) -> ort.InferenceSession:
-    options = ort.SessionOptions()
+    runtime = _onnxruntime()
+    options = runtime.SessionOptions()
     options.intra_op_num_threads = settings.threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 4
     # A plan of all tensors for each input shape takes 35 MB more than an arena that reuses them, and saves no time.
     options.enable_mem_pattern = False
     if not optimised:
-        options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+        options.graph_optimization_level = runtime.GraphOptimizationLevel.ORT_DISABLE_ALL
     # Threads that spin between runs burn the cores that the encoder needs: half the CPU time for no gain.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     # A file that ends in .ort would go to another parser.
     options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
         # Without its own fallback, which tries the same again and prints banners.
-        session = ort.InferenceSession(str(path), options, providers=list(providers), enable_fallback=0)
-    except _ORT_ERRORS as error:
+        session: ort.InferenceSession = runtime.InferenceSession(
+            str(path), options, providers=list(providers), enable_fallback=0
+        )
+    except _ort_errors() as error:
         raise UserError(f"model {path} cannot be opened: {_cause(path, error)}") from error
     _check_ports(path, tuple(map(_port, session.get_inputs())), tuple(map(_port, session.get_outputs())))
     return session
@@ -367,7 +379,7 @@ def _cause(path: Path, error: Exception) -> str:
     except ValueError:  # damaged in a part that only this reads
         return _reason(error)
     known = {
-        "here": f"onnxruntime {ort.__version__}",
+        "here": f"onnxruntime {_onnxruntime().__version__}",
         "version": version,
         "opset": opset,
         "by": f" (written by {producer})" if producer else "",

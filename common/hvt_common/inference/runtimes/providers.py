@@ -10,8 +10,9 @@ tensorrt   the same, and TensorRT                 NVIDIA; builds its engine at t
 coreml     onnxruntime for macOS                  Apple
 =========  =====================================  ============================================================
 
-``auto`` takes cuda where it is installed, then openvino where the processor computes in bf16 (without that it is no
-faster than onnxruntime, measured) and the network is measured to be quicker with it, else cpu.
+``auto`` takes cuda where it is installed, then openvino where three things hold: the network is not light, for
+OpenVINO takes 150 MB itself; the processor computes in bf16, without which it is no faster than onnxruntime
+(measured); and this network is measured to be quicker with it. Else cpu.
 """
 
 from __future__ import annotations
@@ -60,18 +61,22 @@ class ProviderChoice:
 
 
 def choose_provider(
-    wanted: str, *, onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None]
+    wanted: str,
+    *,
+    onnxruntime: Collection[str],
+    openvino: Callable[[], OpenVinoCpu | None],
+    light: bool = False,
 ) -> ProviderChoice:
     """Resolve ``wanted``, one of `PROVIDERS`, to a provider that is installed here.
 
     ``onnxruntime`` has the providers of the installed onnxruntime; ``openvino()`` looks for OpenVINO, where the
-    answer matters. Raises `UserError` for an unknown word, or a provider that is not installed, with what installs
-    it.
+    answer matters, which for ``auto`` it does not where the network is ``light``. Raises `UserError` for an unknown
+    word, or a provider that is not installed, with what installs it.
     """
     if wanted not in PROVIDERS:
         raise UserError(f"--provider '{wanted}' is not known: choose one of {', '.join(PROVIDERS)}")
     if wanted == "auto":
-        return _best(onnxruntime, openvino)
+        return _best(onnxruntime, openvino, light=light)
     if wanted == "openvino":
         found = openvino()
         if found is not None:
@@ -83,9 +88,13 @@ def choose_provider(
     )
 
 
-def _best(onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None]) -> ProviderChoice:
+def _best(
+    onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None], *, light: bool
+) -> ProviderChoice:
     if ONNXRUNTIME_PROVIDERS["cuda"][0] in onnxruntime:
         return ProviderChoice("cuda", "onnxruntime-gpu is installed", explicit=False)
+    if light:
+        return ProviderChoice("cpu", "so light a network is not worth OpenVINO's memory", explicit=False)
     found = openvino()
     if found is None:
         return ProviderChoice("cpu", f"OpenVINO is not installed ({_HOW_TO_GET['openvino']})", explicit=False)

@@ -101,7 +101,7 @@ class Pictures:
         name, components = frame.format.name, frame.format.components
         if name.startswith("gray") and not name.startswith("grayf") and components[0].bits > _DEEP_BITS:
             levels = self._reformatter.reformat(
-                frame, width=wide, height=high, format="gray16le"
+                frame, width=wide, height=high, format="gray16le", threads=1
             ).to_ndarray()
             bits = components[0].bits
             return self._stretch.bgr(np.asarray(levels, np.uint16), at_s=frame.time or 0.0, bits=bits)
@@ -119,7 +119,7 @@ class Pictures:
                 more |= {"dst_color_trc": ColorTrc.BT709, "dst_color_primaries": ColorPrimaries.BT709}
         how = Interpolation.BICUBIC if (wide, high) != (frame.width, frame.height) else Interpolation.BILINEAR
         converted = self._reformatter.reformat(
-            frame, width=wide, height=high, format="bgr24", interpolation=how, **more
+            frame, width=wide, height=high, format="bgr24", interpolation=how, threads=1, **more
         )
         return np.asarray(converted.to_ndarray(), np.uint8)
 
