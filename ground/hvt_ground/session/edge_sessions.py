@@ -22,6 +22,7 @@ from hvt_common.protocol.messages import (
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.runtime.log import log_fields
+from hvt_common.transport.flood import TokenBucket
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
@@ -41,6 +42,8 @@ _BACKLOG_PAUSE_NS = 3 * SECOND_NS
 """After so long without another chunk the recording says how much of the backlog came."""
 _CLOCK_EVERY_NS = 20 * SECOND_NS
 """Time between two queries of the edge's clock."""
+_BURST, _EVERY_NS = 10, 5 * SECOND_NS
+"""So many sessions begin at once, then one in so long: each is a file, and has a log of its own."""
 
 
 class EdgeSessions:
@@ -80,6 +83,7 @@ class EdgeSessions:
         self._ended_patience_ns = round(ended_patience_s * SECOND_NS)
         self._clock = clock or SteadyClock()
         self._pause = pause or RetryPause()
+        self._beginnings = TokenBucket(burst=_BURST, every_ns=_EVERY_NS)
         self.failures = Failures(self._clock)
         """The failures of this edge's reception."""
         self.backlog = EdgeBacklog(port.edge, recordings=recordings)
@@ -286,6 +290,12 @@ class EdgeSessions:
         self._end_session()
         if info is None:
             self._receiver.skip("info", WireError("the edge does not say what its session is"))
+            return
+        if not self._beginnings.take(self._clock()):
+            every_s = _EVERY_NS // SECOND_NS
+            self._receiver.skip(
+                "base", WireError(f"the edge begins sessions again and again: one in {every_s} s is shown")
+            )
             return
         self.port.used.set()
         self._next_clock_ns = time.monotonic_ns() + _CLOCK_EVERY_NS

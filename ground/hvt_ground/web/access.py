@@ -13,12 +13,12 @@ import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import Literal, get_args
 from urllib.parse import urlsplit
 
 import platformdirs
+from starlette.requests import cookie_parser
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.host_names import is_loopback, requested_host
@@ -107,13 +107,10 @@ def _place(url: str) -> tuple[str, ...]:
 
 
 def _cookie(headers: Mapping[str, str]) -> str:
-    try:
-        cookies = SimpleCookie(headers.get("cookie", ""))
-        # The name without a port is what a proxy sends, and what a browser was given by an earlier HVT.
-        found = cookies.get(cookie_name(headers)) or cookies.get("hvt")
-    except CookieError:
-        return ""
-    return "" if found is None else found.value
+    # Others on this host set cookies too: a strict parser gives up at the first that is out of form.
+    cookies = cookie_parser(headers.get("cookie", ""))
+    # The name without a port is what a proxy sends, and what a browser was given by an earlier HVT.
+    return cookies.get(cookie_name(headers)) or cookies.get("hvt", "")
 
 
 def own_tokens(folder: Path | None = None) -> Mapping[Role, str]:

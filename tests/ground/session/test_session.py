@@ -344,6 +344,26 @@ def test_an_edge_that_restarts_gets_a_session_of_its_own(flight):
     assert (last["frames"], last["gaps"], last["lost"], last["stills"]["received"]) == (8, 0, 0, 1)
 
 
+def test_sessions_that_begin_again_and_again_are_bounded(flight):
+    """An edge with valid keys would make a file and a log a second, for all to pay."""
+    edge, now_ns = Flight(1), time.time_ns()
+    with Rig(clock=lambda: now_ns) as rig:
+        rig.port.flight = edge
+        for number in range(16):
+            edge.session_id = 7000 + number
+            rig.put(replace(edge.base(0), received_ns=now_ns))
+            rig.settle()
+            now_ns += 1_100_000_000
+        assert len(rig.opened) == 13  # ten at once, then one in five seconds
+        assert rig.receiver.unusable == 3
+        rig.port.flight = flight
+        now_ns += 5_000_000_000
+        rig.put(*(replace(one, received_ns=now_ns) for one in bases(flight, *range(10))))
+        rig.settle()
+        assert rig.receiver.session.info.session_id == flight.session_id
+        assert rig.receiver.session.frames_decoded == 10
+
+
 def test_a_session_ends_when_all_of_it_has_arrived(flight):
     """``--once`` would cut the last pictures off, or never end."""
     with Rig(ended_patience_s=3600) as rig:

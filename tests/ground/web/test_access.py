@@ -48,6 +48,13 @@ def test_each_ground_takes_its_own_cookie_of_two():
     assert access.role({"host": "10.8.0.1:8080", "cookie": f"hvt={'v' * 20}"}) == "viewer", "of a proxy"
 
 
+def test_a_cookie_of_another_program_that_is_out_of_form_hides_none_of_ours():
+    """A page of the same host that keeps JSON in a cookie would throw every operator out."""
+    cookie = f'prefs={{"theme":"dark"}}; =; a b; hvt-8080={"o" * 20}'
+    access = Access({"operator": "o" * 20, "viewer": "v" * 20})
+    assert access.role({"host": "10.8.0.1:8080", "cookie": cookie}) == "operator"
+
+
 @pytest.mark.parametrize(
     ("host", "origin", "said"),
     [

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,11 +25,17 @@ LIVE = {
 
 def said(calls: list[tuple[str, list]]) -> list:
     """What functions of words.js return."""
-    script = f"""
+    return ran(
+        f"""
       import * as words from {json.dumps((STATIC / "words.js").as_uri())};
       const calls = {json.dumps(calls)};
       console.log(JSON.stringify(calls.map(([name, given]) => words[name](...given))));
     """
+    )
+
+
+def ran(script: str) -> Any:
+    """What a module of JavaScript prints as JSON."""
     done = subprocess.run(
         [NODE, "--input-type=module", "-e", script], capture_output=True, text=True, check=False, timeout=60
     )
@@ -92,6 +99,66 @@ def test_what_is_unknown_is_not_said_to_be_nothing():
         "NOT RECORDED",
         "the ground refuses this page: the proxy takes the port off the header Host",
     ]
+
+
+ELEMENTS = """
+  const element = () => ({ dataset: {}, classList: { toggle() {} }, children: [], append() {}, insertBefore() {},
+    setAttribute() {}, addEventListener() {} });
+  globalThis.document = { createElement: element };
+"""
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+def test_an_edge_that_sends_no_picture_has_no_green_light():
+    """A camera that died behind a link that works would look well on the wall."""
+    found = ran(
+        f"""
+      {ELEMENTS}
+      const {{ Wall }} = await import({json.dumps((STATIC / "wall.js").as_uri())});
+      URL.createObjectURL = () => "";
+      const wall = new Wall(element(), element(), () => {{}});
+      const state = (link) => ({{ link, since: 100000, total: null, budget: null }});
+      wall.thumbnail("uav-1", new Uint8Array(1), 100000);
+      const seen = [["up", 103000], ["up", 112000], ["thin", 112000], ["lost", 112000]].map(([link, now]) => {{
+        wall.state("uav-1", state(link), now);
+        const {{ light, state: words }} = wall.card("uav-1");
+        return [light.dataset.state, words.textContent];
+      }});
+      console.log(JSON.stringify(seen));
+    """
+    )
+    assert found == [
+        ["up", "up 3 s"],
+        ["silent", "no picture 12 s"],
+        ["silent", "no picture 12 s"],
+        ["lost", "lost 12 s"],
+    ]
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+def test_the_plot_draws_no_line_over_what_is_not_known():
+    """A minute without a link would be a straight line of bits that nobody sent, and the past would stand as now."""
+    found = ran(
+        f"""
+      const lines = [];
+      const drawn = (kind) => (x) => lines.push([kind, Math.round(x)]);
+      const known = {{ measureText: () => ({{ width: 1 }}), moveTo: drawn("move"), lineTo: drawn("line") }};
+      const context = new Proxy(known, {{ get: (one, name) => one[name] ?? (() => {{}}) }});
+      globalThis.window = {{ devicePixelRatio: 1 }};
+      globalThis.ResizeObserver = class {{ observe() {{}} }};
+      globalThis.matchMedia = () => ({{ addEventListener() {{}} }});
+      globalThis.document = {{}};
+      globalThis.getComputedStyle = () => ({{ getPropertyValue: () => "" }});
+      const {{ Plot }} = await import({json.dumps((STATIC / "plot.js").as_uri())});
+      const plot = new Plot({{ clientWidth: 240, clientHeight: 100, getContext: () => context }});
+      plot.fill("uav-1", [0, 1, 2, 60, 61].map((second) => [1000 * second, 10, 10, 20]));
+      plot.show("uav-1");
+      lines.length = 0;
+      plot.tick(100000);
+      console.log(JSON.stringify(lines.slice(0, 5)));
+    """
+    )
+    assert found == [["move", 140], ["line", 141], ["line", 142], ["move", 200], ["line", 201]]
 
 
 def test_the_page_shows_no_word_of_the_code():
