@@ -18,7 +18,7 @@ from typing import Any
 from rerun.chunk import Chunk, RrdReader
 
 from hvt_ground.recordings.row import FileAccount, RecordingRow
-from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages
+from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages, drop_footer
 from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 
 SCRATCH = ".part"
@@ -165,6 +165,8 @@ def remove_video(path: Path) -> None:
         subprocess.run(  # noqa: S603
             command, check=True, capture_output=True, timeout=_PATIENCE_S, env=viewer_environment()
         )
+        if scratch.stat().st_size >= state.st_size:
+            drop_footer(scratch)
         os.utime(scratch, ns=(state.st_atime_ns, state.st_mtime_ns))
         scratch.replace(path)
     finally:

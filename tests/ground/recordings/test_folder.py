@@ -354,6 +354,20 @@ def test_video_is_removed_and_the_rest_stays(tmp_path, events):
     assert [one.video for one in look(tmp_path)] == [False, False]
 
 
+def test_a_file_that_breaks_off_is_smaller_without_its_video(tmp_path, events):
+    """Its footer, a row for each chunk, takes more than the pictures of a file that was cut short by a power cut."""
+    fly(tmp_path, events)
+    path = tmp_path / NAMES[0]
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2 - 37])
+    before = path.stat().st_size
+    first, _ = look(tmp_path, Retention(video_age=Limit(seconds=86_400)), later_s=90_000, times=2)
+    assert (first.video, first.size_bytes < before) == (False, True)
+    assert first.size_bytes == path.stat().st_size
+    assert Recording(path).video() == []
+    assert Recording(path).blueprints == 1
+
+
 def test_a_file_that_cannot_be_stripped_holds_up_no_other(tmp_path, events, caplog):
     """One bad file, and nothing is removed any more."""
     fly(tmp_path, events)

@@ -186,21 +186,33 @@ def copy_whole_messages(path: Path, out: Path) -> bool:
 
     False where nothing would be left out, or nothing be left.
     """
-    size = path.stat().st_size
     with path.open("rb") as file:
-        at = _STREAM_HEADER_BYTES
-        while len(head := os.pread(file.fileno(), _MESSAGE_HEADER.size, at)) == _MESSAGE_HEADER.size:
-            _, length = _MESSAGE_HEADER.unpack(head)
-            if at + _MESSAGE_HEADER.size + length > size:
-                break
-            at += _MESSAGE_HEADER.size + length
-        if not _STREAM_HEADER_BYTES < at < size:
+        size = os.fstat(file.fileno()).st_size
+        at = max((end for _, end in _whole_messages(file.fileno())), default=size)
+        if at == size:
             return False
         with out.open("wb") as copy:
             while at > 0 and (data := file.read(min(at, _COPY_BYTES))):
                 copy.write(data)
                 at -= len(data)
     return True
+
+
+def drop_footer(path: Path) -> None:
+    """Take the footer off a recording: it has a row for each chunk, and a small one is mostly that."""
+    with path.open("r+b") as file:
+        file.truncate(max(end for kind, end in _whole_messages(file.fileno()) if kind != _END))
+
+
+def _whole_messages(file: int) -> Iterator[tuple[int, int]]:
+    """The kind of each message, and where it ends; not of one that breaks off."""
+    at, size = _STREAM_HEADER_BYTES, os.fstat(file).st_size
+    while len(head := os.pread(file, _MESSAGE_HEADER.size, at)) == _MESSAGE_HEADER.size:
+        kind, length = _MESSAGE_HEADER.unpack(head)
+        at += _MESSAGE_HEADER.size + length
+        if at > size:
+            return
+        yield kind, at
 
 
 def _created(path: Path) -> int:
