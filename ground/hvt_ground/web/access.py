@@ -9,8 +9,10 @@ import hmac
 import json
 import os
 import secrets
+import socket
 import tempfile
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,6 +96,25 @@ def cookie_name(headers: Mapping[str, str]) -> str:
     """A name by the port that the browser sees: cookies know no port, and another ground of this host has its own."""
     port = _place(f"http://{headers.get('host', '')}")[1:]
     return f"hvt-{port[0]}" if port else "hvt"
+
+
+def crowding(places: Iterable[str], newcomer: str) -> str | None:
+    """Where there is no room: the address whose connection goes, for it has more than a newcomer's; else None.
+
+    What one party may have counts as one: all of an IPv6 network of 64 bits.
+    """
+    known = list(places)
+    counts = Counter(map(_party, known))
+    most = max(known, key=lambda one: counts[_party(one)], default=newcomer)
+    return most if counts[_party(most)] > counts[_party(newcomer)] + 1 else None
+
+
+def _party(address: str) -> bytes:
+    try:
+        whole = socket.inet_pton(socket.AF_INET6, address.partition("%")[0])
+    except OSError:
+        return address.encode()
+    return whole if whole.startswith(bytes(10) + b"\xff\xff") else whole[:8]
 
 
 def _place(url: str) -> tuple[str, ...]:

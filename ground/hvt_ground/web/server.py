@@ -11,7 +11,8 @@ import struct
 import threading
 import time
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -28,7 +29,7 @@ from hvt_common.runtime.host_names import host_and_port, is_loopback
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Refinement
 from hvt_ground.state import GroundState
-from hvt_ground.web.access import Access, own_tokens
+from hvt_ground.web.access import Access, crowding, own_tokens
 from hvt_ground.web.feed import SessionFeed, state_loads, state_message, still_name
 from hvt_ground.web.requests import EdgeRequests
 from hvt_ground.web.site import MOST_MESSAGE_BYTES, make_site
@@ -169,18 +170,26 @@ class WebPage:
 
 
 class _Listener(socket.socket):
-    """Accepts so many connections and closes further ones before TLS: each has a descriptor of the process."""
+    """Accepts so many connections and closes further ones before TLS: each has a descriptor of the process.
 
-    _open: Sequence[socket.socket] = ()
+    Who has fewer gets a place of who has most.
+    """
+
+    _open: list[tuple[socket.socket, str]] | None = None
 
     def accept(self) -> tuple[socket.socket, Any]:
         """As of the base class; asyncio tries again after a `ConnectionAbortedError`."""
         connection, address = super().accept()
-        self._open = [one for one in self._open if one.fileno() >= 0]
+        self._open = [one for one in self._open or () if one[0].fileno() >= 0]
         if len(self._open) >= MOST_OPEN:
-            connection.close()
-            raise ConnectionAbortedError
-        self._open.append(connection)
+            crowd = crowding((one for _, one in self._open), address[0])
+            if crowd is None:
+                connection.close()
+                raise ConnectionAbortedError
+            last = max(at for at, (_, one) in enumerate(self._open) if one == crowd)
+            with suppress(OSError):
+                self._open.pop(last)[0].shutdown(socket.SHUT_RDWR)
+        self._open.append((connection, address[0]))
         return connection, address
 
 
@@ -248,13 +257,27 @@ class _BoundedProtocol(_NoStall, H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        if len(self.connections) > _MOST_CONNECTIONS:
+        if len(self.connections) > _MOST_CONNECTIONS and not self._take_place():
             transport.write(
                 b"HTTP/1.1 503 Service Unavailable\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
             )
             transport.close()
             return
         self._await_request(None)
+
+    def _take_place(self) -> bool:
+        """That of one of whoever has most; False where that is this client."""
+        known: set[Any] = set(self.connections)
+        others = {
+            one: one.client[0]
+            for one in known
+            if one is not self and one.client and not one.transport.is_closing()
+        }
+        crowd = crowding(others.values(), self.client[0]) if self.client else None
+        if crowd is None:
+            return False
+        next(one for one, place in others.items() if place == crowd).transport.abort()
+        return True
 
     def on_response_complete(self) -> None:
         answered = self.cycle

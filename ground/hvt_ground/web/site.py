@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from hvt_common.errors import UserError
-from hvt_ground.web.access import HEADERS, Access, Role, cookie_name
+from hvt_ground.web.access import HEADERS, Access, Role, cookie_name, crowding
 from hvt_ground.web.pictures import RUNGS
 from hvt_ground.web.requests import BadRequestError, BusyError, EdgeRequests
 from hvt_ground.web.viewers import Hub, Viewer, packed, text
@@ -111,11 +111,15 @@ class Site:
 
     async def socket(self, socket: WebSocket) -> None:
         """A viewer from its coming to its leaving."""
-        if len(self._hub.viewers) >= _MOST_VIEWERS:
-            await socket.send_denial_response(PlainTextResponse("too many viewers", 503))
-            return
+        viewer = Viewer(socket.client.host if socket.client else "")
+        viewers = [one for one in self._hub.viewers if not one.hopeless]
+        if len(viewers) >= _MOST_VIEWERS:
+            crowd = crowding((one.address for one in viewers), viewer.address)
+            if crowd is None:
+                await socket.send_denial_response(PlainTextResponse("too many viewers", 503))
+                return
+            next(one for one in viewers if one.address == crowd).give_up()
         await socket.accept()
-        viewer = Viewer()
         role: Role = socket.scope["role"]
         viewer.put(text("hello", role=role, rungs=RUNGS, now=self._now_ms()))
         self._hub.join(viewer)

@@ -43,9 +43,10 @@ def packed(kind: str, payload: bytes, **content: Any) -> bytes:
 
 
 class Viewer:
-    """The queue of one connection. ``watches`` is an edge and a rung."""
+    """The queue of one connection, from ``address``. ``watches`` is an edge and a rung."""
 
-    def __init__(self) -> None:
+    def __init__(self, address: str = "") -> None:
+        self.address = address
         self.watches: tuple[str, Rung] | None = None
         self.wall = False
         self.lost = 0
@@ -61,11 +62,8 @@ class Viewer:
     def put(self, message: str | bytes) -> None:
         """Queue a message that must not be lost."""
         if self._texts >= _MOST_TEXTS or self._text_bytes + len(message) > _MOST_TEXT_BYTES:
-            self.hopeless = True
-            self._queue.clear()
-            self._bytes = self._texts = self._text_bytes = 0
+            self.give_up()
         if self.hopeless:
-            self._there.set()
             return
         self._texts += 1
         self._text_bytes += len(message)
@@ -84,6 +82,13 @@ class Viewer:
                 return
         self._waits_for_keyframe = False
         self._add(message, video=True)
+
+    def give_up(self) -> None:
+        """It is closed: it takes nothing, or has to make room."""
+        self.hopeless = True
+        self._queue.clear()
+        self._bytes = self._texts = self._text_bytes = 0
+        self._there.set()
 
     def leave_video(self) -> None:
         """Forget the queued fragments of the watched picture."""

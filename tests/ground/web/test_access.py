@@ -7,7 +7,7 @@ from threading import Barrier
 
 import pytest
 
-from hvt_ground.web.access import Access, cookie_name, own_tokens
+from hvt_ground.web.access import Access, cookie_name, crowding, own_tokens
 
 GROUNDS = 8
 OPERATOR = {"x-hvt-role": "operator"}
@@ -103,3 +103,21 @@ def test_a_role_counts_from_the_named_proxy_alone():
     """A page may set any header in requests to its own origin, and would name itself operator."""
     assert Access({}, proxy="hvt.example.org").role({"host": "hvt.example.org"} | OPERATOR) == "operator"
     assert Access({}).role({"host": "127.0.0.1:8080"} | OPERATOR) is None, "no proxy was named"
+
+
+@pytest.mark.parametrize(
+    ("places", "newcomer", "goes"),
+    [
+        (["10.0.0.1"] * 3 + ["10.0.0.2"], "10.0.0.3", "10.0.0.1"),
+        (["10.0.0.1"] * 3 + ["10.0.0.2"], "10.0.0.1", None),
+        (["10.0.0.1", "10.0.0.2"], "10.0.0.3", None),
+        (["10.0.0.1", "10.0.0.1"], "10.0.0.2", "10.0.0.1"),
+        (["2001:db8::1", "2001:db8::2", "2001:db8::3"], "2001:db8:0:1::1", "2001:db8::1"),
+        (["2001:db8::1", "2001:db8::2", "2001:db8::3"], "2001:db8::4", None),
+        (["::ffff:10.0.0.1", "::ffff:10.0.0.2", "::ffff:10.0.0.3"], "::ffff:10.0.0.4", None),
+        ([], "10.0.0.1", None),
+    ],
+)
+def test_where_there_is_no_room_who_has_most_makes_some(places, newcomer, goes):
+    """One machine that opens connections without end would keep all others from the page."""
+    assert crowding(places, newcomer) == goes

@@ -19,7 +19,7 @@ from websockets.sync.client import ClientConnection, connect
 from hvt_common.errors import UserError
 from hvt_common.transport.zenoh_config import key_pair
 from hvt_ground.events import Notice, Refinement
-from hvt_ground.web import WebPage, server
+from hvt_ground.web import WebPage, server, site
 from programs.fleet_keys import Fleet
 from programs.processes import eventually, free_ports
 from rigs.flight import Flight
@@ -400,6 +400,45 @@ def test_silent_connections_take_no_more_descriptors_than_others(port, tmp_path,
         eventually(lambda: sum(map(is_closed, silent)) >= 32, within_s=30, what="most are closed")
         for one in silent:
             one.close()
+
+
+def test_who_takes_all_places_makes_room_for_others(public, state_folder, monkeypatch):
+    """One machine with a link for viewers, or with none, would keep the operator out."""
+    token = json.loads((state_folder / "web-tokens.json").read_text())["operator"]
+    cookie = {"Cookie": f"hvt-{public}={token}"}
+
+    def watch(source: str) -> ClientConnection:
+        raw = socket.create_connection(("127.0.0.1", public), timeout=10, source_address=(source, 0))
+        return joined(public, sock=raw, additional_headers=cookie)
+
+    monkeypatch.setattr(site, "_MOST_VIEWERS", 3)
+    with watch("127.0.0.1") as first, watch("127.0.0.1") as second, watch("127.0.0.1") as third:
+        with pytest.raises(InvalidStatus, match="503"):
+            watch("127.0.0.1")
+        with watch("127.0.0.2") as other:
+            assert json.loads(other.recv(timeout=10))["type"] == "hello"
+            eventually(
+                lambda: sum(map(hung_up, (first, second, third))) == 1,
+                within_s=20,
+                what="one of the three has gone",
+            )
+    where = ("127.0.0.1", public)
+    for bound in ("_MOST_CONNECTIONS", "MOST_OPEN"):
+        with ExitStack() as held, monkeypatch.context() as few:
+            few.setattr(server, bound, 3)
+            silent = [held.enter_context(reached(public)) for _ in range(3)]
+            with socket.create_connection(where, timeout=10, source_address=("127.0.0.2", 0)) as late:
+                late.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
+                assert late.recv(100).startswith(b"HTTP/1.1 401"), bound
+            eventually(lambda these=silent: sum(map(is_closed, these)), within_s=20, what="one is closed")
+
+
+def hung_up(viewer: ClientConnection) -> bool:
+    """Whether the page has closed it."""
+    with suppress(TimeoutError, ConnectionClosed):
+        while True:
+            viewer.recv(timeout=0)
+    return viewer.close_code is not None
 
 
 def test_who_begins_no_tls_is_closed(port, tmp_path, monkeypatch):
