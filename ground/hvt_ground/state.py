@@ -312,7 +312,11 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
         edge_failed=()
         if status is None
         else tuple(
-            FailedPart(one.part, one.reason, session.to_local_ns(one.failed_ns))
+            FailedPart(
+                one.part,
+                one.reason,
+                session.to_local_ns(session.edge_failing.get(one.part, one.failed_ns)),
+            )
             for one in status.failed
             if not one.working
         ),

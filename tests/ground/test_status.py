@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +13,7 @@ import pytest
 
 from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.messages import FailedPart, Info, Status
+from hvt_common.protocol.still_words import STILL_WORDS
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_ground.metrics import metrics_text
@@ -22,6 +24,7 @@ from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.state import SessionState, StateMaker
 from hvt_ground.status import completed, status_text, summary, table
+from hvt_ground.web.feed import state_message
 from programs.processes import eventually
 from programs.rrd import Recording
 from rigs.flight import Flight, Port, pipeline_of
@@ -69,6 +72,26 @@ def ground(tmp_path: Path) -> Ground:
     )
     ground.sessions.handle(replace(item, payload=report.pack()))
     return ground
+
+
+def test_the_page_reads_all_of_it_as_sentences(ground):
+    """``base_good 49`` and ``stills paused: 0 of 40`` say nothing to who flies."""
+    state = ground.maker.make([("uav-1", ground.sessions)])
+    (edge,) = state.edges
+    every = dict.fromkeys(STILL_WORDS, 2)
+    levers = "tracks: the video hides 31 objects; stills paused: 0 of 40 renamed something"
+    session = replace(
+        edge.session, still_outcomes=every, stills_not_sent=every, levers=levers, gaps=2, lost=3
+    )
+    state = replace(state, edges=(replace(edge, session=session),), failed=ground.failures.now)
+    shown = json.loads(state_message(state, recorded=True))["edges"]["uav-1"]
+    code = re.compile("|".join(word for word in STILL_WORDS if "_" in word))
+    assert not code.search(json.dumps([shown[one] for one in ("words", "why", "short", "failed")]))
+    assert all(re.fullmatch(r"[A-Z].*[^.]\.", one) for one in shown["why"]), shown["why"]
+    assert shown["why"][-2:] == [
+        "Tracks: the video hides 31 objects.",
+        "Stills paused: 0 of 40 renamed something.",
+    ]
 
 
 def test_who_gets_no_stills_reads_why(ground):
@@ -166,6 +189,22 @@ def test_a_state_can_be_written_as_json(ground):
     read = json.loads(json.dumps(state.as_dict()))
     assert read["edges"][0]["session"]["method"] == ground.sessions.session.info.method
     assert read["edges"][0]["session"]["stills_not_sent"]["base_good"] == 49
+
+
+def test_a_part_of_the_edge_fails_since_it_stopped(ground):
+    """A camera that is gone for a minute would be gone "since two seconds": each try is a new failure."""
+    item, at_ns = ground.port.flight.status(base=5), 1_790_000_000 * SECOND_NS
+    for number, working in enumerate((False, False, True, False, False)):
+        tried_ns = at_ns + number * SECOND_NS
+        source = FailedPart(part="source", reason="gone", failures=1, failed_ns=tried_ns, working=working)
+        report = replace(Status.parse(item.payload), sequence=9 + number, failed=(source,))
+        ground.sessions.handle(replace(item, payload=report.pack()))
+        if number == 1:
+            assert ground.sessions.session.edge_failing == {"source": at_ns}
+    assert ground.sessions.session.edge_failing == {"source": at_ns + 3 * SECOND_NS}
+    session = ground.sessions.session
+    (edge,) = ground.maker.make([("uav-1", ground.sessions)]).edges
+    assert edge.session.edge_failed[0].since_ns == session.to_local_ns(at_ns + 3 * SECOND_NS)
 
 
 def test_words_of_an_edge_do_not_become_series_without_end(ground):

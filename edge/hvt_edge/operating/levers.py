@@ -184,6 +184,7 @@ class LeverControl:
         why = hidden if measured.comparisons else "not measured yet"
         of_tracks = f"{'tracks' if tracks else 'no tracks'}: {why}"
         renamed = f"{sum(self._changed)} of {len(self._changed)} renamed something"
+        renamed = renamed if self._changed else "none was answered yet"
         details = "stills show details, " if self._settings.finer else "stills: "
         return f"{of_tracks}; {details if stills else 'stills paused: '}{renamed}"
 

@@ -256,7 +256,8 @@ class EdgeSessions:
         if session_id != session.info.session_id:
             return
         if arrival.lost_before:
-            session.note("warning", f"{arrival.lost_before} base messages lost; waiting for a keyframe")
+            lost = f"{arrival.lost_before} picture{'s' * (arrival.lost_before != 1)} lost"
+            session.note("warning", f"{lost}; waiting for a keyframe")
         if not session.base(packet):
             self._receiver.wait_for_keyframe()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections import Counter
@@ -90,8 +91,7 @@ class GroundSession:
         self.receive_latency = self._account.receive_latency
         self.overlay_latency = self._account.overlay_latency
         self.pipeline = pipeline_of(self._emit)
-        self.frames_decoded = self.frames_received = 0
-        self.stills_received = 0
+        self.frames_decoded = self.frames_received = self.stills_received = 0
         self.steps_received = 0
         """Reports of the edge's tracks."""
         self._analyzed = (-1, -1)
@@ -111,12 +111,13 @@ class GroundSession:
         self.last_status: Status | None = None
         self.levers = ""
         """What the edge last said that it sends beside the video, and why."""
+        self.edge_failing: Mapping[str, int] = {}
+        """Since when each part of the edge fails, by its clock: a report has the newest try."""
         self._log = SessionLog(self._emit, clock=clock)
-        self._last_step = -1
+        self._last_step = self._last_index = -1
         self._stepped_ns = self._status_ns = self._base_ns = 0
         """When the newest report of tracks came, the newest status, and the newest access unit."""
         self._first_capture_ns: int | None = None
-        self._last_index = -1
         self._last_capture_ns = 0
         self._results: list[StillResult] = []
         self._results_lock = threading.Lock()
@@ -231,9 +232,15 @@ class GroundSession:
         self._account.count(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
         self._account.time(Channel.STATUS, item, status, handled=True)
         self.last_status = status
+        self.edge_failing = {
+            one.part: self.edge_failing.get(one.part, one.failed_ns)
+            for one in status.failed
+            if not one.working
+        }
         self._note_stale(self._last_capture_ns)
-        if status.levers and status.levers != self.levers:
-            self.levers = status.levers
+        decided = _decisions(status.levers) != _decisions(self.levers)
+        self.levers = status.levers or self.levers
+        if status.levers and decided:  # numbers alone change each second: they are in the state
             self.note("info", status.levers)
 
     def backlog_chunk(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
@@ -291,7 +298,7 @@ class GroundSession:
             self.note("error", f"the session failed: {self.failure}", last=True)
         if self.not_sent:
             self.note("info", f"stills that the edge did not send: {counts_text(self.not_sent)}", last=True)
-        self.note("info", f"session {self.info.session_id:016x} ended", last=True)
+        self.note("info", "the flight has ended", last=True)
 
     # What is known of it
 
@@ -456,3 +463,8 @@ class GroundSession:
             event = self.geolocation.located(event)
         for sink in self.sinks:
             sink.log(event)
+
+
+def _decisions(says: str) -> list[str]:
+    """What an edge sends beside the video, without why."""
+    return [re.split("[:,]", part)[0] for part in says.split("; ")]

@@ -215,25 +215,32 @@ def _words(session: SessionState, *, calibrated: bool) -> list[str]:
         words.append(
             f"capture to boxes {session.delay_p50_ms:.0f} ms, at most {session.delay_p95_ms:.0f} ms for 95 %"
         )
-    words.append(f"{session.stills_received} stills")
+    words.append(_some(session.stills_received, "still"))
     trust = "" if calibrated else "; the probability of a class is not calibrated"
-    words.append(f"{session.tracks} tracks, {session.tracks_refined} refined by stills{trust}")
+    words.append(f"{_some(session.tracks, 'track')}, {session.tracks_refined} refined by stills{trust}")
     if session.gaps:
-        words.append(f"{session.gaps} gaps, {session.lost} messages lost")
+        words.append(f"{_some(session.gaps, 'gap')}, {_some(session.lost, 'message')} lost")
     if session.backlog_stills or session.backlog_video_s:
         words.append(
-            f"from outages {session.backlog_stills} stills, {session.backlog_video_s:.0f} s of video"
+            f"from outages {_some(session.backlog_stills, 'still')}, {session.backlog_video_s:.0f} s of video"
         )
     return words
 
 
+def _some(count: int, what: str) -> str:
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
 def _short(one: EdgeState) -> str:
-    """The state of the link on the picture."""
+    """The state of camera and link on the picture."""
     session = one.session
-    if session is None or session.total_bps is None:
+    if session is None:
         return ""
-    thin = "the link does not carry all frames, " if one.link == "thin" else ""
-    return f"{thin}{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}"
+    said = [_failure(part) for part in session.edge_failed if part.part == "source"]
+    if session.total_bps is not None:
+        thin = "link too thin, " if one.link == "thin" else ""
+        said.append(f"{thin}{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")
+    return ", ".join(said)
 
 
 def _why(session: SessionState) -> list[str]:
@@ -244,7 +251,7 @@ def _why(session: SessionState) -> list[str]:
     if session.still_outcomes:
         why.append(f"Of the objects in stills: {counts_text(session.still_outcomes)}.")
     if session.levers:
-        why.append(session.levers)
+        why += [f"{one[:1].upper()}{one[1:]}." for one in session.levers.split("; ")]
     return why
 
 

@@ -95,6 +95,23 @@ def test_an_edge_that_reports_without_end_does_not_talk_to_all_viewers(rig, flig
     assert said[-1].endswith("ended"), "how it ended is said in any case"
 
 
+def test_numbers_alone_are_no_event(rig, flight):
+    """The list of events would be a column of figures that change each second."""
+    item = flight.status(base=3)
+    real = Status.parse(item.payload)
+    said = [
+        "no tracks: not measured yet; stills: none was answered yet",
+        "no tracks: the video hides 2 objects, misnames 1; stills: 1 of 2 renamed something",
+        "tracks: the video hides 9 objects; stills: 1 of 2 renamed something",
+        "tracks: the video hides 9 objects; stills paused: 1 of 40 renamed something",
+        "tracks: the video hides 8 objects; stills paused: 1 of 40 renamed something",
+    ]
+    for number, levers in enumerate(said):
+        rig.session.status(replace(real, sequence=real.sequence + 1 + number, levers=levers), item)
+    assert rig.session.levers == said[-1]
+    assert [one.text for one in rig.events if isinstance(one, Notice)] == [said[0], said[2], said[3]]
+
+
 def test_a_forged_step_number_does_not_end_the_tracks_for_good(rig, flight):
     """The edge's own tracks would be missing for the rest of the flight."""
     items = [flight.step(index, BOX) for index in (3, 4, 5)]  # the first stands by itself

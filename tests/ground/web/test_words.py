@@ -19,7 +19,7 @@ STATIC = Path(hvt_ground.web.__file__).parent / "static"
 NODE = shutil.which("node")
 LIVE = {
     "connected": True, "goneMs": 0, "link": "up", "silentMs": 100, "chosen": True, "shown": True, "follows": True,
-    "plays": True, "ageMs": 300, "sinceMs": 80, "periodMs": 100, "lockstep": False,
+    "plays": True, "ageMs": 300, "sinceMs": 80, "periodMs": 100, "lastMs": 300, "lockstep": False,
 }  # fmt: skip
 
 
@@ -56,6 +56,8 @@ def test_what_is_not_live_never_says_live():
         ({"link": "ended", "shown": False}, "ENDED"),
         ({"connected": False, "goneMs": 9_000}, "NO GROUND 9 s"),
         ({"shown": False}, "waiting for a picture"),
+        ({"shown": False, "lastMs": None}, "waiting for a picture"),
+        ({"shown": False, "lastMs": 94_000}, "NO PICTURE 94 s"),
         ({"sinceMs": 4_000}, "NO NEW PICTURE 4 s"),
         ({"sinceMs": 1_400, "periodMs": 1_000}, "live, 0.3 s"),
     ]
@@ -154,7 +156,8 @@ def test_the_plot_draws_no_line_over_what_is_not_known():
       plot.fill("uav-1", [0, 1, 2, 60, 61].map((second) => [1000 * second, 10, 10, 20]));
       plot.show("uav-1");
       lines.length = 0;
-      plot.tick(100000);
+      plot.now = 100000;
+      plot.draw();
       console.log(JSON.stringify(lines.slice(0, 5)));
     """
     )

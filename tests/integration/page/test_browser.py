@@ -198,8 +198,8 @@ def test_what_an_operator_must_see_stands_on_the_picture(flight, page):
         eventually(
             lambda: "500 kbps" in page.inner_text("#on-link"), within_s=20, what="what the link carries"
         )
-        bottom = page.locator("#sign").evaluate("one => one.getBoundingClientRect().bottom")
-        assert bottom < viewport["height"], "without scrolling"
+        bottom = page.locator("#controls").evaluate("one => one.getBoundingClientRect().bottom")
+        assert bottom <= viewport["height"], "sign, picture and playback, without scrolling"
     page.locator("#pause").click()
     eventually(lambda: page.inner_text("#standing").startswith("PAUSED "), within_s=5, what="it says so")
     page.locator("#now").click()

@@ -197,7 +197,7 @@ function describe() {
   by("name").textContent = chosen;
   by("facts").textContent = `${session.method} · ${width}×${height} at ${Math.round(session.fps * 10) / 10} a second · ${kbps(session.budget)}`;
   by("stage").style.aspectRatio = `${width} / ${height}`;
-  by("stage").style.maxWidth = `calc(72vh * ${width / height})`;
+  by("stage").style.maxWidth = `calc(min(72vh, max(15rem, 100vh - 21.5rem)) * ${width / height})`;
   boxes.size = session.baseSize;
   showSettings();
 }
@@ -240,6 +240,7 @@ function showAge() {
     ageMs: ms,
     sinceMs: now - shown.at,
     periodMs: Math.max(jpeg ? 500 : 0, ...periods),
+    lastMs: wall.age(chosen, connection.now()),
     lockstep: sessions.get(chosen)?.pace === "lockstep",
   });
   const stage = by("stage");
@@ -252,7 +253,7 @@ function showAge() {
   by("recording").textContent = gone ? "" : recordingWords(state?.recording ?? null);
   by("recording").classList.toggle("bad", state?.recording === false);
   by("gap").hidden = shown.frame >= 0;
-  by("gap").textContent = state?.link === "ended" ? "the flight has ended" : "waiting for a picture";
+  by("gap").textContent = state?.link === "ended" ? "the flight has ended" : name === "stale" ? "no picture comes" : "waiting for a picture";
   by("age").textContent = shown.frame < 0 || player.live ? "" : `of ${clock(shown.captured)}, ${seconds(ms)} ago`;
   by("now").disabled = player.live;
   by("pause").textContent = by("video").paused && !player.live ? "Play" : "Pause";
@@ -261,6 +262,7 @@ setInterval(showAge, 200);
 setInterval(() => {
   const told = connected && performance.now() - stateAt < STATE_OLD_MS;
   wall.tick(connection.now(), told);
+  if (performance.now() - tracksAt > 1000) listTracks();
   if (!told && by("link-text").textContent) by("link-text").textContent = "not known: the ground says nothing now";
 }, 500);
 

@@ -56,6 +56,15 @@ export class Wall {
     picture.src = URL.createObjectURL(new Blob([data], { type: "image/jpeg" }));
   }
 
+  /**
+   * How old the newest picture of an edge is, ms; null where there is none.
+   * @param {string} edge @param {number} now
+   */
+  age(edge, now) {
+    const captured = this.cards.get(edge)?.captured;
+    return captured ? now - captured : null;
+  }
+
   /** @param {string} edge @param {string} text */
   event(edge, text) {
     this.card(edge).last.textContent = text;
@@ -119,6 +128,7 @@ export class Wall {
   mark(chosen) {
     this.root.classList.toggle("alone", !chosen);
     for (const [edge, { button }] of this.cards) button.setAttribute("aria-current", String(edge === chosen));
+    this.cards.get(chosen)?.button.scrollIntoView({ block: "nearest", inline: "nearest" });
   }
 }
 

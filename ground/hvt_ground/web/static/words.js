@@ -3,9 +3,10 @@
 /**
  * @typedef {{connected: boolean, goneMs: number, link: string, silentMs: number | null, chosen: boolean,
  *    shown: boolean, follows: boolean, plays: boolean, ageMs: number, sinceMs: number, periodMs: number,
- *    lockstep: boolean}} Facts
+ *    lastMs: number | null, lockstep: boolean}} Facts
  * Whether the ground answers and since when not; the link and for how long nothing has come; whether a picture is
- * shown, follows the newest, plays on; its age, when it was shown, and what usually lies between two.
+ * shown, follows the newest, plays on; its age, when it was shown, what usually lies between two; the age of the newest
+ * one of this edge, wherever it is shown.
  */
 
 /** @type {Record<string, string>} */
@@ -40,6 +41,7 @@ export function standing(facts) {
   if (!facts.connected) return { state: "gone", words: `NO GROUND ${whole(facts.goneMs)}`, live: false };
   if (facts.link === "ended") return { state: "ended", words: shown ? `ENDED, picture ${seconds(ageMs)} old` : "ENDED", live: false };
   if (facts.link === "lost") return { state: "lost", words: `LINK LOST ${whole(facts.silentMs ?? sinceMs)}`, live: false };
+  if (!shown && (facts.lastMs ?? 0) > MOST_GAP_MS) return { state: "stale", words: `NO PICTURE ${whole(facts.lastMs ?? 0)}`, live: false };
   if (!shown) return { state: "waiting", words: "waiting for a picture", live: false };
   if (!facts.follows) {
     return { state: "paused", words: `${facts.plays ? "REPLAY" : "PAUSED"} ${seconds(ageMs)}`, live: false };
