@@ -97,9 +97,9 @@ def run(arguments: argparse.Namespace) -> int:
     plan = _plan(arguments)
     folder: Path = arguments.out
     file = make_out(folder, name="compare.json")
-    pool, _ = open_pool(arguments)
-    with RunProgress("flights") as progress, pool as workers:
-        result = compare(plan, pool=workers, on_flights=progress.update)
+    opened, jobs = open_pool(arguments)
+    with RunProgress("flights") as progress, opened as pool:
+        result = compare(plan, pool=pool, workers=jobs, on_flights=progress.update)
     if not result.rows:
         raise UserError(f"nothing could be flown: {result.missing[0].reason}")
     try:

@@ -39,14 +39,14 @@ class RunProgress:
         )
         self._task = self._bar.add_task(what, total=None, more="")
 
-    def update(self, done: int, of: int, *, failed: int = 0) -> None:
-        """So many are done, of so many."""
+    def update(self, done: int, of: int, left_s: float | None = None, *, failed: int = 0) -> None:
+        """So many are done, of so many; ``left_s`` where the time left is known better than by how fast they were."""
         now_s = time.monotonic()
         if not self._steps[0][1] and done:
             self._steps.clear()
         if not self._steps or done != self._steps[-1][1]:
             self._steps.append((now_s, done))
-        more = self._more(of, failed)
+        more = self._more(time_left_s(self._steps, of) if left_s is None else left_s, failed)
         self._bar.update(self._task, completed=done, total=of, more=more)
         first = not self._said and now_s - self._began_s >= _FIRST_LINE_S
         news = first or (bool(more) and not self._estimated) or done == of
@@ -70,8 +70,7 @@ class RunProgress:
         if self._console.is_terminal:
             self._bar.stop()
 
-    def _more(self, of: int, failed: int) -> str:
-        left_s = time_left_s(self._steps, of)
+    def _more(self, left_s: float, failed: int) -> str:
         words = [f"{failed} failed"] if failed else []
         if left_s:
             words.append(f"about {timedelta(seconds=round(left_s))} left")

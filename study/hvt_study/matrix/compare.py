@@ -7,6 +7,8 @@ are exact where the source knows what it shows (the demo, an annotated picture u
 
 from __future__ import annotations
 
+import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass
@@ -21,8 +23,9 @@ from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.sequence import Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, open_camera
 from hvt_study.matrix.schedule import Pool
+from hvt_study.matrix.time_left import TimeLeft
 from hvt_study.runs.execute import FLIGHTS, run_spec
-from hvt_study.runs.methods import METHODS
+from hvt_study.runs.methods import METHODS, Method
 from hvt_study.runs.spec import ModelChoice, RunSpec
 
 COMPARED: Mapping[str, tuple[str, str]] = {
@@ -64,6 +67,8 @@ class ComparePlan:
     """Kinds that the clip's labels know: objects of others count neither way. None: all that they name."""
 
 
+_Run: TypeAlias = tuple[int, str]
+"""Rate and name of `COMPARED`."""
 CompareRow: TypeAlias = dict[str, Any]
 """One flight over the whole clip (``half`` 0) or one half of it (1, 2), by the names of `_FIGURES`; docs/compare.md
 says what they are. What is not of the list is of the whole clip, in all three alike."""
@@ -121,9 +126,16 @@ class CompareResult:
 
 
 def compare(
-    plan: ComparePlan, *, pool: Pool, on_flights: Callable[[int, int], None] = lambda *_: None
+    plan: ComparePlan,
+    *,
+    pool: Pool,
+    workers: int,
+    on_flights: Callable[[int, int, float | None], None] = lambda *_: None,
 ) -> CompareResult:
-    """Fly everything; ``on_flights(done, of)`` is called at once and then each second, with how many may be needed.
+    """Fly everything; ``on_flights(done, of, left_s)`` is called at once and then each second.
+
+    ``of`` is how many flights may be needed, ``left_s`` the time that they take, None while that is not known;
+    ``workers`` is how many the pool flies at a time.
 
     Raises:
         UserError: the clip, a detector or a rate cannot be used.
@@ -149,23 +161,27 @@ def compare(
         for name in plan.methods
     }
     run = partial(run_spec, cache=plan.cache, folder=Path.cwd())
-    # Those of several flights first, so that no process is left with one at the end.
-    order = sorted(specs, key=lambda one: _flights(specs[one]), reverse=True)
-    left = {one: _distinct_flights(specs[one], beside=plan.methods) for one in order}
+    first, rest = _in_order(specs)
+    left = dict.fromkeys(first, 1)
+    left |= {one: _distinct_flights(specs[one], beside=plan.methods) for one in rest}
+    kinds = {one: _kind(METHODS[specs[one].method]) for one in left}
+    time_left = TimeLeft(left, kinds=kinds, workers=workers, now_s=time.monotonic())
     flights = ResultCache(plan.cache / FLIGHTS)
     before = at_last = flights.count()
-    running = {pool.submit(run, specs[one]): one for one in order}
-    done: dict[tuple[int, str], dict[str, Any]] = {}
+    running = {pool.submit(run, specs[one]): one for one in left}
+    done: dict[_Run, dict[str, Any]] = {}
     try:
         while left:
             flown = flights.count() - before
-            on_flights(flown, max(flown, at_last - before + sum(left.values())))
+            left_s = time_left.left_s(now_s=time.monotonic())
+            on_flights(flown, max(flown, at_last - before + sum(left.values())), left_s)
             unfinished = [future for future, one in running.items() if one in left]
             for future in wait(unfinished, timeout=_REPORT_EVERY_S, return_when=FIRST_COMPLETED).done:
                 done[running[future]] = future.result()
                 del left[running[future]]  # which may have taken fewer flights than expected
                 at_last = flights.count()
-        on_flights(flights.count() - before, flights.count() - before)
+                time_left.ended(running[future], flown=at_last - before, now_s=time.monotonic())
+        on_flights(at_last - before, at_last - before, 0.0)
     finally:
         for future in running:
             future.cancel()
@@ -183,10 +199,32 @@ def _distinct_flights(spec: RunSpec, *, beside: tuple[str, ...]) -> int:
     return max(1, len(method.fps_choices))
 
 
-def _flights(spec: RunSpec) -> tuple[bool, int]:
-    """Orders methods by how many flights they take."""
-    method = METHODS[spec.method]
-    return method.any_size, len(method.fps_choices)
+def _in_order(specs: Mapping[_Run, RunSpec]) -> tuple[list[_Run], list[_Run]]:
+    """First what flies once at one rate, so that what flights of each kind take is known soon.
+
+    Then those of several flights, so that no process is left with one at the end.
+    """
+    methods = {one: METHODS[spec.method] for one, spec in specs.items()}
+    of_kind: Counter[str] = Counter()
+    first: dict[_Run, tuple[bool, int]] = {}
+    for one in reversed(list(specs)):
+        kind = _kind(methods[one])
+        if one[0] == next(iter(specs))[0] and not methods[one].fps_choices:
+            first[one] = kind == "video", of_kind[kind]
+            of_kind[kind] += 1
+    rest = sorted(
+        (one for one in specs if one not in first),
+        key=lambda one: (methods[one].any_size, len(methods[one].fps_choices)),
+        reverse=True,
+    )
+    return sorted(first, key=lambda one: first[one]), rest
+
+
+def _kind(method: Method) -> str:
+    """What decides what a flight takes: the perception of the edge."""
+    if "source" in method.flags:
+        return "source"
+    return "video" if method.flags == METHODS["M0"].flags else "decoded"
 
 
 def _opened(plan: ComparePlan) -> tuple[str, Sequence]:
@@ -233,7 +271,7 @@ def _label_options(plan: ComparePlan, uri: str) -> dict[str, str]:
     return {name: value for name, value in given.items() if value}
 
 
-def _result(clip: str, labels: str, done: list[tuple[tuple[int, str], dict[str, Any]]]) -> CompareResult:
+def _result(clip: str, labels: str, done: list[tuple[_Run, dict[str, Any]]]) -> CompareResult:
     rows: list[CompareRow] = []
     missing: list[Missing] = []
     flown: dict[tuple[int, str], str] = {}
