@@ -15,9 +15,7 @@ PAGE = Path(__file__).with_name("options.md")
 _HEAD = """\
 # All options
 
-You can set every option below as a flag, or in a TOML file as a key without the dashes (`--config FILE`). A flag
-overrides the file.
-`make docs` writes this page from the code.
+Every option is a flag, or in a TOML file a key without the dashes (`--config FILE`). A flag overrides the file.
 
     hvt-edge --help                              # the common options
     hvt-edge --config edge.toml --print-config   # the settings, but those that the start works out, as TOML
@@ -33,7 +31,7 @@ overrides the file.
 | list | the flag may be repeated; in TOML `["…", "…"]` |
 | yes/no | `--name`, `--no-name`; in TOML `true` or `false` |
 
-`hvt-edge --help` leaves out what is marked with a star; `--help-all` lists everything.
+`hvt-edge --help` leaves out options with a star; `--help-all` lists everything.
 A wrong value ends the program before the first frame with one sentence and exit code 2.
 """
 

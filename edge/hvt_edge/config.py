@@ -93,7 +93,7 @@ class EdgeConfig:
         or_auto(SIZE),
         None,
         "size of the base stream in pixels; auto: as large as the rate carries",
-        shown_default="1280x720, or what the source fills of it and --budget carries",
+        shown_default="1280x720, less for a small source or a small --budget",
     )
     fps: float | str = _SOURCE.option(
         or_auto(number(0.1, 240, unit=" frames a second")),
@@ -104,7 +104,7 @@ class EdgeConfig:
         choice("letterbox", "crop"), "letterbox", "how another aspect ratio is fitted"
     )
     source_fps: float | None = _SOURCE_RARE.option(
-        number(0.1, 1000), None, "frame rate of an image folder, or instead of what a file says"
+        number(0.1, 1000), None, "frame rate of an image folder, or in place of a file's own"
     )
     follow: bool = _SOURCE_RARE.switch(
         "wait for a video file that still grows; it ends when it has not for 10 s"
@@ -139,7 +139,7 @@ class EdgeConfig:
         "follow the link's rate below --budget by the ground's reports; never in lockstep", default=True
     )
     min_budget: int | None = _LINK_RARE.option(
-        BITRATE, None, "what --adapt never goes below", shown_default="100kbps, at most --budget"
+        BITRATE, None, "floor of --adapt", shown_default="100kbps, at most --budget"
     )
     window: float = _LINK_RARE.option(DURATION, 1.0, "the budget holds in every window of this length")
     connect: tuple[str, ...] = _LINK.option(
@@ -154,7 +154,7 @@ class EdgeConfig:
         PATH, None, "Zenoh configuration, JSON5, that all this goes on top of"
     )
     links: int = _LINK_RARE.option(
-        integer(1, 2), 1, "2: one Zenoh link for what is urgent and one for the rest (docs/adaptation.md)"
+        integer(1, 2), 1, "2: one Zenoh link for urgent messages and one for the rest (docs/adaptation.md)"
     )
     insecure: bool = _LINK_RARE.switch("allow listening beyond this machine without keys")
     wait: float = _LINK.option(DURATION, 15.0, "how long a clip waits for its first ground before it plays")
@@ -175,7 +175,7 @@ class EdgeConfig:
         TEXT, (), "a parameter of the method, KEY=VALUE (docs/methods.md)", many=True
     )
     borrow_unused: bool = _SENT_RARE.switch(
-        "stills may use what the base stream leaves unspent, never beyond --budget"
+        "stills may use the unspent bits of the base stream, never beyond --budget"
     )
     group_stills: bool = _SENT_RARE.switch("neighbours share one still where that is cheaper")
     cooldown: float = _SENT_RARE.option(
@@ -184,7 +184,9 @@ class EdgeConfig:
     min_gain: float = _SENT_RARE.option(
         number(1, 100), 1.2, "a track is sent again only when this much larger or sharper"
     )
-    still_codec: str = _SENT.option(TEXT, "jpeg", "how stills are coded; residual sends what the base lacks")
+    still_codec: str = _SENT.option(
+        TEXT, "jpeg", "codec of stills; residual sends the difference to the base"
+    )
     fallback_codec: str = _SENT_RARE.option(
         TEXT, "h264-intra", "how a still is coded where residual does not serve: no base, or no gain"
     )
@@ -260,7 +262,7 @@ class EdgeConfig:
     )
     threads: int = _MODELS_RARE.option(integer(1, 64), 1, "threads of the detector")
     provider: str = _MODELS.option(
-        choice(*PROVIDERS), "auto", "what runs the detector; auto says what it took and why"
+        choice(*PROVIDERS), "auto", "runtime of the detector; auto says its choice and why"
     )
 
     ring: int = _FILES_RARE.option(
@@ -272,7 +274,7 @@ class EdgeConfig:
     store: int | None = _FILES.option(
         BYTES,
         None,
-        "disk for what is captured while the link is down, and sent afterwards; 0 for none",
+        "disk for video and stills of an outage, sent afterwards; 0 for none",
         shown_default="200MB for a camera or stream, or with a folder; else 0",
     )
     store_folder: Path | None = _FILES_RARE.option(
@@ -282,7 +284,7 @@ class EdgeConfig:
         shown_default="~/.local/state/hvt/EDGE_ID",
     )
     store_age: float = _FILES_RARE.option(
-        DURATION, 3600.0, "what an earlier run stored longer ago than this is dropped at the start"
+        DURATION, 3600.0, "older objects of earlier runs are dropped at the start"
     )
     record_base: Path | None = _FILES_RARE.option(
         PATH, None, "also keep the base stream in this Matroska file"

@@ -51,7 +51,7 @@ class GroundConfig:
         PATH, None, "Zenoh configuration, JSON5, that all this goes on top of"
     )
     links: int = _LINK_RARE.option(
-        integer(1, 2), 1, "2: where it connects, one Zenoh link for what is urgent and one for the rest"
+        integer(1, 2), 1, "2: where it connects, one Zenoh link for urgent messages and one for the rest"
     )
     insecure: bool = _LINK.switch("allow listening beyond this machine without keys")
     edges: str = _LINK.option(TEXT, "*", "which edges to serve, for example 'uav-*'")
@@ -115,7 +115,7 @@ class GroundConfig:
     )
     threads: int = _MODELS_RARE.option(integer(1, 64), 1, "threads of the detector and the classifier")
     provider: str = _MODELS.option(
-        choice(*PROVIDERS), "auto", "what runs the networks; auto says what it took and why"
+        choice(*PROVIDERS), "auto", "runtime of the networks; auto says its choice and why"
     )
 
     record: Path | None = _FILES.option(

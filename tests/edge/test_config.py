@@ -210,7 +210,7 @@ def test_every_flag_explains_itself(capsys):
         optional = one.default is None or one.default == ()
         assert shown or optional, f"{flag} does not say its default"
     assert "[800kbps]" in out
-    assert "[1280x720, or what the source fills of it and --budget carries]" in out
+    assert "[1280x720, less for a small source or a small --budget]" in out
     assert "[15.0]" in out
 
 
