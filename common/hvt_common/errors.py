@@ -39,7 +39,7 @@ class UserError(Exception):
 
 
 class NotYetError(UserError):
-    """What is named is not there and may come: a camera that boots, the address of a VPN, another program's port.
+    """A named thing is not there and may come: a camera that boots, the address of a VPN, another program's port.
 
     A program that serves waits for it (`hvt_common.runtime.failures.Awaited`); any other ends with exit code 1, so
     that a supervisor starts it again.

@@ -147,7 +147,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """What a detector saw in one frame, best first."""
+    """Detections of one frame, best first."""
 
     boxes_xyxy_px: Boxes
     """(N, 4) in the pixels of the image that was given to the detector."""

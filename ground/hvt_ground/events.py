@@ -1,4 +1,4 @@
-"""What the ground makes of a stream, as one sequence of values: recording, viewers and exports hang on these.
+"""The events of a stream at the ground, as one sequence of values: recording, viewers and exports hang on these.
 
 All boxes are in base pixels. Every event carries the frame it belongs to and that frame's capture time, which
 are the two timelines of a recording.

@@ -1,4 +1,4 @@
-"""What a ground knows at one moment, as one value.
+"""The state of a ground at one moment, as one value.
 
 Made once a second (`StateMaker`). Status line, page, metrics and ``hvt-ground status`` read it and nothing else, so
 that none of them says what another does not. What is not known is None, never 0.

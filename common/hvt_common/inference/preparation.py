@@ -37,7 +37,7 @@ class Preparation:
 
 
 def prepared_as(path: Path, metadata: Mapping[str, str], usual: Preparation) -> Preparation:
-    """What a model's metadata say of pixels (``hvt.mean``, ``hvt.scale``, ``hvt.channel_order``), else as usual.
+    """Pixels by a model's metadata (``hvt.mean``, ``hvt.scale``, ``hvt.channel_order``), else as usual.
 
     Raises `UserError` where they make no sense.
     """

@@ -1,4 +1,4 @@
-"""What became of each source frame of a flight: the groups, and the one sentence that names them.
+"""The outcome of each source frame of a flight: the groups, and the one sentence that names them.
 
 Each frame is in exactly one group. The edge counts (`hvt_edge.loop.counts`), `Status` carries the counts, and status
 line, summary, page and JSON of both sides show this value, so that their numbers add up to the frames that came.

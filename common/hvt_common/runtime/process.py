@@ -1,4 +1,4 @@
-"""What a process sets up for itself: the signals that stop it, its threads' priority, its memory allocator.
+"""The set-up of a process: the signals that stop it, its threads' priority, its memory allocator.
 
 Priorities, as Linux's niceness: 0 for what the operator sees move, 10 for perception, 11 for the networks in it.
 

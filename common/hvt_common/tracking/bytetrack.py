@@ -182,7 +182,7 @@ class ByteTracker:
         return self._listed(frame_index)
 
     def extrapolated(self, *, frame_index: int) -> Tracks:
-        """What `predict` would list at this or a later frame if the camera stood still; nothing is changed.
+        """The list of `predict` at this or a later frame if the camera stood still; nothing is changed.
 
         For lists to show between frames that are given to the tracker. ``started`` is False throughout.
         A `ValueError` means that ``frame_index`` lies before the last frame.

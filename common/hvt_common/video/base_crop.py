@@ -1,4 +1,4 @@
-"""What the base frame shows of a crop of the source, at the size at which the crop is coded.
+"""The base frame's view of a crop of the source, at the size at which the crop is coded.
 
 Edge and ground compute it from the same decoded picture with the same arithmetic: a residual still is the difference
 to it, and a still has to be closer to the source than it. Of a picture as it was decoded it is exact (`exact_crop`);
@@ -38,7 +38,7 @@ def base_crop(
     crop_source_px: tuple[int, int, int, int],
     size: tuple[int, int],
 ) -> Image:
-    """What the base frame shows of a crop, resampled to ``size``: the picture that a still must beat.
+    """The base frame's view of a crop, resampled to ``size``: the picture that a still must beat.
 
     The base gets its best chance: exact sub-pixel alignment, cubic where it is enlarged, area means where it is
     shrunk.

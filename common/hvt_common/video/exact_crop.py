@@ -1,4 +1,4 @@
-"""What a decoded base picture shows of a crop, in whole numbers: the same bytes on every machine, in any language.
+"""The crop of a decoded base picture, in whole numbers: the same bytes on every machine, in any language.
 
 A `residual` still is the difference to it, so edge and ground must have it to the bit. docs/wire-stills.md states
 the same arithmetic. Planes of the picture are resampled to the crop's size with a cubic kernel (a = -3/4, 32 phases,

@@ -1,4 +1,4 @@
-"""What is stored, chunk by chunk over the link, until the ground acknowledges it. Time is an argument.
+"""Sends stored objects, chunk by chunk, until the ground acknowledges them. Time is an argument.
 
 First the facts of a session that is not the present one, then stills by their worth, then video, newest first; video
 first where a ground requested it. Of several objects some bytes may be on their way; in memory is the one of which

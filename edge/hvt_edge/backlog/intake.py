@@ -1,4 +1,4 @@
-"""What the disk thread is given: frames and stills in their order, bounded, and signals that are never refused.
+"""The queue of the disk thread: frames and stills in their order, bounded, and signals that are never refused.
 
 A disk that is too slow costs frames and stills, and says so. It must not cost a signal: a segment that does not end
 would cost much more. So signals are states, not items.

@@ -1,4 +1,4 @@
-"""What the frame loop and the stills ask while the link may be away: send this, or store it.
+"""Decides for frames and stills while the link may be down: send, or store.
 
 The edge goes over to storing at once and comes back with a keyframe: until that has gone out frames are still stored,
 because the ground could not show them. So between what was sent and what was stored no frame is missing.

@@ -1,4 +1,4 @@
-"""What a ground may command on ``control``: a keyframe, a still, the tracks, another budget or method.
+"""The commands of a ground on ``control``: a keyframe, a still, the tracks, another budget or method.
 
 Runs in the link's callbacks: each answer is made at once, from what is at hand, and no command costs more than one
 crop. Who commands is not trusted: arguments have bounds, and requests a rate.

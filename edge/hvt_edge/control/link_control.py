@@ -1,4 +1,4 @@
-"""What the link carries, decided in one place: pace, rate, what is sent again, and what is stored for later."""
+"""Link control: pace, rate, repeated stills and the store are decided here alone."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class LinkControl:
         self._primary = PrimaryReceiver()
 
     def before_frame(self, now_ns: int) -> None:
-        """What the link carries decides on budget, base rate, keyframe, and on whether anything is sent at all."""
+        """Set budget, base rate and keyframe by the link's rate, and decide whether anything is sent at all."""
         ground = self.has_ground()
         # A ground that has left, with somebody there still who reports nothing: what was known of the path is void.
         linked = ground or (self.has_subscriber() and not self._had_ground)
@@ -91,7 +91,7 @@ class LinkControl:
         return self.pacer.admits_base(now_ns, coding_ns=coding_ns) and wait_ns <= most_ns
 
     def holder(self, now_ns: int) -> FrameGroup:
-        """What has no room for a frame that `admits` has just held back."""
+        """The part without room for a frame that `admits` has just held back."""
         return "link" if self.pacer is not None and self.pacer.holds(now_ns) else "budget"
 
     def finish(

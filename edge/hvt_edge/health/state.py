@@ -1,4 +1,4 @@
-"""What an edge knows at one moment, as one value.
+"""The state of an edge at one moment, as one value.
 
 Made once a second (`StateMaker`). Status line, the wire's `Status`, metrics and ``hvt-edge status`` read from it what
 they have in common, so that none of them says what another does not. What is not known is None, never 0.

@@ -392,7 +392,7 @@ class RollingBudget:
         return float((unspent - self._burst - beside).min())
 
     def _unspent(self, now_ns: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-        """What the past leaves of each window that would contain a message sent now, and when that window ends.
+        """The rest of each window that would contain a message sent now, and the end of that window.
 
         The fullest windows end with a base frame. The one that ends with the ``k``-th from now holds the past bytes
         younger than the window less the time until then, and ``k`` frames of the base to come, for each ``k`` of the

@@ -1,4 +1,4 @@
-"""What a requested still takes of the video for a second or two: frames are left out before they are coded.
+"""A requested still borrows from the video for a second or two: frames are left out before they are coded.
 
 In a window of the budget's bytes a still of N bytes has room once N bytes of video have left it, so no frame is
 coded while one waits. After it, for as long as it is in the window, the video has N bytes less: every so many frames

@@ -1,4 +1,4 @@
-"""What is on its way and not yet reported, and whether more may follow: no queue is to stand in kernel or router.
+"""Paces sending: bounds the bytes in flight, so that no queue stands in kernel or router.
 
 A message is expected to be reported when a link of the present rate would have carried it and all before it (the
 *own time*), a round trip and a report later. While one is overdue, or while more than `_MOST_BACKLOG_NS` of own bytes
@@ -130,13 +130,13 @@ class Flight:
         self._backlog_bytes = max(self._backlog_bytes, self.size_bytes)
 
     def give_up(self) -> None:
-        """What is on its way is taken for lost; a report that comes late may still name it."""
+        """Take messages in flight for lost; a late report may still name them."""
         given_up = (*self._given_up, *self._base)
         self.clear()
         self._given_up.extend(given_up)
 
     def clear(self) -> None:
-        """What is on its way is lost."""
+        """Forget messages in flight: they are lost."""
         self._given_up.clear()
         self._base.clear()
         self._stills.clear()

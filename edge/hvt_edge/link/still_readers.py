@@ -24,7 +24,7 @@ class _Reader:
 
 
 class StillReaders:
-    """What each ground said in its `InfoRequest`; a ground that said nothing reads all. Thread-safe.
+    """The still codecs that each ground reads, by its `InfoRequest`; a ground that named none reads all. Thread-safe.
 
     ``clock`` is Unix nanoseconds without steps.
     """

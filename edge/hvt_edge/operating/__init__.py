@@ -1,4 +1,5 @@
-"""What changes in flight, with one owner each: `point` (rates, method, levers), `keyframes` (requests), `levers`.
+"""Settings that change in flight, with one owner each: `point` (rates, method), `keyframes`, `levers`.
 
-`levers` decides what is sent beside the video; keyframes may be requested from any thread.
+`levers` are the decisions of ``--profile auto``: tracks and stills while they pay. Keyframes may be requested from
+any thread.
 """

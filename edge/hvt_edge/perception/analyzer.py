@@ -62,7 +62,7 @@ class FailingDetector(Protocol):
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """What ``class_ids`` index."""
+        """The names that ``class_ids`` index."""
 
     def detect(self, image_bgr: Image) -> Detections | None:
         """As `Detector.detect`; None while it does not work."""

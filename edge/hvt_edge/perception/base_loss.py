@@ -1,4 +1,4 @@
-"""What the base stream lost of a crop: how far it is from the source, and how much of the detail is gone.
+"""The loss of the base stream in a crop: its distance from the source, and the share of lost detail.
 
 The edge decodes its own stream, so it knows exactly what the ground sees. The gate sends no still where nothing was
 lost, and M6 asks first for what lost most.

@@ -41,7 +41,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def _gaps(files: list[Path]) -> str:
-    """What there is to say of numbers that are left out, where most follow each other; else empty."""
+    """A sentence on missing numbers where most follow each other; else empty."""
     found = [re.findall(r"[0-9]+", file.stem)[-1:] for file in files]
     numbers = [int(digits[0][-15:]) for digits in found if digits]
     steps = [later - earlier for earlier, later in pairwise(numbers)]

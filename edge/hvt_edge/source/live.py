@@ -1,4 +1,4 @@
-"""What cannot be paused: a reader thread that keeps the latest frame of a camera or a network stream.
+"""Live sources: a reader thread keeps the latest frame of a camera or a network stream.
 
 Where frames come in bursts, as over UDP through a radio, it keeps those of one burst.
 """

@@ -51,7 +51,7 @@ _ENDED = "the edge has ended"
 
 
 class RequestedLine(Protocol):
-    """What requested stills need of the budget and the link; times are of the budget's windows."""
+    """The need of requested stills for budget and link; times are of the budget's windows."""
 
     @property
     def total_bps(self) -> int:
@@ -61,7 +61,7 @@ class RequestedLine(Protocol):
         """About the largest payload."""
 
     def requested_allowance_bytes(self, now_ns: int, *, still: Still) -> int:
-        """What this one may take now, whether or not the link is free."""
+        """The bytes that this one may take now, whether or not the link is free."""
 
     def link_is_free(self, now_ns: int) -> bool:
         """Whether a still may go as far as the link is concerned."""

@@ -21,7 +21,7 @@ Crop = tuple[int, int, int, int]
 
 
 class RefusedError(Exception):
-    """What is requested cannot be had; the text is one plain sentence for whoever requested it."""
+    """A request cannot be served; the text is one plain sentence for whoever requested it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,7 +150,7 @@ class StillStage:
         return sent
 
     def on_results(self, results: Sequence[StillResult], *, detected: Detected | None = None) -> None:
-        """What a ground made of stills counts for the next decision; one without a name is no opinion.
+        """Take a ground's answers to stills for the next decision; one without a name is no opinion.
 
         A still that it could not decode for want of the base frame is sent once more. ``detected`` is what its own
         detector shows; None: it has said nothing new.
@@ -175,7 +175,7 @@ class StillStage:
             self.levers.take_load(captured, unanalyzed, now_ns=now_ns)
 
     def _decided(self, now_ns: int) -> Levers:
-        """What is to be sent beside the video, from this step on."""
+        """The settings of stills and tracks from this step on."""
         if self.levers is None:
             return _ALL
         if self.shadow is not None:

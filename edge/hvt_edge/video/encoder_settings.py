@@ -1,4 +1,4 @@
-"""What x265 is opened with, from a budget in line bits: rate, VBV, preset, and the least it can follow."""
+"""The settings of x265, from a budget in line bits: rate, VBV, preset, and the least it can follow."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ So much is asked for less, for the first keyframe, one each ten seconds, and som
 
 @dataclass(frozen=True, slots=True)
 class EncoderSettings:
-    """What x265 is asked for; ``bitrate_bps`` is the payload alone, without headers of any transport."""
+    """Settings of x265; ``bitrate_bps`` is the payload alone, without headers of any transport."""
 
     size: tuple[int, int]
     fps: float
@@ -54,7 +54,7 @@ def keyframe_floor_bytes(size: tuple[int, int]) -> int:
 
 
 def usual_keyframe_bytes(size: tuple[int, int]) -> int:
-    """What a keyframe of ``size`` (width, height) usually takes at thin rates."""
+    """The usual bytes of a keyframe of ``size`` (width, height) at thin rates."""
     return round(_KEYFRAME_BYTES + _KEYFRAME_BYTES_PER_SIDE_PX * math.sqrt(size[0] * size[1]))
 
 
@@ -85,7 +85,7 @@ def encoder_settings(
     edge_id: str,
     side_data: bool = False,
 ) -> EncoderSettings:
-    """What to ask of x265 so that the base stream stays within B_v, and its fullest second within B_tot.
+    """Settings of x265 that keep the base stream within B_v, and its fullest second within B_tot.
 
     Where stills have a share, they yield to the base's peaks. Where video takes (nearly) the whole budget, as in M0,
     nothing can yield: the VBV is made tighter and the target lowered by the peak that is left.
@@ -122,6 +122,6 @@ def _vbv_s(fps: float, *, tight: bool = False) -> float:
 
 
 def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
-    """What of the base's rate is not x265's to spend: headers, framing, ``status``, and its debt of keyframes."""
+    """The part of the base's rate beside x265: headers, framing, ``status``, and its debt of keyframes."""
     debt_bps = 8 * usual_keyframe_bytes(size) / _KEYFRAME_EVERY_S
     return base_overhead_bps(line_bps, fps=fps, edge_id=edge_id) + debt_bps

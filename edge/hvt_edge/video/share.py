@@ -94,7 +94,7 @@ class Split:
         self.share = max(self.share, min(1.0, self._settings.least_base_bps / total_bps))
 
     def set_beside(self, *, metadata_bps: int, stills: bool, sparse: bool) -> None:
-        """What is sent beside the base from now on; without stills theirs is the base's.
+        """Set whether stills are sent from now on; without them the base has their share.
 
         ``sparse``: not all source frames are coded.
         """

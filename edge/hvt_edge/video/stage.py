@@ -214,7 +214,7 @@ class BaseStage:
             return
 
     def _at_keyframe(self, index: int, *, now_ns: int) -> None:
-        """What may change with a keyframe only."""
+        """Apply the changes that need a keyframe."""
         before = self._frame_skip.decimation
         decimation = self._frame_skip.at_keyframe(index)
         encoder = None if self.reconfigure is None else self.reconfigure(decimation, now_ns)

@@ -105,7 +105,7 @@ def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:
 
 
 def make_pacer(config: EdgeConfig, stream: CameraStream | None, size: tuple[int, int]) -> Pacer | None:
-    """What tracks the link's rate; None where the budget is to stay as it is.
+    """The pacer, which tracks the link's rate; None where the budget stays as it is.
 
     Of a camera that is passed through (``stream``) the rate is never below what it was seen to make.
     """

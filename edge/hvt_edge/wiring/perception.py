@@ -89,7 +89,7 @@ def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) 
 def make_shadow(
     config: EdgeConfig, detector: FailingDetector, *, before: Shadow = UNMEASURED
 ) -> ShadowGround | None:
-    """What measures how much of the source the base stream shows; None where nothing depends on it.
+    """The shadow ground, which measures how much of the source the base shows; None where nothing depends on it.
 
     It goes on from what was measured ``before``.
 

@@ -93,7 +93,7 @@ def _affordable(config: EdgeConfig, size: tuple[int, int]) -> tuple[int, int]:
 
 
 def default_size(source_size: tuple[int, int], *, fit: Fit) -> tuple[int, int]:
-    """What ``--size`` is unless it is given: at most 1280x720, and never larger than the source.
+    """The default of ``--size``: at most 1280x720, and never larger than the source.
 
     With ``letterbox`` it has the source's aspect ratio, which leaves no border; ``crop`` cuts to that of 1280x720.
     """
@@ -207,21 +207,21 @@ def encoder_opener(
 
 
 def make_presets(config: EdgeConfig, operating: Operating) -> PresetControl | None:
-    """What steps to another preset in flight; None where it is set."""
+    """The control that steps to another preset in flight; None where the preset is set."""
     if not config.auto_preset:
         return None
     return PresetControl(operating, nominal_fps=config.nominal_fps, most_cores=share_of(processors()))
 
 
 def _video_bps(config: EdgeConfig, *, total_bps: int, base_bps: int) -> int:
-    """What video and stills have in all."""
+    """The rate of video and stills together."""
     return max(total_bps - config.metadata_bps, base_bps)
 
 
 def qualify_encoder(
     config: EdgeConfig, source: Source, *, clock: Callable[[], int], stop: threading.Event
 ) -> float:
-    """What of its rate the encoder is to be asked for, from three seconds of the scene; 1 for x265, without them.
+    """The share of its rate to set at the encoder, from three seconds of the scene; 1 for x265, without them.
 
     A camera that is passed through was looked at when it was opened.
     Raises `UserError` with what was measured where it would not stay within the budget. A clip begins anew after it.
@@ -310,7 +310,7 @@ def _qualify_camera(config: EdgeConfig, source: Source) -> None:
 
 
 def reconfiguration_settings(config: EdgeConfig, size: tuple[int, int]) -> ReconfigurationSettings:
-    """What bounds the rates in flight."""
+    """The bounds of the rates in flight."""
     return ReconfigurationSettings(
         size=size,
         nominal_fps=config.nominal_fps,
@@ -322,7 +322,7 @@ def reconfiguration_settings(config: EdgeConfig, size: tuple[int, int]) -> Recon
 
 
 def least_rate_bps(config: EdgeConfig, size: tuple[int, int]) -> int:
-    """What the link's rate is never taken below, where the budget is not lower itself.
+    """The floor of the link's rate, where the budget is not lower itself.
 
     Nobody can make a keyframe smaller than `keyframe_floor_bytes`. Were the rate taken below what one needs, none
     would go; nothing arrives then, and a rate that grows with what arrives never grows again. What a camera's own

@@ -1,4 +1,4 @@
-"""What a recording holds, as the messages that it came in: video, stills and poses.
+"""A recording as the messages that it came in: video, stills and poses.
 
 The edge's own tracks are not among them: a recording has the ground's list, in which they are part.
 """

@@ -215,7 +215,7 @@ def placed_tracks(overlay: Overlay) -> Iterator[PlacedTrack]:
 
 
 def sensor_of(pose: Pose, view: View) -> Sensor | None:
-    """What the camera looks at; None without direction or field of view.
+    """The place that the camera looks at; None without direction or field of view.
 
     Its range is where the middle of the picture's upper edge meets flat ground, 5 km at the most.
     """
@@ -241,7 +241,7 @@ def sensor_of(pose: Pose, view: View) -> Sensor | None:
 
 
 def _why_unplaced(pose: Pose | None) -> str:
-    """What keeps tracks from a place, by the last pose.
+    """The reason why tracks have no place, by the last pose.
 
     | the pose                                   | the reason                                     |
     |--------------------------------------------|------------------------------------------------|

@@ -1,4 +1,4 @@
-"""What an edge stored while its link was down: put together, delivered, shown at its own time.
+"""Objects that an edge stored while its link was down: put together, delivered, shown at their own time.
 
 `edge_backlog` takes the chunks of one edge; `session_backlog` shows them in the session they belong to, `recordings`
 those of earlier sessions; `perception` analyzes them.

@@ -1,4 +1,4 @@
-"""What an edge stored while the link was down, from the chunks that come to the session that they belong to.
+"""Stored objects of an edge, from chunks to the session that they belong to.
 
 Objects of the open session go there, those of a session before into a recording of its own. All of it is done by the
 open session's perception worker when nothing newer is there: the picture of now goes first.

@@ -1,4 +1,4 @@
-"""What an edge stored before it was started again goes into recordings of its own, one for each session.
+"""Objects of an edge's earlier sessions go into recordings of their own, one for each session.
 
 So many files at most, and of those so many open at a time, whatever an edge says that it stored: one that is started
 over and over, or somebody in its name, would fill the disk with them.

@@ -1,4 +1,4 @@
-"""What the receiver tells the edge: the newest message of each stream, when it came, how old; stills missing.
+"""Figures of the receiver report: the newest message of each stream, when it came, how old; stills missing.
 
 Reports cost the way back: they come so often that together they take `_SHARE` of what arrives, within bounds, and
 only when something new has arrived; in a pause the usual ones, twice a second, go on.

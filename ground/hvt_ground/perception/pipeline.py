@@ -65,7 +65,7 @@ class DecodedFrame:
 
 @dataclass(frozen=True, slots=True)
 class PipelineParts:
-    """What perception of one session is made of; but for the detector none of it may be shared with another."""
+    """The parts of one session's perception; but for the detector none of it may be shared with another."""
 
     detector: Detector
     tracker: ByteTracker
@@ -171,7 +171,7 @@ class Pipeline:
 
     @property
     def outcomes(self) -> Counter[str]:
-        """What became of each object in the others."""
+        """The outcome of each object in the others."""
         return self._stills.outcomes
 
     def analyze(self, picture: DecodedFrame, *, hurry: bool) -> None:
@@ -218,7 +218,7 @@ class Pipeline:
         self._carry_merges()
 
     def list_at(self, frame_index: int) -> Overlay:
-        """What would be shown at a frame, from all that is known now; changes nothing.
+        """The list at a frame, from all that is known now; changes nothing.
 
         The frame must not lie before the newest decoded frame (`ValueError`). Nothing known is an empty list.
         """

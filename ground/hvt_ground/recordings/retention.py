@@ -48,7 +48,7 @@ class Due:
 
 
 def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Container[str], now_ns: int) -> Due:
-    """What is to be done, the oldest first.
+    """The due removals, the oldest first.
 
     | a file | is |
     |---|---|

@@ -145,7 +145,7 @@ class SpooledRows(Sequence[Timed]):
 
 
 class Mapped(Sequence[Made], Generic[Item, Made]):
-    """What is made of each of ``items`` when it is asked for, and not kept; a slice is another of these."""
+    """A sequence that makes each of ``items`` on access, and keeps none; a slice is another of these."""
 
     def __init__(
         self, items: Sequence[Item], make: Callable[[Item], Made], places: range | None = None

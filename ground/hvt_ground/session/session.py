@@ -253,7 +253,7 @@ class GroundSession:
             self._statistics.stored_still(header.number)
 
     def learn(self, info: Info) -> None:
-        """What the edge says of the session now: budget and method may be others than at its beginning."""
+        """Take the session's present `Info`: budget and method may have changed."""
         if (info.budget_bps, info.method) != (self.budget_bps, self.method):
             self.note("info", f"budget {bitrate_text(info.budget_bps)}, {info.method} from now on")
         self.budget_bps, self.method = info.budget_bps, info.method
@@ -466,5 +466,5 @@ class GroundSession:
 
 
 def _decisions(says: str) -> list[str]:
-    """What an edge sends beside the video, without why."""
+    """The edge's settings of stills and tracks, without the reasons."""
     return [re.split("[:,]", part)[0] for part in says.split("; ")]

@@ -74,7 +74,7 @@ class Pictures:
     def add(
         self, sample: VideoSample, *, wanted: Mapping[Rung, int], now_ns: int, hurry: bool
     ) -> Iterator[Made]:
-        """What this sample gives on the ``wanted`` rungs; in a ``hurry`` nothing is coded again.
+        """The pictures of this sample on the ``wanted`` rungs; in a ``hurry`` nothing is coded again.
 
         Where the number of a rung is another than before its stream begins anew.
         """

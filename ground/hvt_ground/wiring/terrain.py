@@ -11,7 +11,7 @@ from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
 
 
 def make_surfaces(terrain: Path | None) -> Callable[[str], Surface]:
-    """What makes the ground of one flight, by the name of whose it is.
+    """The surface of one flight, by the edge's name.
 
     The file is looked at once, here: `UserError` where it is no elevation model. One that goes later ends no flight.
     """

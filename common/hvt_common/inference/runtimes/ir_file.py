@@ -44,7 +44,7 @@ def check_ir_file(path: Path) -> None:
 
 
 def ir_metadata(path: Path) -> dict[str, str]:
-    """What stands in ``model_info`` of an IR, names as in ONNX: ``names`` of the classes, and whatever else it says.
+    """The ``model_info`` of an IR, names as in ONNX: ``names`` of the classes, and whatever else it says.
 
     Ultralytics writes its own into ``metadata.yaml`` beside the file: its plain values and names are read too. Raises
     `UserError` as `check_ir_file` does.

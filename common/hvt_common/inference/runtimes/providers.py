@@ -1,4 +1,4 @@
-"""What runs the networks: which execution provider is taken, and why.
+"""Chooses the execution provider of the networks, and says why.
 
 =========  =====================================  ============================================================
 provider   package                                what it is

@@ -1,4 +1,4 @@
-"""What a manifest says of a model, and how it is read.
+"""A model in a manifest, and its reader.
 
 ``manifest.toml`` beside this file is the built-in one; ``added.toml`` in the cache folder has the same form and holds
 what the user added. A table's name is the model's name; its keys are the fields of `ModelEntry`.

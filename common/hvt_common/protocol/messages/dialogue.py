@@ -36,7 +36,7 @@ _FAR_PX = 32767
 
 
 class Command(StrEnum):
-    """What a ground may request; an edge refuses a command that it does not serve, with a reason."""
+    """A command of a ground; an edge refuses a command that it does not serve, with a reason."""
 
     KEYFRAME = "keyframe"
     STILL = "still"
@@ -106,7 +106,7 @@ class ControlAnswer(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StillResult:
-    """What the ground made of one still."""
+    """The ground's result for one still."""
 
     still_sequence: int = wire_field(Int(0, U32))
     track_id: int = wire_field(Int(-1, U32))

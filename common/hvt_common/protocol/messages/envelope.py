@@ -62,7 +62,7 @@ class UnknownVersionError(WireError):
         super().__init__(f"{message} has schema version {version}, only {known} known here")
 
     def between(self, sender: str, reader: str) -> str:
-        """What to do about it, as one sentence."""
+        """The remedy, as one sentence."""
         older = reader if self.version > WIRE_VERSION else sender
         return f"{sender} speaks wire version {self.version}, {reader} reads {self._read}: update {older}"
 
@@ -136,7 +136,7 @@ class PackedMessage:
 
     @property
     def size_bytes(self) -> int:
-        """What `pack` returns, whatever the payload."""
+        """The size of `pack`'s bytes, whatever the payload."""
         return len(self._body()) + _CRC_BYTES
 
     def pack(self, payload: bytes = b"") -> bytes:

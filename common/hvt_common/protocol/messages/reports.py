@@ -183,7 +183,7 @@ class Status(Message):
 
     @property
     def frame_account(self) -> FrameAccount:
-        """What became of each source frame."""
+        """The outcome of each source frame."""
         return FrameAccount.of_counts(self.frames, coded_fps=self.coded_fps, auto_fps=self.auto_fps)
 
     @property

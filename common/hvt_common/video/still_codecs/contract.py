@@ -1,4 +1,4 @@
-"""What a still codec is: a crop to bytes at the edge, the bytes back to a crop at the ground.
+"""The contract of a still codec: a crop to bytes at the edge, the bytes back to a crop at the ground.
 
 A codec is a frozen value without state that may be used by several threads. Its ``decode`` gets bytes from the
 network. It reads the dimensions in the header before it decodes a block, and raises `StillError` for any malformed

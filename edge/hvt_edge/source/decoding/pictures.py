@@ -71,7 +71,7 @@ class Pictures:
             self._say(f"its pixels are {float(aspect):.3g} times as wide as high: made square")
 
     def frames(self, frame: av.VideoFrame | None) -> Iterator[av.VideoFrame]:
-        """What is to be shown of a decoded frame: without combs, and then one frame later; None at the end.
+        """The picture of a decoded frame: deinterlaced, and then one frame later; None at the end.
 
         Frames of interlaced film are interpolated in time (bwdif); others pass as they are.
         """

@@ -1,4 +1,4 @@
-"""What a method is: a pure function from the candidates of a step to requests for stills, most useful first.
+"""The contract of a method: a pure function from the candidates of a step to requests for stills, most useful first.
 
 To add one: a frozen dataclass with its parameters in a file beside this one, and one row in `registry`.
 """

@@ -1,4 +1,4 @@
-"""What a still will cost, estimated on line from the bytes of those already sent.
+"""The expected bytes of a still, estimated on line from the bytes of those already sent.
 
 A still's size is close to a line in its number of pixels: a header with its tables, then so much a pixel. On 413
 crops of the drone_carpark clip JPEG at quality 65 costs 639 bytes plus 0.119 a pixel, which is where the estimate

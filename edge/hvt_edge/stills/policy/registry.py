@@ -72,7 +72,7 @@ def method(name: str, **parameters: float) -> Method:
 
 
 def tuning(texts: Iterable[str]) -> dict[str, float]:
-    """What ``--tune KEY=VALUE`` says, for `method`; each text may hold several, with commas between.
+    """The parameters of ``--tune KEY=VALUE`` for `method`; each text may hold several, with commas between.
 
     Raises `UserError` for what is not of that form; whether the method has such a parameter, `method` says.
     """

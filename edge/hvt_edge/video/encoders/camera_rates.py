@@ -1,4 +1,4 @@
-"""What a camera whose own units are sent needs of the link, measured before and in flight; rates at its keyframes.
+"""The rates of a camera whose own units are sent, measured before and in flight; rates at its keyframes.
 
 Nobody can make its units smaller. Were the link's rate taken below what they need, the next keyframe would have no
 room, or nothing behind it. Then nothing arrives, and a rate that grows with what arrives never grows again. So the

@@ -37,7 +37,7 @@ _MARGIN = 0.97
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """What the budget lets the base stream take, in line bytes: headers and transport included."""
+    """The base stream's limits, in line bytes: headers and transport included."""
 
     window_bytes: int
     window_frames: int
@@ -48,7 +48,7 @@ class Allowed:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What an encoder took, in line bytes."""
+    """The measured bytes of an encoder, in line bytes."""
 
     window_bytes: int
     """The fullest window."""
@@ -61,7 +61,7 @@ class Measured:
 
 
 def allowed(*, size: tuple[int, int], fps: float, total_bps: int, base_bps: int, window_s: float) -> Allowed:
-    """What holds in flight (`RollingBudget`): `BASE_PEAK` times B_v in a window, and B_tot.
+    """The limits that hold in flight (`RollingBudget`): `BASE_PEAK` times B_v in a window, and B_tot.
 
     ``fps`` is of coded frames; ``total_bps`` without metadata, ``window_s`` that of the budget. A keyframe may take
     half of the base's part of a window, and what x265 needs of this size where that is more.
@@ -100,7 +100,7 @@ def headroom_of(
     limit: Allowed,
     edge_id: str,
 ) -> float:
-    """What of its target the encoder is to be asked for so that it stays within ``limit``: 0.5…1.
+    """The factor of its target with which the encoder stays within ``limit``: 0.5…1.
 
     ``open_at(share)`` opens it at that share of its target. ``scene()`` gives the ``frames`` of a run, of which the
     first and the middle one are keyframes; it may give fewer, and none where the flight is over. Raises `UserError`
@@ -144,7 +144,7 @@ def _coded(encoder: Encoder, scene: Iterable[Frame], *, middle: int) -> list[Acc
 
 
 def line_bytes(payload: int, edge_id: str) -> int:
-    """What an access unit of so many bytes takes on the line."""
+    """The line bytes of an access unit of so many bytes."""
     key, encoding = EdgeKeys(edge_id).key(Channel.BASE), DELIVERIES[Channel.BASE].encoding
     around = overhead_bytes(payload, BASE_ATTACHMENT_BYTES, key=key, encoding=encoding)
     return payload + BASE_ATTACHMENT_BYTES + around

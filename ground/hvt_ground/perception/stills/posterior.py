@@ -1,4 +1,4 @@
-"""What stills have said of one track: the newest of them, and all of them fused.
+"""The stills' opinion of one track: the newest of them, and all of them fused.
 
 Fusion is naive Bayes in log space over the classes of tracks (`Vocabulary`), with a flat prior:
 

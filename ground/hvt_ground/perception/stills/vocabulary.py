@@ -1,4 +1,4 @@
-"""What the words of a classifier mean for a track: its classes are those of the detectors.
+"""Translates a classifier's names for a track: its classes are those of the detectors.
 
 *Which.* A class of the same name speaks for that class of a track, and for those of its kind that the classifier has
 no name for; another for the classes of its kind; what is no kind, for those of its group (see `class_names`). A
@@ -76,7 +76,7 @@ class Vocabulary:
         return self.nothing is not None and name == self.names[self.nothing]
 
     def vote(self, said: Posterior, *, called: str, side_px: float) -> Vote:
-        """What the reader's answer means; ``called`` is what the edge calls the object, ``side_px`` its shorter side.
+        """Translate the reader's answer; ``called`` is the edge's name of the object, ``side_px`` its shorter side.
 
         `ValueError` if the answer does not have one probability for each of the reader's classes.
         """

@@ -1,4 +1,4 @@
-"""What of an overlay is worth writing: only what a viewer would see change.
+"""Writes of an overlay only the visible changes.
 
 A recording answers "what was here at frame N" with the latest value of every component, so a value that did not
 change need not be written again. Tracks are in four layers: those that the base stream shows and whose class rests

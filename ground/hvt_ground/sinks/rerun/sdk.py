@@ -1,4 +1,4 @@
-"""What the Rerun SDK does not let go of by itself, and what it may not do twice at once.
+"""Frees what the Rerun SDK keeps, and lets it do one thing at a time.
 
 Each recording would leave four threads and two megabytes behind. A ground opens a recording for each session and each
 return after a long outage, so this has to be flat over weeks. And two recordings that begin and end at the same

@@ -1,4 +1,4 @@
-"""What a recording shows of stills: pairs in a gallery, patches on the picture.
+"""Stills in a recording: pairs in a gallery, patches on the picture.
 
 Others use `rows`, `gallery`, and the words and pictures of one still, `pairs`.
 """
