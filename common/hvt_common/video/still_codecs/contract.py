@@ -46,7 +46,10 @@ class CodedCrop:
 
 
 class StillCodec(Protocol):
-    """The contract of a still codec."""
+    """The contract of a still codec.
+
+    One that codes alike at several qualities may say so: ``step_of(quality_pct)`` of its class is equal for them.
+    """
 
     @property
     def name(self) -> str:

@@ -22,6 +22,7 @@ class H264IntraCodec(IntraCodec):
 
     name = "h264-intra"
     media_type = "application/vnd.hvt.h264-intra"
+    step_of = staticmethod(qp_of)
 
     def _encoded(self, crop_bgr: Image, quality_pct: int) -> bytes:
         qp = qp_of(quality_pct)

@@ -53,6 +53,7 @@ class ResidualCodec:
     name = "residual"
     media_type = "application/vnd.hvt.residual"
     needs_base = True
+    step_of = staticmethod(qp_of)
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:
         """Code the difference of the crop to ``base_bgr``, which has its shape."""

@@ -1,12 +1,16 @@
 """The quality at which a crop is coded, found by trying: what fits so many bytes, or what reaches so many dB.
 
-By bisection over the quality, at most seven encodings each. Codecs promise no exact order, only that more quality is
-no worse and nearly always more bytes; what is returned was tried, so it fits, or reaches, in any case.
+Fidelity and the logarithm of the size rise about evenly with the quality, so that each try tells where the next is
+best made; and no coding is tried twice, where a codec has fewer than a hundred (``step_of``). Codecs promise no exact
+order, only that more quality is no worse and nearly always more bytes; what is returned was tried, so it fits, or
+reaches, in any case.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -15,6 +19,10 @@ from hvt_common.values import Image
 from hvt_common.video.still_codecs.contract import CodedCrop, StillCodec
 
 _BT601_BGR = np.array([[0.114, 0.587, 0.299]], np.float32)
+_WHOLE_DB, _WHOLE_SIZE = 28.0, 4.0
+"""By how much fidelity in dB and the logarithm of the size rise from the least quality to the best: a first guess."""
+_GUESSES = 5
+"""After so many tries the range is halved: this crop does not rise evenly."""
 
 
 def best_fitting(
@@ -30,16 +38,17 @@ def best_fitting(
 
     With that quality in percent; None where nothing fits. ``base_bgr``: see `StillCodec.encode`.
     """
-    best = None
-    middle = high_pct  # most often it fits at once
-    while low_pct <= high_pct:
-        coded = codec.encode(crop_bgr, quality_pct=middle, base_bgr=base_bgr)
-        if len(coded.data) <= limit_bytes:
-            best, low_pct = (coded, middle), middle + 1
-        else:
-            high_pct = middle - 1
-        middle = (low_pct + high_pct + 1) // 2
-    return best
+    best = [steps[-1] for steps in _steps(codec, low_pct, high_pct)]
+    tried: dict[int, CodedCrop] = {}
+
+    def excess(place: int) -> float:
+        """Of the logarithm of the size; above 0 where it does not fit."""
+        tried[place] = coded = codec.encode(crop_bgr, quality_pct=best[place], base_bgr=base_bgr)
+        return math.log((len(coded.data) + 0.5) / (limit_bytes + 1))
+
+    # Most often the best fits at once.
+    found = _first_above(excess, len(best), first=len(best) - 1, rise=_WHOLE_SIZE / max(1, len(best))) - 1
+    return (tried[found], best[found]) if found in tried else None
 
 
 def smallest_reaching(
@@ -57,17 +66,51 @@ def smallest_reaching(
     None where the best does not reach it.
     """
     size = (crop_bgr.shape[1], crop_bgr.shape[0])
-    best = None
-    while low_pct <= high_pct:
-        middle = (low_pct + high_pct) // 2
-        coded = codec.encode(crop_bgr, quality_pct=middle, base_bgr=base_bgr)
+    least = [steps[0] for steps in _steps(codec, low_pct, high_pct)]
+    tried: dict[int, tuple[CodedCrop, int, Image, float]] = {}
+
+    def gain_db(place: int) -> float:
+        """Over the target, which itself counts as reached."""
+        coded = codec.encode(crop_bgr, quality_pct=least[place], base_bgr=base_bgr)
         image = codec.decode(coded.data, size=size, parameters=coded.parameters, base_bgr=base_bgr)
         reached_db = psnr_y_db(image, crop_bgr)
-        if reached_db >= target_db:
-            best, high_pct = (coded, middle, image, reached_db), middle - 1
+        tried[place] = coded, least[place], image, reached_db
+        return reached_db - target_db if reached_db != target_db else math.ulp(1.0)
+
+    rise = _WHOLE_DB / max(1, len(least))
+    return tried.get(_first_above(gain_db, len(least), first=2 * len(least) // 3, rise=rise))
+
+
+def _steps(codec: StillCodec, low_pct: int, high_pct: int) -> list[list[int]]:
+    """The qualities, those together that code alike: ``step_of`` of a codec says which, where it has it."""
+    step_of: Callable[[int], int] = getattr(codec, "step_of", lambda quality_pct: quality_pct)
+    return [list(alike) for _, alike in itertools.groupby(range(low_pct, high_pct + 1), key=step_of)]
+
+
+def _first_above(value: Callable[[int], float], count: int, *, first: int, rise: float) -> int:
+    """The least place (0 … ``count`` - 1) with a value above 0, of values that rise; ``count`` where none is.
+
+    That place and the one before it were tried, where they are in the range.
+    """
+    below, above = (-1, -math.inf), (count, math.inf)
+    place, tries, last = first, 0, None
+    while above[0] - below[0] > 1:
+        here = (place, value(place))
+        below, above = (below, here) if here[1] > 0 else (here, above)
+        tries += 1
+        if tries >= _GUESSES or not math.isfinite(here[1]):
+            zero = (below[0] + above[0]) / 2
+        elif math.isfinite(below[1]) and math.isfinite(above[1]):
+            zero = below[0] - below[1] * (above[0] - below[0]) / (above[1] - below[1])
         else:
-            low_pct = middle + 1
-    return best
+            if last is not None and (here[1] - last[1]) * (here[0] - last[0]) > 0:
+                rise = (here[1] - last[1]) / (here[0] - last[0])
+            zero = here[0] - here[1] / rise
+        last = here
+        # Where it is guessed to be above 0 first, or just before, where that has been tried.
+        guess = math.ceil(min(count, max(-1.0, zero)))
+        place = min(above[0] - 1, max(below[0] + 1, guess))
+    return above[0]
 
 
 def psnr_y_db(image_bgr: Image, source_bgr: Image) -> float:
