@@ -49,6 +49,8 @@ def test_what_is_not_live_never_says_live():
     cases = [
         ({}, "live, 0.3 s"),
         ({"lockstep": True}, "lockstep: no age"),
+        ({"ageMs": -40}, "live, 0.0 s"),
+        ({"ageMs": -3_600_000}, "live, age not known"),
         ({"follows": False, "plays": False, "ageMs": 14_000}, "PAUSED 14 s"),
         ({"follows": False, "ageMs": 5_200}, "REPLAY 5.2 s"),
         ({"link": "lost", "silentMs": 8_000}, "LINK LOST 8 s"),

@@ -101,7 +101,7 @@ function onMessage(message, payload) {
       plot.fill(message.edge, message.rows);
       break;
     case "thumbnail":
-      wall.thumbnail(message.edge, payload, message.captured);
+      wall.thumbnail(message.edge, payload, Math.min(message.captured, connection.now())); // none is of the future
       break;
     case "notice":
       wall.event(message.edge, message.text);

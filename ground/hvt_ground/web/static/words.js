@@ -33,6 +33,12 @@ export const seconds = (ms) => (Math.abs(ms) < 9950 ? `${(ms / 1000).toFixed(1)}
 const whole = (ms) => `${Math.max(0, Math.round(ms / 1000))} s`;
 
 /**
+ * By clocks that agree within the time of a message; of a picture of the future it is not known.
+ * @param {number} ms
+ */
+const age = (ms) => (ms < -LEAST_GAP_MS ? "age not known" : seconds(Math.max(0, ms)));
+
+/**
  * The state of the picture: its name for the style, the words that stand on it, whether it is the picture of now.
  * @param {Facts} facts @returns {{state: string, words: string, live: boolean}}
  */
@@ -48,7 +54,7 @@ export function standing(facts) {
   }
   const patience = Math.min(MOST_GAP_MS, Math.max(LEAST_GAP_MS, 2.5 * facts.periodMs));
   if (sinceMs > patience) return { state: "stale", words: `NO NEW PICTURE ${whole(sinceMs)}`, live: false };
-  return { state: "live", words: facts.lockstep ? "lockstep: no age" : `live, ${seconds(ageMs)}`, live: true };
+  return { state: "live", words: facts.lockstep ? "lockstep: no age" : `live, ${age(ageMs)}`, live: true };
 }
 
 /**
