@@ -35,8 +35,8 @@ from hvt_ground.web.requests import EdgeRequests
 from hvt_ground.web.site import MOST_MESSAGE_BYTES, make_site
 from hvt_ground.web.viewers import EdgePage, Hub
 
-_MOST_CONNECTIONS = 256
-MOST_OPEN = _MOST_CONNECTIONS + 64
+MOST_CONNECTIONS = 256
+MOST_OPEN = MOST_CONNECTIONS + 64
 """With those that are told that it is too many, or are in the middle of TLS."""
 REQUEST_S = 10.0
 """So long a client may take for TLS, and from an answer to the next whole request."""
@@ -88,7 +88,7 @@ class WebPage:
         self.is_local = proxy is None and not tokens
         """Whether only this machine reaches it."""
         scheme = start.partition(":")[0]
-        others = [f"{scheme}://{one}:{port}/" for one in _own_addresses()] if host == "0.0.0.0" else []  # noqa: S104
+        others = [f"{scheme}://{one}:{port}/" for one in own_addresses()] if host == "0.0.0.0" else []  # noqa: S104
         by_token = tuple(
             " or ".join(f"{where}?token={token}" for where in (start, *others)) + f" ({role})"
             for role, token in tokens.items()
@@ -257,7 +257,7 @@ class _BoundedProtocol(_NoStall, H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        if len(self.connections) > _MOST_CONNECTIONS and not self._take_place():
+        if len(self.connections) > MOST_CONNECTIONS and not self._take_place():
             transport.write(
                 b"HTTP/1.1 503 Service Unavailable\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
             )
@@ -293,7 +293,7 @@ class _BoundedProtocol(_NoStall, H11Protocol):
             self.transport.abort()
 
 
-def _own_addresses() -> list[str]:
+def own_addresses() -> list[str]:
     """IPv4 addresses of this machine beside loopback, the first few: a network may have no name server."""
     rows = array("B", bytes(_ROW_BYTES * 64))
     where, size_bytes = rows.buffer_info()

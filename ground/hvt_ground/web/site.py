@@ -26,7 +26,7 @@ from hvt_ground.web.requests import BadRequestError, BusyError, EdgeRequests
 from hvt_ground.web.viewers import Hub, Viewer, packed, text
 
 MOST_MESSAGE_BYTES = 4096
-_MOST_VIEWERS = 64
+MOST_VIEWERS = 64
 _MOST_MESSAGES_A_S = 30
 _COOKIE_S = 30 * 86400
 _KINDS = {"js": "text/javascript", "css": "text/css", "html": "text/html", "svg": "image/svg+xml"}
@@ -113,7 +113,7 @@ class Site:
         """A viewer from its coming to its leaving."""
         viewer = Viewer(socket.client.host if socket.client else "")
         viewers = [one for one in self._hub.viewers if not one.hopeless]
-        if len(viewers) >= _MOST_VIEWERS:
+        if len(viewers) >= MOST_VIEWERS:
             crowd = crowding((one.address for one in viewers), viewer.address)
             if crowd is None:
                 await socket.send_denial_response(PlainTextResponse("too many viewers", 503))

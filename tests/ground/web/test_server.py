@@ -263,7 +263,7 @@ def test_a_viewer_commands_nothing(public, state_folder):
 
 def test_the_links_at_the_start_open_the_page(port, state_folder, monkeypatch):
     """Nobody would know the token."""
-    monkeypatch.setattr(server, "_own_addresses", lambda: ["10.8.0.1"])
+    monkeypatch.setattr(server, "own_addresses", lambda: ["10.8.0.1"])
     with WebPage(f"0.0.0.0:{port}", clock=time.time_ns) as page:
         tokens = json.loads((state_folder / "web-tokens.json").read_text())
         assert any(f"?token={tokens['operator']}" in one for one in page.links)
@@ -411,7 +411,7 @@ def test_who_takes_all_places_makes_room_for_others(public, state_folder, monkey
         raw = socket.create_connection(("127.0.0.1", public), timeout=10, source_address=(source, 0))
         return joined(public, sock=raw, additional_headers=cookie)
 
-    monkeypatch.setattr(site, "_MOST_VIEWERS", 3)
+    monkeypatch.setattr(site, "MOST_VIEWERS", 3)
     with watch("127.0.0.1") as first, watch("127.0.0.1") as second, watch("127.0.0.1") as third:
         with pytest.raises(InvalidStatus, match="503"):
             watch("127.0.0.1")
@@ -423,7 +423,7 @@ def test_who_takes_all_places_makes_room_for_others(public, state_folder, monkey
                 what="one of the three has gone",
             )
     where = ("127.0.0.1", public)
-    for bound in ("_MOST_CONNECTIONS", "MOST_OPEN"):
+    for bound in ("MOST_CONNECTIONS", "MOST_OPEN"):
         with ExitStack() as held, monkeypatch.context() as few:
             few.setattr(server, bound, 3)
             silent = [held.enter_context(reached(public)) for _ in range(3)]
