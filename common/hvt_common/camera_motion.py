@@ -1,4 +1,4 @@
-"""How the camera moved between two frames, from the image alone."""
+"""The camera's motion between two frames, from the image alone."""
 
 from __future__ import annotations
 

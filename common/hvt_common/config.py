@@ -35,7 +35,7 @@ class _Parse(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SettingType:
-    """How a setting's text becomes its value (`UserError` when it cannot), and the value text again."""
+    """Turns a setting's text into its value (`UserError` when it cannot), and the value into text."""
 
     metavar: str
     parse: _Parse

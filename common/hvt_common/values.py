@@ -107,7 +107,7 @@ class AccessUnit:
 
 @dataclass(frozen=True, slots=True)
 class Orientation:
-    """Where something points, in degrees: aircraft angles (yaw, then pitch, then roll), as in MISB ST 0601."""
+    """A direction in degrees: aircraft angles (yaw, then pitch, then roll), as in MISB ST 0601."""
 
     yaw_deg: float
     """Clockwise from true north, 0 up to 360."""
@@ -120,7 +120,7 @@ class Orientation:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a camera was, what it pointed at, and how sure that is. WGS 84."""
+    """Place and direction of a camera, with their errors. WGS 84."""
 
     capture_ns: int
     """By the clock of the frames."""

@@ -111,7 +111,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         ("not sent yet", f"{stills['deferred']}{_reasons(stills['reasons']['deferred'])}"),
         ("not sent", f"{stills['dropped']}{_reasons(stills['reasons']['dropped'])}"),
         ("tracks", str(content["tracks"])),
-        ("keyframes", f"{content['keyframes']}, {content['keyframe_requests']} asked for by a ground"),
+        ("keyframes", f"{content['keyframes']}, {content['keyframe_requests']} requested by a ground"),
     ]
     return rows + _store_rows(content["store"]) + failed
 

@@ -166,7 +166,7 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class MessageTiming:
-    """When a message was captured, sent, received and handled; Unix nanoseconds, 0 where there is none."""
+    """The times of a message: captured, sent, received, handled; Unix nanoseconds, 0 where there is none."""
 
     kind: str
     """The channel; of a backlog chunk with its kind, as ``backlog-still``."""

@@ -32,7 +32,7 @@ _THIN_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class PoseState:
-    """Where the camera was when it last said so."""
+    """The camera's last reported pose."""
 
     latitude_deg: float
     longitude_deg: float

@@ -181,7 +181,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
             "tracks",
             f"{content['tracks']}, {content['tracks_refined']} refined, {content['class_changes']} class changes",
         ),
-        ("keyframes", f"{content['keyframe_requests']} asked for"),
+        ("keyframes", f"{content['keyframe_requests']} requested"),
     ]
     backlog = content["backlog"]
     if backlog["stills"] or backlog["frames"]:

@@ -180,7 +180,7 @@ class OnnxDetector:
 
     @property
     def pixels(self) -> str:
-        """How the network gets its pixels, in words."""
+        """The network's preparation of pixels, in words."""
         how = (
             "stretched" if self.head.anchor == "stretch" else f"letterbox {self.head.anchor}, filled with 114"
         )

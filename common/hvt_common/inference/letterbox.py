@@ -20,7 +20,7 @@ _FILL = 114  # the grey of YOLO letterboxes
 
 @dataclass(frozen=True, slots=True)
 class Letterbox:
-    """How one image lies on the network's input."""
+    """The place of one image on the network's input."""
 
     image_size: tuple[int, int]
     """(width, height) of the image in pixels."""

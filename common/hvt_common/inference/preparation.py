@@ -1,4 +1,4 @@
-"""How pixels become a network's input, as its file says or as its kind is trained."""
+"""Turns pixels into a network's input, as its file says or as its kind is trained."""
 
 from __future__ import annotations
 

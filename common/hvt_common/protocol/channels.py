@@ -43,7 +43,7 @@ class Channel(StrEnum):
 
 
 class Direction(Enum):
-    """Who sends."""
+    """The sender of a channel."""
 
     EDGE_TO_GROUND = "edge to ground"
     GROUND_TO_EDGE = "ground to edge"
@@ -53,7 +53,7 @@ class Direction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """How one channel crosses the link."""
+    """Delivery of one channel over the link."""
 
     direction: Direction
     priority: str

@@ -46,7 +46,7 @@ assert tuple(FRAME_GROUPS) == get_args(FrameGroup), "one order"
 
 @dataclass(frozen=True, slots=True)
 class FrameAccount:
-    """How many source frames are in which group. Groups without a frame may be missing."""
+    """Number of source frames in each group. Groups without a frame may be missing."""
 
     groups: Mapping[FrameGroup, int] = field(default_factory=dict)
     coded_fps: float = 0.0

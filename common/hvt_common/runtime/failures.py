@@ -105,7 +105,7 @@ class Failures:
 
 
 class RetryPause:
-    """How long to wait before the next try: twice as long after each failure. Time is an argument."""
+    """The wait before the next try: twice as long after each failure. Time is an argument."""
 
     def __init__(self, first_ns: int = SECOND_NS, longest_ns: int = 60 * SECOND_NS) -> None:
         self._first_ns = first_ns

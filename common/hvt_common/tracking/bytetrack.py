@@ -225,7 +225,7 @@ class ByteTracker:
             kalman.warp(table.states, affine)
 
     def _outdated(self, frame_index: int) -> bool:
-        """Whether the last update lies so far back that no track of it can be believed."""
+        """Whether the last update lies so far back that no track of it counts."""
         last = self._updated_index
         return last is not None and frame_index - last > self._longest_frames + 1
 

@@ -61,7 +61,7 @@ _CLIENT: Mapping[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class LinkSettings:
-    """How a process takes part. With neither endpoint here nor in the file, a ground listens, the others connect.
+    """Settings of Zenoh. With neither endpoint here nor in the file, a ground listens, the others connect.
 
     A ``client`` only queries: it never listens, and connects in Zenoh's mode of that name, so that a ground or a
     router that it connects to forwards its queries and the answers.

@@ -38,7 +38,7 @@ _FINISH_NS, _STUCK_NS, _POLL_S = 60 * SECOND_NS, 6 * SECOND_NS, 0.05
 
 
 class State(Enum):
-    """Where frames and stills go."""
+    """The destination of frames and stills."""
 
     LIVE = "to the link"
     OFFLINE = "into the store: the link is away"

@@ -206,7 +206,7 @@ class Commands:
         return REGIMES["low"].video_share if method(began.method).video_only else began.fixed_share
 
     def _check_base(self, budget_bps: int, video_share: float | None) -> None:
-        """As `hvt_edge.config.check_rate`, in words for whoever commands from afar."""
+        """As `hvt_edge.config.check_rate`, in words for a remote client."""
         config, size = self.config, self.base_size
         share = FIRST_SHARE if video_share is None else video_share
         least_bps, what = least_budget_bps(config, size, share=share), stream_text(config, size)

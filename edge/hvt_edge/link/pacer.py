@@ -26,7 +26,7 @@ _GIVEN_UP_NS = SECOND_NS
 """A message so long overdue is lost, if reports come and name none newer for as long."""
 _SILENCE_NS = 2 * SECOND_NS
 _PROBE_NS = SECOND_NS
-"""In silence one frame goes out in so long: a ground that has forgotten the session hears nothing else."""
+"""In silence one frame goes out in so long: a ground that has forgotten the session receives nothing else."""
 _START_NS, _START_HOLD_NS = SECOND_NS // 2, 2 * SECOND_NS
 """So much goes out from a keyframe on before the first report; then it is waited for, so long. A thin link that is
 overrun at once does not let the ground ask what the session is. Who never reports gets everything after that."""
@@ -104,7 +104,7 @@ class Flight:
         self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
 
     def backlog_ns(self, *, now_ns: int, rate_bps: int) -> int:
-        """How long a link of this rate has still to do with what was sent."""
+        """The time that a link of this rate still needs for the bytes in flight."""
         self._drain(now_ns, rate_bps)
         return round(8 * SECOND_NS * self._backlog_bytes / rate_bps)
 
@@ -211,7 +211,7 @@ class Pacer:
 
     @property
     def backoffs(self) -> int:
-        """How often the rate was lowered."""
+        """Number of times that the rate was lowered."""
         return self._controller.backoffs
 
     def set_ceiling(self, ceiling_bps: int, *, floor_bps: int | None = None) -> None:

@@ -20,7 +20,7 @@ _EARLY: Final = 0.95
 
 @dataclass(frozen=True, slots=True)
 class TrackReportSettings:
-    """How much is told."""
+    """Limits of the tracks channel."""
 
     most_per_s: float = 3.0
     """Steps a second of capture time at most."""

@@ -357,13 +357,13 @@ class Transmitter:
         return round(self.budget.base_step_bytes)
 
     def base_wait_ns(self, now_ns: int, *, line_bytes: int | None = None) -> int:
-        """How long a base message would wait for the budget's window, were it sent now; None: an average frame."""
+        """The wait of a base message for the budget's window, were it sent now; None: an average frame."""
         with self._lock:
             line_bytes = self.frame_bytes if line_bytes is None else line_bytes
             return max(0, self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True) - now_ns)
 
     def base_unit_wait_ns(self, unit: AccessUnit, *, now_ns: int) -> int | None:
-        """How long this unit would wait for the budget's window; None where nothing would have room for it."""
+        """The wait of this unit for the budget's window; None where it never has room."""
         line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
             at_ns = self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
@@ -384,7 +384,7 @@ class Transmitter:
             self.budget.end_base()
 
     def takes_ns(self, line_bytes: int) -> int:
-        """How long so many line bytes take the whole budget."""
+        """The time of so many line bytes at the whole budget."""
         with self._lock:
             return 8 * SECOND_NS * line_bytes // self.budget.total_bps
 

@@ -1,4 +1,4 @@
 """One frame after the other: `realtime`, or `lockstep` with media time; `counts` of frames, `cpu` they would take.
 
-`perception_rest` says when perception gives way to video.
+`perception_rest` says when perception rests for video.
 """

@@ -65,7 +65,7 @@ class CpuMeter:
 
 
 def processors() -> int:
-    """How many this process may use."""
+    """Number of processors that this process may use."""
     return len(_cores())
 
 

@@ -1,4 +1,4 @@
-"""When perception gives way: video that loses frames for want of processor time shows that it takes too much."""
+"""Rests perception while video loses frames for want of processor time."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ class LeverControl:
         self._changed.append(changed)
 
     def take_load(self, captured: int, unanalyzed: int, *, now_ns: int) -> None:
-        """How many frames came so far, and how many perception had no time for. From any thread.
+        """Take the counts of frames so far: captured, and not analyzed for want of time. From any thread.
 
         It decides too where the machine is too slow, because perception may never come to it.
         """

@@ -25,7 +25,7 @@ _NOISE_ENERGY = 20.0
 
 @dataclass(frozen=True, slots=True)
 class BaseLoss:
-    """How much worse the base shows a crop than the source does."""
+    """The loss of a crop in the base against the source."""
 
     psnr_y_db: float
     """Luma PSNR of the base crop against the source crop; at most `MOST_PSNR_DB`."""

@@ -1,4 +1,4 @@
-"""Where a still is cut: the padded box in the source frame."""
+"""The crop of a still: the padded box in the source frame."""
 
 from __future__ import annotations
 

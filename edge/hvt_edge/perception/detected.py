@@ -1,4 +1,4 @@
-"""How many objects the ground's own detector shows, against what was found on the same base pictures here.
+"""Compares the ground's count of objects with the edge's own on the same base pictures.
 
 The ground's detector may be another, or none, and nobody at the edge knows it. So it reports a count, and for which
 frame; compared are counts of about the same frame, so that a scene which fills or empties is no difference.

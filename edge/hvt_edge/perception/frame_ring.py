@@ -9,7 +9,7 @@ Frames that were coded are preferred: with them stands what the base shows, whic
 only the newest is kept, and one in so long where the video stands still.
 
 Frames come here once they were analyzed, which on a slow machine takes seconds, and not all are. So the newest that
-the camera gave is held beside them, without tracks: it is what "now" means where no track is asked for.
+the camera gave is held beside them, without tracks: it is what "now" means where no track is requested.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class FrameRing:
             return _nearest(frames, lambda one: abs(one.capture_ns - near.capture_ns))
 
     def _held(self, *, tracked: bool) -> Sequence[RingFrame]:
-        """All that may be asked for, oldest first."""
+        """All that may be requested, oldest first."""
         newest, frames = self._captured, self._frames
         near = (
             bool(frames) and newest is not None and newest.capture_ns - frames[-1].capture_ns <= _UNCODED_NS
@@ -181,7 +181,7 @@ class FrameRing:
         return before is not None and before.base is not None and near
 
     def reach_s(self) -> float:
-        """How far it goes back from the newest frame."""
+        """The time from its oldest to its newest frame."""
         with self._lock:
             if not self._frames:
                 return 0.0
@@ -209,7 +209,7 @@ def _nearest(frames: Sequence[RingFrame], distance_ns: Callable[[RingFrame], int
 
 
 def _reach_ns(frames: Sequence[RingFrame]) -> int:
-    """Half a gap before the oldest: what was asked for lies nearer to it than to one that is gone."""
+    """Half a gap before the oldest: what was requested lies nearer to it than to one that is gone."""
     first = frames[0].capture_ns
     gap_ns = frames[1].capture_ns - first if len(frames) > 1 else 0
     return first - gap_ns // 2

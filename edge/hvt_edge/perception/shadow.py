@@ -48,7 +48,7 @@ _BASE_NAMES = 1 / 3
 
 @dataclass(frozen=True, slots=True)
 class ShadowSettings:
-    """How often is compared, and how long it is remembered."""
+    """Rate of the comparisons, and their memory."""
 
     confidence: float
     """From where a detection starts a track, at the edge and at the ground."""
@@ -96,7 +96,7 @@ class Shadow:
 
     @property
     def gain(self) -> float:
-        """How much expected named F1 the ground's list gains by being sent the source's boxes; 0 at first."""
+        """The gain in expected named F1 of the ground's list from the source's boxes; 0 at first."""
         return self._gain(1.0)
 
     @property

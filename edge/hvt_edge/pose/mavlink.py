@@ -189,7 +189,7 @@ class MavlinkPose:
             if len(self._newest) > _MOST_KNOWN:
                 self._newest = {key: one for key, one in self._newest.items() if now_ns - one[0] <= _OLD_NS}
             if name in _FIXES and message.fix_type >= _LEAST_FIX and _has_no_fix(self._of(whose, now_ns)):
-                self._newest.pop((*whose, "GLOBAL_POSITION_INT"), None)  # where it believed to be before
+                self._newest.pop((*whose, "GLOBAL_POSITION_INT"), None)  # its former place
             if len(self._newest) <= _MOST_KNOWN:
                 self._newest[(*whose, name)] = (now_ns, message)
             if name == "GLOBAL_POSITION_INT" and whose != self._vehicle and self._is_better(whose, now_ns):

@@ -1,4 +1,4 @@
-"""Where an autopilot's bytes come from: a UDP port, a TCP server or a serial device. Nothing is sent to it."""
+"""The connection to an autopilot: a UDP port, a TCP server or a serial device. Nothing is sent to it."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ _PART: Final = "pose"
 
 
 class PoseSender(Protocol):
-    """Where reports go: `hvt_edge.link.transmitter.Transmitter`."""
+    """The receiver of reports: `hvt_edge.link.transmitter.Transmitter`."""
 
     def pose(self, make: Callable[[int], bytes], *, now_ns: int) -> bool:
         """Send ``make(now_ns)``; False where the budget has no room for it beside the next frame."""

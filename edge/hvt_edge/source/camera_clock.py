@@ -1,4 +1,4 @@
-"""When a live frame was taken, from the camera's own time stamps where it gives any. Pure."""
+"""The capture time of a live frame, from the camera's own time stamps where it gives any. Pure."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class CameraClock:
         return min(_MOST_JITTER_NS, max(self._recent, default=0) - min(self._recent, default=0))
 
     def capture_ns(self, camera_ns: int | None, *, now_ns: int) -> int:
-        """When the frame that has just come was taken; ``camera_ns`` is None where the camera does not say."""
+        """The capture time of the frame that has just come; ``camera_ns`` is None where the camera does not say."""
         taken_ns = now_ns if camera_ns is None else camera_ns + self._ahead_ns(now_ns - camera_ns, now_ns)
         self._last_ns = max(self._last_ns + 1, min(taken_ns, now_ns))
         self._recent.append(now_ns - self._last_ns)

@@ -142,7 +142,7 @@ def check_stream(name: str, stream: Any) -> None:
 
 
 def check_picture(name: str, picture: av.VideoFrame, *, size: BaseSize) -> str:
-    """Raise `UserError` where a picture is not shown as it is coded, or has another size than is asked for.
+    """Raise `UserError` where a picture is not shown as it is coded, or has another size than is requested.
 
     Return what else will look different at the ground, as a sentence; empty for nothing.
     """

@@ -187,7 +187,7 @@ def check_truth(path: Path | None, source: Source) -> None:
 
 
 def write_truth_of(source: Source, path: Path | None, *, fps: float) -> None:
-    """Write the demo's ground truth, where it is asked for."""
+    """Write the demo's ground truth, where it is requested."""
     if path is not None and isinstance(source, DemoSource):
         source.write_truth(path, fps=fps)
 

@@ -1,4 +1,4 @@
-"""Where frames come from: the first stage of the edge. One function opens every kind of source."""
+"""Opens the source: the first stage of the edge. One function opens every kind of source."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def capture_time_ns(index: int, *, fps: Fraction, start_ns: int) -> int:
 
 
 def base_frame_count(duration_s: Fraction, *, fps: Fraction) -> int:
-    """How many instants k / fps lie in a clip of that duration, the first at 0."""
+    """Number of instants k / fps in a clip of that duration, the first at 0."""
     return -int(-duration_s * fps // 1)
 
 

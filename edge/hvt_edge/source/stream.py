@@ -153,7 +153,7 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
 
 
 def camera_time_ns(packet: av.Packet[Any], *, stamped: bool) -> int | None:
-    """When it was taken by a clock of the camera's, in nanoseconds; None where nothing tells.
+    """Its capture time by a clock of the camera's, in nanoseconds; None where unknown.
 
     Where RTCP sender reports tell the camera's time (RFC 3550, 6.4.1) it is Unix time; of the stream's own time
     stamps, where it is ``stamped``, only the differences count.

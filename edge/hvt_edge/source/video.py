@@ -81,7 +81,7 @@ class VideoSource(Source):
         return float(1 / self._stamps.period_s)
 
     def shown_frames(self) -> tuple[int, tuple[int, ...]]:
-        """How many frames the clip has, and which one each base frame shows, by its packets: nothing is decoded.
+        """Number of frames of the clip, and the one that each base frame shows, by its packets: nothing is decoded.
 
         A clip of which frames cannot be decoded plays fewer.
         """

@@ -30,7 +30,7 @@ _FAR_OFF_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """How far the base is from the source at a crop, and so how far a still may be."""
+    """The distance of the base from the source at a crop, which bounds that of a still."""
 
     places: tuple[Place, ...]
     """The boxes in the crop, without their padding."""
@@ -58,7 +58,7 @@ class Alternative:
         )
 
     def gain_db(self, still: Image, *, crop: Image) -> float:
-        """How much closer the still is: the least of colour and luma, over the crop and over each box."""
+        """The still's gain over the base: the least of colour and luma, over the crop and over each box."""
         errors = _errors(still, crop, self.places)
         return min(
             10 * math.log10(limit / mine) if mine and limit else math.inf if limit else -math.inf

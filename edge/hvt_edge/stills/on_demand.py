@@ -266,7 +266,7 @@ class OnDemand:
     def _check_queue(self) -> None:
         pending = self.outbox.on_demand_pending
         if pending >= _MAX_PENDING:
-            raise RefusedError(f"{pending} stills that were asked for wait already: ask again later")
+            raise RefusedError(f"{pending} requested stills are pending already: try again later")
 
     def _note(self, number: int, *, refusal: str = "", note: str = "") -> None:
         self._outcomes[number] = refusal, note

@@ -43,7 +43,7 @@ def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
     """The frame that is requested, or the nearest in the ring; raises `RefusedError` where it is gone or to come.
 
     The newest means the newest that was coded, unless the track is not in it. A track is in frames that were analyzed
-    alone; anything else may be asked for of the newest from the camera too.
+    alone; anything else may be requested of the newest from the camera too.
     """
     tracked = request.track_id is not None
     newest, newest_held = ring.newest(tracked=False), ring.newest(tracked=tracked)

@@ -21,7 +21,7 @@ _MIB = 2**20
 
 
 class StillState(Enum):
-    """Where a still is in its life; `Outbox` has the table."""
+    """The state of a still; `Outbox` has the table."""
 
     PENDING = "waits for its allowance"
     SENT = "sent, and not named by any report"
@@ -160,7 +160,7 @@ class Outbox:
 
     @property
     def on_demand_pending(self) -> int:
-        """How many that grounds requested are pending."""
+        """Number of pending stills that grounds requested."""
         return len(self._on_demand)
 
     @property
@@ -266,7 +266,7 @@ class Outbox:
 
     @property
     def unacknowledged(self) -> int:
-        """How many were sent that no report has named."""
+        """Number of sent stills that no report has named."""
         with self._lock:
             return len(self._unnamed())
 

@@ -1,4 +1,4 @@
-"""How a requested crop is coded: the source's own pixels, better than what the base shows of them, in one message.
+"""Codes a requested crop: the source's own pixels, better than the base's, in one message.
 
 Quality goes before size. The crop is coded at the quality that is requested, or better until it plainly shows more
 than the base. Where that is larger than what comes promptly, quality is lowered, as long as the still beats the base;

@@ -35,7 +35,7 @@ class StillSender:
         return self.backlog is not None and self.backlog.offline
 
     def allowance(self, now_ns: int, *, paced: bool) -> Allowance:
-        """How many payload bytes a still may take now."""
+        """Payload bytes that a still may take now."""
         return lambda still: self.transmitter.still_allowance_bytes(now_ns, still=still, paced=paced)
 
     def put(self, coded: OutboxStill, *, now_ns: int, store: bool) -> None:

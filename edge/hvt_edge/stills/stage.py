@@ -62,7 +62,7 @@ class StillStage:
 
     @property
     def pending(self) -> int:
-        """How many stills of the method are pending."""
+        """Number of pending stills of the method."""
         return len(self.outbox)
 
     @property
@@ -170,7 +170,7 @@ class StillStage:
                 )
 
     def note_load(self, captured: int, unanalyzed: int, *, now_ns: int) -> None:
-        """How many frames came so far, and how many of them `analyze` never saw; about once a second."""
+        """Take the counts of frames so far: captured, and never analyzed; about once a second."""
         if self.levers is not None:
             self.levers.take_load(captured, unanalyzed, now_ns=now_ns)
 

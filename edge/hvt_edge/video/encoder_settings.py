@@ -30,7 +30,7 @@ _TIGHT_VBV_S = 0.1
 _TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
 _KEYFRAME_EVERY_S = 5.0
 """x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.
-So much is asked for less, for the first keyframe, one each ten seconds, and some that grounds ask for."""
+x265 gets so much less, for the first keyframe, one each ten seconds, and some that grounds ask for."""
 
 
 @dataclass(frozen=True, slots=True)

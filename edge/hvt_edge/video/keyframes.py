@@ -1,4 +1,4 @@
-"""When the next base frame becomes a keyframe: at the start, on a long schedule, and on request.
+"""Schedules keyframes: at the start, on a long schedule, and on request.
 
 A keyframe is the largest message there is, so it is announced: while one is due stills are held, and it is sent as
 soon as it fits the budget's window. A scheduled one may wait ``scheduled_patience_ns`` for that, a requested one
@@ -65,7 +65,7 @@ class KeyframePlan:
 
 
 def keyframe_interval_s(size: tuple[int, int], base_bps: int) -> float:
-    """How long to go without a scheduled keyframe where nobody says: 10 s, up to 60 s where the rate is thin.
+    """The default time between scheduled keyframes: 10 s, up to 60 s where the rate is thin.
 
     A keyframe that the VBV lets through at a low rate is far coarser than the frames before it, and the picture takes
     seconds to recover: at 200 kbps and 1280x720 the objects found fell from 62 to 6. Grounds that join or lose

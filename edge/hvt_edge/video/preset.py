@@ -41,7 +41,7 @@ class PresetChoice:
 
 
 def share_of(cores: int) -> float:
-    """How many of so many processors encoding may take."""
+    """Processors, of so many, that encoding may take."""
     return max(_LEAST_CORES, _SHARE * cores)
 
 

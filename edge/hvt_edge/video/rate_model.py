@@ -1,4 +1,4 @@
-"""How large and how frequent base frames are to be at a given rate: a small model, fitted to measurements.
+"""Size and rate of base frames at a given bitrate: a small model, fitted to measurements.
 
 Fewer frames get more bits each. Measured on a still and on a fast moving camera from 100 to 400 kbps
 (docs/base-stream.md), F1 and class agreement of tracks rise down to three to five frames a second wherever x265 needs

@@ -137,7 +137,7 @@ class BaseStage:
 
     @property
     def budget_waited_ns(self) -> int:
-        """How long frames have waited for the budget's window, all together."""
+        """The time that frames have waited for the budget's window, all together."""
         return self.transmitter.base_waited_ns
 
     def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> bool:

@@ -15,7 +15,7 @@ _LAST = 3
 
 
 def trial_frames(fps: float) -> int:
-    """How many frames are coded, at so many a second; as many as count, at least."""
+    """Number of coded frames of a trial, at so many a second; as many as count, at least."""
     return max(_LAST, 1 + math.floor(_TRIAL_S * fps))
 
 

@@ -34,7 +34,7 @@ _AUTO_REST_S = 8.0
 
 
 def make_link_settings(config: EdgeConfig) -> LinkSettings:
-    """How the edge takes part in Zenoh."""
+    """The edge's settings of Zenoh."""
     return LinkSettings(
         role="edge",
         listen=config.listen,
@@ -73,7 +73,7 @@ def make_budget(config: EdgeConfig, *, base_bps: int, decimation: int) -> Rollin
 
 
 def make_split(config: EdgeConfig, size: tuple[int, int], *, first_share: float) -> Split | None:
-    """Who moves the base's share of the budget, from the first on; None where it is fixed."""
+    """The control of the base's share of the budget; None where it is fixed."""
     if not isinstance(config.video_share, str):
         return None
     fps = LEAST_FPS if config.auto_fps else config.nominal_fps

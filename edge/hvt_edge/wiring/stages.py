@@ -99,7 +99,7 @@ def build_stages(
     """Build every part once, each with all that it needs; files and threads end with ``stack``.
 
     ``beginning`` is what `try_scene` found.
-    ``headroom`` is what of its rate the encoder is asked for (`qualify_encoder`).
+    ``headroom`` is the share of its rate that the encoder is set to (`qualify_encoder`).
     Raises `UserError` where the encoder does not take the settings, or a file cannot be written.
     """
     view, class_names, decimation = source.view, detector.class_names, beginning.decimation

@@ -34,7 +34,7 @@ _MOST_NS = 3 * SECOND_NS
 
 @dataclass(frozen=True, slots=True)
 class Beginning:
-    """How a flight begins."""
+    """The decisions at the beginning of a flight."""
 
     decimation: int
     """Each n-th source frame is coded."""

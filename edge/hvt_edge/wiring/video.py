@@ -161,7 +161,7 @@ def make_encoder(
 ) -> Encoder:
     """The encoder at the rate that the budget leaves it; with several threads only where bytes need not repeat.
 
-    It is asked for ``headroom`` (0…1) of that rate, and has the ``preset`` of the settings unless another is given;
+    It is set to ``headroom`` (0…1) of that rate, and has the ``preset`` of the settings unless another is given;
     with ``--preset auto`` the slowest. Raises `UserError` where it does not take the settings.
     """
     settings = encoder_settings(
@@ -255,7 +255,7 @@ def qualify_encoder(
     )
     if headroom < 1:
         _log.warning(
-            "encoder %s overshoots: it is asked for %.0f %% of its rate", config.encoder, 100 * headroom
+            "encoder %s overshoots: it is set to %.0f %% of its rate", config.encoder, 100 * headroom
         )
     return headroom
 
@@ -342,7 +342,7 @@ def make_regions(config: EdgeConfig, size: tuple[int, int]) -> TrackRegions | No
 
 
 def make_keyframes(config: EdgeConfig, source: Source) -> KeyframeRequests:
-    """Where keyframes are requested, on a long schedule and on demand; a camera makes its own."""
+    """The control of keyframes, on a long schedule and on demand; a camera makes its own."""
     if config.passes_through:
         assert source.camera_stream is not None, "checked by as_the_camera_is"
         every_s = source.camera_stream.keyframe_s

@@ -1,4 +1,4 @@
-"""Where things were, for maps: GeoJSON (RFC 7946) and KML (OGC 12-007r2).
+"""Exports for maps: GeoJSON (RFC 7946) and KML (OGC 12-007r2).
 
 The camera's way is one line; each track is one, of its places at most once a second. A track that stayed within what
 its places may be off by is a point, the surest of them.

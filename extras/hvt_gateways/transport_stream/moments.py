@@ -1,4 +1,4 @@
-"""When metadata is said: once a frame, with its tracks as soon as they are known, without them where they are not.
+"""Times the metadata: once a frame, with its tracks as soon as they are known, without them where they are not.
 
 Pictures go out at once and never wait for perception. Tracks come later, of some frames not at all, and of others
 that the base stream left out.

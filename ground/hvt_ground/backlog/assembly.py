@@ -81,7 +81,7 @@ class BacklogAssembly:
 
     @property
     def in_progress(self) -> int:
-        """How many objects there are of which some is held or handed out."""
+        """Number of objects of which some is held or handed out."""
         return len(self._open)
 
     def chunk(self, header: BacklogHeader, payload: bytes, *, may_finish: bool = True) -> bytes | None:
@@ -152,7 +152,7 @@ class BacklogAssembly:
 
     @property
     def unreported(self) -> int:
-        """How many acknowledgements the edge has not been sent yet."""
+        """Number of acknowledgements not yet sent to the edge."""
         return len(self._unreported)
 
     def take_acknowledged_ranges(self, most: int) -> tuple[AcknowledgedRange, ...]:

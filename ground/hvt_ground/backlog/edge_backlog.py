@@ -58,12 +58,12 @@ class EdgeBacklog:
 
     @property
     def working(self) -> int:
-        """How many objects have come and are not where they belong yet."""
+        """Number of received objects that are not delivered yet."""
         return self._working
 
     @property
     def unreported(self) -> int:
-        """How many acknowledgements the edge has not been sent yet."""
+        """Number of acknowledgements not yet sent to the edge."""
         return self._assembly.unreported
 
     def take_acknowledged_ranges(self, most: int) -> tuple[AcknowledgedRange, ...]:

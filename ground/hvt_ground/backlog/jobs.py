@@ -22,7 +22,7 @@ _Pictures = Iterator[tuple[BacklogUnit, Image | None] | None]
 
 @dataclass(frozen=True, slots=True)
 class Destination:
-    """Where an object goes: acquired when its job begins, released when the job is closed."""
+    """The destination of an object: acquired when its job begins, released when the job is closed."""
 
     acquire: Callable[[], SessionBacklog | None]
     """None: nothing of that session is taken any more."""

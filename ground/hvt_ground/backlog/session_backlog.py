@@ -25,7 +25,7 @@ _LONGEST_S = 1.0
 
 @dataclass(slots=True)
 class BacklogTotals:
-    """How much of a backlog has come."""
+    """Totals of a received backlog."""
 
     stills: int = 0
     frames: int = 0

@@ -74,7 +74,7 @@ class EdgeTrack:
 
 @dataclass(frozen=True, slots=True)
 class RequestedStill:
-    """A still that was asked for."""
+    """A still that was requested."""
 
     edge: str
     header: RoiHeader

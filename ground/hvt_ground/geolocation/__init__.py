@@ -1,4 +1,4 @@
-"""Where on the ground things are.
+"""Places of objects on the ground.
 
 `locate` is for sessions; `camera`, `footprint`, `trail`, `surface`, `terrain` and `elevation` are for others.
 """

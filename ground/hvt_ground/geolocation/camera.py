@@ -30,7 +30,7 @@ _SURE: Final = 2.0
 def ground_points(
     pose: Pose, points_px: Points, *, size: tuple[int, int], surface: Surface = FLAT_GROUND
 ) -> Points:
-    """Where the rays of pixels meet the ground, metres north and east of the point below the camera, (N, 2).
+    """Points where rays of pixels meet the ground, metres north and east of the point below the camera, (N, 2).
 
     ``points_px`` (N, 2) are source pixels, (0, 0) the outer corner of the first one, of a picture of ``size`` (width,
     height). The optical axis goes through its middle; pixels are square; no lens distortion. NaN where a ray does
@@ -58,7 +58,7 @@ def _rays(pose: Pose, points_px: Points, *, size: tuple[int, int]) -> Rays:
 def places_of_boxes(
     pose: Pose, boxes_base_px: Boxes, *, view: View, surface: Surface = FLAT_GROUND
 ) -> Places | None:
-    """Where the objects in (N, 4) boxes stand, with the ellipse that holds each with 95 %.
+    """Places of the objects in (N, 4) boxes, with the ellipse that holds each with 95 %.
 
     An object is taken to stand at the lower edge of its box where the camera looks along the ground, in the middle
     where it looks straight down, and between the two otherwise. The ellipse comes from the errors of the pose, of the

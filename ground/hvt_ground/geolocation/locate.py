@@ -47,7 +47,7 @@ class Geolocation:
         return self._trail.newest
 
     def stale_s(self, capture_ns: int) -> float | None:
-        """How old the newest pose is where it is too old to use; None where it is not, or none ever came."""
+        """The age of the newest pose where it is too old to use; None where it is not, or none ever came."""
         age_s = self._trail.age_s(capture_ns)
         return age_s if age_s is not None and age_s > STALE_S else None
 

@@ -27,11 +27,11 @@ class Surface(Protocol):
         ...
 
     def meet(self, pose: Pose, rays: Rays) -> Points:
-        """Where rays from the camera meet it, metres north and east of the camera, (N, 2); NaN where they do not."""
+        """Points where rays meet it, metres north and east of the camera, (N, 2); NaN where they do not."""
         ...
 
     def below_m(self, pose: Pose, metres: Points) -> npt.NDArray[np.float64]:
-        """How far below the camera the ground is, (N,), so many metres north and east of it; NaN where not known."""
+        """The ground's depth below the camera, (N,), so many metres north and east of it; NaN where not known."""
         ...
 
 

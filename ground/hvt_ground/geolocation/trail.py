@@ -43,7 +43,7 @@ class PoseTrail:
         return self._poses[-1] if self._poses else None
 
     def age_s(self, capture_ns: int) -> float | None:
-        """How much older than this moment the newest pose is; None without one."""
+        """The age of the newest pose at this moment; None without one."""
         newest = self.newest
         return None if newest is None else (capture_ns - newest.capture_ns) / SECOND_NS
 

@@ -93,7 +93,7 @@ class GroundGroup:
         self._pages: dict[str, str] = {}
         """The answers by member; empty for none."""
         self._requested: set[str] = set()
-        """Members that are asked for theirs."""
+        """Members whose pages are queried."""
         key, data = self._keys.member(self.member), page.encode()
         self._answers = session.declare_queryable(key, lambda query: query.reply(key, data))
         self._token = session.liveliness().declare_token(self._keys.member(self.member))

@@ -1,4 +1,4 @@
-"""Who may use the detector next, of the sessions that share it: all get it alike, and none waits for long.
+"""A fair lock: sessions that share a detector get it equally often, and none waits for long.
 
 A session that waited its turn out would let its pictures pile up, and show them all late. So it waits for a part of
 the time to its next picture; then it follows its tracks through this one and asks again with the next.

@@ -1,4 +1,4 @@
-"""When things are analyzed: beside the receiving thread, so that decoding never waits for detection.
+"""The thread of perception, beside the receiving one, so that decoding never waits for detection.
 
 In real time what comes too fast is passed over, newest first; in lockstep nothing is, and the order is always the
 same: the same input gives the same tracks.
@@ -67,7 +67,7 @@ class Job(ABC):
 
 
 class PerceptionWorker(ABC):
-    """Where the receiving thread hands over what is to be analyzed, and where jobs are done.
+    """Takes pictures and stills from the receiving thread, and runs their jobs.
 
     Args:
         analyze: takes pictures.
@@ -183,7 +183,7 @@ class RealtimeWorker(PerceptionWorker):
     @property
     def idle(self) -> bool:
         """Nothing waits, and nothing is in hand."""
-        # What is in hand is asked for last: it is taken from what waits, and never put back.
+        # What is in hand is requested last: it is taken from what waits, and never put back.
         return not (self._has_news() or self._jobs or self._last_jobs or self._in_hand)
 
     @property

@@ -36,7 +36,7 @@ class DrawnLayer:
     def __init__(self) -> None:
         self._rows: dict[str, SpooledRows] = {}
         self._shown: dict[str, tuple[int, list[Any]]] = {}
-        """By component, the row that was asked for last, and its place."""
+        """By component, the row that was requested last, and its place."""
         self._names: dict[int, str] = {}
 
     def add(self, component: str, rows: Sequence[Timed]) -> None:

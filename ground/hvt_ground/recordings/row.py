@@ -53,7 +53,7 @@ def is_own_name(name: str) -> bool:
 
 
 def begun_ns(name: str) -> int | None:
-    """When the session of a file began by its name, Unix time; None where that says nothing."""
+    """The beginning of a file's session by its name, Unix time; None where that says nothing."""
     found = _OWN.fullmatch(name)
     try:
         return (

@@ -309,22 +309,22 @@ class GroundSession:
 
     @property
     def newest_capture_ns(self) -> int:
-        """When the newest access unit was captured, the edge's clock; 0 before the first."""
+        """The capture time of the newest access unit, the edge's clock; 0 before the first."""
         return self._last_capture_ns
 
     @property
     def newest_captured_ns(self) -> int | None:
-        """When the newest picture was captured, this ground's clock; None before the first."""
+        """The capture time of the newest picture, this ground's clock; None before the first."""
         return None if self._first_capture_ns is None else self.to_local_ns(self._last_capture_ns)
 
     def traffic(self, now_ns: int) -> Traffic | None:
-        """How full the link is; None before the first access unit, and where none has come lately."""
+        """The link's load; None before the first access unit, and where none has come lately."""
         fps = self.info.fps if self.last_status is None else self.last_status.coded_fps or self.info.fps
         lately_ns = max(_LATELY_NS, round(_FRAMES_LATELY * SECOND_NS / fps))
         return None if now_ns - self._base_ns > lately_ns else self._account.last_traffic
 
     def health(self, now_ns: int) -> Health | None:
-        """How the edge is; None before its first report, and where none has come lately."""
+        """The edge's health; None before its first report, and where none has come lately."""
         if self.last_status is None or now_ns - self._status_ns > _LATELY_NS:
             return None
         return self.last_status.health

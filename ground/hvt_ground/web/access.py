@@ -1,4 +1,4 @@
-"""Who may open the page, and what for: tokens, roles, and requests that come from our own page alone.
+"""Access to the page: tokens, roles, and requests that come from our own page alone.
 
 On loopback everybody on this machine is an operator, or a reverse proxy says who somebody is; elsewhere a token does.
 """
@@ -99,7 +99,7 @@ def cookie_name(headers: Mapping[str, str]) -> str:
 
 
 def crowding(places: Iterable[str], newcomer: str) -> str | None:
-    """Where there is no room: the address whose connection goes, for it has more than a newcomer's; else None.
+    """Without room, the address whose connection is closed, for it has more than a newcomer's; else None.
 
     What one party may have counts as one: all of an IPv6 network of 64 bits.
     """

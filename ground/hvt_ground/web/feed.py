@@ -164,7 +164,7 @@ def still_name(info: Info, still: Refinement) -> str:
 
 
 def state_message(state: GroundState, *, recorded: bool | None = None) -> str:
-    """How all edges are, for the wall and the plot; the words that an operator reads are made here.
+    """The state of all edges, for the wall and the plot; the words that an operator reads are made here.
 
     ``recorded``: this ground writes recordings; None where that is not known.
     """

@@ -129,7 +129,7 @@ class WebPage:
         return lambda: SessionFeed(info, page, self._hub, clock=self._clock)
 
     def still_address(self, info: Info, still: Refinement) -> str:
-        """Where a browser finds the picture of a still, as long as the page has it; without a token."""
+        """The address of a still's picture, as long as the page has it; without a token."""
         return f"{self.address}stills/{info.edge}/{still_name(info, still)}/still"
 
     def show(self, state: GroundState) -> None:

@@ -1,4 +1,4 @@
-"""Who looks at what: every viewer has a bounded queue, every edge a memory of what a newcomer needs.
+"""The viewers: each has a bounded queue, every edge a memory for newcomers.
 
 All of this lives in the thread of the web server's loop; `Hub.post` is the way in for others.
 """
@@ -248,7 +248,7 @@ class Hub:
         self._to_all(message)
 
     def state(self, message: str, loads: Mapping[str, Sequence[float]], *, known: frozenset[str]) -> None:
-        """How all edges are; ``loads`` is what the plot shows of each, and is remembered for newcomers.
+        """Take the state of all edges; ``loads`` are the points of the plot, and are remembered for newcomers.
 
         An edge that is not ``known`` any more is forgotten, with its pictures, at the second state without it: one
         that has just come may not be in the first.

@@ -56,7 +56,7 @@ def make_record_folder(config: GroundConfig) -> None:
 def output_path(
     target: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path], claim: bool = True
 ) -> Path:
-    """Where a file of one session goes, and note it in ``taken``.
+    """The path of a session's file, noted in ``taken``.
 
     ``target`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. A named file
     is written anew, but each session of this process gets one of its own: the first takes the name, others have the
@@ -72,7 +72,7 @@ def output_path(
 
 
 def backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
-    """Where the backlog of a session that is over goes, beside the recording of the one that is open.
+    """The path for the backlog of a session that is over, beside the recording of the one that is open.
 
     Never over another file: its edge has forgotten what is in there.
     """

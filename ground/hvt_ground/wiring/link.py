@@ -7,7 +7,7 @@ from hvt_ground.config import GroundConfig
 
 
 def make_link_settings(config: GroundConfig) -> LinkSettings:
-    """How the ground takes part in Zenoh."""
+    """The ground's settings of Zenoh."""
     return LinkSettings(
         role="ground",
         listen=config.listen,

@@ -75,7 +75,7 @@ class SessionFactory:
         self._index = index
         self._program = program
         self.records = program is None or config.record is not None
-        """Whether there are recordings: a program takes their place unless they are asked for."""
+        """Whether there are recordings: a program takes their place unless they are requested."""
         self._paths: set[Path] = set()
         """Taken by this process."""
         self._naming = threading.Lock()

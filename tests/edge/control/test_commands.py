@@ -145,7 +145,7 @@ def test_too_many_are_refused():
     rig.run(30)
     answers = [rig.ask("still", quality=95) for _ in range(6)]
     assert [one.accepted for one in answers] == [True] * 4 + [False] * 2
-    assert "4 stills that were asked for wait already" in answers[-1].reason
+    assert "4 requested stills are pending already" in answers[-1].reason
 
 
 def test_whoever_waits_can_ask_what_became_of_it():

@@ -38,7 +38,7 @@ class Decoder(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """How one family of networks wants its input and writes its output."""
+    """Input and output of one family of networks."""
 
     name: str
     """The name for ``--head``."""

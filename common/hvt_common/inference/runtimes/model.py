@@ -79,7 +79,7 @@ def _ort_errors() -> tuple[type[Exception], ...]:
 
 @dataclass(frozen=True, slots=True)
 class ModelSettings:
-    """How a model is run."""
+    """Settings of a model's run."""
 
     threads: int = 1
     """CPU threads inside one operator, 1 or more."""
@@ -238,7 +238,7 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
 
 
 def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
-    """An OpenVINO model, in float32 where the reference is asked for."""
+    """An OpenVINO model, in float32 where the reference is requested."""
     if settings.provider not in ("auto", "cpu", "openvino"):
         raise UserError(
             f"model {path} is OpenVINO's: --provider {settings.provider} cannot run it; openvino can"

@@ -30,7 +30,7 @@ _ADDED = "added.toml"
 
 
 def cache_folder() -> Path:
-    """Where models lie: ``HVT_MODELS``, else ``hvt/models`` in the platform's cache folder."""
+    """The folder of models: ``HVT_MODELS``, else ``hvt/models`` in the platform's cache folder."""
     own = os.environ.get("HVT_MODELS")
     if own:
         return Path(own).expanduser()
@@ -72,7 +72,7 @@ class Store:
         return entries[name]
 
     def path(self, name: str) -> Path:
-        """Where the model of this name lies, or would."""
+        """The path of the model of this name, there or not."""
         return self.folder / f"{self.entry(name).name}.onnx"
 
     def held_bytes(self, name: str) -> int:

@@ -83,7 +83,7 @@ class BacklogHeader(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcknowledgedRange:
-    """How much of an object a ground holds, contiguous from its beginning."""
+    """The bytes of an object that a ground holds, contiguous from its beginning."""
 
     session_id: int = wire_field(Int(0, U64))
     kind: str = wire_field(_KIND)
@@ -102,7 +102,7 @@ class BacklogStill:
     """A stored still: its message on ``roi``."""
 
     attachment: bytes = wire_field(Blob(_MAX_HEADER_BYTES))
-    """A `RoiHeader` with the flag `STORED`, sealed over ``payload``."""
+    """A `RoiHeader` with the flag `STORED`, with the checksum of ``payload``."""
     encoding: str = wire_field(Text(_MAX_ENCODING_BYTES))
     """Of Zenoh: the media type."""
     payload: bytes = wire_field(Blob(MAX_BACKLOG_BYTES, least=1))

@@ -98,7 +98,7 @@ class Info(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """How the edge is doing; counts are since its start."""
+    """The health of the edge; counts are since its start."""
 
     frames_captured: int = wire_field(_COUNT)
     frames_encoded: int = wire_field(_COUNT)

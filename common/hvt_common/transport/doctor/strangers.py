@@ -1,4 +1,4 @@
-"""Who connects to our listening ports and is refused: Zenoh closes such a connection and says nothing of it.
+"""Finds refused connections to our listening ports: Zenoh closes such a connection and says nothing of it.
 
 The kernel's table of TCP connections (/proc/net/tcp, Linux only) has who connects now. A connection that ends and
 never was one of the session's links was refused: no certificate, one of another CA, or no Zenoh at all. From a host

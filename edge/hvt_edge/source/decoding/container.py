@@ -177,7 +177,7 @@ def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
 
 
 def shown_times(container: Any, stream: Any, *, stamps: Stamps) -> list[Fraction]:
-    """When each frame is shown, in seconds and in presentation order, by packets alone: nothing is decoded.
+    """The time of each frame, in seconds and in presentation order, by packets alone: nothing is decoded.
 
     The same times as of `decoded`, where all decodes.
     """

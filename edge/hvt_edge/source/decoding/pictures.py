@@ -165,7 +165,7 @@ def matrix_of(frame: av.VideoFrame) -> int:
 
 
 def turn_of(frame: av.VideoFrame) -> str:
-    """How a frame is to be shown by its display matrix, to the nearest right angle, in words; empty for as it is."""
+    """The turn of a frame by its display matrix, to the nearest right angle, in words; empty for as it is."""
     return _TURNS[_turn_of(frame)]
 
 

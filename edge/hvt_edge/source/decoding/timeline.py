@@ -124,7 +124,7 @@ class Timeline:
         )
 
     def at(self, stamp_s: Fraction | None) -> Fraction:
-        """When the next frame is shown, in seconds; ``stamp_s`` is None where it has none."""
+        """The time of the next frame, in seconds; ``stamp_s`` is None where it has none."""
         at_s = self._next(stamp_s)
         if stamp_s is not None:
             self._stamp_s = stamp_s

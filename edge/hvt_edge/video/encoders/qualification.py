@@ -77,7 +77,7 @@ def allowed(*, size: tuple[int, int], fps: float, total_bps: int, base_bps: int,
 
 
 def run_frames(fps: float, limit: Allowed) -> int:
-    """How many coded frames a run takes: three seconds, and two windows at least."""
+    """Number of coded frames of a run: three seconds, and two windows at least."""
     return max(round(_RUN_S * fps), 2 * limit.window_frames)
 
 

@@ -1,4 +1,4 @@
-"""How the camera moved over the last seconds: boxes are moved from one frame to another."""
+"""The camera's motion over the last seconds: boxes are moved from one frame to another."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ CORRECTION_WEIGHT = 0.5
 
 @dataclass(frozen=True, slots=True)
 class FusionRules:
-    """How two opinions on one object become one, where it depends on the session; the reasons stand in `fuse`."""
+    """Rules that fuse two opinions on one object, where they depend on the session; `fuse` has the reasons."""
 
     patience: int
     """For how many frames an edge-only track holds."""

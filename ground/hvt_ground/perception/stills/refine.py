@@ -159,7 +159,7 @@ class Refiner:
         return self.preview(tracks)
 
     def preview(self, tracks: Tracks) -> ShownClasses:
-        """The classes that would be shown for these tracks; changes nothing, so any frame may be asked for."""
+        """The classes that would be shown for these tracks; changes nothing, so any frame may be requested."""
         names = self._vocabulary.names
         base_classes = tuple(names[class_id] for class_id in tracks.class_ids)
         classes = list(base_classes)

@@ -55,7 +55,7 @@ class StillSeen:
     frame_index: int
     capture_ns: int
     edge_track_id: int
-    """The edge's own track; negative when the still was asked for by box."""
+    """The edge's own track; negative when the still was requested by box."""
     box_base_px: tuple[float, float, float, float]
     """x1 y1 x2 y2, base pixels, without padding."""
     class_name: str
@@ -101,7 +101,7 @@ class ResolvedStill:
 
 @dataclass(frozen=True, slots=True)
 class ShownClasses:
-    """Classes of N tracks, parallel to the `Tracks` they were asked for; fields of `events.Overlay`."""
+    """Classes of N tracks, parallel to the given `Tracks`; fields of `events.Overlay`."""
 
     base_classes: tuple[str, ...]
     classes: tuple[str, ...]

@@ -30,7 +30,7 @@ MAX_PENDING, MAX_PENDING_BYTES = 64, 16 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far the ground is."""
+    """The ground's progress."""
 
     frame_index: int = 0
     """The newest frame of which anything is known; new events are shown there."""

@@ -1,4 +1,4 @@
-"""Where words stand on the picture: beside their own object and over no other; where there is no room, nowhere.
+"""Places labels on the picture: beside their own object and over no other; without room there is none.
 
 A viewer draws text at a size of its own, in points of the screen, centred below a point. How large that is on the
 picture depends on the window; it is reckoned for a picture that is `_POINTS_WIDE` points wide, and takes less room in
@@ -43,7 +43,7 @@ class Label:
 
 
 def points(count: float, width_px: int) -> float:
-    """How many pixels of a picture of this width so many points of the screen are."""
+    """Pixels of a picture of this width for so many points of the screen."""
     return count * width_px / _POINTS_WIDE
 
 

@@ -1,4 +1,4 @@
-"""How rows become columns of a Rerun chunk. A table is one entity with one set of columns."""
+"""Turns rows into columns of a Rerun chunk. A table is one entity with one set of columns."""
 
 from __future__ import annotations
 

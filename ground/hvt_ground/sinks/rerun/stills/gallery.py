@@ -1,4 +1,4 @@
-"""Where a still goes in the gallery, and for how long it stays: a grid of pairs, base crop left, still right.
+"""The gallery: slots of stills and the time that each is held: a grid of pairs, base crop left, still right.
 
 Coordinates are those of the gallery's own canvas, `CANVAS` units wide and high; nothing here knows Rerun. A recording
 is read by time, so what is in a slot may be written in any order.
@@ -31,7 +31,7 @@ Rect = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """How a picture is brought onto the canvas: ``canvas = picture * scale + (x, y)``."""
+    """The place of a picture on the canvas: ``canvas = picture * scale + (x, y)``."""
 
     x: float
     y: float
