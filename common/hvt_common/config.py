@@ -309,7 +309,6 @@ def _flags(config_class: type, *, program: str, description: str, rare: bool) ->
 
 
 def _titles(fields: Sequence[dataclasses.Field[Any]]) -> list[str]:
-    """The groups, in order of their first setting."""
     return list(dict.fromkeys(field.metadata["group"] for field in fields if field.metadata["group"]))
 
 

@@ -140,7 +140,6 @@ def _too_slow(content: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _store_rows(store: dict[str, Any] | None) -> list[tuple[str, str]]:
-    """The store's counts, if there are any."""
     if store is None or not any(store.values()):
         return []
     sent = f"{store['sent_stills']} stills and {store['sent_video_s']:.0f} s of video sent afterwards"

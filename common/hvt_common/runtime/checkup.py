@@ -145,8 +145,6 @@ def _bounded(check: Callable[[], Finding], patience_s: float) -> Finding:
 
 
 class _Said(logging.Handler):
-    """The log records of one thread."""
-
     def __init__(self, thread: int) -> None:
         super().__init__(logging.INFO)
         self._thread = thread

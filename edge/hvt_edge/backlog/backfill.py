@@ -149,7 +149,6 @@ class Backfill:
         self._data = None
 
     def _forget(self) -> None:
-        """Forget objects that are not here any more."""
         self._refused = {key for key in self._refused if self._store.find(key) is not None}
         self._acknowledged = {
             key: size for key, size in self._acknowledged.items() if self._store.find(key) is not None

@@ -172,7 +172,6 @@ class LeverControl:
         return sum(self._changed) / max(1, len(self._changed))
 
     def _says(self, *, tracks: bool, stills: bool) -> str:
-        """One line for people."""
         if self._too_slow:
             return "video alone: this machine is too slow for the detector"
         measured = self._measured

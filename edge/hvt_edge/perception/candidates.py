@@ -100,8 +100,6 @@ def sharpness(crop_bgr: Image) -> float:
 
 @dataclass(slots=True)
 class _History:
-    """All that is kept of one track."""
-
     seen_ns: int
     start_frame: int
     border_since_ns: int | None = None

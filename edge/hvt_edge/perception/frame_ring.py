@@ -170,7 +170,6 @@ class FrameRing:
 
     @property
     def _last_index(self) -> int:
-        """Of the newest frame from the camera."""
         newest = (self._captured, *self._frames[-1:])
         return max(one.frame_index for one in newest if one is not None)
 

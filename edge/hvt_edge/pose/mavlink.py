@@ -206,7 +206,6 @@ class MavlinkPose:
         return whose == (self._vehicle[0], _AUTOPILOT)
 
     def _of(self, whose: tuple[int, int], now_ns: int) -> dict[str, Any]:
-        """The latest messages of one component."""
         return {
             name: message
             for (system, component, name), (at_ns, message) in self._newest.items()

@@ -90,7 +90,6 @@ def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
 
 
 def _place(body: str, *, latitude_first: bool) -> dict[str, float]:
-    """What GPS(…) says."""
     found = _GPS.search(body)
     if found is None:
         return {}

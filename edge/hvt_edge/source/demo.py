@@ -158,7 +158,6 @@ def _end(drawing: subprocess.Popen[bytes]) -> None:
 
 
 def _draw(seed: int, spec: str) -> None:
-    """The loop of the drawing process."""
     (entry,) = entry_points(group="hvt.scenes", name="demo")
     scene: DrawnScene = entry.load()(seed, **demo_scene(spec))
     requests, answers = sys.stdin.buffer, sys.stdout.buffer

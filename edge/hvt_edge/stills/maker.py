@@ -53,8 +53,6 @@ class NoStill:
 
 @dataclass(frozen=True, slots=True)
 class _Fitted:
-    """A coded crop."""
-
     data: bytes
     parameters: Parameters
     quality_pct: int

@@ -372,7 +372,6 @@ class Outbox:
             del self._pending[pending.track_id]
 
     def _drop_crop(self, sent: OutboxStill) -> None:
-        """It will not be coded again."""
         sent.job = None
         self._undecodable.discard(sent.still.sequence)
         if sent.state is StillState.ACKNOWLEDGED or not self._reports:

@@ -214,7 +214,6 @@ def make_presets(config: EdgeConfig, operating: Operating) -> PresetControl | No
 
 
 def _video_bps(config: EdgeConfig, *, total_bps: int, base_bps: int) -> int:
-    """The rate of video and stills together."""
     return max(total_bps - config.metadata_bps, base_bps)
 
 

@@ -196,7 +196,6 @@ class GroundGroup:
             claim[1].undeclare()  # type: ignore[no-untyped-call]
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        """Handles a token in Zenoh's thread."""
         parsed = self._keys.parse(str(sample.key_expr))
         if parsed is None or parsed[0] == self.member:
             return

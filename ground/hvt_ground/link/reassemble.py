@@ -209,7 +209,6 @@ class Reassembler:
         return released
 
     def _give_up(self, lost: int) -> None:
-        """Count the next ``lost`` sequence numbers as lost."""
         self.counters.gaps += 1
         self.counters.lost += lost
         self._recent = self._recent << min(lost, SEQUENCE_SLACK) & _WINDOW_MASK
@@ -310,7 +309,6 @@ class Reassembler:
         starts_session: bool = False,
         duplicate: bool = False,
     ) -> Arrival:
-        """The unit with its verdict, counted."""
         self.counters.duplicates += verdict == "duplicate"
         self.counters.replayed += verdict == "stale"
         starts_run = verdict == "decode" and not self._synced

@@ -348,8 +348,6 @@ def _sample(row: Timed) -> VideoSample:
 
 @dataclass(frozen=True, slots=True)
 class _StillPlace:
-    """Where a still's pictures are."""
-
     frame: int
     picture: tuple[SpooledRows, int]
     base: tuple[SpooledRows, int] | None

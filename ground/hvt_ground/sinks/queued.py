@@ -229,7 +229,6 @@ class QueuedSink(Generic[T]):
             done(True)
 
     def _fail(self, error: BaseException) -> None:
-        """Count the queue as lost."""
         self._pause.failed(time.monotonic_ns())
         with self._changed:
             self._open, self._failing = False, True

@@ -160,8 +160,6 @@ class Pictures:
 
 
 class _H264:
-    """One encoder with its muxer."""
-
     def __init__(self, info: Info) -> None:
         self._encoder = _encoder(info)
         self._muxer = Muxer("h264", size=info.base_size, fps=info.fps)

@@ -305,7 +305,6 @@ class Fusion:
     # After news
 
     def _update(self, own: Tracks | None, frame_index: int) -> None:
-        """Associate tracks, forget ended ones, give ids."""
         if own is not None:
             self._pair(own, frame_index)
         self._forget_old(frame_index)

@@ -253,7 +253,6 @@ def _held(screen: _Screen, overlay: Overlay) -> _Screen:
 
 
 def _layers(overlay: Overlay, screen: _Screen) -> Iterator[tuple[Layer, dict[str, Any]]]:
-    """All components of each layer."""
     origins = overlay.origins or ("base",) * len(overlay.track_ids)
     reported, doubted = _reported(overlay), _doubted(overlay)
     of_layer: dict[Layer, npt.NDArray[np.bool_]] = {

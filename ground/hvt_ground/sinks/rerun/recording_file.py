@@ -113,7 +113,6 @@ class RecordingFile:
             self._output.compact(chunks)
 
     def _add(self, row: TableRow) -> Chunk:
-        """Add a row to its table."""
         assert row.at is not None, "a row has its time"
         table = self._tables.setdefault((row.path, row.columns), Table(row.path, row.columns))
         if not table:

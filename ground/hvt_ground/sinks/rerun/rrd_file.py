@@ -137,7 +137,6 @@ class RrdFile:
             scratch.unlink(missing_ok=True)
 
     def _encoded(self, chunks: Sequence[Chunk]) -> bytes:
-        """The chunks as messages, LZ4-compressed by the SDK."""
         self._recording.send_chunks(chunks)
         return _messages(self._stream.read() or b"")
 
@@ -216,7 +215,6 @@ def _whole_messages(file: int) -> Iterator[tuple[int, int]]:
 
 
 def _created(path: Path) -> int:
-    """A file descriptor of a new, empty file."""
     if path.is_dir():
         raise UserError(
             f"recording {path} is a folder: give the name of a file in it, such as {path / 'flight.rrd'}"
