@@ -28,7 +28,7 @@ class TimeLeft(Generic[_Run]):
         self, runs: Mapping[_Run, int], *, kinds: Mapping[_Run, str], workers: int, now_s: float
     ) -> None:
         self._flights, self._kinds = dict(runs), kinds
-        self._waiting = list(runs)
+        self._pending = list(runs)
         self._began: dict[_Run, tuple[float, int]] = {}
         """When, and how many flights were done by then."""
         for _ in range(workers):
@@ -39,8 +39,8 @@ class TimeLeft(Generic[_Run]):
 
     def ended(self, run: _Run, *, flown: int, now_s: float) -> None:
         """This run has ended; ``flown`` flights are done in all."""
-        if run in self._waiting:  # a worker took it out of turn
-            self._waiting.remove(run)
+        if run in self._pending:  # a worker took it out of turn
+            self._pending.remove(run)
         began_s, flown_then = self._began.pop(run, (now_s, flown))
         flights, kind = self._flights.pop(run), self._kinds[run]
         if flights and flown > flown_then and run not in self._first:  # else it was in the cache
@@ -61,10 +61,10 @@ class TimeLeft(Generic[_Run]):
             for run, (began_s, _) in self._began.items()
         ]
         heapq.heapify(free_s)
-        for run in self._waiting:
+        for run in self._pending:
             heapq.heapreplace(free_s, free_s[0] + expected_s[run])
         return max(free_s, default=0.0)
 
     def _begin(self, now_s: float, flown: int) -> None:
-        if self._waiting:
-            self._began[self._waiting.pop(0)] = (now_s, flown)
+        if self._pending:
+            self._began[self._pending.pop(0)] = (now_s, flown)
