@@ -10,6 +10,7 @@ from hvt_common import __version__
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import (
+    BASE_CODEC,
     MOST_FAILED_PARTS,
     FailedPart,
     Health,
@@ -61,7 +62,7 @@ class InfoReporter:
             view_scale=view.scale,
             view_offset_px=view.offset_px,
             fps=config.nominal_fps,
-            codec="hevc",
+            codec=BASE_CODEC,
             pace=config.pace,
             method=now.method,
             budget_bps=now.budget_bps,

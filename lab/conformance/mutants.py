@@ -174,7 +174,6 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("a value of a map is not looked at", "        of(one);\n", ""),
     Mutant("a box may be inside out", "x1 <= x2 && y1 <= y2", "x1 <= x2"),
     Mutant("a box without an inside is refused", "x1 <= x2 && y1 <= y2", "x1 < x2 && y1 < y2"),
-    Mutant("a crop may be empty", "empty || (x1 < x2 && y1 < y2)", "empty || x1 < x2"),
     Mutant(
         "a parameter may be infinite",
         "float(-most, most)(value);",
@@ -290,6 +289,23 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("a pose's numbers have no bounds", "value >= kinds[index][0] && value <= kinds[index][1]", "true"),
     Mutant("a pose may go back in time", "time > this.time && ", ""),
     Mutant("a pose's number does not begin again at 16", "(this.number + 1) % 16", "this.number + 1"),
+    # Where a still is
+    Mutant("a word may be one beyond the list", "BigInt(words.length - 1)", "BigInt(words.length)"),
+    Mutant("a word may be a text of any length", "text(most)(value);", "text(1e9)(value);"),
+    Mutant(
+        "a place may have nine numbers",
+        "place.length === 8 || place.length === 10",
+        "place.length >= 8 && place.length <= 10",
+    ),
+    Mutant("a crop may begin before the frame", "x >= 0 && y >= 0 && width > 0", "width > 0"),
+    Mutant("a crop may be of no size", "width > 0 && height > 0 && ", ""),
+    Mutant("a crop may end too far to the right", "x + width <= 32767 && ", ""),
+    Mutant("a crop may end too far below", " && y + height <= 32767", ""),
+    Mutant("a box may be inside out", " && box[0] <= box[2] && box[1] <= box[3]", ""),
+    Mutant("a box has no bound", "Math.abs(side) <= 8 * 32767", "true"),
+    Mutant("a coded size may be nothing", "side >= 1 && side <= 32767", "side <= 32767"),
+    Mutant("a coded size has no bound", "side >= 1 && side <= 32767", "side >= 1"),
+    Mutant("a field may be told as a parameter", '["w", "h", "b"].some(', "[].some("),
     # Stills
     Mutant("the loop filter is off at QP 16", "qp > 15 ?", "qp > 16 ?"),
     Mutant("the loop filter is on at QP 15", "qp > 15 ?", "qp >= 15 ?"),

@@ -140,11 +140,10 @@ const list = (least: number, most: number, of: Kind): Kind => (value) => {
   need(Array.isArray(value) && value.length >= least && value.length <= most, `no array of ${least} to ${most}`);
   return value.map((one) => of(one) ?? one);
 };
-const box = (of: Kind, empty: boolean): Kind => (value) => {
+const box = (of: Kind): Kind => (value) => {
   list(4, 4, of)(value);
   const [x1, y1, x2, y2] = value as bigint[];
   need(x1 <= x2 && y1 <= y2, "a box that is inside out");
-  need(empty || (x1 < x2 && y1 < y2), "a box without an inside");
 };
 const map = (most: number, keys: number, of: Kind): Kind => (value) => {
   need(value instanceof Map && value.size <= most, `no map of ${most}`);
@@ -165,12 +164,13 @@ const allowed = (value: string): boolean =>
 function kindOf(row: any): Kind {
   switch (row.type) {
     case "int": return int(BigInt(row.low), BigInt(row.high));
+    case "word": return word(row.words, row.most_bytes);
     case "float": return float(row.low, row.high);
     case "bool": return bool;
     case "str": return text(row.most_bytes);
     case "bin": return bin(row.least_bytes, row.most_bytes);
     case "scalar": return scalar(int(BigInt(row.low), BigInt(row.high)), row.most, row.most_bytes);
-    case "array": return row.box ? box(kindOf(row.of), row.box === "may be empty") : list(row.least, row.most, kindOf(row.of));
+    case "array": return row.box ? box(kindOf(row.of)) : list(row.least, row.most, kindOf(row.of));
     case "map": return map(row.most, row.key_bytes, kindOf(row.of));
     case "nested": return nested(fieldsOf(SCHEMA.nested[row.of]));
     default: throw new Error(`a type that this reader does not know: ${row.type}`);
@@ -180,6 +180,11 @@ function kindOf(row: any): Kind {
 const valueOf = (json: any): Value => typeof json === "number" ? BigInt(json) : Array.isArray(json) ? json.map(valueOf) : json;
 const fieldsOf = (table: any): Fields =>
   table.fields.map((row: any) => ({ name: row.name, kind: kindOf(row), missing: "default" in row ? valueOf(row.default) : undefined }));
+// A word of the list by its number, or any other text.
+const word = (words: string[], most: number): Kind => (value) => {
+  if (typeof value === "string") text(most)(value);
+  else int(0n, BigInt(words.length - 1))(value);
+};
 const nested = (fields: Fields): Kind => (value) => {
   need(Array.isArray(value), "no nested array");
   return checkFields(fields, value);
@@ -215,7 +220,23 @@ function read(name: string, data: Uint8Array, payload: Uint8Array): Value[] {
   if (!SCHEMA.reads.includes(Number(values[0]))) throw new Refused(`version ${values[0]}`, true);
   need(data[data.length - 5] === 0xce, "no checksum at its end");
   need(values[values.length - 1] === BigInt(crc32(payload, data.subarray(0, -5))), "another checksum");
-  return checkFields(fieldsOf(table), values.slice(1, -1));
+  const fields = checkFields(fieldsOf(table), values.slice(1, -1));
+  if (name === "RoiHeader") {
+    checkPlace((field(name, fields, "place") as bigint[]).map(Number));
+    const parameters = field(name, fields, "parameters");
+    need(!(parameters instanceof Map && ["w", "h", "b"].some((one) => parameters.has(one))), "a parameter that has a field");
+  }
+  return fields;
+}
+
+// Of the crop x, y, width and height, how far inside its sides those of the box are, and the coded size.
+function checkPlace(place: number[]): void {
+  need(place.length === 8 || place.length === 10, "a place of another length");
+  const [x, y, width, height, left, top, right, bottom, ...coded] = place;
+  need(x >= 0 && y >= 0 && width > 0 && height > 0 && x + width <= 32767 && y + height <= 32767, "no crop");
+  const box = [8 * x + left, 8 * y + top, 8 * (x + width) - right, 8 * (y + height) - bottom];
+  need(box.every((side) => Math.abs(side) <= 8 * 32767) && box[0] <= box[2] && box[1] <= box[3], "no box");
+  need(coded.every((side) => side >= 1 && side <= 32767), "no coded size");
 }
 
 // The place of a field among the values of a message.

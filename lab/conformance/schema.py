@@ -6,7 +6,7 @@ The tables of docs/wire-messages.md are checked against it, and the reader in Ty
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import MISSING, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from hvt_common.protocol.messages import (
     MAX_BACKLOG_BYTES,
     MAX_PAYLOAD_BYTES,
     MOST_UNKNOWN_FIELDS,
-    READ_VERSIONS,
+    SPOKEN_VERSIONS,
     WIRE_VERSION,
     BacklogHeader,
     BacklogStill,
@@ -27,8 +27,8 @@ from hvt_common.protocol.messages import (
     InfoRequest,
     Message,
     PoseReport,
-    RoiHeader,
     Status,
+    StillWire,
     TrackStep,
     kinds,
 )
@@ -39,7 +39,7 @@ from hvt_common.protocol.messages.track_boxes import MOST_BOXES, MOST_CLASSES
 PATH = Path(__file__).resolve().parents[2] / "docs" / "wire.json"
 MESSAGES: tuple[type[Message], ...] = (
     BaseHeader,
-    RoiHeader,
+    StillWire,
     BacklogHeader,
     Info,
     TrackStep,
@@ -59,7 +59,7 @@ def schema() -> dict[str, Any]:
     }
     return {
         "version": WIRE_VERSION,
-        "reads": list(READ_VERSIONS),
+        "reads": list(SPOKEN_VERSIONS),
         "limits": {
             "payload_bytes": MAX_PAYLOAD_BYTES,
             "object_bytes": MAX_BACKLOG_BYTES,
@@ -70,7 +70,7 @@ def schema() -> dict[str, Any]:
             "refused_characters": [list(one) for one in REFUSED_CHARACTERS],
         },
         "messages": {
-            one.__name__: {
+            name_of(one): {
                 "most_bytes": one.MAX_BYTES,
                 "payload_bytes": one.MAX_PAYLOAD,
                 "fields": list(_fields(one)),
@@ -80,6 +80,11 @@ def schema() -> dict[str, Any]:
         "nested": {name: {"fields": list(_fields(one))} for name, one in nested.items()},
         "objects": {one.__name__: {"fields": list(_fields(one))} for one in (BacklogStill, BacklogUnit)},
     }
+
+
+def name_of(message: type[Message]) -> str:
+    """As the pages call it."""
+    return "RoiHeader" if message is StillWire else message.__name__
 
 
 def nested_of(kind: Kind) -> Iterator[type]:
@@ -92,7 +97,7 @@ def nested_of(kind: Kind) -> Iterator[type]:
 
 
 def _fields(message: type) -> Iterator[dict[str, Any]]:
-    defaults = {item.name: item.default for item in fields(message) if item.default is not MISSING}
-    for name, kind in kinds(message):
-        default = {"default": kind.encode(defaults[name])} if name in defaults else {}
-        yield {"name": name, **kind.schema(), **default}
+    for item in fields(message):
+        meta, kind = item.metadata, item.metadata["wire"]
+        default = {"default": kind.encode(meta["default"])} if meta["optional"] else {}
+        yield {"name": item.name, **kind.schema(), **default}

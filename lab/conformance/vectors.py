@@ -11,7 +11,7 @@ import struct
 import sys
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from hvt_common.protocol.messages import (
     Flags,
     Message,
     PackedMessage,
-    RoiHeader,
+    StillWire,
     WireError,
     kinds,
     pack_backlog_still,
@@ -32,14 +32,15 @@ from hvt_common.protocol.messages import (
     parse_backlog_still,
     parse_backlog_units,
 )
-from hvt_common.protocol.messages.envelope import DEEPEST, MOST_UNKNOWN_FIELDS, READ_VERSIONS, WIRE_VERSION
-from lab.conformance.schema import PATH, schema
+from hvt_common.protocol.messages.envelope import DEEPEST, MOST_UNKNOWN_FIELDS, WIRE_VERSION
+from lab.conformance.schema import PATH, name_of, schema
 from lab.conformance.sessions import poses, track_steps
 from lab.conformance.stills import still_cases
 from rigs.messages import BASE, EXAMPLES, INFO, REQUEST, ROI
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "conformance"
-_PAYLOADS: Mapping[type[Message], bytes] = {BaseHeader: b"an access unit", RoiHeader: b"a still"}
+_PAYLOADS: Mapping[type[Message], bytes] = {BaseHeader: b"an access unit", StillWire: b"a still"}
+_EXAMPLES = [one.on_wire() for one in EXAMPLES]
 _WITH_NESTED = {"RoiHeader": ("also", 16), "ControlAnswer": ("tracks", 6), "Feedback": ("stills", 19)}
 """A field that holds nested arrays, and its place."""
 _EXACT = 2**53 - 1
@@ -103,7 +104,7 @@ _OF_ANY_TYPE: tuple[tuple[Any, str], ...] = (
 )
 
 
-def edges(kind: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:  # noqa: C901 - a case for each type
+def edges(kind: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:  # noqa: C901, PLR0912 - a case for each type
     """Values at and beyond the bounds of a schema; MessagePack holds no more than 64 bits."""
     match kind:
         case {"type": "int", "low": low, "high": high}:
@@ -114,6 +115,9 @@ def edges(kind: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:  # noqa: C901 -
                 (float(low), "as a fraction"),
             ]
             yield from ((one, f"is {what}") for one, what in found if -(2**63) <= one < 2**64)
+        case {"type": "word", "words": words, "most_bytes": most}:
+            yield from edges({"type": "int", "low": 0, "high": len(words) - 1})
+            yield from edges({"type": "str", "most_bytes": most})
         case {"type": "float", "low": low, "high": high}:
             yield from ((low, "is at its bound"), (high, "is at its upper bound"), (math.nan, "is NaN"))
             yield from (
@@ -148,6 +152,11 @@ def edges(kind: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:  # noqa: C901 -
                 yield from (
                     ([raw] + [one] * max(0, least - 1), f"has one that {what}") for raw, what in edges(of)
                 )
+        case {"type": "nested", "of": name}:
+            whole = _plain_value(kind)
+            for place, field in enumerate(schema()["nested"][name]["fields"]):
+                for raw, what in edges(field):
+                    yield [*whole[:place], raw, *whole[place + 1 :]], f"has a {field['name']} that {what}"
         case {"type": "map", "most": most, "key_bytes": key_bytes, "of": of}:
             one = _plain_value(of)
             yield {f"{number}": one for number in range(most)}, "is as large as may be"
@@ -187,11 +196,30 @@ def _plain_value(kind: Mapping[str, Any]) -> Any:
     return {"str": "", "bin": b"", "bool": False, "scalar": 0, "map": {}}[kind["type"]]
 
 
+_PLACES: tuple[tuple[list[int], str], ...] = (
+    ([0, 0, 1, 1, 0, 0, 0, 0], "is the smallest"),
+    ([32766, 32766, 1, 1, -8, -8, 8, 8], "is the last pixel, and its box beside it"),
+    ([9, 9, 40, 30, -100, 5, -100, 7, 20, 15], "has a coded size"),
+    ([9, 9, 40, 30, 0, 0, 0, 0, 0, 15], "has a coded size of nothing"),
+    ([9, 9, 40, 30, 0, 0, 0, 0, 20], "has a number too many"),
+    ([9, 9, 40, 30, 0, 0, 0], "has a number too few"),
+    ([9, 9, 0, 30, 0, 0, 0, 0], "is of no width"),
+    ([9, 9, 40, -3, 0, 0, 0, 0], "is of a height below 0"),
+    ([-1, 9, 40, 30, 0, 0, 0, 0], "begins before the frame"),
+    ([32767, 9, 1, 30, 0, 0, 8, 0], "ends too far to the right"),
+    ([9, 32738, 40, 30, 0, 0, 0, 8], "ends too far below"),
+    ([9, 9, 40, 30, 0, 0, 0, 0, 32768, 15], "has a coded size that is too wide"),
+    ([9, 9, 40, 30, 161, 0, 160, 0], "has a box that is inside out"),
+    ([9, 9, 40, 30, 160, 120, 160, 120], "has a box without an inside"),
+    ([9, 9, 40, 30, -262209, 0, 0, 0], "has a box too far to the left"),
+)
+
+
 # Messages that are to be read
 
 
 def _messages() -> Iterator[dict[str, Any]]:
-    for message in EXAMPLES:
+    for message in _EXAMPLES:
         yield _vector(message, "an example")
         yield from (
             _vector(replace_at(message, place, raw), what) for place, raw, what in _edges(message, good=True)
@@ -203,7 +231,7 @@ def _messages() -> Iterator[dict[str, Any]]:
 def _of_other_minors(message: Message) -> Iterator[dict[str, Any]]:
     """From a sender that knows more fields than we do, or fewer."""
     payload = _PAYLOADS.get(type(message), b"")
-    values = msgpack.unpackb(message.pack(payload))[:-1]
+    values = _values(message)
     left_bytes = type(message).MAX_BYTES - len(message.pack(payload))
     for what, unknown in (
         ("one unknown field behind its own", [0]),
@@ -212,17 +240,16 @@ def _of_other_minors(message: Message) -> Iterator[dict[str, Any]]:
     ):
         if len(b"".join(map(msgpack.packb, unknown))) + 2 <= left_bytes:
             yield _vector(message, what, _packed([*values, *unknown], payload))
-    if type(message).__name__ in _WITH_NESTED:
-        name, place = _WITH_NESTED[type(message).__name__]
+    if name_of(type(message)) in _WITH_NESTED:
+        name, place = _WITH_NESTED[name_of(type(message))]
         nested = [[*one, 7] for one in values[place]]
         longer = [*values[:place], nested, *values[place + 1 :]]
         yield _vector(message, f"an unknown field in each of {name}", _packed(longer, payload))
-    optional = sum(item.default is not MISSING for item in fields(type(message)))
-    for version in READ_VERSIONS if optional else (WIRE_VERSION - 1,):
-        older = [version, *values[1 : len(values) - optional]]
-        what = f"version {version}" + (" without what was added since" if optional else "")
-        defaults = {item.name: item.default for item in fields(type(message)) if item.default is not MISSING}
-        yield _vector(replace(message, **defaults), what, _packed(older, payload))
+    table = fields(type(message))
+    optional = {one.name: one.metadata["default"] for one in table if one.metadata["optional"]}
+    if optional:
+        fewer = _packed(values[: len(table) + 1 - len(optional)], payload)
+        yield _vector(replace(message, **optional), "without what was added since", fewer)
 
 
 def _vector(message: Message, what: str, data: bytes | None = None) -> dict[str, Any]:
@@ -231,11 +258,11 @@ def _vector(message: Message, what: str, data: bytes | None = None) -> dict[str,
     if data is not None:
         assert type(message).parse(data, payload) == type(message).parse(message.pack(payload), payload), what
     return {
-        "message": type(message).__name__,
+        "message": name_of(type(message)),
         "what": what,
         "hex": (message.pack(payload) if data is None else data).hex(),
         "payload": payload.hex(),
-        "fields": _plain(msgpack.unpackb(message.pack(payload))[1:-1]),
+        "fields": _plain(_values(message)[1:]),
     }
 
 
@@ -308,6 +335,11 @@ def _bad_envelopes() -> Iterator[dict[str, Any]]:
         ("a text in place of a map", b"\xa1a"),
     ):
         yield _bad(REQUEST, what, _coded(REQUEST, {"arguments": coded}), b"")
+    for name in ("w", "h", "b"):
+        sent = [kind.encode(getattr(ROI.on_wire(), one)) for one, kind in kinds(StillWire)]
+        sent[[one for one, _ in kinds(StillWire)].index("parameters")] = {name: 5}
+        what = f"a parameter {name}, which has a field of its own"
+        yield _bad(ROI.on_wire(), what, _packed([WIRE_VERSION, *sent], b"a still"), b"a still")
     whole = BASE.pack(payload)
     other = whole[:1] + bytes((WIRE_VERSION + 1,)) + whole[2:]
     yield _bad(BASE, "another version whose checksum is wrong", other, payload, version=True)
@@ -315,7 +347,7 @@ def _bad_envelopes() -> Iterator[dict[str, Any]]:
     body = bytes((whole[0], *whole[1:-5], 0xCF, 0, 0, 0))
     checksum = zlib.crc32(body, zlib.crc32(payload)).to_bytes(4, "big")
     yield _bad(BASE, "the checksum in eight bytes", body + b"\0" + checksum, payload)
-    for message in (BASE, ROI):
+    for message in (BASE, ROI.on_wire()):
         most = type(message).MAX_PAYLOAD
         vector = _bad(message, "a payload that is too long", message_of(message, most + 1), bytes(most + 1))
         yield vector | {"payload": {"zeros": most + 1}}
@@ -351,10 +383,10 @@ def _coded(message: Message, changed: Mapping[str, bytes]) -> bytes:
 
 def _refused() -> Iterator[dict[str, Any]]:
     """What is damaged, of another version, or out of bounds, each with a checksum that fits unless that is it."""
-    for message in EXAMPLES:
+    for message in _EXAMPLES:
         payload = _PAYLOADS.get(type(message), b"")
         good = message.pack(payload)
-        values = msgpack.unpackb(good)[:-1]
+        values = _values(message)
         yield _bad(message, "a bit is flipped", bytes((*good[:-7], good[-7] ^ 1, *good[-6:])), payload)
         yield _bad(message, "its end is missing", good[:-1], payload)
         yield _bad(message, "a byte follows", good + b"\0", payload)
@@ -362,7 +394,7 @@ def _refused() -> Iterator[dict[str, Any]]:
         yield _bad(
             message,
             "an older version",
-            _packed([READ_VERSIONS[0] - 1, *values[1:]], payload),
+            _packed([WIRE_VERSION - 1, *values[1:]], payload),
             payload,
             version=True,
         )
@@ -377,9 +409,12 @@ def _refused() -> Iterator[dict[str, Any]]:
         yield _bad(
             message, "more unknown fields than are skipped", _packed([*values, *unknown], payload), payload
         )
-        optional = sum(item.default is not MISSING for item in fields(type(message)))
+        optional = sum(item.metadata["optional"] for item in fields(type(message)))
         yield _bad(
-            message, "a field too few", _packed(values[: len(values) - optional - 1], payload), payload
+            message,
+            "a field too few",
+            _packed(values[: len(fields(type(message))) - optional], payload),
+            payload,
         )
         yield from (
             _bad(message, what, _packed([*values[:place], raw, *values[place + 1 :]], payload), payload)
@@ -388,14 +423,20 @@ def _refused() -> Iterator[dict[str, Any]]:
     yield from _bad_envelopes()
 
 
+def _values(message: Message) -> list[Any]:
+    """Its version and all its fields as they are sent, those at the end too that are left out."""
+    return [WIRE_VERSION, *(kind.encode(getattr(message, name)) for name, kind in kinds(type(message)))]
+
+
 def _edges(message: Message, *, good: bool) -> Iterator[tuple[int, Any, str]]:
     """Values at the edges of what each field may hold, by its place: those that are read, or those refused."""
     size = len(message.pack(_PAYLOADS.get(type(message), b"")))
-    values = msgpack.unpackb(message.pack())[:-1]
+    values = _values(message)
     for place, (name, kind) in enumerate(kinds(type(message)), 1):
-        for raw, what in (*edges(kind.schema()), *_OF_ANY_TYPE):
+        more = _PLACES if name == "place" else ()
+        for raw, what in (*edges(kind.schema()), *_OF_ANY_TYPE, *more):
             try:
-                kind.decode(raw)
+                type(message).of_version(WIRE_VERSION, [*values[1:place], raw, *values[place + 1 :]])
             except WireError:
                 read = False
             else:
@@ -412,7 +453,7 @@ def _bad(
         type(message).parse(data, payload)
     except WireError:
         return {
-            "message": type(message).__name__,
+            "message": name_of(type(message)),
             "what": what,
             "hex": data.hex(),
             "payload": payload.hex(),

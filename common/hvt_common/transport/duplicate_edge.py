@@ -16,7 +16,7 @@ import zenoh
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
-from hvt_common.protocol.messages import Info, WireError
+from hvt_common.protocol.messages import READ_VERSIONS, Info, WireError
 from hvt_common.transport.session import query
 from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
 
@@ -91,7 +91,7 @@ def _info(config: zenoh.Config, keys: EdgeKeys, *, answer_s: float) -> Info | No
             if not any(reply.ok is not None for reply in tokens):
                 return None
             answer = query(session, Channel.INFO, keys=keys, question=b"", timeout_s=answer_s)
-            return None if answer is None else Info.parse(answer)
+            return None if answer is None else Info.parse(answer, versions=READ_VERSIONS)
     except (zenoh.ZError, WireError) as error:
         _log.debug("no edge of this id was found: %s", error)
         return None

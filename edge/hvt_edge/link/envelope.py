@@ -48,6 +48,9 @@ class StillEnvelope:
         own = still.media_type.startswith(_OWN_TYPES)
         return cls(still, PackedMessage.of(header), _PLAIN_ENCODING if own else still.media_type)
 
-    def header_at(self, send_ns: int, *, flags: int) -> PackedMessage:
-        """The header of a still that goes out at this time."""
-        return self.header.with_fields(send_delay_ns=send_ns - self.still.capture_ns, flags=int(flags))
+    def header_at(self, send_ns: int, *, flags: int, frame_sent: bool = False) -> PackedMessage:
+        """The header of a still that goes out at this time; ``frame_sent``: who gets it can have the capture time."""
+        times = {"send_delay_ns": send_ns - self.still.capture_ns}
+        if frame_sent and "ask" not in self.still.parameters:  # who asks need not have the video
+            times["capture_ns"] = -1
+        return self.header.with_fields(flags=int(flags), **times)

@@ -12,7 +12,6 @@ import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import (
-    WIRE_VERSION,
     ControlAnswer,
     ControlRequest,
     Feedback,
@@ -29,9 +28,6 @@ from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_edge.link.transmitter import Outlet
 
 _log = logging.getLogger(__name__)
-
-_SPOKEN = (WIRE_VERSION,)
-"""Of messages that come now; earlier versions are read where they were stored alone."""
 
 _PUBLISHED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.POSE, Channel.BACKLOG, Channel.STATUS)
 _MOST_PER_S = 1000
@@ -197,7 +193,7 @@ class EdgeListener:
     def _on_info(self, query: bytes) -> bytes | None:
         if query:
             try:
-                self.on_info_request(InfoRequest.parse(query, versions=_SPOKEN))
+                self.on_info_request(InfoRequest.parse(query))
             except WireError as error:  # who asks so is answered all the same
                 self._skip("info", error)
         return self._answered(Channel.INFO, lambda: self.info(self.clock()))
@@ -205,7 +201,7 @@ class EdgeListener:
     def _on_control(self, query: bytes) -> bytes | None:
         self._watch(Channel.CONTROL)
         try:
-            request = ControlRequest.parse(query, versions=_SPOKEN)
+            request = ControlRequest.parse(query)
         except WireError as error:
             self._skip("control", error)
             return None
@@ -224,7 +220,7 @@ class EdgeListener:
     def _on_feedback(self, sample: zenoh.Sample) -> None:
         self._watch(Channel.FEEDBACK)
         try:
-            feedback = Feedback.parse(sample.payload.to_bytes(), versions=_SPOKEN)
+            feedback = Feedback.parse(sample.payload.to_bytes())
         except WireError as error:
             self._skip("feedback", error)
             return

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from hvt_common.protocol.messages import InfoRequest
+from hvt_common.protocol.messages import BASE_CODEC, InfoRequest
 
 _log = logging.getLogger(__name__)
 
@@ -35,9 +35,17 @@ class StillReaders:
         self._readers: dict[int, _Reader] = {}
         """Codecs by requester, in the order of the last request; a stranger's numbers cost a place each."""
         self._said: set[str] = set()
+        self._video_said = False
 
     def on_request(self, request: InfoRequest) -> None:
         """A ground says what it reads."""
+        if BASE_CODEC not in request.base_codecs and not self._video_said:
+            self._video_said = True
+            _log.warning(
+                "a ground reads video of %s: this edge sends %s, and that ground will show none",
+                ", ".join(request.base_codecs) or "no codec",
+                BASE_CODEC,
+            )
         with self._lock:
             self._readers.pop(request.requester_id, None)
             if len(self._readers) >= _MOST_READERS:

@@ -30,7 +30,9 @@ from hvt_common.protocol.messages import (
     BacklogHeader,
     BacklogStill,
     BaseHeader,
+    CaptureTimes,
     Flags,
+    PackedMessage,
     Status,
 )
 from hvt_common.units import SECOND_NS
@@ -42,7 +44,7 @@ from hvt_edge.link.envelope import StillEnvelope
 from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES
 from hvt_edge.link.pacer import Pacer
 
-STILL_ATTACHMENT_BYTES = 100
+STILL_ATTACHMENT_BYTES = 60
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
 `Transmitter.still_allowance_bytes` of one that is counts its own header."""
 BACKLOG_ATTACHMENT_BYTES = 48
@@ -92,6 +94,7 @@ class Transmitter:
         self.still_sequence = -1
         self.base_waited_ns = 0
         """How long base messages have waited for the budget's window, all together."""
+        self._captures = CaptureTimes()
         self._newest: StillEnvelope | None = None
         self._ended = False
 
@@ -118,6 +121,7 @@ class Transmitter:
                 flags=self._flags | ((Flags.KEYFRAME | Flags.PARAMETER_SETS) if unit.keyframe else 0),
             )
             attachment = header.pack(unit.data)
+            self._captures.note(header)
             line_bytes = self._count(Channel.BASE, Account.BASE, unit.data, attachment, at_ns=at_ns)
             self.budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe and announced)
             if self.pacer is not None:
@@ -152,7 +156,7 @@ class Transmitter:
         if still is None:
             return self._payload_bytes(line_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding)
         envelope = self.envelope(still)
-        header_bytes = envelope.header_at(now_ns, flags=self._flags).size_bytes
+        header_bytes = self._header_at(envelope, now_ns).size_bytes
         return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
 
     def requested_allowance_bytes(self, now_ns: int, *, still: Still) -> int:
@@ -160,7 +164,7 @@ class Transmitter:
         with self._lock:
             line_bytes = self.budget.requested_allowance(now_ns)
         envelope = self.envelope(still)
-        header_bytes = envelope.header_at(now_ns, flags=self._flags).size_bytes
+        header_bytes = self._header_at(envelope, now_ns).size_bytes
         return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
 
     def link_is_free(self, now_ns: int) -> bool:
@@ -220,7 +224,7 @@ class Transmitter:
             self.ledger.record_outcome("sent", copy or still.reason)
             self.still_sequence = max(self.still_sequence, still.sequence)
             at_ns = self._still_at_ns(envelope, now_ns)
-            attachment = envelope.header_at(at_ns, flags=self._flags).pack(still.data)
+            attachment = self._header_at(envelope, at_ns).pack(still.data)
             line_bytes = self._count(
                 Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=encoding
             )
@@ -430,13 +434,17 @@ class Transmitter:
 
     def _still_at_ns(self, envelope: StillEnvelope, now_ns: int) -> int:
         """When it may go: now, unless its allowance is gone."""
-        header_bytes = envelope.header_at(now_ns, flags=self._flags).size_bytes
+        header_bytes = self._header_at(envelope, now_ns).size_bytes
         line_bytes = self._line_bytes(
             Channel.ROI, envelope.still.data, header_bytes, encoding=envelope.encoding
         )
         if self.budget.fits(line_bytes, now_ns=now_ns):
             return now_ns
         return self.budget.earliest_ns(line_bytes + _GROWTH_BYTES, now_ns=now_ns)
+
+    def _header_at(self, envelope: StillEnvelope, send_ns: int) -> PackedMessage:
+        frame_sent = self._captures.knows(self.session_id, envelope.still.frame_index)
+        return envelope.header_at(send_ns, flags=self._flags, frame_sent=frame_sent)
 
     def _payload_bytes(self, line_bytes: int, attachment_bytes: int, media_type: str) -> int:
         """The payload that so many line bytes leave for a still."""

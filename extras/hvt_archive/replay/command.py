@@ -23,7 +23,7 @@ from hvt_archive.replay.from_recording import messages_of
 from hvt_common.config import load
 from hvt_common.errors import Parser, UserError
 from hvt_common.protocol.channels import Channel, check_edge_pattern, matches, parse_key
-from hvt_common.protocol.messages import Feedback, Info, WireError
+from hvt_common.protocol.messages import READ_VERSIONS, Feedback, Info, WireError
 from hvt_common.runtime.process import stop_on_signals
 from hvt_common.runtime.reporting import print_table, say, write_json
 from hvt_common.transport.inbox import Received
@@ -170,6 +170,7 @@ class _Replay:
                         on_ended=lambda one: ended.append((summary(one), one)),
                         recordings=BacklogRecordings(factory.open_backlog),
                         clock=self._clock,
+                        versions=READ_VERSIONS,
                     )
                 edges[edge].work(item, pending=False)
             for one in edges.values():
@@ -222,7 +223,7 @@ def _infos(messages: Iterator[Received]) -> dict[str, dict[int, Info]]:
         if parsed is None or parsed[1] is not Channel.INFO:
             continue
         try:
-            info = Info.parse(item.payload)
+            info = Info.parse(item.payload, versions=READ_VERSIONS)
         except WireError:
             continue
         found.setdefault(parsed[0], {})[info.session_id] = replace(info, pace="lockstep")

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 
 from hvt_common.protocol.messages import (
     MAX_BACKLOG_BYTES,
+    READ_VERSIONS,
     AcknowledgedRange,
     BacklogHeader,
     BacklogKind,
@@ -213,7 +214,7 @@ def backlog_content(key: ObjectKey, data: bytes, *, edge: str) -> BacklogContent
 
 
 def _info(session_id: int, data: bytes, *, edge: str) -> Info:
-    info = Info.parse(data)
+    info = Info.parse(data, versions=READ_VERSIONS)
     if info.session_id != session_id or info.edge != edge:
         raise WireError("the facts of a stored session are those of another")
     return info
@@ -221,7 +222,7 @@ def _info(session_id: int, data: bytes, *, edge: str) -> Info:
 
 def _still(session_id: int, number: int, data: bytes) -> ReceivedStill:
     stored = parse_backlog_still(data)
-    header = RoiHeader.parse(stored.attachment, stored.payload)
+    header = RoiHeader.parse(stored.attachment, stored.payload, versions=READ_VERSIONS)
     if header.session_id != session_id or header.sequence != number:
         raise WireError(f"stored still {number} has another number inside")
     return ReceivedStill(replace(header, flags=header.flags | Flags.STORED), stored.payload)

@@ -21,7 +21,7 @@ import numpy as np
 from rerun.chunk import Chunk, RrdReader
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.messages import Info, RoiHeader, WireError
+from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireError
 from hvt_common.video.annex_b import is_keyframe, parameter_sets
 from hvt_ground.events import Notice, Overlay, PoseUpdate, VideoSample
 from hvt_ground.geolocation.camera import places_of_boxes
@@ -411,14 +411,14 @@ class _Headers:
         """The one whose checksum covers this picture; None without one."""
         for message in self._by_frame.get(frame, []):
             with suppress(WireError):
-                return RoiHeader.parse(message, jpeg)
+                return RoiHeader.parse(message, jpeg, versions=READ_VERSIONS)
         return None
 
 
 def _info(rows: Iterable[Timed]) -> Info | None:
     for _, _, value in rows:
         with suppress(WireError):
-            return Info.parse(bytes(value[0]))
+            return Info.parse(bytes(value[0]), versions=READ_VERSIONS)
     return None
 
 

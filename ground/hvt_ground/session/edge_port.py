@@ -13,7 +13,6 @@ import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import (
-    WIRE_VERSION,
     Command,
     ControlRequest,
     Feedback,
@@ -21,7 +20,6 @@ from hvt_common.protocol.messages import (
     InfoRequest,
     UnknownVersionError,
     WireError,
-    wire_version,
 )
 from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.flood import FloodWatch
@@ -113,11 +111,6 @@ class EdgePort:
             except WireError as error:
                 _log.warning("%s: its answer to info cannot be used: %s", self.edge, error)
                 return
-            if (version := wire_version(data)) != WIRE_VERSION:
-                self._say_version(
-                    f"edge {self.edge} speaks wire version {version}: it is shown, but reads no report and no "
-                    f"request of this ground, which speaks {WIRE_VERSION}: update the edge"
-                )
             if info.session_id == session_id:
                 found.append((info, requested_ns, answered_ns))
                 on_end()

@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from hvt_common import __version__
 from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.messages import (
+    BASE_CODEC,
+    SPOKEN_VERSIONS,
     BacklogHeader,
     Info,
     PoseReport,
@@ -35,6 +37,8 @@ from hvt_ground.session.receiver import Receiver
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 
+_BASE_CODECS = (BASE_CODEC, "hevc")
+"""The second is the name in version 4."""
 _log = logging.getLogger(__name__)
 
 _INFO_TRIES = 3
@@ -62,6 +66,7 @@ class EdgeSessions:
         patience_s: an edge whose token is gone and that sends nothing for so long has ended without saying so.
         ended_patience_s: how long the rest of a session may take to arrive after its edge has said that it ended.
         pause: between a session that failed and the next.
+        versions: of the wire, that are read.
     """
 
     def __init__(
@@ -75,6 +80,7 @@ class EdgeSessions:
         patience_s: float = 5.0,
         ended_patience_s: float = 2.0,
         pause: RetryPause | None = None,
+        versions: Sequence[int] = SPOKEN_VERSIONS,
     ) -> None:
         self.port = port
         self._open_session = open_session
@@ -92,7 +98,7 @@ class EdgeSessions:
         self._reports = ReceiverReports(
             port.report, clock=self._clock, clock_offset=self._clock_offset, backlog=self.backlog
         )
-        self._receiver = Receiver(port.edge, clock=self._clock)
+        self._receiver = Receiver(port.edge, clock=self._clock, versions=versions)
         self._pre_session = PreSessionBuffer()
         self._counted = StreamCounters()
         """When the session before ended."""
@@ -191,6 +197,10 @@ class EdgeSessions:
         info, requested_ns, answered_ns = answer
         if info.edge != self.port.edge:  # it names files and keys: another's name is nobody's
             self._receiver.skip("info", WireError(f"the edge says that it is {info.edge!r:.40}"))
+            return None
+        if info.codec not in _BASE_CODECS:
+            text = f"the edge sends video of {info.codec!r:.40}, and this ground reads {BASE_CODEC}"
+            self._receiver.skip("info", WireError(text))
             return None
         self._clock_offset.add(
             t0_ns=requested_ns, t1_ns=info.received_ns, t2_ns=info.answered_ns, t3_ns=answered_ns

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (
     BacklogHeader,
     BaseHeader,
+    CaptureTimes,
     PoseReport,
     RoiHeader,
     Status,
@@ -26,19 +27,34 @@ from hvt_ground.link.statistics import Uptime
 
 _log = logging.getLogger(__name__)
 
+_Message = BaseHeader | RoiHeader | BacklogHeader | TrackStep | PoseReport | Status
+_KINDS: Mapping[Channel, type[_Message]] = {
+    Channel.BASE: BaseHeader,
+    Channel.ROI: RoiHeader,
+    Channel.BACKLOG: BacklogHeader,
+    Channel.TRACKS: TrackStep,
+    Channel.POSE: PoseReport,
+    Channel.STATUS: Status,
+}
+_ATTACHED = (Channel.BASE, Channel.ROI, Channel.BACKLOG)
 _SILENT_NS = 2_000_000_000
 """A keyframe is requested only of an edge that sent something so long ago at most."""
 
 
 class Receiver:
-    """Receives one edge, over all its sessions; ``clock`` is Unix nanoseconds without steps."""
+    """Receives one edge, over all its sessions; ``clock`` is Unix nanoseconds without steps.
 
-    def __init__(self, edge: str, *, clock: Callable[[], int]) -> None:
+    Messages of other ``versions`` are skipped.
+    """
+
+    def __init__(self, edge: str, *, clock: Callable[[], int], versions: Sequence[int]) -> None:
         self._edge = edge
+        self._versions = versions
         self._clock = clock
         self._reassembler: Reassembler = Reassembler()
         self._duplicates = DuplicatePublishers(edge)
         self._uptime = Uptime()
+        self._captures = CaptureTimes()
         self._last_message_ns = time.monotonic_ns()
         self._damaged = 0
         self.of_other_versions = 0
@@ -66,11 +82,16 @@ class Receiver:
         parsed = parse_key(item.key)
         row = parsed[1] if parsed else None
         try:
-            if row is Channel.BASE:
-                header = BaseHeader.parse(item.attachment, item.payload)
-                arrivals = self._reassembler.accept(header, item.payload, now_ns=at_ns)
-                return [_base_packet(arrival, item) for arrival in arrivals]
-            return _packets(row, item)
+            message = _parsed(row, item, self._versions)
+            match message:
+                case BaseHeader():
+                    self._captures.note(message)
+                    arrivals = self._reassembler.accept(message, item.payload, now_ns=at_ns)
+                    return [_base_packet(arrival, item) for arrival in arrivals]
+                case RoiHeader():
+                    otherwise_ns = item.received_ns - message.send_delay_ns
+                    message = self._captures.filled(message, otherwise_ns=otherwise_ns)
+            return [] if message is None else [Packet(message, item)]
         except WireError as error:
             if row is Channel.BASE:
                 self._reassembler.corrupt()
@@ -126,17 +147,10 @@ def _base_packet(arrival: Arrival, item: Received) -> BasePacket:
     return BasePacket(arrival, replace(item, payload=arrival.payload, attachment=attachment), on_time=False)
 
 
-def _packets(row: Channel | None, item: Received) -> list[Packet]:
-    """The packets of any channel but ``base``; none for one that the ground does not read."""
-    match row:
-        case Channel.ROI:
-            return [Packet(RoiHeader.parse(item.attachment, item.payload), item)]
-        case Channel.BACKLOG:
-            return [Packet(BacklogHeader.parse(item.attachment, item.payload), item)]
-        case Channel.TRACKS:
-            return [Packet(TrackStep.parse(item.payload), item)]
-        case Channel.POSE:
-            return [Packet(PoseReport.parse(item.payload), item)]
-        case Channel.STATUS:
-            return [Packet(Status.parse(item.payload), item)]
-    return []
+def _parsed(row: Channel | None, item: Received, versions: Sequence[int]) -> _Message | None:
+    """None for a channel that the ground does not read."""
+    kind = None if row is None else _KINDS.get(row)
+    if kind is None:
+        return None
+    data, payload = (item.attachment, item.payload) if row in _ATTACHED else (item.payload, b"")
+    return kind.parse(data, payload, versions=versions)

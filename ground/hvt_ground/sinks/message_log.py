@@ -20,7 +20,7 @@ import msgpack
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, Info, WireError
+from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, READ_VERSIONS, Info, WireError
 from hvt_common.transport.inbox import Received
 from hvt_ground.sinks.line_file import check_there
 
@@ -113,7 +113,7 @@ class MessageLog:
 def _is_info(payload: bytes) -> bool:
     """Anybody on the link may send other bytes here, and as many as a picture."""
     try:
-        Info.parse(payload)
+        Info.parse(payload, versions=READ_VERSIONS)
     except WireError:
         return False
     return True

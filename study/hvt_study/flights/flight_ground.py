@@ -14,6 +14,7 @@ from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.protocol.messages import (
     MAX_STILL_RESULTS,
     BaseHeader,
+    CaptureTimes,
     Feedback,
     Info,
     RoiHeader,
@@ -126,6 +127,7 @@ class GroundSide:
         self._link = link
         self._observer = observer
         self._info = info
+        self._captures = CaptureTimes()
         self._now_ns = info.started_ns
         detector, classifier = models.take()
         shared = SharedModels(detector, classifier)
@@ -208,9 +210,12 @@ class GroundSide:
         item = arrival.message
         row = (parse_key(item.key) or ("", None))[1]
         if row is Channel.BASE:
-            self._picture(BaseHeader.parse(item.attachment, item.payload), arrival)
+            base = BaseHeader.parse(item.attachment, item.payload)
+            self._captures.note(base)
+            self._picture(base, arrival)
         elif row is Channel.ROI:
             header = RoiHeader.parse(item.attachment, item.payload)
+            header = self._captures.filled(header, otherwise_ns=arrival.arrival_ns - header.send_delay_ns)
             self._record.still(header, arrival)
             self._session.still(header, item)
         elif row is Channel.TRACKS:

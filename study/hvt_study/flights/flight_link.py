@@ -9,7 +9,7 @@ from typing import Any
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
-from hvt_common.protocol.messages import BaseHeader, RoiHeader, Status, StillResult, TrackStep
+from hvt_common.protocol.messages import BaseHeader, CaptureTimes, RoiHeader, Status, StillResult, TrackStep
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.transport.inbox import Received
 from hvt_edge.link.feedback import FeedbackInbox
@@ -78,6 +78,7 @@ class FlightOutlet:
         self._keys = EdgeKeys(edge_id)
         self._on_listen = on_listen
         self._digest = hashlib.sha256()
+        self._captures = CaptureTimes()
         self.line_bytes: Counter[str] = Counter()
         self.messages: Counter[str] = Counter()
         self.max_frame_bytes = 0
@@ -128,9 +129,11 @@ class FlightOutlet:
             header = BaseHeader.parse(attachment, payload)
             self.last_frame = header.frame_index
             self.max_frame_bytes = max(self.max_frame_bytes, len(payload))
+            self._captures.note(header)
             return header.send_ns
         if channel is Channel.ROI:
-            return RoiHeader.parse(attachment, payload).send_ns
+            still = RoiHeader.parse(attachment, payload)
+            return self._captures.filled(still, otherwise_ns=0).send_ns
         if channel is Channel.TRACKS:
             return TrackStep.parse(payload).send_ns
         assert channel is Channel.STATUS, f"the edge sends no {channel}"

@@ -43,6 +43,19 @@ def test_all_grounds_have_to_read_a_codec():
     assert read(readers, "jpeg", "residual", "avif", "jxl") == ["jpeg", "residual"]
 
 
+def test_a_ground_that_reads_no_video_of_the_edge_is_told_of(caplog):
+    """Its screen would stay black, and nobody would know why."""
+    caplog.set_level(logging.WARNING)
+    readers = StillReaders(Clock())
+    readers.on_request(request(1, "jpeg"))
+    assert caplog.messages == []
+    for _ in range(2):
+        readers.on_request(InfoRequest(requester_id=2, still_codecs=("jpeg",), base_codecs=("h264", "av1")))
+    assert caplog.messages == [
+        "a ground reads video of h264, av1: this edge sends h265, and that ground will show none"
+    ]
+
+
 def test_a_ground_that_has_gone_counts_for_a_minute():
     """A look from a phone would cost the bits of all that follows."""
     clock = Clock()

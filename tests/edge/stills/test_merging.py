@@ -109,8 +109,10 @@ def test_a_car_park_row_shares_and_the_far_one_does_not():
     assert [one.candidate.track_id for one in others] == [2, 3, 4]
     assert union_crop(first, padding=PADDING, source_size=SOURCE) == (121, 197, 219, 223)
     assert (second, alone) == (far, [])
-    single = sum(one.score * line_bytes(one, CostEstimate(300, 0.1, 1000), 180) for one in row)
-    assert first.score == pytest.approx(single / (300 + 0.1 * 98 * 26 + 180 + 3 * 17))
+    single = sum(
+        one.score * line_bytes(one, CostEstimate(300, 0.1, 1000), STILL_OVERHEAD_BYTES) for one in row
+    )
+    assert first.score == pytest.approx(single / (300 + 0.1 * 98 * 26 + STILL_OVERHEAD_BYTES + 3 * 17))
 
 
 def test_pixels_between_have_their_price():
@@ -136,7 +138,7 @@ def test_the_overhead_that_is_reckoned_with_is_the_real_one():
                 session_id=2**63,
                 sequence=1200,
                 frame_index=4500,
-                capture_ns=1_790_000_000 * 10**9 + 7,
+                capture_ns=-1,
                 send_delay_ns=30_000_000,
                 flags=0,
                 track_id=345,

@@ -20,6 +20,7 @@ from hvt_common.protocol.messages.backlog import (
     parse_backlog_units,
 )
 from hvt_common.protocol.messages.dialogue import (
+    BASE_CODEC,
     MAX_MISSING_STILLS,
     MAX_STILL_CODECS,
     MAX_STILL_RESULTS,
@@ -36,6 +37,7 @@ from hvt_common.protocol.messages.envelope import (
     MAX_PAYLOAD_BYTES,
     MOST_UNKNOWN_FIELDS,
     READ_VERSIONS,
+    SPOKEN_VERSIONS,
     WIRE_VERSION,
     CorruptError,
     Message,
@@ -54,10 +56,19 @@ from hvt_common.protocol.messages.reports import (
     Status,
     fitted_class_names,
 )
-from hvt_common.protocol.messages.stream import MAX_ALSO, AlsoShown, BaseHeader, Flags, RoiHeader
+from hvt_common.protocol.messages.stream import (
+    MAX_ALSO,
+    AlsoShown,
+    BaseHeader,
+    CaptureTimes,
+    Flags,
+    RoiHeader,
+    StillWire,
+)
 from hvt_common.protocol.messages.track_step import TrackStep, TrackStepDecoder, TrackStepEncoder
 
 __all__ = [
+    "BASE_CODEC",
     "MAX_ACKNOWLEDGED_RANGES",
     "MAX_ALSO",
     "MAX_BACKLOG_BYTES",
@@ -69,6 +80,7 @@ __all__ = [
     "MOST_FAILED_PARTS",
     "MOST_UNKNOWN_FIELDS",
     "READ_VERSIONS",
+    "SPOKEN_VERSIONS",
     "WIRE_VERSION",
     "AcknowledgedRange",
     "AlsoShown",
@@ -77,6 +89,7 @@ __all__ = [
     "BacklogStill",
     "BacklogUnit",
     "BaseHeader",
+    "CaptureTimes",
     "Command",
     "ControlAnswer",
     "ControlRequest",
@@ -96,6 +109,7 @@ __all__ = [
     "RoiHeader",
     "Status",
     "StillResult",
+    "StillWire",
     "TrackNow",
     "TrackStep",
     "TrackStepDecoder",

@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import ClassVar
 
 from hvt_common.protocol.messages.backlog import MAX_ACKNOWLEDGED_RANGES, AcknowledgedRange
-from hvt_common.protocol.messages.envelope import Message, Nested
+from hvt_common.protocol.messages.envelope import WIRE_VERSION, Message, Nested
 from hvt_common.protocol.messages.fields import (
     I63,
     U32,
@@ -29,6 +29,9 @@ MAX_MISSING_STILLS = 32
 """How many one report names; of more, the newest."""
 MAX_STILL_CODECS = 24
 """How many a ground names."""
+MAX_BASE_CODECS = 8
+BASE_CODEC = "h265"
+"""Of all that an edge of HVT sends on ``base``."""
 MAX_TRACKS_NOW = 64
 """How many tracks one answer lists: the most confident."""
 _COUNT = Int(0, 2**53 - 1)
@@ -54,10 +57,17 @@ class Command(StrEnum):
 class InfoRequest(Message):
     """Payload of a question on ``info``. A question without one is answered alike, and says nothing of codecs."""
 
+    lowest_version: int = wire_field(Int(1, 255), default=WIRE_VERSION, since=5, before=4)
+    """As in `Info`, of the ground."""
+    highest_version: int = wire_field(Int(1, 255), default=WIRE_VERSION, since=5, before=4)
     requester_id: int = wire_field(Int(0, U64))
     """Random, new at each start of the ground: a later request of the same number takes the place of this one."""
     still_codecs: tuple[str, ...] = wire_field(ListOf(Text(24), MAX_STILL_CODECS))
     """Codecs of stills that the ground reads: the edge sends no other, but for ``jpeg``."""
+    base_codecs: tuple[str, ...] = wire_field(
+        ListOf(Text(24), MAX_BASE_CODECS), default=(BASE_CODEC,), since=5, before=(BASE_CODEC,)
+    )
+    """Codecs of video that the ground reads."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

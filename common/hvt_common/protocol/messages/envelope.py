@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any, ClassVar, Self, TypeVar
 
 import msgpack
@@ -26,6 +27,7 @@ __all__ = [
     "MAX_PAYLOAD_BYTES",
     "MOST_UNKNOWN_FIELDS",
     "READ_VERSIONS",
+    "SPOKEN_VERSIONS",
     "WIRE_VERSION",
     "CorruptError",
     "Message",
@@ -38,10 +40,12 @@ __all__ = [
     "wire_version",
 ]
 
-WIRE_VERSION = 4
+WIRE_VERSION = 5
 """That of every message that is sent."""
-READ_VERSIONS = (3, 4)
-"""A message of version 3 is one of version 4 without the fields that were added since; it had to be exact."""
+SPOKEN_VERSIONS = (5,)
+"""Of messages that come over the link now."""
+READ_VERSIONS = (4, 5)
+"""Where they were stored: in logs, recordings, and what an edge kept on its disk."""
 MOST_UNKNOWN_FIELDS = 16
 """So many fields behind the last known one are skipped, in each array; with more it is no message of ours."""
 DEEPEST = 8
@@ -83,6 +87,17 @@ class Message:
     MAX_BYTES: ClassVar[int] = 1024
     MAX_PAYLOAD: ClassVar[int] = MAX_PAYLOAD_BYTES
     """Bytes of the payload that it may be attached to."""
+    TRIMMED: ClassVar[bool] = False
+    """Fields at the end that have their defaults are left out."""
+
+    def on_wire(self) -> Message:
+        """The message whose fields are sent."""
+        return self
+
+    @classmethod
+    def of_version(cls, version: int, values: list[Any]) -> Self:
+        """From what a message of that version holds."""
+        return from_values(cls, values, version)
 
     def pack(self, payload: bytes = b"") -> bytes:
         """The message as bytes; ``payload`` is the Zenoh payload that it will be attached to, if any.
@@ -92,7 +107,7 @@ class Message:
         return PackedMessage.of(self).pack(payload)
 
     @classmethod
-    def parse(cls, data: bytes, payload: bytes = b"", *, versions: Sequence[int] = READ_VERSIONS) -> Self:
+    def parse(cls, data: bytes, payload: bytes = b"", *, versions: Sequence[int] = SPOKEN_VERSIONS) -> Self:
         """The message that ``data`` holds and that fits ``payload``; ``versions`` are those that are read.
 
         Raises UnknownVersionError, CorruptError or another WireError, and nothing else, for any bytes whatever.
@@ -109,7 +124,7 @@ class Message:
             raise WireError(f"{name} does not end with its checksum")
         if array[-1] != _checksum(data[:-_CRC_BYTES], payload):
             raise CorruptError(f"{name} or its payload is not what was sent: checksum differs")
-        return from_values(cls, array[1:-1])
+        return cls.of_version(array[0], array[1:-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +138,9 @@ class PackedMessage:
     @classmethod
     def of(cls, message: Message) -> PackedMessage:
         """Raises ValueError when a field is out of its bounds."""
-        table = kinds(type(message))
-        return cls(
-            type(message), {name: _packed(kind.encode(getattr(message, name))) for name, kind in table}
-        )
+        sent = message.on_wire()
+        table = kinds(type(sent))
+        return cls(type(sent), {name: _packed(kind.encode(getattr(sent, name))) for name, kind in table})
 
     def with_fields(self, **values: Any) -> PackedMessage:
         """The same message with other values of these fields; what two fields promise together is not checked."""
@@ -149,8 +163,24 @@ class PackedMessage:
         return body + bytes((_CRC_TAG,)) + _checksum(body, payload).to_bytes(4, "big")
 
     def _body(self) -> bytes:
-        head: bytes = msgpack.Packer().pack_array_header(len(self.fields) + 2)
-        return b"".join((head, _packed(WIRE_VERSION), *self.fields.values()))
+        values = list(self.fields.values())
+        if self.message.TRIMMED:
+            kind: type = self.message
+            defaults = _packed_defaults(kind)
+            while values and values[-1] == defaults.get(len(values)):
+                values.pop()
+        head: bytes = msgpack.Packer().pack_array_header(len(values) + 2)
+        return b"".join((head, _packed(WIRE_VERSION), *values))
+
+
+@cache
+def _packed_defaults(message: type) -> dict[int, bytes]:
+    """By the number of the field, of those that may be left out."""
+    return {
+        number: _packed(item.metadata["wire"].encode(item.metadata["default"]))
+        for number, item in enumerate(fields(message), 1)
+        if item.metadata["optional"]
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,13 +238,14 @@ def wire_version(data: bytes) -> int:
     return version
 
 
-def from_values(message: type[_T], values: list[Any]) -> _T:
+def from_values(message: type[_T], values: list[Any], version: int = WIRE_VERSION) -> _T:
     """A dataclass of `wire_field` fields from the values of its array; raises `WireError`."""
-    table = kinds(message)
-    least, most = _required(message), len(table) + MOST_UNKNOWN_FIELDS
+    of: type = message
+    table, least, before = _layout(of, version)
+    most = len(table) + MOST_UNKNOWN_FIELDS
     if not least <= len(values) <= most:
         raise WireError(f"{message.__name__} has {len(values)} fields, not {least} to {most}")
-    decoded = {}
+    decoded = dict(before)
     for (name, kind), raw in zip(table, values, strict=False):
         try:
             decoded[name] = kind.decode(raw)
@@ -234,9 +265,13 @@ def _too_deep(value: Any, levels: int) -> bool:
     )
 
 
-def _required(message: type) -> int:
-    """How many fields the first of these messages had: those without a default."""
-    return sum(item.default is MISSING for item in fields(message))
+@cache
+def _layout(message: type, version: int) -> tuple[tuple[tuple[str, Kind], ...], int, Mapping[str, Any]]:
+    """Of the messages of a version: their fields, how many of them the first had, and what the later fields are."""
+    there = [item for item in fields(message) if item.metadata["since"] <= version]
+    later = {item.name: item.metadata["before"] for item in fields(message) if item not in there}
+    table = tuple((item.name, item.metadata["wire"]) for item in there)
+    return table, sum(not item.metadata["optional"] for item in there), later
 
 
 def _checksum(body: bytes, payload: bytes) -> int:

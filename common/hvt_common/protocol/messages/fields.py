@@ -72,13 +72,17 @@ class _Sequence(Kind):
         return tuple(self.inner.decode(item) for item in raw)
 
 
-def wire_field(kind: Kind, *, default: Any = MISSING) -> Any:
+def wire_field(kind: Kind, *, default: Any = MISSING, since: int = 0, before: Any = None) -> Any:
     """A dataclass field that crosses the wire as ``kind``; fields are sent in the order they are declared.
 
     One that was added later has a ``default``, which it has in the messages of earlier senders; it stands behind all
-    that have none.
+    that have none. One that is there ``since`` a version is ``before`` in messages of earlier ones.
     """
-    return field(metadata={"wire": kind}, default=default)
+    optional = default is not MISSING and not since
+    metadata = {"wire": kind, "optional": optional, "default": default, "since": since, "before": before}
+    if isinstance(default, dict):
+        return field(metadata=metadata, default_factory=dict)
+    return field(metadata=metadata, default=default)
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,6 +235,25 @@ class OneOf(Kind):
 
 
 @dataclass(frozen=True, slots=True)
+class Word(Kind):
+    """One of some known words, sent as its position, or any other text."""
+
+    words: tuple[str, ...]
+    max_bytes: int
+
+    def _encode(self, value: Any) -> Any:
+        return self.words.index(value) if value in self.words else value[:]
+
+    def decode(self, raw: Any) -> Any:
+        if type(raw) is str:
+            return Text(self.max_bytes).decode(raw)
+        return self.words[Int(0, len(self.words) - 1).decode(raw)]
+
+    def schema(self) -> dict[str, Any]:
+        return {"type": "word", "words": list(self.words), "most_bytes": self.max_bytes}
+
+
+@dataclass(frozen=True, slots=True)
 class Scalar(Kind):
     """A parameter's value: a whole number of 64 bits, a finite float or short text."""
 
@@ -336,7 +359,7 @@ def _check_size(raw: Any, wanted: type[Sized], name: str, most: int) -> None:
 _PARTS = {8: "eighths", 10: "tenths", 100: "hundredths", 1000: "thousandths"}
 
 
-def described(kind: dict[str, Any]) -> str:  # noqa: PLR0911 - one return for each kind
+def described(kind: dict[str, Any]) -> str:  # noqa: C901, PLR0911 - one return for each kind
     """A schema in a few words."""
     match kind:
         case {"type": "int", "words": words}:
@@ -349,6 +372,10 @@ def described(kind: dict[str, Any]) -> str:  # noqa: PLR0911 - one return for ea
             return f"float {low:g}…{high:g}"
         case {"type": "str" | "bin" as name, "most_bytes": most}:
             return f"{name} ≤ {most} B"
+        case {"type": "word", "words": words, "most_bytes": most}:
+            return (
+                ", ".join(f"{number} {word}" for number, word in enumerate(words)) + f"; else str ≤ {most} B"
+            )
         case {"type": "scalar", "most_bytes": most}:
             return f"int, finite float or str ≤ {most} B"
         case {"type": "array", "least": least, "most": most, "of": of}:

@@ -27,6 +27,7 @@ class PoseReport(Message):
     """Payload of ``pose``."""
 
     MAX_BYTES: ClassVar[int] = 80
+    TRIMMED: ClassVar[bool] = True
 
     session: int = wire_field(Int(0, U32))
     """The lowest 32 bits of the session's id: four bytes less, and it is a session or the one before it."""
@@ -34,6 +35,8 @@ class PoseReport(Message):
     """When the edge handed the message to Zenoh, its clock; media time in lockstep."""
     coded: bytes = wire_field(Blob(_MOST_BYTES))
     """Bits; see docs/wire-messages.md."""
+    coding: int = wire_field(Int(1, 255), default=1)
+    """1: as docs/wire-messages.md has it."""
 
     def is_of(self, session_id: int) -> bool:
         """Whether it is of this session."""
@@ -188,6 +191,8 @@ class PoseDecoder:
 
         Raises `WireError` where the bits make no sense; the decoder is as it was before.
         """
+        if report.coding != 1:
+            raise WireError(f"a pose of coding {report.coding}, which is not known here")
         bits = BitReader(report.coded)
         alone, number = bits.plain(1), bits.plain(4)
         step: tuple[int, ...] = (0, 0)

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.ledger import MOST_WINDOW_NS
-from hvt_common.protocol.messages.envelope import Message, Nested
+from hvt_common.protocol.messages.envelope import WIRE_VERSION, Message, Nested
 from hvt_common.protocol.messages.fields import (
     I63,
     U32,
@@ -59,6 +59,9 @@ class Info(Message):
 
     MAX_BYTES: ClassVar[int] = 65536
 
+    lowest_version: int = wire_field(Int(1, 255), default=WIRE_VERSION, since=5, before=4)
+    """Versions of the wire that the edge speaks: both sides use the highest that they have in common."""
+    highest_version: int = wire_field(Int(1, 255), default=WIRE_VERSION, since=5, before=4)
     session_id: int = wire_field(Int(0, U64))
     edge: str = wire_field(Text(32))
     software: str = wire_field(Text(32))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
-from hvt_common.protocol.messages.envelope import Message, Nested
+from hvt_common.protocol.messages.envelope import Message, Nested, from_values, kinds
 from hvt_common.protocol.messages.fields import (
     I63,
     U32,
@@ -19,6 +20,8 @@ from hvt_common.protocol.messages.fields import (
     Scalar,
     Scaled,
     Text,
+    WireError,
+    Word,
     wire_field,
 )
 
@@ -28,6 +31,10 @@ MAX_ALSO = 15
 _TIME = Int(0, I63)
 _DELAY = Int(-I63, I63)
 _FAR_PX = 32767
+_BOX = Box(Scaled(-_FAR_PX, _FAR_PX, 8))
+_CROP = Box(Int(0, _FAR_PX), empty=False)
+_COMPACT = 5
+"""Since this version a still's header is sent as `StillWire`."""
 
 
 class Flags(IntFlag):
@@ -78,13 +85,104 @@ class AlsoShown:
 
     track_id: int = wire_field(Int(0, U32))
     """The edge's."""
-    box_source_px: tuple[float, float, float, float] = wire_field(Box(Scaled(-_FAR_PX, _FAR_PX, 8)))
+    box_source_px: tuple[float, float, float, float] = wire_field(_BOX)
     """x1, y1, x2, y2 in eighths of a pixel."""
+
+
+STILL_CODEC_WORDS = ("jpeg", "webp", "avif", "jxl", "h264-intra", "residual")
+"""Their positions are sent; another codec by its name. A new one stands last."""
+STILL_REASON_WORDS = ("gain", "due", "new", "uncertain", "small", "utility", "asked", "again", "stored")
+_MOST_CAPTURES = 1024
+_PER_PX = 8
+_PLACE = Int(-2 * _PER_PX * _FAR_PX, 2 * _PER_PX * _FAR_PX)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StillWire(Message):
+    """A `RoiHeader` as it is sent."""
+
+    MAX_BYTES: ClassVar[int] = 1024
+    MAX_PAYLOAD: ClassVar[int] = 2**20
+    TRIMMED: ClassVar[bool] = True
+
+    session_id: int = wire_field(Int(0, U64))
+    sequence: int = wire_field(Int(0, U32))
+    frame_index: int = wire_field(Int(0, U32))
+    capture_ns: int = wire_field(Int(-1, I63))
+    send_delay_ns: int = wire_field(_DELAY)
+    flags: int = wire_field(Int(0, 255))
+    track_id: int = wire_field(Int(-1, U32))
+    place: tuple[int, ...] = wire_field(ListOf(_PLACE, 10))
+    """Of the crop x, y, width and height; how far inside its sides those of the track's box are, left, top, right,
+    bottom, in eighths; and, where it is not the crop's own, the coded size."""
+    class_name: str = wire_field(Text(64))
+    confidence: float = wire_field(Scaled(0, 1, 1000))
+    reason: str = wire_field(Word(STILL_REASON_WORDS, 48))
+    codec: str = wire_field(Word(STILL_CODEC_WORDS, 24))
+    quality_pct: int = wire_field(Int(0, 100))
+    base_check: int = wire_field(Int(-1, U32), default=-1)
+    parameters: Mapping[str, int | float | str] = wire_field(MapOf(Scalar(), 8, key_bytes=16), default={})
+    also: tuple[AlsoShown, ...] = wire_field(ListOf(Nested(AlsoShown), MAX_ALSO), default=())
+
+    @classmethod
+    def of(cls, header: RoiHeader) -> StillWire:
+        """What is sent of a header."""
+        x1, y1, x2, y2 = header.crop_source_px
+        left, top, right, bottom = (round(_PER_PX * side) for side in header.box_source_px)
+        parameters = dict(header.parameters)
+        coded = (parameters.pop("w", x2 - x1), parameters.pop("h", y2 - y1))
+        check: Any = parameters.pop("b", -1)
+        return cls(
+            **{name: getattr(header, name) for name in _SAME},
+            place=(
+                *(x1, y1, x2 - x1, y2 - y1),
+                *(left - _PER_PX * x1, top - _PER_PX * y1, _PER_PX * x2 - right, _PER_PX * y2 - bottom),
+                *(() if coded == (x2 - x1, y2 - y1) else coded),
+            ),
+            base_check=check,
+            parameters=parameters,
+        )
+
+    @classmethod
+    def of_version(cls, version: int, values: list[Any]) -> Self:
+        """Checked as a `RoiHeader`."""
+        return cls.of(RoiHeader.of_version(version, values))  # type: ignore[return-value]
+
+    def header(self) -> RoiHeader:
+        """What it says; raises `WireError` for a place that is none."""
+        if len(self.place) not in (8, 10):
+            raise WireError(f"a place of {len(self.place)} numbers: 8 or 10 are accepted")
+        x1, y1, width, height, left, top, right, bottom, *coded = self.place
+        crop = x1, y1, x1 + width, y1 + height
+        box = (
+            *(_PER_PX * x1 + left, _PER_PX * y1 + top),
+            *(_PER_PX * crop[2] - right, _PER_PX * crop[3] - bottom),
+        )
+        if not _APART.isdisjoint(self.parameters):
+            raise WireError(f"{', '.join(sorted(_APART))} are fields of their own, not parameters")
+        if coded and not all(1 <= side <= _FAR_PX for side in coded):
+            raise WireError(f"a coded size of {coded[0]}x{coded[1]}")
+        known: dict[str, int | float | str] = dict(zip(("w", "h"), coded, strict=False))
+        if self.base_check >= 0:
+            known["b"] = self.base_check
+        return RoiHeader(
+            **{name: getattr(self, name) for name in _SAME},
+            crop_source_px=_CROP.decode(list(crop)),
+            box_source_px=_BOX.decode(list(box)),
+            parameters={**known, **self.parameters},
+        )
+
+
+_APART = frozenset(("w", "h", "b"))
+_SAME = tuple(name for name, _ in kinds(StillWire) if name not in ("place", "base_check", "parameters"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoiHeader(Message):
-    """Attachment of ``roi``. Boxes are x1, y1, x2, y2 in source pixels, x2 and y2 exclusive."""
+    """Attachment of ``roi``. Boxes are x1, y1, x2, y2 in source pixels, x2 and y2 exclusive.
+
+    Its fields are those of version 4; `StillWire` is what is sent.
+    """
 
     MAX_BYTES: ClassVar[int] = 1024
     MAX_PAYLOAD: ClassVar[int] = 2**20
@@ -94,14 +192,15 @@ class RoiHeader(Message):
     sequence: int = wire_field(Int(0, U32))
     """Of stills: 0, 1, 2 … apart from that of ``base``."""
     frame_index: int = wire_field(Int(0, U32))
-    capture_ns: int = wire_field(_TIME)
+    capture_ns: int = wire_field(Int(-1, I63))
+    """-1: that of the access unit of this frame."""
     send_delay_ns: int = wire_field(_DELAY)
     flags: int = wire_field(Int(0, 255))
     track_id: int = wire_field(Int(-1, U32))
     """The edge's track; -1 where the still belongs to none."""
-    box_source_px: tuple[float, float, float, float] = wire_field(Box(Scaled(-_FAR_PX, _FAR_PX, 8)))
+    box_source_px: tuple[float, float, float, float] = wire_field(_BOX)
     """The track's box at that frame, in eighths of a pixel; may reach beyond the frame."""
-    crop_source_px: tuple[int, int, int, int] = wire_field(Box(Int(0, _FAR_PX), empty=False))
+    crop_source_px: tuple[int, int, int, int] = wire_field(_CROP)
     """What the still shows."""
     class_name: str = wire_field(Text(64))
     confidence: float = wire_field(Scaled(0, 1, 1000))
@@ -115,7 +214,48 @@ class RoiHeader(Message):
     also: tuple[AlsoShown, ...] = wire_field(ListOf(Nested(AlsoShown), MAX_ALSO))
     """Further tracks that the same crop shows."""
 
+    def on_wire(self) -> StillWire:
+        """As it is sent."""
+        return StillWire.of(self)
+
+    @classmethod
+    def of_version(cls, version: int, values: list[Any]) -> Self:
+        """Of version 4 as its fields stand here."""
+        if version < _COMPACT:
+            return from_values(cls, values, version)
+        return from_values(StillWire, values, version).header()  # type: ignore[return-value]
+
     @property
     def send_ns(self) -> int:
         """When the edge handed the message to Zenoh, its clock; media time in lockstep."""
         return self.capture_ns + self.send_delay_ns
+
+
+class CaptureTimes:
+    """When the frames of ``base`` were captured: the header of a still leaves that out where its frame was sent."""
+
+    def __init__(self) -> None:
+        self._known: OrderedDict[tuple[int, int], int] = OrderedDict()
+        """Session and frame → capture time, the newest."""
+
+    def note(self, header: BaseHeader) -> None:
+        """A frame came, or was sent."""
+        key = header.session_id, header.frame_index
+        self._known[key] = header.capture_ns
+        if len(self._known) > _MOST_CAPTURES:
+            self._known.popitem(last=False)
+
+    def knows(self, session_id: int, frame_index: int) -> bool:
+        """Whether a still of this frame need not say it."""
+        return (session_id, frame_index) in self._known
+
+    def filled(self, header: RoiHeader, *, otherwise_ns: int) -> RoiHeader:
+        """The header with its time: that of its frame, of the nearest where that was lost, or ``otherwise_ns``."""
+        if header.capture_ns >= 0:
+            return header
+        capture_ns = self._known.get((header.session_id, header.frame_index))
+        if capture_ns is None:
+            near = [one for one in self._known if one[0] == header.session_id]
+            nearest = min(near, key=lambda one: abs(one[1] - header.frame_index), default=None)
+            capture_ns = max(0, otherwise_ns) if nearest is None else self._known[nearest]
+        return replace(header, capture_ns=capture_ns)

@@ -39,6 +39,7 @@ class TrackStep(Message):
     """Payload of ``tracks``: what the edge's tracker listed at one frame. Boxes are in base pixels."""
 
     MAX_BYTES: ClassVar[int] = 16_384
+    TRIMMED: ClassVar[bool] = True
 
     session_id: int = wire_field(Int(0, U64))
     sequence: int = wire_field(Int(0, U32))
@@ -52,6 +53,8 @@ class TrackStep(Message):
     """Sequence of the step that the boxes are coded against; -1 where they stand by themselves."""
     boxes: bytes = wire_field(Blob(_MOST_BOX_BYTES))
     """Range-coded; see docs/wire-tracks.md."""
+    coding: int = wire_field(Int(1, 255), default=1)
+    """How the boxes are coded: 1 is docs/wire-tracks.md."""
 
     @property
     def send_ns(self) -> int:
@@ -138,6 +141,8 @@ class TrackStepDecoder:
         listed the track here; ``started`` marks those that the last readable step did not list. Raises
         `WireError` where the coded boxes make no sense; the decoder is as it was before.
         """
+        if step.coding != 1:
+            raise WireError(f"boxes of coding {step.coding}, which is not known here")
         if step.sequence <= self._sequence or step.reference not in (-1, self._sequence):
             return None
         frames = step.frame_index - self._frame_index

@@ -14,8 +14,8 @@ from hvt_edge.stills.policy.cost import CostEstimate
 if TYPE_CHECKING:
     from hvt_edge.perception.candidates import Candidate
 
-STILL_OVERHEAD_BYTES = 180.0
-"""With the usual names: 91 of header and 83 of framing and TCP for JPEG, 18 more for a residual's parameters."""
+STILL_OVERHEAD_BYTES = 147.0
+"""With the usual names: 56 of header and 83 of framing and TCP for JPEG, 9 more for a residual."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ import contextlib
 import re
 import struct
 import zlib
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import msgpack
@@ -19,6 +19,7 @@ from hvt_common.protocol.messages import (
     MAX_PAYLOAD_BYTES,
     MAX_STILL_RESULTS,
     MOST_UNKNOWN_FIELDS,
+    READ_VERSIONS,
     AcknowledgedRange,
     AlsoShown,
     BacklogHeader,
@@ -39,6 +40,7 @@ from hvt_common.protocol.messages import (
     RoiHeader,
     Status,
     StillResult,
+    StillWire,
     TrackNow,
     TrackStep,
     UnknownVersionError,
@@ -75,6 +77,7 @@ from hvt_common.values import View
 from rigs.messages import BASE, EXAMPLES, FEEDBACK, INFO, REQUEST, ROI, STATUS, STEP
 
 DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "wire-messages.md"
+V4 = WIRE_VERSION - 1
 MESSAGES: tuple[type[Message], ...] = (
     BaseHeader,
     RoiHeader,
@@ -151,7 +154,11 @@ def test_examples_survive_the_wire(message):
 def test_typical_sizes_are_small():
     """Metadata would eat the bits that stills need."""
     assert len(BASE.pack()) <= 40
-    assert len(ROI.pack()) <= 150
+    usual = replace(
+        ROI, parameters={"w": 64, "h": 43, "b": U32}, also=(), codec="residual", send_delay_ns=10**8
+    )
+    assert len(replace(usual, capture_ns=-1).pack()) <= 62
+    assert len(replace(usual, capture_ns=-1, parameters={}, codec="h264-intra").pack()) <= 50
     assert len(STEP.pack()) <= 45 + len(STEP.boxes)
     assert len(replace(STATUS, failed=(), levers="").pack()) <= 190
     assert len(REQUEST.pack()) <= 20
@@ -294,7 +301,7 @@ def test_text_that_is_long_or_does_not_print_is_refused(bad):
     values = [kind.encode(getattr(ROI, name)) for name, kind in kinds(RoiHeader)]
     values[[name for name, _ in kinds(RoiHeader)].index("class_name")] = bad
     with pytest.raises(WireError, match=re.escape("RoiHeader.class_name: text")):
-        RoiHeader.parse(sealed([WIRE_VERSION, *values]))
+        RoiHeader.parse(sealed([V4, *values]), versions=READ_VERSIONS)
 
 
 @pytest.mark.parametrize(
@@ -306,18 +313,18 @@ def test_an_empty_crop_or_inverted_box_is_refused(name, bad):
     values = [kind.encode(getattr(ROI, field)) for field, kind in kinds(RoiHeader)]
     values[[field for field, _ in kinds(RoiHeader)].index(name)] = bad
     with pytest.raises(WireError, match=f"RoiHeader.{name}: box .* is (empty|inside out)"):
-        RoiHeader.parse(sealed([WIRE_VERSION, *values]))
+        RoiHeader.parse(sealed([V4, *values]), versions=READ_VERSIONS)
 
 
 def test_another_version_is_told_apart():
     """A newer edge would be reported as corrupt instead of as newer."""
-    with pytest.raises(UnknownVersionError, match="schema version 5, only 3 and 4 are known") as newer:
-        BaseHeader.parse(sealed([5, "anything"]))
+    with pytest.raises(UnknownVersionError, match="schema version 6, only 5 is known") as newer:
+        BaseHeader.parse(sealed([6, "anything"]))
     assert newer.value.between("edge uav-1", "this ground") == (
-        "edge uav-1 speaks wire version 5, this ground reads 3 and 4: update this ground"
+        "edge uav-1 speaks wire version 6, this ground reads 5: update this ground"
     )
     with pytest.raises(UnknownVersionError) as older:
-        BaseHeader.parse(sealed([2, "anything"]))
+        BaseHeader.parse(sealed([4, "anything"]))
     assert older.value.between("edge uav-1", "this ground").endswith("update edge uav-1")
     with pytest.raises(WireError, match=r"begins with a version"):
         BaseHeader.parse(sealed([True, 1, 2, 3, 4, 5, 6]))
@@ -326,12 +333,13 @@ def test_another_version_is_told_apart():
 @pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
 def test_fields_of_a_later_minor_version_are_skipped(message):
     """Every new field would need every ground and every edge to be updated on one day."""
-    values = msgpack.unpackb(message.pack())[:-1]
+    sent = message.on_wire()
+    values = [WIRE_VERSION, *(kind.encode(getattr(sent, name)) for name, kind in kinds(type(sent)))]
     assert type(message).parse(sealed([*values, 0])) == message
     room = type(message).MAX_BYTES - len(message.pack())
     if room > 40:
         assert type(message).parse(sealed([*values, "new", [1, {"a": None}], b"x"])) == message
-    with pytest.raises(WireError, match=f"{type(message).__name__} has"):
+    with pytest.raises(WireError, match=f"{type(message.on_wire()).__name__} has"):
         type(message).parse(sealed([*values, *[0] * (MOST_UNKNOWN_FIELDS + 1)]))
     with pytest.raises(WireError, match=r"longer than|has|more than"):
         type(message).parse(sealed([*values, bytes(type(message).MAX_BYTES)]))
@@ -347,11 +355,18 @@ def test_fields_of_a_later_minor_version_are_skipped_in_nested_arrays_too():
 def test_the_version_before_is_read():
     """What an edge has stored on its disk would be lost by an update."""
     for message in EXAMPLES:
-        values = msgpack.unpackb(message.pack())[:-1]
-        since = {"still_codecs": (), "channels": ()} if isinstance(message, Info) else {}
-        older = sealed([3, *values[1 : len(values) - len(since)]])
-        assert type(message).parse(older) == replace(message, **since)
-        assert (wire_version(older), wire_version(message.pack())) == (3, WIRE_VERSION)
+        older = replace(
+            message, **{one.name: one.metadata["before"] for one in fields(message) if one.metadata["since"]}
+        )
+        values = [
+            one.metadata["wire"].encode(getattr(message, one.name))
+            for one in fields(message)
+            if not one.metadata["since"]
+        ]
+        assert type(message).parse(sealed([V4, *values]), versions=READ_VERSIONS) == older
+        with pytest.raises(UnknownVersionError):  # nobody speaks it any more
+            type(message).parse(sealed([V4, *values]))
+        assert (wire_version(sealed([V4, *values])), wire_version(message.pack())) == (V4, WIRE_VERSION)
 
 
 def test_oversized_messages_are_not_looked_at():
@@ -498,8 +513,9 @@ def test_the_document_lists_every_field_with_its_bounds(message):
     section = DOCUMENT.read_text(encoding="utf-8").split(f"### `{message.__name__}`", 1)[1].split("\n#", 1)[0]
     rows = re.findall(r"^\| (\d+) \| `(\w+)` \| ([^|]+) \|", section, re.MULTILINE)
     first = 1 if issubclass(message, Message) else 0
+    sent = StillWire if message is RoiHeader else message
     expected = [
-        (str(number), name, kind.describe()) for number, (name, kind) in enumerate(kinds(message), first)
+        (str(number), name, kind.describe()) for number, (name, kind) in enumerate(kinds(sent), first)
     ]
     assert [(number, name, bounds.strip()) for number, name, bounds in rows] == expected
 

@@ -14,6 +14,7 @@ from hvt_archive.replay.command import messages_in
 from hvt_archive.replay.from_recording import messages_of
 from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (
+    READ_VERSIONS,
     BaseHeader,
     Info,
     Message,
@@ -32,8 +33,8 @@ from rigs.drawn_flight import FRAMES
 pytestmark = [pytest.mark.integration, pytest.mark.xdist_group("drawn")]
 
 SETTINGS = ("--provider", "cpu", "--quiet")
-RECORDED = Path(__file__).parent / "recorded" / "wire-3.hvtlog"
-"""Of schema version 3; the README beside it says how it was made."""
+RECORDED = Path(__file__).parent / "recorded" / "wire-4.hvtlog"
+"""Of schema version 4; the README beside it says how it was made."""
 NAMES = ("frame", "id", "x", "y", "w", "h", "class", "refined", "origin")
 
 
@@ -153,16 +154,16 @@ def parsed(item: Received) -> object:
     _, channel = parse_key(item.key) or ("", None)
     match channel:
         case Channel.BASE:
-            return BaseHeader.parse(item.attachment, item.payload)
+            return BaseHeader.parse(item.attachment, item.payload, versions=READ_VERSIONS)
         case Channel.ROI:
-            return RoiHeader.parse(item.attachment, item.payload)
+            return RoiHeader.parse(item.attachment, item.payload, versions=READ_VERSIONS)
     kinds: dict[Channel | None, type[Message]] = {
         Channel.TRACKS: TrackStep,
         Channel.POSE: PoseReport,
         Channel.STATUS: Status,
         Channel.INFO: Info,
     }
-    return kinds[channel].parse(item.payload)
+    return kinds[channel].parse(item.payload, versions=READ_VERSIONS)
 
 
 def test_the_halves_of_a_log_are_played_in_their_order(drawn, tmp_path):
@@ -180,20 +181,21 @@ def test_the_halves_of_a_log_are_played_in_their_order(drawn, tmp_path):
     assert times == sorted(times)
 
 
-def test_every_message_of_version_3_is_read():
+def test_every_message_of_version_4_is_read():
     """Recordings, and what an edge has stored on its disk, would be lost by an update."""
     items = list(read_log(RECORDED))
-    assert {wire_version(item.attachment or item.payload) for item in items} == {3}
+    assert {wire_version(item.attachment or item.payload) for item in items} == {4}
     kinds = {type(parsed(item)).__name__ for item in items}
     assert kinds == {"BaseHeader", "RoiHeader", "TrackStep", "PoseReport", "Status", "Info"}
 
 
-def test_a_flight_of_version_3_is_received(tmp_path, capsys):
+def test_a_flight_of_version_4_is_received(tmp_path, capsys):
     """The log of last year's flight would show nothing with this year's detector."""
     words = ("--detector", "motion", "--classifier", "none", "--summary", tmp_path / "summary.json")
     replay(capsys, RECORDED, *words, "--record", tmp_path, *SETTINGS)
     sessions = {one["edge"]: one for one in json.loads((tmp_path / "summary.json").read_text())}
-    assert {edge: one["frames"] for edge, one in sessions.items()} == {"uav-2": 42, "edge-1": 64}
-    assert sessions["uav-2"]["stills"]["received"] == 29
+    assert {edge: one["frames"] for edge, one in sessions.items()} == {"uav-2": 59, "edge-1": 28}
+    assert sessions["uav-2"]["stills"]["received"] == 34
     assert "undecodable" not in sessions["uav-2"]["stills"]["reasons"]["outcomes"]
     assert sessions["edge-1"]["unusable_messages"] == 0
+    assert sessions["edge-1"]["stills"]["received"] == 7
