@@ -7,15 +7,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from hvt_common.config import PATH, Group, SettingType
 from hvt_common.errors import UserError, needs_extra
-from hvt_common.runtime.checkup import Finding
-from hvt_gateways.cot.type_table import read_types
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
-from hvt_ground.sinks import Outputs
+
+if TYPE_CHECKING:
+    from hvt_common.runtime.checkup import Finding
+    from hvt_ground.sinks import Outputs
 
 _GATEWAYS = Group("gateways", rare=True)
 
@@ -70,6 +72,7 @@ class CotExtra(Extra):
         if isinstance(config, CotOptions) and config.cot:
             with needs_extra("'hvt[cot]'"):
                 from hvt_gateways.cot.connection import check_connection  # noqa: PLC0415 - who has none needs no pytak
+                from hvt_gateways.cot.type_table import read_types  # noqa: PLC0415
             read_types(config.cot_types)
             for url in config.cot:
                 check_connection(url)
@@ -82,6 +85,8 @@ class CotExtra(Extra):
 
     def _found(self, config: CotOptions) -> Finding:
         self.check_outputs(config, reads=())  # type: ignore[arg-type]
+        from hvt_common.runtime.checkup import Finding  # noqa: PLC0415
+
         return Finding("ok", f"to {', '.join(config.cot)}; types and certificates can be read")
 
     def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:
@@ -91,6 +96,7 @@ class CotExtra(Extra):
         self.check_outputs(config, reads=())
         from hvt_gateways.cot.connection import CotConnection  # noqa: PLC0415 - as above
         from hvt_gateways.cot.reporter import SessionReporter  # noqa: PLC0415 - as above
+        from hvt_gateways.cot.type_table import read_types  # noqa: PLC0415 - as above
 
         targets = [outputs.open(f"CoT {url}", partial(CotConnection, url)) for url in config.cot]
         reporter = partial(SessionReporter, targets=targets, types=read_types(config.cot_types))

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 
 from hvt_common.config import PATH, Group
 from hvt_common.errors import needs_extra
-from hvt_common.runtime.reporting import check_writable
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
-from hvt_ground.sinks import Outputs
 
 if TYPE_CHECKING:
     from hvt_gateways.mcap.file import McapFile
     from hvt_ground.recordings.recorded import Recorded
+    from hvt_ground.sinks import Outputs
 
 
 @dataclass(frozen=True)
@@ -41,6 +40,8 @@ class McapExtra(Extra):
 
     def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
         """Refuse a file that cannot be written."""
+        from hvt_common.runtime.reporting import check_writable  # noqa: PLC0415
+
         for name, path in self.writes(config):
             if not path.is_dir():
                 check_writable(path, name=name, reads=reads)

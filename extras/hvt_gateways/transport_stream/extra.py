@@ -6,14 +6,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hvt_common.config import TEXT, Group
-from hvt_gateways.transport_stream.destination import Addresses, check_destination, destination
-from hvt_gateways.transport_stream.stream import live_stream, stream_file, write_recorded
-from hvt_gateways.transport_stream.uas import Platform
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
-from hvt_ground.sinks import Outputs
+
+if TYPE_CHECKING:  # what writes it opens PyAV, which settings alone do without
+    from hvt_ground.recordings.recorded import Recorded
+    from hvt_ground.sinks import Outputs
 
 
 @dataclass(frozen=True)
@@ -28,11 +29,17 @@ class TransportStreamOptions:
     )
 
 
+def _export(recorded: Recorded, path: Path) -> None:
+    from hvt_gateways.transport_stream.stream import write_recorded  # noqa: PLC0415
+
+    write_recorded(recorded, path)
+
+
 class TransportStreamExtra(Extra):
     """A file or a live stream a session."""
 
     options = TransportStreamOptions
-    exports = {"ts": write_recorded}  # noqa: RUF012
+    exports = {"ts": _export}  # noqa: RUF012
 
     def writes(self, config: GroundConfig) -> Iterable[tuple[str, Path]]:
         """The file that is named."""
@@ -44,12 +51,18 @@ class TransportStreamExtra(Extra):
     def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
         """Refuse a destination that cannot be written or sent to."""
         if isinstance(config, TransportStreamOptions):
+            from hvt_gateways.transport_stream.destination import check_destination  # noqa: PLC0415
+
             check_destination(config.ts, reads=reads)
 
     def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
         """Make the function that opens the stream of a session."""
         if not isinstance(config, TransportStreamOptions) or config.ts is None:
             return lambda _flight: ()
+        from hvt_gateways.transport_stream.destination import Addresses, destination  # noqa: PLC0415
+        from hvt_gateways.transport_stream.stream import live_stream, stream_file  # noqa: PLC0415
+        from hvt_gateways.transport_stream.uas import Platform  # noqa: PLC0415
+
         where, addresses = destination(config.ts), Addresses()
 
         def sinks(flight: Flight) -> Iterable[Opening]:
