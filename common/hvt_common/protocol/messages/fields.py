@@ -367,7 +367,7 @@ def described(kind: dict[str, Any]) -> str:  # noqa: C901, PLR0911 - one return 
         case {"type": "int", "low": low, "high": high, "per": per}:
             return f"int {low}…{high}, {_PARTS[per]}"
         case {"type": "int", "low": low, "high": high}:
-            return f"int {_power(low)}…{_power(high)}"
+            return _range(low, high)
         case {"type": "float", "low": low, "high": high}:
             return f"float {low:g}…{high:g}"
         case {"type": "str" | "bin" as name, "most_bytes": most}:
@@ -389,9 +389,9 @@ def described(kind: dict[str, Any]) -> str:  # noqa: C901, PLR0911 - one return 
     return str(kind["type"])
 
 
-def _power(number: int) -> str:
-    """Large bounds as powers of two, for people."""
-    for bits in (16, 32, 53, 63, 64):
-        if abs(number) == 2**bits - 1:
-            return f"{'−' if number < 0 else ''}(2^{bits} − 1)"  # noqa: RUF001
-    return str(number)
+def _range(low: int, high: int) -> str:
+    """Whole numbers of so many bits by the name that the page explains: ``u32`` is 0…(2^32 - 1)."""
+    bits = high.bit_length()
+    if bits >= 32 and high == 2**bits - 1 and low in (0, -1, -high):
+        return f"u{bits}" if low == 0 else f"u{bits} or −1" if low == -1 else f"±u{bits}"  # noqa: RUF001
+    return f"int {low}…{high}"
