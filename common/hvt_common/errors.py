@@ -27,7 +27,7 @@ _MAY_COME = frozenset(
 
 
 class UserError(Exception):
-    """Something the user can mend: one sentence that names the thing, its value and what is accepted.
+    """Something the user can mend: one sentence that names the thing, its value and the accepted ones.
 
     Command-line tools print it without a traceback and exit with code 2. Raise it only for what comes from
     outside (arguments, files, the machine); a wrong value between our own functions is a bug and crashes

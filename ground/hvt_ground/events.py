@@ -90,7 +90,7 @@ class Overlay:
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """A still that was decoded and classified, and what it did to one object.
+    """A still that was decoded and classified, and its effect on one object.
 
     A still that shows several objects makes one event for each, under the same number.
     """

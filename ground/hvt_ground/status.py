@@ -121,7 +121,7 @@ def completed(
     sinks: Iterable[Sink[Event]] = (),
     failures: Failures | None = None,
 ) -> dict[str, Any]:
-    """The summary of a session, with what counts over all sessions of its edge, and the ground's own failures.
+    """The summary of a session, with the counts over all sessions of its edge, and the ground's own failures.
 
     Messages that were skipped, recordings of former sessions, of which a backlog came, parts that failed; and, once
     they are closed, what became of the session's ``sinks``.

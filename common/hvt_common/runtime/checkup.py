@@ -44,7 +44,7 @@ class Finding:
 def run_checks(
     checks: Mapping[str, Callable[[], Finding]], *, patience_s: float = _PATIENCE_S
 ) -> dict[str, Finding]:
-    """Each in turn, by name. A `UserError` is what is wrong; a check without an end is left behind.
+    """Each in turn, by name. A `UserError` is a fault; a check without an end is left behind.
 
     What a check logs belongs to its finding: a warning makes of ``ok`` a ``warning``.
     """

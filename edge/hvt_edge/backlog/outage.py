@@ -42,7 +42,7 @@ class Outage:
         return reported_ns is not None and now_ns - reported_ns <= SILENCE_NS
 
     def offline(self, now_ns: int, *, linked: bool) -> bool:
-        """Whether the link is away; called before each frame. ``linked``: somebody subscribes, by what Zenoh knows.
+        """Whether the link is away; called before each frame. ``linked``: Zenoh reports a subscriber.
 
         Before anybody ever subscribed, only a live source is stored: a clip plays again.
         """

@@ -319,7 +319,7 @@ class RollingBudget:
         return _SPARE_SHARE * self._loan_bytes + self._settings.metadata_bps * self._loan_ns / 8 / SECOND_NS
 
     def backlog_allowance(self, now_ns: int, *, reserve: float) -> int:
-        """Return how many line bytes of what was kept may go now: what neither base nor stills will want.
+        """The line bytes of the backlog that may go now: those that neither base nor stills will need.
 
         It takes no share of anybody's. ``reserve`` is left free of a window, as a share of what stills have of one.
         A camera that is silent may give its next frame at any moment: its room stays free until `end_base`.

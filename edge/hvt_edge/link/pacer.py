@@ -54,7 +54,7 @@ class Sent:
 
 
 class Flight:
-    """The account of what is on its way. Pure: time is an argument; bounded in memory."""
+    """The account of messages in flight. Pure: time is an argument; bounded in memory."""
 
     def __init__(self) -> None:
         self._base: deque[Sent] = deque(maxlen=_MOST_RECORDS)
@@ -281,7 +281,7 @@ class Pacer:
                 self._flight.refill()
 
     def on_fault(self, now_ns: int) -> None:
-        """A report came and could not be used: of what is on its way nothing is known, and the least is sent."""
+        """Take a useless report: messages in flight are unknown, and the least is sent."""
         with self._lock:
             self._controller.on_silence(now_ns)
             self._flight.clear()

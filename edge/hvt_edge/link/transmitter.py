@@ -136,7 +136,7 @@ class Transmitter:
         return line_bytes
 
     def envelope(self, still: Still) -> StillEnvelope:
-        """The still with its header. The one asked for last is at hand: what was measured is what is sent."""
+        """The still with its header. The newest is cached, so the measured bytes are those sent."""
         newest = self._newest
         if newest is None or newest.still is not still:
             self._newest = newest = StillEnvelope.of(still, session_id=self.session_id)

@@ -34,7 +34,7 @@ class BaseLoss:
 
 
 def measure_loss(source_crop: Image, base_crop: Image) -> BaseLoss:
-    """Compare two uint8 BGR crops of one size, at least 1x1: the source's, and what the base shows of it.
+    """Compare two uint8 BGR crops of one size, at least 1x1: the source's and the base's.
 
     With ``S`` and ``B`` the Laplacians of both lumas (BT.601), ``detail_lost = sum(S (S - B)) / (sum(S S) + noise)``:
     0 where the base has all edges of the source, 1 where it has none of them, 0.5 where it has them at half their

@@ -1,4 +1,4 @@
-"""Candidates: the tracks of one decision step, each with what the edge remembers of it.
+"""Candidates: the tracks of one decision step, each with the edge's memory of it.
 
 Methods and suppression see nothing else, so that they can be pure functions.
 """
@@ -115,7 +115,7 @@ class _History:
 
 
 class TrackMemory:
-    """Remembers of each track when it started, what was sent of it and what the ground said.
+    """Remembers the start of each track, its stills and the ground's answers.
 
     Bounded: a track that has not been seen for ``forget_s`` is forgotten, and beyond ``max_tracks`` those seen
     longest ago go first.

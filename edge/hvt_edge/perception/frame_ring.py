@@ -40,7 +40,7 @@ class RingSettings:
 
 @dataclass(frozen=True, slots=True)
 class RingFrame:
-    """A source frame and what was tracked in it."""
+    """A source frame with its tracks."""
 
     frame_index: int
     capture_ns: int
@@ -125,7 +125,7 @@ class FrameRing:
             )
 
     def add(self, frame: Frame, tracks: Tracks, *, base: YuvPicture | Image | None = None) -> None:
-        """Keep a frame, newer than all before; let go of what there is no more room or time for."""
+        """Keep a frame, newer than all before; drop frames beyond the ring's room or time."""
         height, width = frame.source_bgr.shape[:2]
         newest = RingFrame(frame.index, frame.capture_ns, (width, height), frame.source_bgr, tracks, base)
         with self._lock:

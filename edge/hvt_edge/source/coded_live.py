@@ -73,7 +73,7 @@ class _Queued:
 
 
 class CodedLiveSource(LiveSource):
-    """Every unit of the camera with its picture. ``fps`` is what its time stamps say; see `LiveSource` for the rest.
+    """Every unit of the camera with its picture. ``fps`` follows its time stamps; see `LiveSource` for the rest.
 
     Opening takes three to ten seconds, in which `camera_stream` is measured. Raises `UserError` where its units
     cannot be the base stream.

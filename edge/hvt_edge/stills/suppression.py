@@ -85,7 +85,7 @@ class Suppression:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Refuses a still of what the base already shows well enough; refuses nothing at 0 dB. Frozen, without state.
+    """Refuses a still where the base shows enough; refuses nothing at 0 dB. Frozen, without state.
 
     The edge decodes its own stream and knows what the base lost of each candidate (`base_loss`). Both conditions have
     to hold, because each has its blind spot: PSNR is high on a dark or smooth object whatever became of its edges,

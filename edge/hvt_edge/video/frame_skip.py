@@ -1,4 +1,4 @@
-"""Which source frames are coded: each n-th, and with ``--fps auto`` an n that follows from what was measured.
+"""Chooses the source frames to code: each n-th, with ``--fps auto`` by an n from measurements.
 
 Fewer frames get more bits each. How many are best depends on how hard the scene is to code, which shows in the
 quantiser that x265 needs at the given rate: `MeasuredFrameSkip` holds it in a band (see rate_model). The rate changes

@@ -1,4 +1,4 @@
-"""Stretches of the base stream that were stored: which of their frames can be shown, and what they show.
+"""Stored segments of the base stream: their frames that can be shown, and the objects in them.
 
 A stretch that begins with a keyframe stands by itself. The first one of an outage need not: it goes on from the last
 picture that came over the link, so the units since the last keyframe before each gap are remembered.

@@ -1,4 +1,4 @@
-"""From the access units of one edge, as the link delivers them, to what a decoder may be given.
+"""From the access units of one edge, as the link delivers them, to those that a decoder may get.
 
 After one lost P frame an HEVC decoder shows nothing, or garbage, until the next keyframe, and says so to
 nobody. So the rule is strict: the decoder gets runs that start with a keyframe and have no hole, in order,

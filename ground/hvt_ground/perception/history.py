@@ -1,4 +1,4 @@
-"""The last seconds of what the ground decoded and tracked, by frame index.
+"""The pictures and tracks of the last seconds, by frame index.
 
 A still arrives after its frame: it is matched to the tracks of that very frame and shown beside (or pasted
 into) the decoded picture of it. Tracks are small and kept for `track_frames`. Pictures are large: 1280x720 BGR

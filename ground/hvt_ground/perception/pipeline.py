@@ -233,7 +233,7 @@ class Pipeline:
         return self._stills.take_results()
 
     def end(self) -> None:
-        """The session is over: what still waits is given out as unmatched, and what is large is let go of.
+        """End the session: pending stills are given out as unmatched, and large memory is freed.
 
         A ground goes on for days, and its edges come and go.
         """

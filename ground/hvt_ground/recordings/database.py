@@ -1,4 +1,4 @@
-"""The index in SQLite: which files a folder of recordings has, and what is in them.
+"""The index in SQLite: the files of a folder of recordings, and their content.
 
 It is written ahead (WAL), so that a crash leaves it whole. Readers and the writer do not hold each other up.
 """

@@ -1,4 +1,4 @@
-"""Writes every still as a picture file, and a table of what each shows, for people and programs that come after.
+"""Writes every still as a picture file, and a table of their objects, for people and other programs.
 
 The recording shows what it has room for; here nothing is left out, and nothing is coded again.
 """

@@ -35,7 +35,7 @@ class EdgeRequests:
         self._free = threading.BoundedSemaphore(_MOST_AT_ONCE)
 
     def request_still(self, edge: str, body: Mapping[str, Any]) -> tuple[bytes, dict[str, Any]]:
-        """A still of ``box`` (x1, y1, x2, y2 in base pixels) at ``frame``, or at the newest: JPEG, and what it shows.
+        """A still of ``box`` (x1, y1, x2, y2 in base pixels) at ``frame``, or at the newest: JPEG, and its place.
 
         Raises `BadRequestError`, `BusyError`, or what `RemoteEdge.still` does.
         """

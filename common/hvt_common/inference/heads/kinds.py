@@ -1,4 +1,4 @@
-"""The heads that are known, and what tells each of them from all others.
+"""The known heads, and the marks of each.
 
 A head *fits* where the outputs have its shape. It is *proven* where the values of the trial, the names of the outputs
 or the number of class names leave no other: then `Match.proof` says what. With ``--head`` a fit is enough.

@@ -42,7 +42,7 @@ def download(
     progress: Progress,
     pauses_s: Sequence[float] = (1.0, 2.0, 4.0),
 ) -> None:
-    """Bring ``part`` to ``size_bytes``, going on from what it already holds; its content is not checked here.
+    """Bring ``part`` to ``size_bytes``, continuing after the bytes that it holds; its content is not checked here.
 
     A try that brought bytes is followed by another; after ``pauses_s`` tries in a row that brought none it gives up.
 

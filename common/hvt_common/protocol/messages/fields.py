@@ -46,7 +46,7 @@ class Kind(ABC):
 
     @abstractmethod
     def decode(self, raw: Any) -> Any:
-        """The value of what MessagePack held; WireError when of another type or out of bounds."""
+        """The value of a MessagePack object; WireError when of another type or out of bounds."""
 
     @abstractmethod
     def schema(self) -> dict[str, Any]:

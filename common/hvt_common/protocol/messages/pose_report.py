@@ -105,7 +105,7 @@ class _Sample:
 
     @classmethod
     def of(cls, pose: Pose) -> _Sample:
-        """Raises ValueError for a pose outside of what can be said."""
+        """Raises ValueError for a pose out of bounds."""
         camera, platform = (None if one is None else _angles(one) for one in (pose.camera, pose.platform))
         return cls(
             time_ms=round(pose.capture_ns / _MILLION),
@@ -162,7 +162,7 @@ class PoseEncoder:
         self._fresh_ns = 0
 
     def encode(self, pose: Pose) -> Callable[[int], PoseReport]:
-        """The next report, to be made for its time of sending. ValueError for a pose outside of what can be said."""
+        """The next report, to be made for its time of sending. ValueError for a pose out of bounds."""
         sample, last = _Sample.of(pose), self._last
         number = (self._number + 1) % _NUMBERS
         coded, alone = _whole(sample, number), True

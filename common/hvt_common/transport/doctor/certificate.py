@@ -98,7 +98,7 @@ class TlsFiles:
 
 
 def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | None, now_s: float) -> None:
-    """Raise UserError for keys that no other side would accept; warn of what will soon be, or may be, a fault.
+    """Raise UserError for keys that no other side would accept; warn of coming and possible faults.
 
     ``name`` is who this machine has to be by its certificate: the id of an edge; None for anybody. ``now_s`` is
     Unix time.

@@ -54,7 +54,7 @@ class _Place:
 
 
 def why_no_link(endpoint: str, files: TlsFiles) -> str:
-    """One sentence on what keeps us from the endpoint, which it begins with. Blocks for some seconds at most.
+    """One sentence on the obstacle to the endpoint, which it begins with. Blocks for some seconds at most.
 
     A name is looked up by the system's resolver, which has time limits of its own.
     """

@@ -1,4 +1,4 @@
-"""Refinement: the class of a ground track is what its stills say.
+"""Refinement: stills decide the class of a ground track.
 
 A still names a frame and a box of the edge. Which of the ground's own tracks that is, is decided by `match`
 at that very frame (`Tracks` of the frame, from the history), never by position on the screen of now: a lost

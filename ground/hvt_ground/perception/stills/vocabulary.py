@@ -42,7 +42,7 @@ class Vote:
 
 
 class Vocabulary:
-    """The classes that a track may be shown as, and what a reader of stills says of them.
+    """The classes that a track may have, and their names by a reader of stills.
 
     ``detectors`` are the names of both sides' detectors, ``reader`` those of the still reader; ``kinds`` lets a
     network of ImageNet tell kinds (the paper's rule). Where a detector says only that something moves, the reader's

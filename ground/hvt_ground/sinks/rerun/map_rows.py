@@ -51,7 +51,7 @@ class MapRows:
 
 
 def pose_numbers(update: PoseUpdate) -> npt.NDArray[np.float64]:
-    """A pose and a view as (21,) float64; NaN for what is not known.
+    """A pose and a view as (21,) float64; NaN for unknown ones.
 
     Latitude, longitude, height, altitude, field of view, the three errors, the angles of camera and platform, as
     `Pose` and `Orientation` have them; then (width, height) of source and base, scale and offset of the `View`.

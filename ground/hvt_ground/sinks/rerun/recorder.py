@@ -192,7 +192,7 @@ class Recorder:
         )
 
     def go_on_in(self, file: RecordingFile, *, at: tuple[int, int]) -> None:
-        """Write into ``file`` from now on, which begins ``at`` (frame and capture time) with what is shown then.
+        """Write into ``file`` from now on, which begins ``at`` (frame and capture time) with the present screen.
 
         The former one is left open, for `close_file`.
         """
