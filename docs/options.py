@@ -31,7 +31,7 @@ Every option is a flag, or in a TOML file a key without the dashes (`--config FI
 | list | the flag may be repeated; in TOML `["…", "…"]` |
 | yes/no | `--name`, `--no-name`; in TOML `true` or `false` |
 
-`hvt-edge --help` leaves out options with a star; `--help-all` lists everything.
+The default stands in brackets. `hvt-edge --help` leaves out options with a star; `--help-all` lists everything.
 A wrong value ends the program before the first frame with one sentence and exit code 2.
 """
 
@@ -50,19 +50,20 @@ def _program(name: str, config: type) -> Iterator[str]:
     for group, fields in groups.items():
         if group:
             yield f"### {group[0].upper()}{group[1:]}\n"
-        yield "| option | default | meaning |\n|---|---|---|"
         yield from map(_row, fields)
         yield ""
 
 
 def _row(field: dataclasses.Field[Any]) -> str:
-    key, meaning = field.name.replace("_", "-"), field.metadata["help"].replace("|", r"\|")
-    star = " *" if field.metadata.get("rare") else ""
+    key, star = field.name.replace("_", "-"), "*" if field.metadata.get("rare") else ""
     if field.metadata.get("switch"):
-        return f"| `--{key}`, `--no-{key}`{star} | {'yes' if field.default else 'no'} | {meaning} |"
-    kind, many = field.metadata["kind"], field.metadata["many"]
-    value = kind.metavar.replace("|", r"\|")
-    return f"| `--{key} {value}`{', list' if many else ''}{star} | {_default(field)} | {meaning} |"
+        named, default = f"`--{key}`, `--no-{key}`{star}", "yes" if field.default else "no"
+    else:
+        named = (
+            f"`--{key} {field.metadata['kind'].metavar}`{star}{', list' if field.metadata['many'] else ''}"
+        )
+        default = _default(field)
+    return f"- {named}{f' ({default})' if default else ''}: {field.metadata['help']}"
 
 
 def _default(field: dataclasses.Field[Any]) -> str:
