@@ -1,6 +1,6 @@
 """``docs/wire.json``: every message, field, type, bound and limit of the wire as data, from the code's own tables.
 
-The tables of docs/wire-messages.md are checked against it, and the reader in TypeScript reads its fields from it.
+The lists of docs/wire-messages.md are checked against it, and the reader in TypeScript reads its fields from it.
 """
 
 from __future__ import annotations

@@ -43,9 +43,11 @@ def _text(name: str) -> str:
 
 
 def _prose_words(text: str) -> int:
-    """Words outside tables, lists of options, code and pictures."""
+    """Words outside tables, lists of options and of fields, code and pictures."""
     text = re.sub(r"^ *```.*?^ *```", "", text, flags=re.MULTILINE | re.DOTALL)
-    lines = (line for line in text.splitlines() if not line.startswith(("|", "- `--", "    ", "<!--", "![")))
+    lines = (
+        line for line in text.splitlines() if not re.match(r"\||- `--|\d+\. `\w+` \(|    |<!--|!\[", line)
+    )
     return sum(len(line.split()) for line in lines)
 
 

@@ -511,7 +511,7 @@ def test_a_kept_still_that_cannot_be_one_is_refused(values):
 def test_the_document_lists_every_field_with_its_bounds(message):
     """Whoever writes a subscriber from docs/wire.md would read the wrong field."""
     section = DOCUMENT.read_text(encoding="utf-8").split(f"### `{message.__name__}`", 1)[1].split("\n#", 1)[0]
-    rows = re.findall(r"^\| (\d+) \| `(\w+)` \| ([^|]+) \|", section, re.MULTILINE)
+    rows = re.findall(r"^(\d+)\. `(\w+)` \((.+?)\)(?=: |$)", section, re.MULTILINE)
     first = 1 if issubclass(message, Message) else 0
     sent = StillWire if message is RoiHeader else message
     expected = [
