@@ -379,7 +379,7 @@ def test_oversized_messages_are_not_looked_at():
 
 def test_our_own_values_out_of_bounds_are_a_bug_and_say_so():
     """A wrong value would be sent and refused on the other side, far from its cause."""
-    with pytest.raises(ValueError, match=r"^-1 cannot be sent as int"):
+    with pytest.raises(ValueError, match=r"^-1 cannot be sent as u64"):
         BaseHeader(session_id=-1, sequence=0, frame_index=0, capture_ns=0, send_delay_ns=0, flags=0).pack()
     with pytest.raises(ValueError, match=rf"array ≤ {MAX_STILL_RESULTS}"):
         Feedback(
