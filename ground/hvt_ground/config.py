@@ -11,6 +11,7 @@ from hvt_common.config import BYTES, DURATION, PATH, TEXT, Group, SettingType, c
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
+from hvt_common.inference.ensemble import parts_of
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
 from hvt_common.protocol.channels import GroupKeys
 from hvt_common.runtime.log import LOG_FORMATS
@@ -72,7 +73,7 @@ class GroundConfig:
     detector: str = _MODELS.option(
         TEXT,
         EMBEDDED_DETECTOR,
-        "FILE.onnx or .xml, a name of hvt-models list (NAME:TEXT for a plug-in), or motion, which needs no model",
+        "FILE.onnx or .xml, a name of hvt-models list (NAME:TEXT for a plug-in), up to three with + between, or motion",
     )
     labels: Path | None = _MODELS.option(PATH, None, "class names of the classifier, one a line")
     detector_labels: Path | None = _MODELS_RARE.option(
@@ -106,7 +107,7 @@ class GroundConfig:
         TEXT,
         None,
         "FILE.onnx, a name of hvt-models list, none, or detector: it runs again with the stills pasted in",
-        shown_default="aerial-cls; detector where --detector is another",
+        shown_default="aerial-cls; detector where --detector is without aerial-nano",
     )
     refine: str = _MODELS.option(
         choice("replace", "fuse"),
@@ -217,7 +218,8 @@ def check(config: GroundConfig, *, files: Iterable[tuple[str, Path]] = ()) -> Gr
             f"--classifier {DETECTOR} needs a detector that knows classes, and --detector is {MOTION}: give a model"
         )
     if config.classifier is None:
-        classifier = EMBEDDED_CLASSIFIER if config.detector in (MOTION, EMBEDDED_DETECTOR) else DETECTOR
+        embedded = {MOTION, EMBEDDED_DETECTOR}.intersection(parts_of(config.detector))
+        classifier = EMBEDDED_CLASSIFIER if embedded else DETECTOR
         return replace(config, classifier=classifier)
     return config
 

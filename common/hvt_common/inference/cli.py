@@ -72,12 +72,18 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("name", metavar="NAME")
     one.set_defaults(run=_path)
 
-    one = commands.add_parser("add", help="take in a file that was brought by hand")
+    one = commands.add_parser(
+        "add", help="take in a file that was brought by hand, the .bin beside an .xml too"
+    )
     one.add_argument("file", type=Path, metavar="FILE")
     one.add_argument(
         "--name", required=True, help="a name of 'hvt-models list', or a new one: a-z, 0-9 and -"
     )
-    one.add_argument("--sha256", help="what its origin says; needed for a new name, which it pins")
+    one.add_argument(
+        "--sha256",
+        metavar="DIGEST",
+        help="what its origin says; needed for a new name, which it pins; of .xml and .bin by a comma",
+    )
     one.set_defaults(run=_add)
 
     one = commands.add_parser("info", help="ports, adapter, classes and speed of a model")
@@ -102,18 +108,18 @@ def _list(_: argparse.Namespace) -> int:
         table.add_row(name, task, f"{path.stat().st_size / 1e6:.1f}", "Apache-2.0", "yes", about)
     for name, entry in store.entries.items():
         held = store.held_bytes(name)
-        here = "yes" if store.is_there(name) else f"{100 * held // entry.size_bytes} %" if held else "no"
+        here = "yes" if store.is_there(name) else f"{100 * held // entry.total_bytes} %" if held else "no"
         table.add_row(
             name,
             entry.task,
-            f"{entry.size_bytes / 1e6:.1f}",
+            f"{entry.total_bytes / 1e6:.1f}",
             entry.licence,
             here,
             entry.about or "added by hand",
         )
     for name, origin in plug_in_names().items():
         table.add_row(name, "detector", "", "", "yes", f"plug-in of {origin}")
-    Console(highlight=False).print(table)
+    Console(highlight=False, markup=False).print(table)
     print("hvt-models fetch NAME brings one here; then --detector NAME or --classifier NAME takes it")
     return 0
 
@@ -132,13 +138,13 @@ def _fetch(arguments: argparse.Namespace) -> int:
 
 
 def _with_progress(store: Store, entry: ModelEntry, bar: Progress) -> Path:
-    task = bar.add_task(entry.name, total=entry.size_bytes)
+    task = bar.add_task(entry.name, total=entry.total_bytes)
 
     def say_waits() -> None:
         bar.console.print(f"another process fetches {entry.name}; waiting for it")
 
     path = store.fetch(entry.name, progress=lambda held: bar.update(task, completed=held), on_wait=say_waits)
-    bar.update(task, completed=entry.size_bytes)
+    bar.update(task, completed=entry.total_bytes)
     return path
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,26 +14,22 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import group_of
+from hvt_common.inference.ensemble import EnsembleDetector, on_scale_of, parts_of
 from hvt_common.inference.heads.choose import HEAD_NAMES, check_head_name, choose_head
 from hvt_common.inference.heads.contract import Head
 from hvt_common.inference.heads.trial import Trial, trial_pictures
 from hvt_common.inference.labels import KNOWN_LABELS, class_labels, read_labels
 from hvt_common.inference.letterbox import Letterboxer, as_bgr
-from hvt_common.inference.motion import MotionDetector
+from hvt_common.inference.motion import MOTION, MotionDetector
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
 from hvt_common.inference.preparation import Preparation, prepared_as
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
+from hvt_common.inference.scores import USUAL_CONFIDENCE, default_confidence
 from hvt_common.inference.store import model_names, resolve_model
 from hvt_common.values import Detections, Image
 
 _log = logging.getLogger(__name__)
-
-MOTION = "motion"
-"""The word that stands for the detector without weights."""
-
-USUAL_CONFIDENCE = 0.25
-"""From where detections count, where neither the user nor the model says."""
 
 _CELL = 32  # input sides are multiples of the largest usual stride
 _CELLS = (_CELL, 64, 128)
@@ -83,21 +80,28 @@ def open_detector(
     provider: str = "cpu",
     niceness: int = 0,
 ) -> Detector:
-    """Open a detector: ``motion``, the name of a model (see `resolve_model`), a file, or a plug-in's name.
+    """Open a detector: ``motion``, the name of a model (see `resolve_model`), a file, a plug-in's name, or ``A+B``.
 
     ``labels`` are class names, see `read_labels`; else those of the metadata, or "class 0" and so on, which is said.
     ``head`` is one of `heads.choose.HEAD_NAMES`; else the file tells, or what it answers. ``confidence`` is the least
     of a detection, ``nms_iou`` the largest overlap of two of one class, both 0…1. ``size`` is (width, height) of the
     network's input where the model leaves it free; else each image gets the multiples of the network's stride that
     hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). ``niceness``: see `ModelSettings`. A
-    plug-in gets none of these; ``confidence`` is applied to its answer.
-    Raises `UserError` where there is no such model, it is no detector, its
+    plug-in gets none of these; ``confidence`` is applied to its answer. For ``A+B`` (see `ensemble`) it is on the
+    scale of A, and ``labels``, ``head`` and ``size`` are refused. Raises `UserError` where there is no such model, it is no detector, its
     labels do not fit, or a setting is out of its range.
     """
     for name, value in (("confidence", confidence), ("NMS IoU", nms_iou)):
         if not 0 <= value <= 1:
             raise UserError(f"{name} {value} is not accepted; a number from 0 to 1 is")
     check_head_name(head)
+    parts = parts_of(spec)
+    if len(parts) > 1:
+        for word, given in (("labels file", labels), ("head", head), ("detector size", size)):
+            if given is not None:
+                raise UserError(f"{word} {given} has no say: detector {spec!r} is several, each with its own")
+        settings = {"nms_iou": nms_iou, "threads": threads, "provider": provider, "niceness": niceness}
+        return _open_ensemble(parts, confidence=confidence, settings=settings)
     plug_in = None if spec == MOTION else plug_in_of(spec, taken=model_names)
     if head is not None and (spec == MOTION or plug_in is not None):
         raise UserError(f"--head {head} has no say: {spec!r} is no network of a file")
@@ -110,6 +114,25 @@ def open_detector(
     path = resolve_model(spec, role="detector", words=(MOTION, *plug_in_names()))
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider, niceness=niceness))
     return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size, head=head)
+
+
+def _open_ensemble(
+    parts: tuple[str, ...], *, confidence: float, settings: Mapping[str, Any]
+) -> EnsembleDetector:
+    if MOTION in parts:
+        raise UserError(
+            f"detector {'+'.join(parts)!r} is not accepted: {MOTION} looks at several pictures, and stands alone"
+        )
+    owns = [default_confidence(part) for part in parts]
+    least = np.array([confidence], np.float32)
+    return EnsembleDetector(
+        [
+            open_detector(part, confidence=float(on_scale_of(least, owns[0], own)[0]), **settings)
+            for part, own in zip(parts, owns, strict=True)
+        ],
+        owns,
+        confidence=confidence,
+    )
 
 
 def detect_every(given: int | None, *, fps: float) -> int:

@@ -57,7 +57,11 @@ def read_labels(path: Path) -> tuple[str, ...]:
 
 def class_labels(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...] | None:
     """The class names that a model carries, or that are known of this very file; None where there are none."""
-    return metadata_labels(metadata) or KNOWN_LABELS.get(known_classes(path))
+    own = metadata_labels(metadata)
+    if own is not None:
+        return own
+    known = known_classes(path)
+    return KNOWN_LABELS.get(known.partition(",")[0].lower()) or _written_names(known)
 
 
 def metadata_labels(metadata: Mapping[str, str]) -> tuple[str, ...] | None:

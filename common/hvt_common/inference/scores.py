@@ -6,12 +6,16 @@ import math
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_common.inference.detect import MOTION, USUAL_CONFIDENCE
+from hvt_common.inference.ensemble import parts_of
 from hvt_common.inference.labels import metadata_labels
+from hvt_common.inference.motion import MOTION
 from hvt_common.inference.runtimes.ir_file import ir_metadata, is_ir
 from hvt_common.inference.runtimes.onnx_file import onnx_metadata
 from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
 from hvt_common.inference.store import resolve_model
+
+USUAL_CONFIDENCE = 0.25
+"""From where detections count, where neither the user nor the model says."""
 
 _CONFIDENCE = "hvt.confidence"
 _CALIBRATION = "hvt.calibration"
@@ -19,19 +23,22 @@ _LEAST_CONFIDENCE = 0.01
 
 
 def declared_class_names(spec: str) -> tuple[str, ...] | None:
-    """A detector's class names, where its file says them; None for others, the motion detector and plug-ins.
+    """A detector's class names, where its file says them; None for others, motion, plug-ins and ensembles.
 
     Raises `UserError` where there is no such model.
     """
+    if len(parts_of(spec)) > 1:
+        return None
     return metadata_labels(_metadata(spec, role="detector"))
 
 
 def default_confidence(spec: str) -> float:
     """From where a detector's detections start a track, 0.01…1: ``hvt.confidence`` of its metadata, else 0.25.
 
-    ``spec`` is as of `open_detector`. Raises `UserError` where there is no such model, or the metadata make no sense.
+    ``spec`` is as of `open_detector`; of an ensemble the first counts. Raises `UserError` where there is no such
+    model, or the metadata make no sense.
     """
-    text = _metadata(spec, role="detector").get(_CONFIDENCE)
+    text = _metadata(parts_of(spec)[0], role="detector").get(_CONFIDENCE)
     if text is None:
         return USUAL_CONFIDENCE
     try:
@@ -49,9 +56,11 @@ def default_confidence(spec: str) -> float:
 def is_calibrated(spec: str, *, role: str) -> bool:
     """Whether a model's scores were fitted to how often they are right: its metadata have ``hvt.calibration``.
 
-    Those of the motion detector and of plug-ins are not. Raises `UserError` where there is no such model.
+    Those of the motion detector and of plug-ins are not; an ensemble's are where all its parts' are. Raises
+    `UserError` where there is no such model.
     """
-    return _CALIBRATION in _metadata(spec, role=role)
+    parts = parts_of(spec) if role == "detector" else (spec,)
+    return all(_CALIBRATION in _metadata(part, role=role) for part in parts)
 
 
 def _metadata(spec: str, *, role: str) -> dict[str, str]:

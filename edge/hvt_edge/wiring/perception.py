@@ -8,7 +8,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Literal, cast
 
-from hvt_common.inference.detect import MOTION, Detector, detect_every, open_detector, warm_up
+from hvt_common.inference.detect import Detector, detect_every, open_detector, warm_up
+from hvt_common.inference.motion import MOTION
 from hvt_common.inference.scores import (
     declared_class_names,
     default_confidence,

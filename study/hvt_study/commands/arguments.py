@@ -12,8 +12,10 @@ from typing import Any
 
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import open_classifier
-from hvt_common.inference.detect import MOTION, open_detector
+from hvt_common.inference.detect import open_detector
+from hvt_common.inference.ensemble import parts_of
 from hvt_common.inference.labels import first_synonym
+from hvt_common.inference.motion import MOTION
 from hvt_common.inference.runtimes.plug_in import plug_in_of
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.runtime.reporting import check_writable
@@ -283,6 +285,8 @@ def _models(arguments: argparse.Namespace) -> tuple[ModelChoice, ...]:
         raise UserError(f"{MOTION!r} remembers pictures, and cannot serve a study: give a detection network")
     for one in models:
         for name in (one.detector, one.edge_detector):
+            if len(parts_of(name)) > 1:
+                raise UserError(f"detector {name!r} is several: a study takes one ONNX model")
             if plug_in_of(name) is not None:
                 raise UserError(
                     f"detector {name!r} is a plug-in, and no file names its results: give an ONNX model"

@@ -152,7 +152,7 @@ def test_the_three_words_of_the_setting():
     assert two.grid((99, 99)) == (2, 1)
     assert tiled(network, "auto").class_names == ("car", "truck")
     assert tiled(motion, "auto") is motion, "it compares a picture with the one before"
-    with pytest.raises(UserError, match="motion and plug-ins take whole pictures"):
+    with pytest.raises(UserError, match="take whole pictures"):
         tiled(motion, "2x2")
 
 

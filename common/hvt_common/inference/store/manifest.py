@@ -20,27 +20,47 @@ MAX_SIZE_BYTES = 1 << 30
 """1 GiB, as much as a model may have when it is opened."""
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,47}")
+_PIN = ("size_bytes", "sha256", "urls")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True, slots=True)
-class ModelEntry:
-    """One pinned model."""
+class PinnedFile:
+    """One file of a model."""
 
-    name: str
     size_bytes: int
     sha256: str
     """64 hexadecimal digits in lower case."""
     urls: tuple[str, ...] = ()
     """Where the file is, best first; empty for a model that only came by hand."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelEntry(PinnedFile):
+    """One pinned model; the fields of `PinnedFile` are those of its first file."""
+
+    name: str
+    weights: PinnedFile | None = None
+    """The .bin beside the .xml of an OpenVINO model; None for an ONNX file."""
     task: str = ""
     """detector or classifier."""
     about: str = ""
     classes: str = ""
+    """The data set and a number, or the names by commas where the file does not hold them."""
     licence: str = ""
     preprocessing: Mapping[str, Any] | None = None
     """channels, mean and scale (network value = (pixel - mean) * scale), fit. The adapters do not need it:
     it is for use of the file elsewhere, and a test compares both."""
+
+    @property
+    def files(self) -> dict[str, PinnedFile]:
+        """The files that the model is, by suffix; the one that is opened comes first."""
+        return {".onnx": self} if self.weights is None else {".xml": self, ".bin": self.weights}
+
+    @property
+    def total_bytes(self) -> int:
+        """The size of all its files."""
+        return sum(file.size_bytes for file in self.files.values())
 
 
 def builtin_manifest() -> dict[str, ModelEntry]:
@@ -73,7 +93,22 @@ def check_digest(digest: str) -> str:
 
 
 def _entry(name: str, table: Any, *, origin: str) -> ModelEntry:
-    known = {field.name for field in fields(ModelEntry)} - {"name"}
+    pin = _pin(name, table, ModelEntry, origin=origin)
+    weights = table.get("weights")
+    rest = {key: value for key, value in table.items() if key not in (*_PIN, "weights")}
+    return ModelEntry(
+        name=check_name(name),
+        weights=None
+        if weights is None
+        else PinnedFile(**_pin(f"{name}.weights", weights, PinnedFile, origin=origin)),
+        **pin,
+        **rest,
+    )
+
+
+def _pin(name: str, table: Any, kind: type[PinnedFile], *, origin: str) -> dict[str, Any]:
+    """The fields of a `PinnedFile` out of a table that holds those of ``kind``."""
+    known = {field.name for field in fields(kind)} - {"name"}
     if not isinstance(table, dict) or not {"size_bytes", "sha256"} <= table.keys() <= known:
         raise UserError(
             f"{origin} has a model '{name}' that needs size_bytes and sha256 and takes {', '.join(sorted(known))}"
@@ -85,10 +120,7 @@ def _entry(name: str, table: Any, *, origin: str) -> ModelEntry:
         )
     if not isinstance(urls, list) or not all(_is_http(url) for url in urls):
         raise UserError(f"{origin}: urls of '{name}' are not accepted: a list of http and https addresses is")
-    rest = {key: value for key, value in table.items() if key not in ("urls", "sha256")}
-    return ModelEntry(
-        name=check_name(name), urls=tuple(urls), sha256=check_digest(str(table["sha256"])), **rest
-    )
+    return {"size_bytes": size, "sha256": check_digest(str(table["sha256"])), "urls": tuple(urls)}
 
 
 def _is_http(url: object) -> bool:

@@ -34,14 +34,14 @@ def model_names() -> tuple[str, ...]:
 
 
 def known_classes(path: Path) -> str:
-    """The set whose classes a file has that the built-in manifest pins, in lower case (``coco``); "" for others."""
+    """The classes of a file as the built-in manifest that pins it says: ``COCO, 80``, or names; "" for others."""
     try:
         size_bytes = path.stat().st_size
     except OSError:
         return ""
     entries = [entry for entry in builtin_manifest().values() if entry.size_bytes == size_bytes]
     same = [entry for entry in entries if file_digest(path) == entry.sha256]
-    return same[0].classes.partition(",")[0].lower() if same else ""
+    return same[0].classes if same else ""
 
 
 def resolve_model(

@@ -1,7 +1,7 @@
 """The cache folder of models: fetched or brought by hand, and checked each time before use.
 
-Layout: ``NAME.onnx``, ``NAME-DIGEST.part`` while it is being fetched, ``added.toml`` for what the user added, and
-lock files, so that two processes may fetch at once.
+Layout: ``NAME.onnx``, or ``NAME.xml`` and ``NAME.bin`` of OpenVINO; ``NAME-DIGEST.part`` while it is being fetched;
+``added.toml`` for what the user added; lock files, so that two processes may fetch at once.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.store.manifest import (
     MAX_SIZE_BYTES,
     ModelEntry,
+    PinnedFile,
     builtin_manifest,
     check_digest,
     check_name,
@@ -72,30 +73,38 @@ class Store:
         return entries[name]
 
     def path(self, name: str) -> Path:
-        """The path of the model of this name, there or not."""
-        return self.folder / f"{self.entry(name).name}.onnx"
+        """The path of the model of this name, there or not; of an OpenVINO model the .xml."""
+        return next(iter(self._files(name)))
+
+    def _files(self, name: str) -> dict[Path, PinnedFile]:
+        entry = self.entry(name)
+        return {self.folder / f"{entry.name}{suffix}": file for suffix, file in entry.files.items()}
 
     def held_bytes(self, name: str) -> int:
         """Bytes of an unfinished fetch of this name."""
-        part = self._part(self.entry(name))
-        return part.stat().st_size if part.exists() else 0
+        if self.is_there(name):
+            return 0
+        candidates = [(path, self._part(path, file)) for path, file in self._files(name).items()]
+        held = (next((one for one in pair if one.exists()), None) for pair in candidates)
+        return sum(one.stat().st_size for one in held if one is not None)
 
     def is_there(self, name: str) -> bool:
-        """Whether a file of this name is there, right or not."""
-        return self.path(name).exists()
+        """Whether all files of this name are there, right or not."""
+        return all(path.exists() for path in self._files(name))
 
     def verified(self, name: str) -> Path:
         """The path of a model that is there and is the pinned file, size and SHA-256.
 
         Raises `UserError` where it is not there, with the ways to get it, or it is another file.
         """
-        entry, path = self.entry(name), self.path(name)
-        if not path.exists():
+        entry = self.entry(name)
+        if not self.is_there(name):
             raise UserError(f"model {name} is not on this machine: {self._how_to_get(entry)}")
-        wrong = _what_is_wrong(path, entry)
-        if wrong:
-            raise UserError(f"model {name} in {path} {wrong} and is not used: {self._how_to_get(entry)}")
-        return path
+        for path, file in self._files(name).items():
+            wrong = _what_is_wrong(path, file)
+            if wrong:
+                raise UserError(f"model {name} in {path} {wrong} and is not used: {self._how_to_get(entry)}")
+        return self.path(name)
 
     def fetch(
         self,
@@ -111,56 +120,89 @@ class Store:
         the same model; then this one waits for it. ``pauses_s`` are the seconds after each try that brought
         nothing. Raises `UserError` where no address gives the pinned file, or the folder cannot be written.
         """
-        from hvt_common.inference.store.download import DownloadError  # noqa: PLC0415 - as above
-
-        entry, path = self.entry(name), self.path(name)
+        before = 0
         with self._lock(name, on_wait):
-            if path.exists() and not _what_is_wrong(path, entry):
-                return path
-            part = self._part(entry)
-            failures = []
-            for url in entry.urls:
-                try:
-                    _from_address(url, part, entry, progress=progress, pauses_s=pauses_s)
-                except DownloadError as error:
-                    failures.append(str(error))
-                    continue
-                _put_in_place(part, path)
-                return path
+            for path, file in self._files(name).items():
+                failures = self._fetch_file(path, file, progress, before, pauses_s)
+                if failures is not None:
+                    break
+                before += file.size_bytes
+            else:
+                return self.path(name)
         why = "; ".join(failures) or "no address is known for it"
         held = self.held_bytes(name)
         rest = f" ({held} bytes are kept, and the same command goes on from there)" if held else ""
-        raise UserError(f"model {name} could not be fetched: {why}{rest}; {_by_hand(entry)}")
+        raise UserError(f"model {name} could not be fetched: {why}{rest}; {_by_hand(self.entry(name))}")
+
+    def _fetch_file(
+        self,
+        path: Path,
+        file: PinnedFile,
+        progress: Callable[[int], None],
+        before: int,
+        pauses_s: Sequence[float],
+    ) -> list[str] | None:
+        """None once the pinned file lies at ``path``; else why each address failed."""
+        from hvt_common.inference.store.download import DownloadError  # noqa: PLC0415 - as above
+
+        if path.exists() and not _what_is_wrong(path, file):
+            return None
+        part = self._part(path, file)
+        failures = []
+        for url in file.urls:
+            try:
+                _from_address(
+                    url, part, file, progress=lambda held: progress(before + held), pauses_s=pauses_s
+                )
+            except DownloadError as error:
+                failures.append(str(error))
+                continue
+            _put_in_place(part, path)
+            return None
+        return failures
 
     def add(self, file: Path, *, name: str, sha256: str | None = None) -> Path:
         """Copy a file that was brought by hand into the folder, if it is the pinned one.
 
-        ``sha256`` must be given for a new name, and pins it; for a built-in name it must agree with the
-        manifest. Raises `UserError` for another file than pinned, a missing pin, or a folder that cannot be
-        written.
+        The .bin beside an OpenVINO .xml comes along. ``sha256`` must be given for a new name, of an OpenVINO model
+        both by a comma, and pins it; for a built-in name it must agree with the manifest. Raises `UserError` for
+        another file than pinned, a missing pin, or a folder that cannot be written.
         """
         check_name(name)
-        given = check_digest(sha256) if sha256 is not None else None
-        found = file_digest(file)
-        size_bytes = file.stat().st_size
-        if not 0 < size_bytes <= MAX_SIZE_BYTES:
-            raise UserError(f"model file {file} has {size_bytes} bytes: 1 to {MAX_SIZE_BYTES} are accepted")
+        brought = (file, file.with_suffix(".bin")) if file.suffix.lower() == ".xml" else (file,)
+        given = () if sha256 is None else tuple(check_digest(one.strip()) for one in sha256.split(","))
+        pins = [_pin_of(one) for one in brought]
         known = self.entries.get(name)
-        if known is None and given is None:
+        found = tuple(pin.sha256 for pin in pins)
+        pinned = () if known is None else tuple(one.sha256 for one in known.files.values())
+        names = " with ".join(map(str, brought))
+        one_text = ",".join(found)
+        if known is None and not given:
             raise UserError(
-                f"model file {file} has SHA-256 {found}: give --sha256 {found} if its origin says the same"
+                f"model file {names} has SHA-256 {one_text}: give --sha256 {one_text} if its origin says the same"
             )
-        if given not in (found, None):
-            raise UserError(f"model file {file} has SHA-256 {found}, but --sha256 is {given}")
+        if given not in (found, ()):
+            raise UserError(f"model file {names} has SHA-256 {one_text}, but --sha256 is {','.join(given)}")
         # The digest that was given is a new pin, except for the models that HVT itself pins.
-        if known is not None and known.sha256 != found and (name in self._builtin or given is None):
-            raise UserError(f"model file {file} has SHA-256 {found}, but {known.sha256} is pinned for {name}")
+        if known is not None and pinned != found and (name in self._builtin or not given):
+            raise UserError(
+                f"model file {names} has SHA-256 {one_text}, but {','.join(pinned)} is pinned for {name}"
+            )
         with self._lock(name):
-            if known is None or known.sha256 != found:
-                self._note(ModelEntry(name=name, size_bytes=size_bytes, sha256=found))
-            part = self._part(self.entry(name))
-            _copy_file(file, part)
-            _put_in_place(part, self.path(name))
+            if pinned != found:
+                first, *more = pins
+                self._note(
+                    ModelEntry(
+                        name=name,
+                        size_bytes=first.size_bytes,
+                        sha256=first.sha256,
+                        weights=more[0] if more else None,
+                    )
+                )
+            for source, (path, pin) in zip(brought, self._files(name).items(), strict=True):
+                part = self._part(path, pin)
+                _copy_file(source, part)
+                _put_in_place(part, path)
         return self.verified(name)
 
     def _added(self) -> dict[str, ModelEntry]:
@@ -185,9 +227,9 @@ class Store:
             scratch.write_text(tomli_w.dumps(tables), encoding="utf-8")
             scratch.replace(file)
 
-    def _part(self, entry: ModelEntry) -> Path:
+    def _part(self, path: Path, file: PinnedFile) -> Path:
         # The digest is in the name: what was fetched for one pin is never carried on for another.
-        return self.folder / f"{entry.name}-{entry.sha256[:12]}.part"
+        return path.with_name(f"{path.stem}-{file.sha256[:12]}.part")
 
     @contextmanager
     def _lock(self, name: str, on_wait: Callable[[], None] = lambda: None) -> Iterator[None]:
@@ -213,38 +255,48 @@ class Store:
     def _how_to_get(self, entry: ModelEntry) -> str:
         if not entry.urls:
             return _by_hand(entry)
-        return f"run 'hvt-models fetch {entry.name}' ({entry.size_bytes / 1e6:.1f} MB); {_by_hand(entry)}"
+        return f"run 'hvt-models fetch {entry.name}' ({entry.total_bytes / 1e6:.1f} MB); {_by_hand(entry)}"
 
 
 def _by_hand(entry: ModelEntry) -> str:
-    file = entry.urls[0] if entry.urls else f"the file with SHA-256 {entry.sha256}"
-    return f"where there is no network, bring {file} and run 'hvt-models add FILE --name {entry.name}'"
+    files = entry.files.values()
+    file = " and ".join(one.urls[0] if one.urls else f"the file with SHA-256 {one.sha256}" for one in files)
+    given = "FILE" if entry.weights is None else "FILE.xml"
+    return f"where there is no network, bring {file} and run 'hvt-models add {given} --name {entry.name}'"
 
 
-def _what_is_wrong(path: Path, entry: ModelEntry) -> str:
+def _pin_of(file: Path) -> PinnedFile:
+    found = file_digest(file)
+    size_bytes = file.stat().st_size
+    if not 0 < size_bytes <= MAX_SIZE_BYTES:
+        raise UserError(f"model file {file} has {size_bytes} bytes: 1 to {MAX_SIZE_BYTES} are accepted")
+    return PinnedFile(size_bytes, found)
+
+
+def _what_is_wrong(path: Path, file: PinnedFile) -> str:
     """Why this is not the pinned file, as half a sentence; empty where it is."""
     size_bytes = path.stat().st_size
-    if size_bytes != entry.size_bytes:
-        return f"has {size_bytes} bytes, not the {entry.size_bytes} that are pinned,"
+    if size_bytes != file.size_bytes:
+        return f"has {size_bytes} bytes, not the {file.size_bytes} that are pinned,"
     found = file_digest(path)
-    if found != entry.sha256:
-        return f"has SHA-256 {found[:12]}…, not the pinned {entry.sha256[:12]}…,"
+    if found != file.sha256:
+        return f"has SHA-256 {found[:12]}…, not the pinned {file.sha256[:12]}…,"
     return ""
 
 
 def _from_address(
-    url: str, part: Path, entry: ModelEntry, *, progress: Callable[[int], None], pauses_s: Sequence[float]
+    url: str, part: Path, file: PinnedFile, *, progress: Callable[[int], None], pauses_s: Sequence[float]
 ) -> None:
     """Bring ``part`` to the pinned file; `DownloadError` where this address does not give it."""
     from hvt_common.inference.store.download import DownloadError, download  # noqa: PLC0415 - as above
 
     went_on = part.exists()
-    download(url, part, size_bytes=entry.size_bytes, progress=progress, pauses_s=pauses_s)
-    wrong = _what_is_wrong(part, entry)
+    download(url, part, size_bytes=file.size_bytes, progress=progress, pauses_s=pauses_s)
+    wrong = _what_is_wrong(part, file)
     if wrong:
         part.unlink()
         if went_on:  # the fault may be in what was there before
-            _from_address(url, part, entry, progress=progress, pauses_s=pauses_s)
+            _from_address(url, part, file, progress=progress, pauses_s=pauses_s)
             return
         raise DownloadError(f"{url} gives a file that {wrong.rstrip(',')}")
 
@@ -270,5 +322,10 @@ def _put_in_place(part: Path, path: Path) -> None:
 
 def _table(entry: ModelEntry) -> dict[str, Any]:
     """The entry as TOML knows it: without its name and without empty values."""
-    fields = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(entry).items()}
-    return {key: value for key, value in fields.items() if value and key != "name"}
+    return {key: value for key, value in _plain(asdict(entry)).items() if key != "name"}
+
+
+def _plain(table: dict[str, Any]) -> dict[str, Any]:
+    """Lists for tuples, and nothing that is empty, in tables in it too."""
+    lists = {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
+    return {key: _plain(value) if isinstance(value, dict) else value for key, value in lists.items() if value}

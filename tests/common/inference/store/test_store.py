@@ -22,6 +22,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
 from hvt_common.inference.cli import main
 from hvt_common.inference.detect import OnnxDetector, open_detector
+from hvt_common.inference.heads.kinds import KINDS
 from hvt_common.inference.inspect import inspect_model
 from hvt_common.inference.runtimes.model import open_model
 from hvt_common.inference.store import embedded_models, resolve_model
@@ -403,6 +404,71 @@ def test_a_file_brought_by_hand_is_taken_in_if_its_digest_is_right(
     assert (folder / "mine.onnx").read_bytes() != file.read_bytes()
 
 
+def two_files(folder: Path, origin: Origin) -> Store:
+    """A store that knows an OpenVINO model; the server gives the same bytes for both of its files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    pin = {"size_bytes": len(CONTENT), "sha256": DIGEST}
+    weights = {**pin, "urls": [origin.url.replace("onnx", "bin")]}
+    table = {**pin, "urls": [origin.url.replace("onnx", "xml")], "weights": weights}
+    (folder / "added.toml").write_text(tomli_w.dumps({"made": table}))
+    return Store(folder)
+
+
+def test_an_openvino_model_is_fetched_and_checked_in_both_files(origin: Origin, folder: Path) -> None:
+    """Its weights would be missing, or be anybody's."""
+    store = two_files(folder, origin)
+    origin.plan = ["ok", "cut:1000", "ok"]
+    held: list[int] = []
+    with pytest.raises(UserError, match=r"301000 bytes are kept.*model\.xml and http.*model\.bin and run"):
+        store.fetch("made", pauses_s=ONE_TRY)
+    assert not store.is_there("made")
+    assert store.held_bytes("made") == len(CONTENT) + 1000
+    assert store.fetch("made", progress=held.append) == folder / "made.xml"
+    assert origin.asked == [
+        ("/model.xml", None),
+        ("/model.bin", None),
+        ("/model.bin", "bytes=1000-"),
+    ]
+    assert held[-1] == 2 * len(CONTENT)
+    (folder / "made.bin").write_bytes(CONTENT[::-1])
+    with pytest.raises(UserError, match=r"made\.bin has SHA-256 .* and is not used"):
+        resolve_model("made")
+
+
+def test_an_openvino_model_is_brought_by_hand_with_its_weights(folder: Path, tmp_path: Path) -> None:
+    """The .bin would stay behind, unpinned."""
+    file, weights = tmp_path / "theirs.xml", tmp_path / "theirs.bin"
+    file.write_bytes(b"<net/>")
+    store = Store(folder)
+    with pytest.raises(UserError, match=r"theirs\.bin cannot be read"):
+        store.add(file, name="own", sha256=DIGEST)
+    weights.write_bytes(b"weights")
+    digests = ",".join(hashlib.sha256(one.read_bytes()).hexdigest() for one in (file, weights))
+    for said in (None, digests.partition(",")[0], digests[::-1]):
+        with pytest.raises(UserError, match="SHA-256"):
+            store.add(file, name="own", sha256=said)
+    assert not folder.exists()
+    assert store.add(file, name="own", sha256=digests) == Store(folder).verified("own")
+    assert (folder / "own.bin").read_bytes() == b"weights"
+    weights.write_bytes(b"changed")
+    with pytest.raises(UserError, match="is pinned for own"):
+        store.add(file, name="own")
+
+
+@pytest.mark.realdata
+def test_the_open_model_zoo_is_known_by_name(data: Path, folder: Path) -> None:
+    """A digit of a pin, or the order of the classes, would be wrong for everybody."""
+    pytest.importorskip("openvino")
+    for name, file in (
+        ("pvb-2003", "pvb-2003"),
+        ("pvb-2001", "pvb-2001"),
+        ("crossroad-1016", "crossroad-1016-int8"),
+    ):
+        Store().add(data / f"models/omz/{file}.xml", name=name)
+        first = "bike" if name == "crossroad-1016" else "vehicle"
+        assert open_detector(name).class_names[0] == first
+
+
 def test_list_and_verify_say_what_is_here(
     origin: Origin, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -449,15 +515,18 @@ def test_the_manifest_pins_the_files_that_are_known() -> None:
         "resnet50-int8": (25816052, "c234f30975989788b4405f25253275aae247ab6dbdd34aaa69ab0a59ff76f6d0"),
     }
     manifest = builtin_manifest()
-    assert {"yolox-nano", "yolox-tiny", *facts} == manifest.keys()
+    of_openvino = {"pvb-2003", "pvb-2001", "crossroad-1016"}
+    assert {"yolox-nano", "yolox-tiny", *facts, *of_openvino} == manifest.keys()
+    assert {name for name, entry in manifest.items() if entry.weights is not None} == of_openvino
     for name, pinned in facts.items():
         assert (manifest[name].size_bytes, manifest[name].sha256) == pinned
     for entry in manifest.values():
         assert entry.task in ("detector", "classifier")
         assert entry.licence == "Apache-2.0"
         assert entry.preprocessing is not None
-        assert all(url.startswith("https://") for url in entry.urls)
-        assert entry.urls
+        for file in entry.files.values():
+            assert all(url.startswith("https://") for url in file.urls)
+            assert file.urls
 
 
 def test_the_manifest_and_the_adapters_prepare_pixels_alike(tmp_path: Path) -> None:
@@ -469,7 +538,10 @@ def test_the_manifest_and_the_adapters_prepare_pixels_alike(tmp_path: Path) -> N
     for entry in builtin_manifest().values():
         said = entry.preprocessing
         assert said is not None
-        if entry.task == "detector":
+        if entry.weights is not None:
+            own = KINDS[{"crossroad-1016": "ssd", "pvb-2001": "ssd", "pvb-2003": "atss"}[entry.name]]
+            assert (said["fit"], said["channels"], said["mean"]) == (own.anchor, "BGR", [0])
+        elif entry.task == "detector":
             assert said["fit"] == f"letterbox, {head.anchor}, 114"
             assert (said["channels"] == "RGB", said["mean"], said["scale"]) == (
                 head.preparation.rgb,
