@@ -225,7 +225,7 @@ class EdgeConfig:
     detector: str = _MODELS.option(
         TEXT,
         EMBEDDED_DETECTOR,
-        "FILE.onnx or .xml, a name of hvt-models list (NAME:TEXT for a plug-in), up to three with + between, or motion",
+        "FILE.onnx or .xml, a name of hvt-models list (NAME:TEXT for a plug-in), several joined by +, or motion",
     )
     labels: Path | None = _MODELS.option(
         PATH, None, "class names of the detector: a file of one a line, or coco or visdrone"

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from hvt_common.config import BYTES, DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
 from hvt_common.errors import NotYetError, UserError
+from hvt_common.inference.ensemble import parts_of
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
-from hvt_common.inference.ensemble import parts_of
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
 from hvt_common.protocol.channels import GroupKeys
 from hvt_common.runtime.log import LOG_FORMATS
@@ -73,7 +73,7 @@ class GroundConfig:
     detector: str = _MODELS.option(
         TEXT,
         EMBEDDED_DETECTOR,
-        "FILE.onnx or .xml, a name of hvt-models list (NAME:TEXT for a plug-in), up to three with + between, or motion",
+        "FILE.onnx or .xml, a name of hvt-models list (NAME:TEXT for a plug-in), several joined by +, or motion",
     )
     labels: Path | None = _MODELS.option(PATH, None, "class names of the classifier, one a line")
     detector_labels: Path | None = _MODELS_RARE.option(

@@ -81,7 +81,8 @@ class Overlay:
     stored: bool = False
     """Whether the `VideoSample` was stored."""
     doubted: npt.NDArray[np.bool_] | None = None
-    """(N,) True where stills say that it is nothing of mine; None is nowhere."""
+    """(N,) True where stills say that it is nothing of mine, or the view is unlike what the detector knows; None is
+    nowhere."""
     sure: npt.NDArray[np.bool_] | None = None
     """(N,) True where stills agree on the class with a calibrated probability above .9; None is nowhere."""
     places: Places | None = None

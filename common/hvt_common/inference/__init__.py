@@ -1,6 +1,7 @@
 """Detectors and classifiers: others use `detect`, `tiles`, `motion`, `classify`, `class_names`, `labels`, `nms`.
 
-`few_found` says when the embedded one finds little, `scores` what a model's file says of its classes and scores.
+`few_found` says when the embedded one finds little or does not know a view, `scores` what a model's file says of its
+classes and scores, `ensemble` merges several.
 
 `preparation` is what a network sees of a pixel. The room `runtimes` runs a network, `heads` tells what its outputs
 mean, `store` gives paths of models.

@@ -88,8 +88,9 @@ def open_detector(
     network's input where the model leaves it free; else each image gets the multiples of the network's stride that
     hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). ``niceness``: see `ModelSettings`. A
     plug-in gets none of these; ``confidence`` is applied to its answer. For ``A+B`` (see `ensemble`) it is on the
-    scale of A, and ``labels``, ``head`` and ``size`` are refused. Raises `UserError` where there is no such model, it is no detector, its
-    labels do not fit, or a setting is out of its range.
+    scale of A, and ``labels``, ``head`` and ``size`` are refused.
+    Raises `UserError` where there is no such model, it is no detector, its labels do not fit, or a setting is out of
+    its range.
     """
     for name, value in (("confidence", confidence), ("NMS IoU", nms_iou)):
         if not 0 <= value <= 1:

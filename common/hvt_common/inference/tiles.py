@@ -77,7 +77,9 @@ def tiled(detector: Detector, tiles: str) -> Detector:
     if not isinstance(detector, _Sized):
         if grid == "auto":
             return detector
-        raise UserError(f"tiles {tiles} need an ONNX network; motion, plug-ins and ensembles take whole pictures")
+        raise UserError(
+            f"tiles {tiles} need an ONNX network; motion, plug-ins and ensembles take whole pictures"
+        )
     return TiledDetector(detector, grid=grid)
 
 

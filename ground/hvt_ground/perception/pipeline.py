@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.detect import Detector
+from hvt_common.inference.few_found import ViewTrust
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
@@ -78,6 +79,8 @@ class PipelineParts:
     """The one that ``fusion`` moves boxes by."""
     turns: Turns
     """Of the sessions that share the detector."""
+    trust: ViewTrust
+    """Of the detector, in this session's video."""
     patient: bool = False
     """Wait for a turn, however long: what is due is always detected, as lockstep needs it."""
 
@@ -253,6 +256,7 @@ class Pipeline:
                 found = parts.detector.detect(image)
             finally:
                 parts.turns.release()
+            parts.trust.take(found)
             own = parts.tracker.update(found, frame_index=index, image_bgr=image)
             self.objects_detected = int((own.seen_frames == index).sum())
         else:
@@ -291,6 +295,9 @@ class Pipeline:
             self._listed_frame = own.frame_index
             shown = self._parts.refiner.shown(fused.tracks)
             self.doubted = int(shown.doubted.sum())
+            if self._parts.trust.unlike:  # of our detector: what the edge's alone sees is its own affair
+                ours = np.array(["base" in origin for origin in fused.origins], np.bool_)
+                shown = replace(shown, doubted=shown.doubted | ours & ~shown.refined)
             self._emit(_overlay(fused, shown, capture_ns, base_size=self._base_size))
 
     def _carry_merges(self) -> None:

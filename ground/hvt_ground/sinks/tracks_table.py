@@ -24,9 +24,9 @@ COLUMNS = (
 camera by the edge's clock; ``base_class`` is what the detectors say without stills, ``class`` the same after
 refinement, ``refined`` 1 once a still has refined it; ``origin``: ``base``, ``edge``, ``edge+base`` or ``still``;
 ``late``: 1 where it is of stored video that came after an outage, behind later frames; ``doubted``: 1 where stills
-say that it is nothing of mine; ``latitude longitude`` are where it stands (WGS 84, degrees) and ``error_m`` half the
-longer axis of the ellipse that holds it with 95 %, empty where no pose tells. A source frame that the base stream
-left out has lines too where the edge reported it."""
+say that it is nothing of mine, or the view is unlike what the detector knows; ``latitude longitude`` are where it
+stands (WGS 84, degrees) and ``error_m`` half the longer axis of the ellipse that holds it with 95 %, empty where no
+pose tells. A source frame that the base stream left out has lines too where the edge reported it."""
 
 
 class TrackTable:

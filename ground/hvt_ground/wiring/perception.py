@@ -7,6 +7,7 @@ from typing import Literal, cast
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector, detect_every
+from hvt_common.inference.few_found import ViewTrust
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_ground.backlog.perception import BacklogPerception
@@ -44,6 +45,7 @@ def make_pipeline(
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path, base_per_source=info.view.scale),
         path=path,
         turns=models.turns,
+        trust=ViewTrust(config.detector),
         # In lockstep the same input gives the same detections, however long they take.
         patient=info.pace == "lockstep",
     )

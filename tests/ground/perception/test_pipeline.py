@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from hvt_common.inference.few_found import ViewTrust
 from hvt_common.protocol.messages import AlsoShown, RoiHeader
 from hvt_common.values import Detections, View
 from hvt_common.video.base_crop import base_crop
@@ -66,6 +67,23 @@ def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures
         assert one.track_ids.tolist() == [1]
         np.testing.assert_allclose(one.boxes_base_px[0], square_box(one.frame_index), atol=6)
         assert (one.classes, one.refined.tolist()) == (("car",), [False])
+
+
+def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flight, pictures):
+    """A box that is a guess would be drawn and named like one that is right nine times in ten."""
+    trust = ViewTrust("motion")  # which measures nothing by itself
+    rig = Rig(trust=trust)
+    for picture in pictures[:20]:
+        trust.unlike = picture.frame_index >= 10
+        if picture.frame_index == 14:
+            rig.pipeline.read([received(flight, 13, 0)])
+        rig.pipeline.analyze(picture, hurry=False)
+    overlays = {one.frame_index: one for one in rig.of(Overlay)}
+    assert not overlays[9].doubted.any()
+    assert overlays[12].doubted.all()
+    assert overlays[19].refined.all()
+    assert not overlays[19].doubted.any()
+    assert rig.pipeline.doubted == 0
 
 
 def test_what_the_detector_shows_is_counted_without_what_the_edge_tells(pictures):

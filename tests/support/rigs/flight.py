@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
+from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.motion import MOTION
 from hvt_common.protocol.channels import MSGPACK_ENCODING
 from hvt_common.protocol.messages import (
     BaseHeader,
@@ -118,6 +120,7 @@ def pipeline_of(
     detect_every: int = 1,
     edge_classes: Sequence[str] = CLASSES,
     wants_base: bool = False,
+    trust: ViewTrust | None = None,
 ) -> Pipeline:
     """The perception pipeline of a session of this flight."""
     reader = reader or SameAnswer()
@@ -133,6 +136,7 @@ def pipeline_of(
         fusion=Fusion(fps=15, edge_classes=places, path=path),
         path=path,
         turns=Turns(),
+        trust=trust or ViewTrust(MOTION),
     )
     view = View.fitted(SIZE, SIZE, fit="letterbox")
     return Pipeline(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)

@@ -256,10 +256,10 @@ def _layers(overlay: Overlay, screen: _Screen) -> Iterator[tuple[Layer, dict[str
     origins = overlay.origins or ("base",) * len(overlay.track_ids)
     reported, doubted = _reported(overlay), _doubted(overlay)
     of_layer: dict[Layer, npt.NDArray[np.bool_]] = {
-        "tracks": ~overlay.refined & ~reported,
-        "reported": ~overlay.refined & reported,
+        "tracks": ~overlay.refined & ~reported & ~doubted,
+        "reported": ~overlay.refined & reported & ~doubted,
         "refined": overlay.refined & ~doubted,
-        "doubted": overlay.refined & doubted,
+        "doubted": doubted,
     }
     for layer, mask in of_layer.items():
         rows = np.flatnonzero(mask).tolist()

@@ -318,7 +318,8 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(
 def test_a_full_disk_is_one_sentence_and_keeps_what_came(origin: Origin, folder: Path) -> None:
     """A fetch that fills the disk would leave a file that looks whole."""
     store = known(folder, origin.url)
-    command = f"ulimit -f 200; exec {sys.executable} -m hvt_common.inference.cli fetch made"
+    # -B: a .pyc that the limit cut off would break every later Python of this environment.
+    command = f"ulimit -f 200; exec {sys.executable} -B -m hvt_common.inference.cli fetch made"
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "made-" in done.stderr
