@@ -1,7 +1,8 @@
 """Keeps the secrets of addresses in memory: what is printed, logged, written or sent of one goes through here. Pure.
 
-Of an address scheme, host and port are shown, and a path of plain words. A password, a token, a stream key may stand
-in its user, its query, its path or its fragment, and an address with a typing error has them anywhere.
+Of an address scheme, host and port are shown, and the words of its path that cameras use. A password, a token or a
+stream key may stand in its user, its query, its path or its fragment, and may look like any other word; an address
+with a typing error has them anywhere.
 """
 
 from __future__ import annotations
@@ -16,16 +17,25 @@ HIDDEN = "…"
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{0,15}):[/\\]+", re.ASCII)
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]*(?:%\w{1,16})?\]|[\w*-]+(?:\.[\w*-]+)*)(?::(\d{1,5}))?", re.ASCII)
-_FILE = re.compile(r"[^@?&=#:\\]+|[^@?&=#\\]*\d:\d[^@?&=#\\]*")
+_FILE = re.compile(r"[^@?&=#:\\]*|[^@?&=#\\]*\d:\d[^@?&=#\\]*")
 """Text that may be the name of a file: a colon stands between the digits of a time alone."""
 _SCHEMELESS = re.compile(
     r"\s*(?:(?:rtsps?|rtmps?|https?|srt|udp|tcp|rtp)\b[:/\\]|\w*//|[^/]*:\d+/|(?:\d{1,3}\.){3}\d)|.*:[/\\]",
     re.IGNORECASE | re.DOTALL,
 )
 """Text that looks like an address with a typing error, and like no file."""
-_WORD = re.compile(
-    r"(?:[A-Za-z]{0,12}[0-9]{0,4}|h26[45][A-Za-z]{0,12})(?:[._-](?:[A-Za-z]{0,12}[0-9]{0,4}|mp4))*", re.ASCII
-)
+_STREAM_WORDS = """
+amp api asf bin av avi avc axis axis-media c cam camera cameras cgi ch clip clips channel channels cif default
+dev drone feed file flv h hd hevc high hls image img index input ipcam ir isapi jpeg jpg live livechannel
+livestream low m main media mediainput mjpeg mjpg mkv mov mp mpeg multicast mxpeg onvif play preview profile
+psia ptz realmonitor rgb rtp rtpvideo rtsp s sav sd sdp sensor smp snapshot src stream streaming streams sub
+test thermal third track tracks ts u uav udp unicast v vga video videoinput videomain videosub visible vod
+webm wide x zoom
+"""
+"""Words in the paths that cameras, gimbals and media servers give their streams."""
+_MOST_DIGITS, _MOST_DIGITS_TOGETHER = 6, 4
+_PLAIN = re.compile(r"[A-Z]?[a-z]{0,12}[0-9]{0,4}", re.ASCII)
+"""What is hidden in its address alone: a word that may stand anywhere else, such as in the name of an edge."""
 _SEPARATOR = re.compile(r"[/?#\\]")
 _HOSTLIKE = r"(?:\[|localhost|(?:\d{1,3}\.){3}\d|[^/]*:\d)"
 _BEGIN = re.compile(
@@ -74,8 +84,19 @@ def redacted(address: str) -> str:
 def _path(rest: str, *, hidden: bool) -> str:
     """The part of a path that may be shown: words as cameras name their streams. RTMP has a stream key there."""
     path = re.split(r"[?#\\]", rest, maxsplit=1)[0]
-    parts = (part if not hidden and _WORD.fullmatch(part) else part and HIDDEN for part in path.split("/"))
+    parts = (part if not hidden and _is_usual(part) else part and HIDDEN for part in path.split("/"))
     return "/".join(parts) + (f"?{HIDDEN}" if path != rest else "")
+
+
+def _is_usual(part: str) -> bool:
+    """Whether a part of a path has nothing but the words and short numbers of cameras: ``h264Preview_01_main``."""
+    runs = re.findall(r"[A-Za-z]+|[0-9]+|.", part, re.DOTALL)
+    numbers, usual = [one for one in runs if one.isdigit()], _STREAM_WORDS.split()
+    return (
+        sum(map(len, numbers)) <= _MOST_DIGITS
+        and max(map(len, numbers), default=0) <= _MOST_DIGITS_TOGETHER
+        and all(one in "._-" or one.isdigit() or one.lower() in usual for one in runs)
+    )
 
 
 class Redaction:
@@ -126,7 +147,7 @@ def _secrets(word: str) -> Iterable[str]:
     shown = redacted(address)
     for part in re.split(r"[/?#&;@\[\]\\]", body):
         for one in (part, *part.split("=", 1)[1:], *part.split(":")):
-            if one not in shown and not (_WORD.fullmatch(one) and not at):
+            if one not in shown and (at or not _PLAIN.fullmatch(one)):
                 yield one
 
 
