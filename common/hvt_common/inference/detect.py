@@ -42,7 +42,6 @@ _UNNAMED = 100
 _MAX_FREE_SIDE = 1920
 _MAX_SIDE = 8192
 _ENLARGE_TO = "hvt.enlarge_to"
-_TASK = "detect"
 _MOST_ENLARGED = 2.0
 """Beyond that nothing more is found, and the time grows with the square."""
 _TWIN_IOU = 0.8
@@ -173,9 +172,9 @@ class OnnxDetector:
         self.model = model
         self._confidence = confidence
         self._nms_iou = nms_iou
-        task = model.metadata.get("task", _TASK)
-        if task != _TASK:
-            raise UserError(_not_a_detector(model, f"its task is '{task:.80}', and {_TASK} is accepted"))
+        task = model.metadata.get("task", "")
+        if task and "detect" not in task.lower():
+            raise UserError(_not_a_detector(model, f"its task is '{task:.80}', and detect is accepted"))
         self._channels_last, declared = _geometry(model)
         names = read_labels(labels) if labels is not None else class_labels(model.path, model.metadata)
         self._cells = _cells(model)

@@ -117,15 +117,25 @@ def _written_names(text: str) -> tuple[str, ...] | None:
     if text[0] not in "[{(":
         names = [name.strip() for name in re.split(r"[,\n]", text) if name.strip()]
         return _names(names) if all(map(_NAME.fullmatch, names)) else None
-    for read in (ast.literal_eval, json.loads):
+    for read in (ast.literal_eval, json.loads, _unquoted):
         # Not a literal; or a key that is a list, or a number that is too long to print.
         with suppress(ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
             return _names(read(text))
     return None
 
 
+def _unquoted(text: str) -> dict[str, str]:
+    """A table as YAML and others write it: ``{0: car, 1: bus}``. `ValueError` for anything else."""
+    pairs = [re.fullmatch(r"\s*(\d+)\s*[:=]\s*([^:=]+?)\s*", one) for one in text.strip("{}").split(",")]
+    if not all(pairs):
+        raise ValueError(text)
+    return {pair[1]: pair[2] for pair in pairs if pair}
+
+
 def _names(value: object) -> tuple[str, ...] | None:
     if isinstance(value, dict):
+        if set(value.values()) == set(range(len(value))):  # by name, as Keras has them
+            value = {number: name for name, number in value.items()}
         numbers = {int(key): name for key, name in value.items() if re.fullmatch(r"\d{1,6}", str(key))}
         if len(numbers) < len(value) or max(numbers, default=MAX_LABELS) >= MAX_LABELS:
             return None

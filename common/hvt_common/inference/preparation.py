@@ -63,7 +63,9 @@ def _three_numbers(
         numbers = [float(word) for word in metadata[key].strip("[]() ").replace(",", " ").split()]
     except ValueError:
         numbers = []
-    if len(numbers) not in (1, 3) or not np.isfinite(numbers).all():
-        raise UserError(f"model {path} has {key} '{metadata[key]}' in its metadata; one number or three do")
+    nothing = key == "hvt.scale" and 0 in numbers
+    if len(numbers) not in (1, 3) or not np.isfinite(numbers).all() or nothing:
+        accepted = f"one number or three do{', not 0' if nothing else ''}"
+        raise UserError(f"model {path} has {key} '{metadata[key]:.80}' in its metadata; {accepted}")
     red, green, blue = numbers * 3 if len(numbers) == 1 else numbers
     return red, green, blue

@@ -20,6 +20,7 @@ from hvt_common.inference.motion import MotionDetector
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
 from hvt_common.inference.preparation import Preparation
 from hvt_common.inference.runtimes.model import open_model
+from media.head_models import family_model
 from media.onnx_models import STRIDES, cells, colour_classifier, colour_detector, constant_model
 
 RGB = str({0: "red", 1: "green", 2: "blue"})
@@ -493,3 +494,18 @@ def test_the_detector_runs_three_times_a_second_where_frames_are_few(fps: float,
     """At 2 frames a second every fifth would be one look in 2.5 s: what moves is never in one place twice."""
     assert detect_every(None, fps=fps) == every
     assert detect_every(7, fps=fps) == 7
+
+
+def test_a_scale_of_nothing_is_refused(tmp_path: Path) -> None:
+    """Every pixel would be the same, or the start end in a division by it."""
+    model = family_model(tmp_path / "m.onnx", "yolov8", metadata={"hvt.scale": "0"})
+    with pytest.raises(UserError, match="one number or three do, not 0"):
+        open_detector(str(model))
+
+
+@pytest.mark.parametrize("task", ["Detect", "object-detection", ""])
+def test_a_detector_by_any_word_is_one(tmp_path: Path, task: str) -> None:
+    """Other exporters than Ultralytics name the task too; their models would be refused."""
+    assert open_detector(
+        str(family_model(tmp_path / "m.onnx", "yolov8", metadata={"task": task}))
+    ).class_names

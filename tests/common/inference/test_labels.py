@@ -68,6 +68,9 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
         ({"names": "{}"}, None),
         ({"classes": "[" * 100_000}, None),
         ({"classes": "3"}, None),
+        ({"names": "{0: small car, 1: bus}"}, ("small car", "bus")),
+        ({"classes": '{"bus": 1, "car": 0}'}, ("car", "bus")),
+        ({"names": '{"nc": 2}'}, None),
     ],
 )
 def test_names_in_metadata_are_read_but_never_run(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -25,7 +26,13 @@ from hvt_common.inference.heads.decode import (
     cell_grid,
     rows_of,
 )
-from hvt_common.inference.heads.trial import Trial, anchor_count, are_probabilities, are_scores, are_whole
+from hvt_common.inference.heads.trial import (
+    Trial,
+    anchor_count,
+    are_probabilities,
+    are_scores,
+    are_whole,
+)
 from hvt_common.inference.letterbox import Anchor
 from hvt_common.inference.preparation import Preparation
 
@@ -135,19 +142,13 @@ def _yolox(trial: Trial) -> Match | None:
     return None
 
 
-def _yolox_decoded(trial: Trial) -> Match | None:
-    return _with_objectness(trial, constant=False)
-
-
-def _yolov6(trial: Trial) -> Match | None:
-    return _with_objectness(trial, constant=True)
-
-
 def _with_objectness(trial: Trial, *, constant: bool) -> Match | None:
     """(1, A, 5+C) in pixels; YOLOv6 has no objectness, and writes 1."""
     for index, strides in _of_cells(trial, _YOLOX_STRIDES):
         classes, table = trial.shape(index)[2] - 5, trial.table(index)
         if classes < 1 or not are_probabilities(table[:, 4:]) or _is_raw(trial, index, strides):
+            continue
+        if trial.has_angles(index, 5):
             continue
         ones = bool((abs(table[:, 4] - 1) < 1e-3).all())
         if ones != constant:
@@ -165,6 +166,8 @@ def _yolov8_rows(trial: Trial) -> Match | None:
     for index, strides in _of_cells(trial):
         classes, table = trial.shape(index)[2] - 4, trial.table(index)
         if not are_probabilities(table[:, 4:]) or _is_raw(trial, index, strides):
+            continue
+        if trial.has_angles(index, 4):
             continue
         same = classes == trial.names
         proof = f"a row a cell in pixels and {classes} scores, as many as there are names" if same else None
@@ -188,7 +191,10 @@ def _yolov8(trial: Trial) -> Match | None:
         index
         for index in _tables(trial)
         for shape in [trial.shape(index)]
-        if shape[2] in counts and shape[1] >= _LEAST_COLUMNS and are_probabilities(_scores(trial, index))
+        if shape[2] in counts
+        and shape[1] >= _LEAST_COLUMNS
+        and are_probabilities(_scores(trial, index))
+        and not trial.has_angles(index, 4, transposed=True)
     ]
     if not found or len({trial.shape(index) for index in found}) > 1:
         return None
@@ -247,15 +253,8 @@ def _rt_detr_rows(trial: Trial) -> Match | None:
     return Match((index,), columns - 4, Dense(), proof)
 
 
-def _yolov7_rows(trial: Trial) -> Match | None:
-    return _with_image(trial, score=6, kind=5, columns="image, x1 y1 x2 y2, class, score")
-
-
-def _nas_rows(trial: Trial) -> Match | None:
-    return _with_image(trial, score=5, kind=6, columns="image, x1 y1 x2 y2, score, class")
-
-
-def _with_image(trial: Trial, *, score: int, kind: int, columns: str) -> Match | None:
+def _with_image(trial: Trial, *, score: int, kind: int) -> Match | None:
+    """(N, 7): image, x1 y1 x2 y2, and score and class in either order."""
     index = _only([one for one in _tables(trial, 7) if len(trial.shape(one)) == 2])
     if index is None:
         return None
@@ -265,7 +264,8 @@ def _with_image(trial: Trial, *, score: int, kind: int, columns: str) -> Match |
         if not are_probabilities(table[:, score]) or not are_whole(table[:, kind]):
             return None
         decided = not are_whole(table[:, score]) or float(table[:, kind].max()) > 1
-        proof = f"rows of seven: {columns}" if decided else None
+        order = "score, class" if score < kind else "class, score"
+        proof = f"rows of seven: image, x1 y1 x2 y2, {order}" if decided else None
     return Match((index,), None, Listed(1, score, kind, image=0), proof)
 
 
@@ -302,7 +302,7 @@ def _shows_centres(boxes: Array) -> bool:
 
 
 def _boxes_and_table(trial: Trial) -> tuple[int, int] | None:
-    """Outputs (1, N, 4) and (1, N, C)."""
+    """Outputs (1, N, 4) and (1, N, C); of several the last layer's, by DETR's names."""
     tables = _tables(trial)
     pairs = [
         (boxes, scores)
@@ -313,7 +313,9 @@ def _boxes_and_table(trial: Trial) -> tuple[int, int] | None:
         and trial.shape(boxes)[1] == trial.shape(scores)[1]
     ]
     if len(pairs) > 1:  # four classes: the box is named so
-        pairs = [pair for pair in pairs if "box" in trial.ports[pair[0]].name.lower()]
+        last = trial.named("pred_boxes", "pred_logits")
+        boxed = [pair for pair in pairs if "box" in trial.ports[pair[0]].name.lower()]
+        pairs = [pair for pair in boxed if pair == last] or boxed
     return pairs[0] if len(pairs) == 1 else None
 
 
@@ -397,7 +399,11 @@ def _atss(trial: Trial) -> Match | None:
     table = trial.table(boxes)
     if not are_probabilities(table[:, 4]) or not _are_corners_or_none(trial, boxes):
         return None
-    proof = "boxes with their score, and classes; pixels as the Open Model Zoo takes them, which hvt.mean overrules"
+    proof: str | None = (
+        "boxes with their score, and classes; pixels as the Open Model Zoo takes them, which hvt.mean overrules"
+    )
+    if trial.ports[boxes].name == "dets" and "hvt.mean" not in trial.metadata:
+        proof = None  # MMDeploy's, whose networks each take other pixels
     return Match((boxes, kinds), None, Corners(), proof)
 
 
@@ -424,90 +430,60 @@ def _are_corners_or_none(trial: Trial, index: int) -> bool:
     return not len(boxes) or _are_corners(boxes)
 
 
+_letterboxed = partial(Kind, anchor="centre", preparation=_RGB_1)
+_stretched = partial(Kind, anchor="stretch", preparation=_RGB_1, suppresses=False)
+
 KINDS: Mapping[str, Kind] = {
     "yolox": Kind("YOLOX, raw: (1, A, 5+C)", _yolox, "top-left", _BGR_255),
-    "yolox-decoded": Kind("YOLOX in pixels: (1, A, 5+C)", _yolox_decoded, "top-left", _BGR_255),
-    "yolov5": Kind("YOLOv5 and YOLOv7: (1, 3A, 5+C)", _yolov5, "centre", _RGB_1),
-    "yolov6": Kind("YOLOv6: (1, A, 5+C), objectness 1", _yolov6, "centre", _RGB_1),
-    "yolov8": Kind("YOLOv8 to v13, YOLOv5-u, YOLOv9: (1, 4+C, A)", _yolov8, "centre", _RGB_1),
-    "yolov8-rows": Kind("the same, transposed: (1, A, 4+C)", _yolov8_rows, "centre", _RGB_1),
-    "end-to-end": Kind(
-        "YOLOv10, YOLO26, and NMS inside: (1, N, 6) x1 y1 x2 y2 score class",
-        _end_to_end,
-        "centre",
-        _RGB_1,
-        suppresses=False,
+    "yolox-decoded": Kind(
+        "YOLOX in pixels: (1, A, 5+C)", partial(_with_objectness, constant=False), "top-left", _BGR_255
     ),
-    "yolov7-rows": Kind(
+    "yolov5": _letterboxed("YOLOv5 and YOLOv7: (1, 3A, 5+C)", _yolov5),
+    "yolov6": _letterboxed("YOLOv6: (1, A, 5+C), objectness 1", partial(_with_objectness, constant=True)),
+    "yolov8": _letterboxed("YOLOv8 to v13, YOLOv5-u, YOLOv9: (1, 4+C, A)", _yolov8),
+    "yolov8-rows": _letterboxed("the same, transposed: (1, A, 4+C)", _yolov8_rows),
+    "end-to-end": _letterboxed(
+        "YOLOv10, YOLO26, and NMS inside: (1, N, 6) x1 y1 x2 y2 score class", _end_to_end, suppresses=False
+    ),
+    "yolov7-rows": _letterboxed(
         "YOLOv7 with NMS: (N, 7) image x1 y1 x2 y2 class score",
-        _yolov7_rows,
-        "centre",
-        _RGB_1,
+        partial(_with_image, score=6, kind=5),
         suppresses=False,
     ),
-    "yolo-nas": Kind("YOLO-NAS: (1, A, 4) x1 y1 x2 y2 and (1, A, C)", _yolo_nas, "centre", _RGB_1),
-    "nas-rows": Kind(
+    "yolo-nas": _letterboxed("YOLO-NAS: (1, A, 4) x1 y1 x2 y2 and (1, A, C)", _yolo_nas),
+    "nas-rows": _letterboxed(
         "YOLO-NAS with NMS: (N, 7) image x1 y1 x2 y2 score class",
-        _nas_rows,
-        "centre",
-        _RGB_1,
+        partial(_with_image, score=5, kind=6),
         suppresses=False,
     ),
-    "nms-lists": Kind(
+    "nms-lists": _letterboxed(
         "NMS of TensorRT, YOLO-NAS, YOLOv6: count (1, 1), boxes (1, N, 4), scores (1, N), classes (1, N)",
         _nms_lists,
-        "centre",
-        _RGB_1,
         suppresses=False,
     ),
-    "rt-detr": Kind(
-        "RT-DETR, D-FINE, DEIM: logits (1, N, C) and boxes (1, N, 4), centre x y w h 0…1",
-        _rt_detr,
-        "stretch",
-        _RGB_1,
-        suppresses=False,
+    "rt-detr": _stretched(
+        "RT-DETR, D-FINE, DEIM: logits (1, N, C) and boxes (1, N, 4), centre x y w h 0…1", _rt_detr
     ),
-    "rt-detr-rows": Kind(
-        "RT-DETR of Ultralytics: (1, N, 4+C) or (1, N, 6), centre x y w h",
-        _rt_detr_rows,
-        "stretch",
-        _RGB_1,
-        suppresses=False,
+    "rt-detr-rows": _stretched(
+        "RT-DETR of Ultralytics: (1, N, 4+C) or (1, N, 6), centre x y w h", _rt_detr_rows
     ),
-    "rf-detr": Kind(
-        "RF-DETR: dets (1, N, 4) and labels (1, N, C)",
-        _rf_detr,
-        "stretch",
-        Preparation.torchvision(),
-        suppresses=False,
+    "rf-detr": _stretched(
+        "RF-DETR: dets (1, N, 4) and labels (1, N, C)", _rf_detr, preparation=Preparation.torchvision()
     ),
-    "labels-boxes-scores": Kind(
+    "labels-boxes-scores": _stretched(
         "RT-DETR and D-FINE as deployed, torchvision: labels (N), boxes (N, 4) x1 y1 x2 y2, scores (N)",
         _labels_boxes_scores,
-        "stretch",
-        _RGB_1,
-        suppresses=False,
     ),
-    "ssd": Kind(
-        "SSD of the Open Model Zoo: (1, 1, N, 7) image class score x1 y1 x2 y2",
-        _ssd,
-        "stretch",
-        _BGR_255,
-        suppresses=False,
+    "ssd": _stretched(
+        "SSD of the Open Model Zoo: (1, 1, N, 7) image class score x1 y1 x2 y2", _ssd, preparation=_BGR_255
     ),
-    "atss": Kind(
-        "ATSS of the Open Model Zoo: boxes (N, 5) x1 y1 x2 y2 score, labels (N)",
-        _atss,
-        "stretch",
-        _BGR_255,
-        suppresses=False,
+    "atss": _stretched(
+        "ATSS of the Open Model Zoo: boxes (N, 5) x1 y1 x2 y2 score, labels (N)", _atss, preparation=_BGR_255
     ),
-    "tf-lists": Kind(
+    "tf-lists": _stretched(
         "TensorFlow: detection_boxes (1, N, 4) y1 x1 y2 x2, _scores, _classes from 1",
         _tf_lists,
-        "stretch",
-        _RGB_255,
-        suppresses=False,
+        preparation=_RGB_255,
     ),
 }
 """The heads by the name of ``--head``."""

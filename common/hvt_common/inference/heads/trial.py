@@ -17,6 +17,8 @@ if TYPE_CHECKING:  # the runtimes take a while to import, and a list of heads ne
 
 _BLOCK_PX = 32
 _PADDING = -1
+_SCORE, _ANGLE = 0.05, 0.2
+"""On a grey picture the mean over all cells of a class is below the one, that of an angle above the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,12 @@ class Trial:
         """Whether an output has whole numbers by its type."""
         dtype = self.ports[index].dtype
         return dtype is not None and bool(np.issubdtype(dtype, np.integer))
+
+    def has_angles(self, index: int, first: int, *, transposed: bool = False) -> bool:
+        """Whether the last column is no class as those from ``first`` on: on grey it alone has numbers."""
+        grey = self.runs[0][index].astype(np.float32).reshape(self.runs[0][index].shape[-2:])
+        means = (grey.T if transposed else grey)[:, first:].mean(axis=0)
+        return bool(len(means) > 1 and means[-1] > _ANGLE > _SCORE > means[:-1].max())
 
     def relative(self, boxes: Array) -> bool:
         """Whether there are boxes, and all are shares of the input."""

@@ -423,6 +423,7 @@ _CAUSES: Mapping[str, str] = {
     r"(?:till|up to|is) opset (\d+)": (
         f"it has opset {{opset}}{{by}}, and {{here}} knows up to {{0}}: {_NEWER} with opset_version={{0}}"
     ),
+    r"\b(\w+_TRT)\b": (f"it needs the operator {{0}} of TensorRT, which {{here}} does not have: {_WITHOUT}"),
     r"([\w.]+):(\w+)\(-?\d+\) is not a registered function": (
         f"it needs the operator {{1}} of {{0}}, which {{here}} does not have: {_WITHOUT}"
     ),

@@ -120,6 +120,39 @@ def test_a_softmax_over_no_object_is_no_sigmoid(tmp_path: Path) -> None:
         open_detector(str(constant_model(tmp_path / "m.onnx", logits, boxes)))
 
 
+@pytest.mark.parametrize("transposed", [False, True])
+@pytest.mark.parametrize("names", [{}, NAMED])
+def test_an_angle_is_no_class(tmp_path: Path, names: dict[str, str], *, transposed: bool) -> None:
+    """Rotated boxes without metadata end in a column of angles: each cell would hold an object of one more class."""
+    table = np.full((1, 126, 7), 1e-3)
+    table[..., :4], table[..., 6] = 32, np.linspace(0, 1, 126)
+    table = table.transpose(0, 2, 1) if transposed else table
+    with pytest.raises(UserError, match=r"fit no head that is known|could be yolox, which"):
+        opened(constant_model(tmp_path / "m.onnx", table, size=(96, 64), metadata=names))
+
+
+def test_layers_that_only_training_reads_are_passed_over(tmp_path: Path) -> None:
+    """An export of DETR's kind with its auxiliary outputs would be refused."""
+    graph = Graph()
+    outputs = {name: tensor for name, (tensor, _) in FAMILIES["rt-detr"][1](graph, "images").items()}
+    outputs |= {
+        "enc_logits": graph.const(np.full((1, 100, 2), -5)),
+        "enc_boxes": graph.const(np.full((1, 100, 4), 0.4)),
+    }
+    check(opened(write(tmp_path / "m.onnx", graph, outputs)), "rt-detr")
+
+
+def test_boxes_of_mmdeploy_need_a_word_about_their_pixels(tmp_path: Path) -> None:
+    """Its networks take pixels in three ways, and the outputs of all look alike: nothing would be found."""
+    graph = Graph()
+    boxes, scores = graph.find("images", bgr=True, top=255)
+    table = graph.batch(graph.op("Concat", boxes, graph.column(scores), axis=1))
+    path = write(tmp_path / "m.onnx", graph, {"dets": table, "labels": graph.const([[0, 1]], np.int64)})
+    with pytest.raises(UserError, match="could be atss, which --head"):
+        opened(path)
+    check(opened(path, head="atss"), "atss")
+
+
 def test_raw_levels_beside_the_rows_are_passed_over(tmp_path: Path) -> None:
     """YOLOv5 exports the levels before decoding too; the model would be refused as two."""
     rows = np.zeros((1, 252, 7))
@@ -253,10 +286,11 @@ def test_a_second_input_that_is_a_scale_is_refused(tmp_path: Path) -> None:
         opened(path)
 
 
-def write(path: Path, graph: Graph, outputs: dict[str, str], *, second: str) -> Path:
-    """A detector of two inputs, the first 320x192."""
-    inputs = [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, 192, 320])]
-    inputs.append(helper.make_tensor_value_info(second, TensorProto.FLOAT, [1, 2]))
+def write(path: Path, graph: Graph, outputs: dict[str, str], *, second: str = "") -> Path:
+    """A detector of 320x192 with a second input, else of 320x320."""
+    high = 192 if second else 320
+    inputs = [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, high, 320])]
+    inputs += [helper.make_tensor_value_info(second, TensorProto.FLOAT, [1, 2])] if second else []
     graph.nodes += [helper.make_node("Identity", [tensor], [name]) for name, tensor in outputs.items()]
     ports = [
         helper.make_tensor_value_info(

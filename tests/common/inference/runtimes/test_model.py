@@ -170,6 +170,7 @@ def test_an_input_of_the_wrong_shape_is_a_sentence(tmp_path: Path) -> None:
             r"operator Relu of mmdeploy, which onnxruntime .* export the model without it",
         ),
         ({"operator": "Foo"}, r"opset 13 has no operator Foo .*export the model anew"),
+        ({"operator": "BatchedNMS_TRT"}, r"operator BatchedNMS_TRT of TensorRT, which .* without NMS inside"),
     ],
 )
 def test_what_the_runtime_does_not_read_is_said_with_what_to_do(
