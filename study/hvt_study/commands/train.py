@@ -30,8 +30,7 @@ from hvt_study.commands.detect import detected
 from hvt_study.commands.progress import RunProgress
 from hvt_study.datasets.label_files import LOOKED_IN
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
-from hvt_study.datasets.labels import FrameLabels, inside_frame
-from hvt_study.datasets.yolo_labels import IGNORED
+from hvt_study.datasets.labels import IGNORED, FrameLabels, inside_frame
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.frames import LabelledFrame
 from hvt_study.metrics.judged import judged

@@ -106,7 +106,12 @@ def read_rows(path: Path, *, columns: str, least: int, frames: bool = True, of_d
             whole = (table[:, 0] % 1 == 0) & (table[:, 0] >= 0) & (table[:, 0] <= LAST_FRAME)
         good = np.logical_and(good, whole)
     numbers = np.array([number for number, _ in numbered], np.int64)
-    return Rows(path, table, names[:count], numbers, lines, of_dataset).only(good, accepted=wanted)
+    rows = Rows(path, table, names[:count], numbers, lines, of_dataset).only(good, accepted=wanted)
+    if not of_dataset or names[:2] != ("frame", "id"):
+        return rows
+    once = np.zeros(len(rows), np.bool_)
+    once[np.unique(rows.table[:, :2], axis=0, return_index=True)[1]] = True
+    return rows.only(once | (rows["id"] <= 0), accepted="each id once in a frame")
 
 
 def _text(path: Path) -> str:

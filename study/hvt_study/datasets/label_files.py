@@ -29,7 +29,17 @@ LOOKED_IN = (
 )
 """For sentences."""
 _PICTURES = ("images", "JPEGImages", "data", "obj_train_data")
-_LABELS = (("labels", ".txt"), ("annotations", ".txt"), ("Annotations", ".xml"), ("annotations", ".xml"))
+_LABELS = (
+    *(("labels", ".txt"), ("annotations", ".txt")),
+    *(("Annotations", ".xml"), ("annotations", ".xml"), ("labels", ".xml")),
+)
+_OTHER = {"annotations.xml": "CVAT for images", "label_2": "KITTI", "labelTxt": "DOTA", "ann": "Supervisely"}
+_OTHER_FILES = (".json", ".csv", ".odgt", ".xml")
+_OTHER_WORDS = re.compile(
+    rb"bbox|xmin|x_min|box2d|gtboxes|shape_attributes|coordinates|rectanglelabels|\"(?:shapes|labels|annotations)\""
+)
+"""In the first bytes of files that hold labels of a kind that is not read."""
+_LOOKED_AT = 65536
 _CLASSES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml")
 _COCO = ("labels.json", "result.json", "annotations.json", "_annotations.coco.json", "coco.json")
 _COCO_BOXES = "instances_"
@@ -83,11 +93,19 @@ def label_file(picture: Path, place: Path, folders: Folders) -> Path | None:
 
 def check_strange(place: Path, pictures: Sequence[Path]) -> None:
     """Raise `UserError` for labels of a kind that is not read, which nobody means to be left out."""
-    kinds = {place / "annotations.xml": "CVAT for images"}
-    kinds |= {file.with_suffix(".json"): "LabelMe" for file in pictures[:_DEPTH]}
-    for path, kind in kinds.items():
-        if path.is_file():
-            raise UserError(f"{path} holds labels of {kind}, which are not read: export them as COCO or YOLO")
+    strange = [(place / name, f"labels of {kind}") for name, kind in _OTHER.items()]
+    strange += [(file.with_suffix(".json"), "labels of LabelMe") for file in pictures[:_DEPTH]]
+    for folder in dict.fromkeys((place, *(one.parent for one in pictures))):
+        for file in sorted(folder.iterdir()):
+            if file.suffix.lower() in _OTHER_FILES and file.is_file():
+                with file.open("rb") as opened:
+                    if _OTHER_WORDS.search(opened.read(_LOOKED_AT)):
+                        strange.append((file, "labels, it seems"))
+    for path, what in strange:
+        if path.exists():
+            raise UserError(
+                f"{path} holds {what}, which are not read: export them as COCO, YOLO or Pascal VOC"
+            )
 
 
 def class_file(place: Path, pictures: list[Path]) -> Path | None:
@@ -116,7 +134,23 @@ def coco_files(place: Path) -> list[Path]:
     folders = _folders(place, 1)
     found = [folder / name for folder in folders for name in _COCO if (folder / name).is_file()]
     files = sorted((place / "annotations").glob("*.json"))
-    return found + ([one for one in files if one.name.startswith(_COCO_BOXES)] or files)
+    found += [one for one in files if one.name.startswith(_COCO_BOXES)] or files
+    return found or [one for one in sorted(place.glob("*.json")) if _is_coco(one)]
+
+
+def _is_coco(path: Path) -> bool:
+    text = path.read_bytes()
+    return all(f'"{word}"'.encode() in text for word in ("images", "annotations", "categories"))
+
+
+def yaml_folders(path: Path) -> list[Path]:
+    """Where the pictures of a YOLO set are: its ``path``, else beside it, else in ``train``, ``val`` and ``test``."""
+    said = dict(re.findall(r"(?m)^(path|train|val|test)\s*:[ \t]*['\"]?([^'\"#\n]+)", read_text(path)))
+    root = path.parent / said.pop("path", ".").strip()
+    if root != path.parent and root.is_dir():
+        return [root]
+    places = dict.fromkeys(root / one.strip() for one in said.values())
+    return [path.parent] if pictures_below(path.parent) else [one for one in places if one.is_dir()] or [root]
 
 
 def keypoint_columns(path: Path | None) -> int:
@@ -254,6 +288,6 @@ def read_voc(path: Path) -> VocFile:
 
 def _number(text: str | None, *, missing: float = 0.0) -> float:
     try:
-        return float(text or "")
+        return float((text or "").replace(",", "."))
     except ValueError:
         return missing

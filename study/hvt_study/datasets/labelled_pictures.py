@@ -18,7 +18,6 @@ from urllib.parse import unquote
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
@@ -35,15 +34,17 @@ from hvt_study.datasets.label_files import (
     keypoint_columns,
     label_file,
     pictures_below,
+    read_class_file,
     read_text,
     read_voc,
+    yaml_folders,
 )
-from hvt_study.datasets.labels import FrameLabels, LabelDoubts
+from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts
 from hvt_study.datasets.layouts.mot import open_mot
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.layouts.visdrone import table_of
 from hvt_study.datasets.visdrone_rows import read_image_rows
-from hvt_study.datasets.yolo_labels import IGNORED, YOLO_COLUMNS, labels_of, read_yolo, yolo_names
+from hvt_study.datasets.yolo_labels import YOLO_COLUMNS, read_yolo, yolo_names
 
 _TRUTH = "gt/gt.txt"
 _YAML = (".yaml", ".yml")
@@ -98,25 +99,17 @@ class LabelledPicture:
             rows = [(name, box, f"{self.path}, object {name}") for name, box in self.labels.objects]
         else:
             rows = [_coco_row(row) for row in self.labels]
-        return self._labels(rows, size, scale)
-
-    def _labels(
-        self, rows: Sequence[_Annotation], size: tuple[int, int], scale: tuple[float, float]
-    ) -> FrameLabels:
-        """Of (class, x1 y1 x2 y2 as labelled, place); rows without four numbers are left out."""
-        names, boxes, wheres = [], [], []
+        good = []
         for name, box, where in rows:
-            if box is None or not all(map(math.isfinite, box)):
+            if not name:
+                self.doubts.leave_out(f"{where} has no class")
+            elif box is None or not all(map(math.isfinite, box)):
                 self.doubts.leave_out(
                     f"{where} has no box of four numbers; x, y, w, h in the picture of {size[0]}x{size[1]} do"
                 )
-                continue
-            names.append(name)
-            boxes.append(box)
-            wheres.append(where)
-        corners: npt.NDArray[np.float64] = np.array(boxes, np.float64).reshape(-1, 4) * (scale * 2)
-        inside, rows_inside = self.doubts.inside(corners, wheres, size)
-        return labels_of(inside, [names[row] for row in rows_inside.tolist()])
+            else:
+                good.append((name, box, where))
+        return self.doubts.labels(good, size, scale)
 
     def _scale(self, size: tuple[int, int]) -> tuple[float, float]:
         said = self.labelled_size
@@ -147,7 +140,7 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
     if place.suffix == ".json" and place.is_file():
         return _coco_pictures(place, doubts)
     if place.suffix in _YAML and place.is_file():
-        return find_pictures(place.parent, classes=classes)
+        return _of_yaml(place, classes)
     if place.is_file():
         return [LabelledPicture(place, None, ())]
     if not place.is_dir():
@@ -168,7 +161,7 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
     keypoints = 0
     if voc:
         named = {name for one in voc.values() for name, _ in one.objects}
-        names = tuple(sorted(name for name in named if name.casefold() not in IGNORED))
+        names = tuple(sorted(name for name in named if name and name.casefold() not in IGNORED))
     elif texts and not visdrone:
         names = yolo_names(place, classes, files)
         keypoints = keypoint_columns(class_file(place, files))
@@ -184,6 +177,13 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
         )
         for file in files
     ]
+
+
+def _of_yaml(path: Path, classes: Sequence[str] | None) -> list[LabelledPicture]:
+    folders = yaml_folders(path)
+    if classes is None and folders != [path.parent]:
+        classes = read_class_file(path)
+    return [one for folder in folders for one in find_pictures(folder, classes=classes)]
 
 
 def doubts_of(pictures: Sequence[LabelledPicture]) -> list[str]:
@@ -256,7 +256,8 @@ def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:
                 continue
             of[image].append({**row, "name": names[category], "where": where})
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} is not COCO's JSON: {type(error).__name__} {error}") from None
+        why = f"{error}" if isinstance(error, ValueError) else "it lacks images, annotations or categories"
+        raise UserError(f"{path} is not COCO's JSON: {why}") from None
     _check_pixels(path, rows)
     folders = Folders()
     pictures: dict[Path, tuple[str, Any, tuple[int, int] | None]] = {}

@@ -13,6 +13,8 @@ from hvt_common.values import Boxes
 
 _NOTICED_PX = 0.01
 """Rows that end nearer to the edge are as exact as their digits."""
+IGNORED = frozenset({"difficult", "dontcare", "ignore", "ignored"})
+"""Classes (any case) whose boxes count neither for nor against."""
 NO_ID = -1
 """Of an object whose dataset knows no identities."""
 
@@ -65,27 +67,44 @@ class LabelDoubts:
         self._first_resized = self._first_resized or sentence
         self._resized += 1
 
-    def inside(
-        self, corners: npt.NDArray[np.float64], wheres: Sequence[str], size: tuple[int, int]
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.intp]]:
-        """(M, 4) boxes cut at a picture of this (width, height), and (M,) which of the (N, 4) corners they were.
+    def labels(
+        self,
+        rows: Sequence[tuple[str, Sequence[float], str]],
+        size: tuple[int, int],
+        scale: tuple[float, float],
+    ) -> FrameLabels:
+        """Of (class, x1 y1 x2 y2, place in words), times ``scale``, in a picture of this (width, height).
 
-        ``wheres`` has the place of each, for words. What has no area inside is left out.
+        Boxes are cut at the picture. What has no area inside, and what stands there twice, is left out; boxes of
+        `IGNORED` become regions.
         """
+        names, boxes, wheres = zip(*rows, strict=True) if rows else ((), (), ())
+        corners = np.array(boxes, np.float64).reshape(-1, 4) * (scale * 2)
         limits = np.array([*size, *size], np.float64)
         inside = np.clip(corners, 0, limits)
         beyond = np.abs(corners - inside).max(axis=1, initial=0)
-        solid = (inside[:, 2:] > inside[:, :2]).all(axis=1)
+        solid = np.asarray((inside[:, 2:] > inside[:, :2]).all(axis=1), np.bool_)
         for row in np.flatnonzero(solid & (beyond > _NOTICED_PX)).tolist():
             self._clipped += 1
             self._worst = max(self._worst, (float(beyond[row]), wheres[row]))
-        for row in np.flatnonzero(~solid).tolist():
-            self.leave_out(
-                f"{wheres[row]} has a box outside the picture of {size[0]}x{size[1]}, or without area"
-            )
-        rows = np.flatnonzero(solid)
-        self.good += len(rows)
-        return inside[rows], rows
+        once: dict[tuple[str, *tuple[float, ...]], int] = {}
+        for row in range(len(names)):
+            if not solid[row]:
+                self.leave_out(
+                    f"{wheres[row]} has a box outside the picture of {size[0]}x{size[1]}, or without area"
+                )
+            elif once.setdefault((names[row], *inside[row].tolist()), row) != row:
+                self.leave_out(f"{wheres[row]} stands there twice")
+        self.good += len(once)
+        found = inside[list(once.values())].astype(np.float32)
+        kinds = [name for name, *_ in once]
+        passed = np.array([name.casefold() in IGNORED for name in kinds], bool)
+        return FrameLabels(
+            boxes_xyxy_px=found[~passed],
+            ids=np.full(np.count_nonzero(~passed), NO_ID, np.int64),
+            class_names=tuple(name for name, skip in zip(kinds, passed, strict=True) if not skip),
+            ignored_xyxy_px=found[passed],
+        )
 
     def sentences(self) -> list[str]:
         """What there is to say."""

@@ -29,9 +29,9 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
 from hvt_study.datasets.label_files import class_file, keypoint_columns
-from hvt_study.datasets.labels import FrameLabels, LabelDoubts, covered_share
+from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts, covered_share
 from hvt_study.datasets.visdrone_rows import read_image_rows
-from hvt_study.datasets.yolo_labels import IGNORED, read_yolo, yolo_names
+from hvt_study.datasets.yolo_labels import read_yolo, yolo_names
 
 SCHEME = "still:"
 """``still:FILE`` is a virtual camera over that picture, ``still:FILE@1.5`` one that sees 1.5 times its height."""

@@ -6,15 +6,10 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
 from hvt_common.errors import UserError
 from hvt_study.datasets.label_files import class_file, read_class_file, read_text
-from hvt_study.datasets.labels import NO_ID, FrameLabels, LabelDoubts
+from hvt_study.datasets.labels import FrameLabels, LabelDoubts
 
-IGNORED = frozenset({"difficult", "dontcare", "ignore", "ignored"})
-"""Classes (any case) whose boxes count neither for nor against."""
 YOLO_COLUMNS = 5
 """Class and box."""
 _MOST_COLUMNS = 6
@@ -47,7 +42,7 @@ def read_yolo(
     Behind the boxes there may be so many columns of ``keypoints``, which are no polygon. What ends outside the
     picture is cut, and a row that cannot be is left out; ``doubts`` counts both.
     """
-    boxes, kinds, wheres = [], [], []
+    rows = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
@@ -56,24 +51,8 @@ def read_yolo(
         except UserError as error:
             doubts.leave_out(str(error))
             continue
-        boxes.append(corners)
-        kinds.append(names[int(kind)])
-        wheres.append(f"{path}, line {number}")
-    corners_px = np.array(boxes, np.float64).reshape(-1, 4) * [*size, *size]
-    inside, rows = doubts.inside(corners_px, wheres, size)
-    return labels_of(inside, [kinds[row] for row in rows.tolist()])
-
-
-def labels_of(corners: npt.NDArray[np.float64], names: Sequence[str]) -> FrameLabels:
-    """(N, 4) x1 y1 x2 y2 pixels and their N names; those of `IGNORED` become regions."""
-    passed = np.array([name.casefold() in IGNORED for name in names], bool)
-    boxes = corners.astype(np.float32)
-    return FrameLabels(
-        boxes_xyxy_px=boxes[~passed],
-        ids=np.full(np.count_nonzero(~passed), NO_ID, np.int64),
-        class_names=tuple(name for name, skip in zip(names, passed, strict=True) if not skip),
-        ignored_xyxy_px=boxes[passed],
-    )
+        rows.append((names[int(kind)], corners, f"{path}, line {number}"))
+    return doubts.labels(rows, size, size)
 
 
 def _yolo_row(path: Path, number: int, line: str, classes: int, keypoints: int) -> list[float]:

@@ -344,6 +344,30 @@ def test_real_mot15_annotations(data, name, count):
     assert len(table.ignored.frames) == 0
 
 
+def test_an_id_is_one_object_of_a_frame(tmp_path, caplog):
+    """A row that tools have doubled would be an object that nobody can find."""
+    rows = "".join(f"1,{number},{left},11,9,9,1,1,1\n" for number, left in ((1, 11), (1, 11), (2, 31)))
+    write_mot(tmp_path / "a", rows=rows)
+    (sequence,) = open_dataset(f"mot:{tmp_path}")
+    assert sequence.labels(0).ids.tolist() == [1, 2]
+    assert "1 of 3 lines are left out" in caplog.text
+    write_mot(tmp_path / "a", rows="1,-1,11,11,9,9,1,1,1\n1,-1,31,11,9,9,1,1,1\n")
+    (sequence,) = open_dataset(f"mot:{tmp_path}")
+    assert len(sequence.labels(0)) == 2
+    assert not sequence.one_target, "nobody knows which object is which"
+
+
+def test_pictures_of_another_size_than_a_sequence_says_are_refused(tmp_path):
+    """Of images that were made smaller the boxes lie elsewhere, and recall is 0 without a word."""
+    write_mot(tmp_path / "a")
+    said = tmp_path / "a" / "seqinfo.ini"
+    said.write_text(said.read_text() + f"imWidth={2 * SIZE[0]}\n")
+    with pytest.raises(
+        UserError, match=f"says imWidth={2 * SIZE[0]}, and its images are {SIZE[0]} pixels wide"
+    ):
+        open_dataset(f"mot:{tmp_path}")
+
+
 def test_mot_of_others(tmp_path):
     """CVAT writes names of its own, and says nothing of the frame rate."""
     write_mot(tmp_path / "a", rows="1,1,11,11,9,9,1,2,1,\n1,2,31,11,9,9,0,1,1\n")

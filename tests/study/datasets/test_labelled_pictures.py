@@ -404,6 +404,78 @@ def test_labels_that_are_not_read_are_said(tmp_path: Path, name: str, content: s
         find_pictures(tmp_path, classes=None)
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("label_2/a.txt", "Car 0.00 0 -1.58 100 50 300 200 1.6 1.6 3.9 1 1 1 -1.6"),
+        ("labelTxt/a.txt", "100 50 300 50 300 200 100 200 car 0"),
+        ("ann/a.jpg.json", "{}"),
+        ("images/_annotations.createml.json", '[{"image": "a.jpg", "annotations": [{"coordinates": {}}]}]'),
+        ("images/_annotations.csv", "filename,width,height,class,xmin,ymin,xmax,ymax"),
+        ("val.json", '[{"name": "a.jpg", "labels": [{"box2d": {}}]}]'),
+        ("val.odgt", '{"ID": "a", "gtboxes": []}'),
+        ("via.json", '{"a.jpg1": {"regions": [{"shape_attributes": {}}]}}'),
+    ],
+)
+def test_labels_of_another_kind_are_not_passed_over(tmp_path: Path, name: str, content: str) -> None:
+    """A labelled set would be taken for one that nobody labelled, and nothing be scored."""
+    picture(tmp_path / "images/a.jpg")
+    text(tmp_path / "telemetry.csv", "time,x\n1,2")
+    assert find_pictures(tmp_path, classes=None)[0].labels is None
+    text(tmp_path / name, content)
+    with pytest.raises(UserError, match="which are not read: export them as"):
+        find_pictures(tmp_path, classes=None)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "path: ../data\ntrain: images/train\nval: images/val\n",
+        "path: {data}  # here\nval: images/val\n",
+        "val: {data}/images/val\ntest: nowhere\n",
+    ],
+)
+def test_a_yaml_may_lie_elsewhere_than_its_pictures(tmp_path: Path, said: str) -> None:
+    """Ultralytics keeps its YAML apart; the set would not be found."""
+    picture(tmp_path / "data/images/val/a.jpg")
+    text(tmp_path / "data/labels/val/a.txt", ROW)
+    yaml = text(tmp_path / "settings/ours.yaml", said.format(data=tmp_path / "data") + "names: [car, bus]\n")
+    ((_, labels),) = read(yaml)
+    assert labels.class_names == ("bus",)
+
+
+def test_a_box_that_stands_there_twice_is_one(tmp_path: Path) -> None:
+    """The second would be missed by every detector: tools that join sets write it."""
+    picture(tmp_path / "a.jpg")
+    text(tmp_path / "a.txt", ROW + ROW)
+    text(tmp_path / "classes.txt", "car\nbus\n")
+    ((one, labels),) = read(tmp_path)
+    assert len(labels) == 1
+    assert "a.txt, line 2 stands there twice" in doubts_of([one])[0]
+
+
+def test_an_object_without_a_class_is_left_out(tmp_path: Path) -> None:
+    """It would be of a class without a name."""
+    picture(tmp_path / "a.jpg")
+    whole = voc()
+    text(
+        tmp_path / "a.xml",
+        whole.replace("</annotation>", whole[whole.index("<object>") :].replace("bus", "", 1)),
+    )
+    ((one, labels),) = read(tmp_path)
+    assert labels.class_names == ("bus",)
+    assert "has no class" in doubts_of([one])[0]
+
+
+def test_a_coco_file_of_any_name_is_found(tmp_path: Path) -> None:
+    """Its pictures would be taken for some that nobody labelled."""
+    picture(tmp_path / "images/a.jpg")
+    text(tmp_path / "ours.json", coco())
+    text(tmp_path / "other.json", "{}")
+    ((_, labels),) = read(tmp_path)
+    assert len(labels) == 1
+
+
 @pytest.mark.parametrize("encoding", ["iso-8859-1", "utf-16"])
 def test_an_xml_is_read_in_its_encoding_and_difficult_objects_do_not_count(
     tmp_path: Path, encoding: str

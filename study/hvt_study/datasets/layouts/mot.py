@@ -177,8 +177,9 @@ def _open(name: str, folder: Path, options: Options) -> Sequence:
 
 
 def _one_target(table: LabelTable) -> bool:
-    """Whether it is a single-object set: one id, and nothing marked as not counting."""
-    return len(np.unique(table.ids)) == 1 and not len(table.ignored.frames)
+    """Whether it is a single-object set: one id, once a frame, and nothing marked as not counting."""
+    alone = len(np.unique(table.frames)) == len(table.frames)
+    return alone and len(np.unique(table.ids)) == 1 and table.ids[0] >= 0 and not len(table.ignored.frames)
 
 
 def _images(folder: Path, info: Mapping[str, str]) -> ImageSequence:
@@ -191,6 +192,13 @@ def _images(folder: Path, info: Mapping[str, str]) -> ImageSequence:
         raise UserError(
             f"MOTChallenge sequence {folder} says seqLength={said} and has {images.frame_count} images"
         )
+    for side, word, found in zip(("Width", "Height"), ("wide", "high"), images.size, strict=True):
+        said = info.get(f"im{side}", "")
+        if said.isdecimal() and int(said) not in (0, found):
+            raise UserError(
+                f"MOTChallenge sequence {folder} says im{side}={said}, and its images are {found} pixels {word}: "
+                "boxes would lie elsewhere; put the images back that were labelled, or correct it"
+            )
     return images
 
 
