@@ -14,11 +14,20 @@ def compass_deg(yaw_deg: float) -> float:
     return 0.0 if turned >= 360.0 else turned
 
 
-def euler_deg(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+_UNIT = 0.1
+"""So much may the length of a quaternion differ from 1."""
+
+
+def euler_deg(w: float, x: float, y: float, z: float) -> tuple[float, float, float] | None:
     """Yaw, pitch and roll of the unit quaternion of a device in north-east-down (MAVLink, common.xml).
 
     Order yaw, pitch, roll. Straight up or down only their sum or difference is known: it is the yaw, and the roll 0.
+    None for what is no turn: zeros or NaN, from a device that does not know.
     """
+    length = math.hypot(w, x, y, z)
+    if not abs(length - 1) <= _UNIT:
+        return None
+    w, x, y, z = w / length, x / length, y / length, z / length
     sine = 2 * (w * y - z * x)
     if abs(sine) > _UPRIGHT:
         return math.degrees(2 * math.atan2(z, w)), math.copysign(90.0, sine), 0.0

@@ -11,19 +11,25 @@ import logging
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
-from itertools import pairwise
+from itertools import dropwhile, pairwise
 from pathlib import Path
+from statistics import median
+from typing import Any
 from xml.etree import ElementTree as ET
 
+import numpy as np
+
 from hvt_common.errors import UserError
+from hvt_common.geodesy import turned_deg
 from hvt_common.inference.labels import decoded
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
 from hvt_edge.pose.angles import compass_deg
 from hvt_edge.pose.subtitles import subtitle_rows
-from hvt_edge.pose.table import PoseTable
+from hvt_edge.pose.table import MOST_GAP_S, PoseTable
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +56,12 @@ _BOUNDS: Mapping[str, tuple[float, float]] = {
 _FAR = 1e6
 _ANY_TIME = (-1e11, 1e11)
 _LONGEST_PAUSE_S = 86_400.0
+_M_A_DEGREE = 111_320.0
+_MOST_SPEED, _MOST_M = 700.0, 1000.0
+"""Metres a second, and what receivers may err: further away a place is a fault."""
+_POINTS = ("trkpt", "rtept", "wpt")
+_BEFORE_HEAD = re.compile(r"\s*(?:#.*|sep=.)?\s*$")
+"""Lines before the names: a comment, the word of a spreadsheet, or nothing."""
 _NOWHERE = 0.001
 """Degrees around 0, 0: there a receiver without a fix says it is."""
 _UNKNOWN_YAW = (655.35, 65535.0)
@@ -87,7 +99,17 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
     if not poses:
         raise UserError(f"pose file {path} has no row with a time, a latitude and a longitude")
     poses = [one if one.hfov_deg is not None else replace(one, hfov_deg=hfov_deg) for one in poses]
-    return PoseTable(_in_order(poses, path), notes=tuple(notes))
+    poses = _together(_in_order(poses, path), path)
+    apart_s = (
+        median((two.capture_ns - one.capture_ns) / SECOND_NS for one, two in pairwise(poses))
+        if poses[1:]
+        else 0
+    )
+    if apart_s > MOST_GAP_S:
+        notes.append(
+            f"its poses are {apart_s:.4g} s apart, and beyond {MOST_GAP_S:g} s nothing is known between"
+        )
+    return PoseTable(poses, notes=tuple(notes))
 
 
 def _text(content: bytes) -> str:
@@ -178,6 +200,29 @@ def _in_order(poses: list[Pose], path: Path) -> list[Pose]:
     return rising
 
 
+def _together(poses: list[Pose], path: Path) -> list[Pose]:
+    """Without single places that nothing that flies can reach from those around them in its time."""
+    places = np.array([(one.latitude_deg, one.longitude_deg, one.capture_ns / SECOND_NS) for one in poses])
+    good = np.zeros(len(poses), bool)
+    for step in (1, 2):  # beside one that is wrong stands a good one
+        north, east, passed_s = (places[step:] - places[:-step]).T
+        wide = np.cos(np.radians(places[step:, 0]))
+        metres = _M_A_DEGREE * np.hypot(north, turned_deg(east) * wide)
+        near = metres <= _MOST_M + _MOST_SPEED * passed_s
+        good[step:] |= near
+        good[:-step] |= near
+    wrong = len(poses) - int(good.sum())
+    if 0 < wrong < len(poses) / 2:
+        _log.warning(
+            "pose file %s: %d of %d places are far from those around them, and are left out",
+            path,
+            wrong,
+            len(poses),
+        )
+        return [one for one, is_good in zip(poses, good.tolist(), strict=True) if is_good]
+    return poses
+
+
 def _check(row: _Values, path: Path, number: int) -> None:
     """Raise `UserError` for a place that does not exist on earth."""
     for name, value in row.items():
@@ -214,10 +259,12 @@ def _orientation(row: _Values, prefix: str) -> Orientation | None:
 
 
 def _table_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
-    head = text.lstrip().partition("\n")[0]
-    between = max(",;\t", key=head.count)
-    lines = csv.DictReader(text.splitlines(), delimiter=between, skipinitialspace=between != "\t")
+    written = list(dropwhile(_BEFORE_HEAD.match, text.splitlines()))
+    between = max(",;\t|", key=(written or [""])[0].count)
+    lines = csv.DictReader(written, delimiter=between, skipinitialspace=between != "\t")
     names = [(name or "").strip().lower() for name in lines.fieldnames or ()]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UserError(f"pose file {path} has the column {twice[0]!r} twice")
     lines.fieldnames = names
     unknown = [name for name in names if name not in COLUMNS]
     if unknown:
@@ -245,15 +292,32 @@ def _table_row(line: Mapping[str, str | None], where: str) -> _Values:
     return row
 
 
-def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
+def _points(text: str, path: Path) -> list[ET.Element]:
+    """Of a track, else of a route, else waypoints; of a file that breaks off those that are whole."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise UserError(f"pose file {path} declares a document type, which no GPS track has")
+    points: dict[str, list[ET.Element]] = {}
+    parser: Any = ET.XMLPullParser()  # the user's own file, and it declares nothing
+    broken = ""
     try:
-        root = ET.fromstring(text)  # noqa: S314 - the user's own file, and it declares nothing
+        parser.feed(text)
+        parser.close()
     except ET.ParseError as error:
-        raise UserError(f"pose file {path} is no GPX: {error}") from None
+        broken = str(error)
+    with suppress(ET.ParseError):
+        for _, element in parser.read_events():
+            points.setdefault(element.tag.rpartition("}")[2], []).append(element)
+    found = next((points[kind] for kind in _POINTS if kind in points), [])
+    if broken and not found:
+        raise UserError(f"pose file {path} is no GPX: {broken}")
+    if broken:
+        _log.warning("pose file %s breaks off after %d points: %s", path, len(found), broken)
+    return found
+
+
+def _track_rows(text: str, path: Path) -> Iterator[_Values | UserError]:
     untimed = 0
-    for number, point in enumerate(root.findall(".//{*}trkpt"), 1):
+    for number, point in enumerate(_points(text, path), 1):
         where = f"pose file {path}, point {number}"
         time = point.findtext("{*}time")
         if time is None:
@@ -289,7 +353,7 @@ def _number(text: str, where: str) -> float:
 
 def _utc_s(text: str, where: str) -> float:
     try:
-        time = datetime.fromisoformat(text.strip())
+        time = datetime.fromisoformat(text.strip().upper().replace(" UTC", "Z"))
     except ValueError:
         raise UserError(
             f"{where}: the time {text!r:.40} is not ISO 8601, such as 2026-11-23T10:00:00Z"

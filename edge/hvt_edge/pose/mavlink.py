@@ -1,8 +1,9 @@
 """Poses from an autopilot by MAVLink: listens only, and sends it nothing.
 
-Place and height come from GLOBAL_POSITION_INT, the platform's angles from ATTITUDE, the camera's from
-GIMBAL_DEVICE_ATTITUDE_STATUS, MOUNT_ORIENTATION or MOUNT_STATUS, its field of view from CAMERA_FOV_STATUS, the fix
-and its accuracy from GPS_RAW_INT. A value that is older than two seconds, a fix of ten, is not known any more.
+Place and height come from GLOBAL_POSITION_INT, the platform's angles from ATTITUDE or ATTITUDE_QUATERNION, the
+camera's from GIMBAL_DEVICE_ATTITUDE_STATUS, MOUNT_ORIENTATION or MOUNT_STATUS, its field of view from
+CAMERA_FOV_STATUS, the fix and its accuracy from GPS_RAW_INT. A value that is older than two seconds, a fix of ten, is
+not known any more.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ _OLD_NS, _OLD_FIX_NS = 2 * SECOND_NS, 10 * SECOND_NS
 _MESSAGES = (
     "GLOBAL_POSITION_INT",
     "ATTITUDE",
+    "ATTITUDE_QUATERNION",
     "MOUNT_ORIENTATION",
     "MOUNT_STATUS",
     "GIMBAL_DEVICE_ATTITUDE_STATUS",
@@ -33,7 +35,9 @@ _MESSAGES = (
     "GPS_RAW_INT",
     "GPS2_RAW",
 )
-_OF_AUTOPILOT = frozenset({"GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT", "GPS2_RAW"})
+_OF_AUTOPILOT = frozenset(
+    {"GLOBAL_POSITION_INT", "ATTITUDE", "ATTITUDE_QUATERNION", "GPS_RAW_INT", "GPS2_RAW"}
+)
 """Messages that a gimbal or a companion may send of itself, not of the aircraft."""
 _FIXES = ("GPS_RAW_INT", "GPS2_RAW")
 _AUTOPILOT = 1
@@ -42,6 +46,7 @@ _LEAST_FIX = 2
 """``GPS_FIX_TYPE_2D_FIX``; with less an autopilot says where its estimate has drifted to from 0, 0."""
 _NOWHERE = 10_000
 """1e-7 degrees around 0, 0: a hundred metres in the Gulf of Guinea."""
+_MOST_LATITUDE = 900_000_000
 _MOST_SENDERS = 8
 _MOST_KNOWN = 200
 """Limit of the messages of all senders, by name: strangers may send any number."""
@@ -101,7 +106,7 @@ class MavlinkPose:
         if not _has_place(known):
             return None
         place = known["GLOBAL_POSITION_INT"]
-        platform = _attitude(known.get("ATTITUDE"))
+        platform = _attitude(known)
         field = known.get("CAMERA_FOV_STATUS")
         hfov = self._hfov_deg
         if field is not None and 0 < field.hfov < 180:
@@ -223,6 +228,10 @@ def _has_place(known: dict[str, Any]) -> bool:
     place = known.get("GLOBAL_POSITION_INT")
     if place is None or max(abs(place.lat), abs(place.lon)) < _NOWHERE:
         return False
+    if (
+        abs(place.lat) > _MOST_LATITUDE or abs(place.lon) > 2 * _MOST_LATITUDE
+    ):  # the largest number: not known
+        return False
     return not _has_no_fix(known)
 
 
@@ -231,17 +240,20 @@ def _has_no_fix(known: dict[str, Any]) -> bool:
     return bool(fixes) and max(fixes) < _LEAST_FIX
 
 
-def _attitude(message: Any) -> Orientation | None:
-    if message is None:
-        return None
-    return _orientation(math.degrees(message.yaw), math.degrees(message.pitch), math.degrees(message.roll))
+def _attitude(known: dict[str, Any]) -> Orientation | None:
+    if (angles := known.get("ATTITUDE")) is not None:
+        return _orientation(math.degrees(angles.yaw), math.degrees(angles.pitch), math.degrees(angles.roll))
+    turn = known.get("ATTITUDE_QUATERNION")
+    euler = None if turn is None else euler_deg(turn.q1, turn.q2, turn.q3, turn.q4)
+    return None if euler is None else _orientation(*euler)
 
 
 def _camera(known: dict[str, Any], platform: Orientation | None) -> Orientation | None:
     """Where the gimbal points; None where its yaw is the platform's and that is not known."""
     device = known.get("GIMBAL_DEVICE_ATTITUDE_STATUS")
-    if device is not None and all(map(math.isfinite, device.q)):  # NaN where it does not know
-        yaw, pitch, roll = euler_deg(*device.q)
+    euler = None if device is None else euler_deg(*device.q)
+    if device is not None and euler is not None:
+        yaw, pitch, roll = euler
         if _is_of_the_earth(device.flags):
             return _orientation(yaw, pitch, roll)
         return None if platform is None else _orientation(yaw + platform.yaw_deg, pitch, roll)

@@ -12,12 +12,13 @@ _OVERSHOT_DEG = 92.0
 """So far a gimbal's pitch goes where it means straight down or up."""
 _NUMBER = r"[+-]?\d+(?:[.,]\d+)?"
 """With a point, or with the comma that half of Europe writes."""
-_TIMES = re.compile(r"(?<!\d)(\d{1,4}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
-_NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER})")
+_TIMES = re.compile(r"(?<![\d:])(?:(\d{1,4}):)?(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_FEET, _METRES = r"(?:\s?(ft|feet)\b)?", 0.3048
+_NAMED = re.compile(rf"\b([A-Za-z_]{{1,32}})\s{{0,4}}[:(]\s*({_NUMBER}){_FEET}")
 _HEMISPHERES = re.compile(rf"([EWNS])\s*:\s*({_NUMBER})")
 """Autel's GPS(E: 8.5, N: 47.1, 30.5m)."""
 _GPS = re.compile(r"\bGPS\s*\(([^()\n]{1,80})\)")
-_HEIGHT = re.compile(rf"(?<![\w.])H\s+({_NUMBER})\s*m\b")
+_HEIGHT = re.compile(rf"(?<![\w.])H\s+({_NUMBER})(?:\s*m\b|{_FEET[3:-2]})")
 _ANGLES = re.compile(r"\b([FG])\.PRY\s*\(([^()\n]{1,80})\)")
 """Pitch, roll and yaw of the aircraft (F) and of the gimbal (G): Phantom 4 and Mavic Mini, all in one line."""
 _DJI = {
@@ -69,16 +70,16 @@ def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[st
 def _values(body: str, *, latitude_first: bool) -> dict[str, float]:
     row = _place(body, latitude_first=latitude_first)
     if (height := _HEIGHT.search(body)) is not None:
-        row["height_m"] = _value(height[1])
+        row["height_m"] = _value(height[1], feet=height[2])
     for whose, angles in _ANGLES.findall(body):
         values = _numbers(angles)
         prefix = "camera_" if whose == "G" else ""
         if len(values) == 3:
             angle_names = (f"{prefix}pitch_deg", f"{prefix}roll_deg", f"{prefix}yaw_deg")
             row |= {name: value for name, (value, _) in zip(angle_names, values, strict=True)}
-    for name, said in _NAMED.findall(body):
+    for name, said, feet in _NAMED.findall(body):
         if name.lower() in _DJI:
-            row[_DJI[name.lower()]] = _value(said)
+            row[_DJI[name.lower()]] = _value(said, feet=feet)
     focal_mm = row.pop("focal_mm", 0.0)
     if focal_mm >= 1:
         focal_mm = focal_mm / 10 if focal_mm > 200 else focal_mm  # some models write tenths: 240 is 24 mm
@@ -140,10 +141,10 @@ def _numbers(text: str) -> list[tuple[float, str]]:
     return [(_value(number[0]), one) for number, one in found if number is not None]
 
 
-def _value(text: str) -> float:
-    return float(text.replace(",", "."))
+def _value(text: str, *, feet: str | None = None) -> float:
+    return float(text.replace(",", ".")) * (_METRES if feet else 1.0)
 
 
 def _seconds(time: re.Match[str]) -> float:
-    hours, minutes, seconds, rest = time.groups()
+    hours, minutes, seconds, rest = time.groups(default="0")
     return 3600 * int(hours) + 60 * int(minutes) + int(seconds) + float(f"0.{rest}")

@@ -10,6 +10,7 @@ from hvt_common.geodesy import between
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
 
+MOST_GAP_S = 10.0
 _BEYOND_NS = SECOND_NS
 """So long before the first pose and after the last one they are still taken."""
 
@@ -18,7 +19,7 @@ class PoseTable:
     """``poses`` in order of time, at least one; their ``capture_ns`` counts from the clip's first frame."""
 
     def __init__(
-        self, poses: Sequence[Pose], *, most_gap_s: float = 10.0, notes: tuple[str, ...] = ()
+        self, poses: Sequence[Pose], *, most_gap_s: float = MOST_GAP_S, notes: tuple[str, ...] = ()
     ) -> None:
         self.notes = notes
         self._poses = poses

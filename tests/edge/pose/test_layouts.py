@@ -194,3 +194,73 @@ def test_a_table_of_windows_is_read(tmp_path):
     file.write_bytes(text.encode("utf-16"))
     pose = read_poses(file, hfov_deg=60.0).at(0, capture_ns=0)
     assert (pose.latitude_deg, pose.longitude_deg, pose.platform) == (47.0, 8.0, None)
+
+
+@pytest.mark.parametrize("place", [0, 2, 5])
+def test_a_place_that_nothing_can_fly_to_is_left_out(tmp_path, caplog, place):
+    """For a second the aircraft would be four thousand kilometres away, and the objects with it."""
+    table, _ = read(
+        tmp_path,
+        "a.srt",
+        blocks(lambda n: f"[latitude: {12 if n == place else 47.5}] [longitude: 9.7]", count=6),
+    )
+    seen = [table.at(n * SECOND_NS, capture_ns=0) for n in range(6)]
+    assert {one.latitude_deg for one in seen if one} == {47.5}
+    assert "1 of 6 places are far from those around them" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("line", "metres"),
+    [
+        ("[latitude: 47.5] [longitude: 9.7] [rel_alt: 100.0ft abs_alt: 1000 ft]", 30.48),
+        ("GPS (9.7, 47.5, 15), D 10.0ft, H 100.0ft", 30.48),
+        ("[latitude: 47.5] [longitude: 9.7] [rel_alt: 100.0 abs_alt: 1000]", 100.0),
+    ],
+)
+def test_feet_are_feet(tmp_path, line, metres):
+    """Everything on the map would be three times as far away."""
+    _, pose = read(tmp_path, "a.srt", blocks(lambda _: line))
+    assert pose.height_m == pytest.approx(metres)
+
+
+def test_subtitles_of_the_web_count_minutes(tmp_path):
+    """WebVTT leaves the hours out: there would be no block in it."""
+    text = (
+        blocks(lambda _: "[latitude: 47.5] [longitude: 9.7]").replace("00:00:", "00:").replace(",000", ".000")
+    )
+    table, _ = read(tmp_path, "a.srt", f"WEBVTT\n\n{text}")
+    assert table.at(3 * SECOND_NS, capture_ns=0).latitude_deg == 47.5
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("trkpt", "rtept"), ""),
+        (("trkpt", "wpt"), ""),
+        (("</trkseg></trk></gpx>", "<trkpt la"), "breaks off after 4 points"),
+        (("Z<", "z<"), ""),
+        (("Z<", " UTC<"), ""),
+    ],
+)
+def test_a_track_of_another_kind_or_half_a_track_is_read(tmp_path, caplog, change, says):
+    """What a recorder had not finished when its battery went would be lost."""
+    table, pose = read(tmp_path, "a.gpx", track([0, 1, 2, 3]).replace(*change))
+    assert pose.latitude_deg == pytest.approx(47.5)
+    assert table.at(3 * SECOND_NS, capture_ns=0) is not None
+    assert says in caplog.text
+
+
+def test_what_stands_before_the_names_of_a_table_is_passed_over(tmp_path):
+    """Spreadsheets and loggers put their own line there; columns between bars are columns."""
+    head = "sep=|\n# made by a logger\n\ntime_s|latitude_deg|longitude_deg\n"
+    _, pose = read(tmp_path, "a.csv", head + "0|47,5|9,7\n1|47,5|9,7\n")
+    assert pose.longitude_deg == pytest.approx(9.7)
+    with pytest.raises(UserError, match="has the column 'latitude_deg' twice"):
+        read(tmp_path, "b.csv", "time_s,latitude_deg,longitude_deg,latitude_deg\n0,47.5,9.7,48\n")
+
+
+def test_a_table_in_another_unit_of_time_is_doubted(tmp_path):
+    """Of milliseconds no pose would be known but the first, without a word."""
+    rows = "".join(f"{1000 * n},47.5,9.7\n" for n in range(5))
+    table, _ = read(tmp_path, "a.csv", f"time_s,latitude_deg,longitude_deg\n{rows}")
+    assert "its poses are 1000 s apart" in " ".join(table.notes)

@@ -10,6 +10,7 @@ pytest.importorskip("pymavlink")
 
 from pymavlink.dialects.v20 import ardupilotmega
 
+from hvt_edge.pose.angles import euler_deg
 from hvt_edge.pose.mavlink_frames import FrameParser
 from hvt_edge.pose.opening import open_pose
 
@@ -89,6 +90,33 @@ def test_there_is_no_place_before_the_fix(source, send, wait_for):
     with pytest.raises(AssertionError, match="no GPS fix"):
         wait_for(source, limit_s=1.0, say=lambda: send(one.fix(1), one.place(1.0, 1.0)))
     assert wait_for(source, say=lambda: send(one.fix(3), one.place())).latitude_deg == pytest.approx(47.1)
+
+
+@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0), (float("nan"),) * 4])
+def test_a_turn_that_is_none_says_nothing(q):
+    """A gimbal that has not found its level yet would point the camera straight ahead."""
+    assert euler_deg(*q) is None
+
+
+def test_a_place_beyond_the_earth_is_none(source, send, wait_for):
+    """An autopilot that knows none says the largest number there is."""
+    one = Device()
+    nowhere = one.say("global_position_int", 1000, 2**31 - 1, 2**31 - 1, 0, 0, *(0, 0, 0, 0))
+    with pytest.raises(AssertionError, match="no GPS fix"):
+        wait_for(source, limit_s=0.5, say=lambda: send(nowhere))
+
+
+def test_a_turn_alone_is_an_attitude(source, send, wait_for):
+    """The camera's direction from the vehicle would count for nothing."""
+    one = Device()
+
+    def say():
+        half = 0.5**0.5
+        send(one.place(), one.say("attitude_quaternion", 1000, half, 0.0, 0.0, half, 0, 0, 0))
+        send(one.mount_status(-4500, 0, 3000))
+
+    pose = wait_for(source, accept=lambda one: one is not None and one.camera is not None, say=say)
+    assert pose.camera.yaw_deg == pytest.approx(120.0)
 
 
 def test_a_place_near_0_0_is_none_where_nobody_says_a_fix(source, send, wait_for):
