@@ -26,7 +26,7 @@ from hvt_edge.source.camera_units import CameraUnits
 from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit, Source
 from hvt_edge.source.decoding.container import name_of, open_video, said_rate, survey, without_stamps
 from hvt_edge.source.decoding.notes import Notes
-from hvt_edge.source.decoding.timeline import Stamps, Timeline
+from hvt_edge.source.decoding.timeline import Stamps
 from hvt_edge.source.resample import Resizer
 
 _log = logging.getLogger(__name__)
@@ -128,8 +128,7 @@ class CodedVideoSource(Source):
         self, container: Any, stream: Any, *, say: bool = False
     ) -> Generator[tuple[float, bytes], None, None]:
         """(seconds, packet) in order; a jump of the time stamps is mended, and told of in the log if ``say``."""
-        quantum_s = stream.time_base if self._stamps.usable else None
-        timeline = Timeline(self._stamps.period_s, quantum_s=quantum_s, long_s=self._stamps.long_s)
+        timeline = self._stamps.timeline(stream)
         packets = container.demux(stream)
         while True:
             try:

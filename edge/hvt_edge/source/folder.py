@@ -76,8 +76,8 @@ class FolderSource(Source):
             endings = ", ".join(sorted(ending[1:] for ending in _ENDINGS))
             raise UserError(f"source folder {spec!r} holds no images; accepted endings are {endings}")
         notes = Notes(spec)
-        self._reader = _Reader(notes)
-        images = (self._reader.bgr(file, at_s=0.0) for file in self._files)
+        self._stretch = Stretch(notes)
+        images = (_bgr(file, self._stretch, at_s=0.0) for file in self._files)
         first = next((image for image in images if image is not None), None)
         if first is None:
             raise UserError(
@@ -111,7 +111,7 @@ class FolderSource(Source):
             yield replace(frame, index=index, capture_ns=capture_ns)
 
     def _readable(self, place: int, *, held: Image) -> Image:
-        image = self._reader.bgr(self._files[place], at_s=float(place * self._period_s))
+        image = _bgr(self._files[place], self._stretch, at_s=float(place * self._period_s))
         if image is None:
             _log.warning(
                 "%s cannot be read as an image; the one before is shown in its place", self._files[place]
@@ -119,23 +119,20 @@ class FolderSource(Source):
         return held if image is None else image
 
 
-class _Reader:
-    """Reads one folder, whose deep grey is a sensor's levels (`Stretch`)."""
+def _bgr(file: Path, stretch: Stretch, *, at_s: float) -> Image | None:
+    """The image as BGR, 8 bits; None if it cannot be read or decoded. ``at_s`` is when it is shown.
 
-    def __init__(self, notes: Notes) -> None:
-        self._stretch = Stretch(notes)
-
-    def bgr(self, file: Path, *, at_s: float) -> Image | None:
-        """The image as BGR, 8 bits; None if it cannot be read or decoded. ``at_s`` is when it is shown."""
-        try:
-            data = np.fromfile(file, np.uint8)
-            if not data.size:
-                return None
-            image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
-            if image is not None and image.itemsize > 1 and image.ndim == 2:
-                return self._stretch.bgr(image, at_s=at_s)
-            # All else as OpenCV takes it: without transparency, in 8 bits, turned as its EXIF data say.
-            image = cv2.imdecode(data, cv2.IMREAD_COLOR)
-        except (OSError, cv2.error):  # it was there a moment ago, or its header says what no memory holds
+    Deep grey is a sensor's levels.
+    """
+    try:
+        data = np.fromfile(file, np.uint8)
+        if not data.size:
             return None
-        return None if image is None else np.asarray(image, np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+        if image is not None and image.itemsize > 1 and image.ndim == 2:
+            return stretch.bgr(image, at_s=at_s)
+        # All else as OpenCV takes it: without transparency, in 8 bits, turned as its EXIF data say.
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    except (OSError, cv2.error):  # it was there a moment ago, or its header says what no memory holds
+        return None
+    return None if image is None else np.asarray(image, np.uint8)

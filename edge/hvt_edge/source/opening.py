@@ -21,13 +21,14 @@ from hvt_edge.source.decoding.container import is_local
 from hvt_edge.source.demo import DemoSource, is_demo
 from hvt_edge.source.folder import FolderSource
 from hvt_edge.source.live import LiveSource
-from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber
+from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber, is_description
 from hvt_edge.source.video import VideoSource
 
 __all__ = ["REENCODE", "Source", "check_shape", "open_source", "shown"]
 
 _ACCEPTED = (
-    "a video file, a folder of images, rtsp://…, http://…, udp://…, /dev/videoN, demo or demo:codes,4k"
+    "a video file, a folder of images, rtsp://…, rtmp://…, http://…, udp://…, FILE.sdp, /dev/videoN, demo or "
+    "demo:codes,4k"
 )
 
 
@@ -65,7 +66,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
         LiveSource, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock, failures=failures
     )
     scheme = "" if is_local(spec) else spec.partition("://")[0].lower()
-    if scheme in LIVE_SCHEMES:
+    if scheme in LIVE_SCHEMES or (is_description(spec) and _is_there(spec)):
         stream = CodedStreamGrabber(spec) if coded else StreamGrabber(spec)
         stream.open()
         if isinstance(stream, CodedStreamGrabber) and not stream.holds_a_clip:
@@ -110,7 +111,7 @@ def shown(spec: str) -> str:
 
 def _is_there(spec: str) -> bool:
     try:
-        return Path(spec).exists()
+        return bool(spec) and Path(spec).exists()
     except (OSError, ValueError):  # too long for a name, or with a character that none has
         return False
 

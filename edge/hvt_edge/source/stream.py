@@ -1,4 +1,4 @@
-"""Network streams (RTSP, HTTP, UDP, TCP, SRT) through PyAV."""
+"""Network streams (RTSP, RTMP, HTTP, UDP, TCP, SRT, and RTP as an SDP file describes it) through PyAV."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ import av.error
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
 from hvt_common.units import SECOND_NS
-from hvt_edge.source.decoding.container import cause_of, choose_stream
+from hvt_edge.source.decoding.container import cause_of, choose_stream, is_local
 from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.live import Shot, SignalLost
 
-LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "http", "https", "udp", "rtp", "tcp", "srt"})
+LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "udp", "rtp", "tcp", "srt"})
 
 _OPEN_S = 10.0
 _RESTART_S = 2.5
@@ -165,16 +165,25 @@ def camera_time_ns(packet: av.Packet[Any], *, stamped: bool) -> int | None:
     return round(packet.pts * packet.time_base * SECOND_NS)
 
 
+def is_description(spec: str) -> bool:
+    """Whether it is a file that describes a stream which is sent to us (SDP, RFC 8866)."""
+    return spec.lower().endswith(".sdp") and is_local(spec)
+
+
 def _open(url: str, *, open_s: float) -> Any:
+    how: dict[str, Any] = {"options": _OPTIONS, "timeout": (open_s, _READ_S)}
     try:
-        return av.open(url, options=_OPTIONS, timeout=(open_s, _READ_S))
+        if is_description(url):
+            how["options"] = {**_OPTIONS, "protocol_whitelist": "file,udp,rtp"}
+            return av.open(f"file:{url}", format="sdp", **how)
+        return av.open(url, **how)
     except (av.error.FFmpegError, OSError, ValueError) as error:
         name, cause = redacted(url), cause_of(error)
         kind = UserError if isinstance(error, _NEVER) else NotYetError
         if isinstance(error, av.error.InvalidDataError) and url.lower().startswith("http"):
             # A camera's JPEGs without the boundary before the first: FFmpeg finds them by their own beginnings.
             with suppress(av.error.FFmpegError, OSError):
-                return _pictures_of(av.open(url, format="mjpeg", options=_OPTIONS, timeout=(open_s, _READ_S)))
+                return _pictures_of(av.open(url, format="mjpeg", **how))
     raise kind(f"source {name} cannot be opened within {open_s:g} s ({cause}){_spelt(url)}")
 
 

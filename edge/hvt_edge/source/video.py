@@ -17,6 +17,7 @@ from hvt_common.values import Fit, Frame
 from hvt_edge.source.contract import BaseSize, Source
 from hvt_edge.source.decoding.container import (
     decoded,
+    duration_s,
     name_of,
     open_video,
     said_rate,
@@ -56,7 +57,7 @@ class VideoSource(Source):
             self._stamps, first = survey(container, stream)
             if self._override is not None:
                 self._stamps = Stamps(1 / self._override, usable=False)
-            duration_s = self._duration_s(container, stream)
+            lasts_s = self._duration_s(stream)
             self._pictures.begin(stream)
             shown = None if first is None else next(iter(self._shown([(Fraction(0), first)])), None)
             if shown is None:
@@ -69,10 +70,10 @@ class VideoSource(Source):
         self.notes = notes.taken()
         self._resizer = Resizer((picture.shape[1], picture.shape[0]), size, fit=fit, name=self._name)
         self.view = self._resizer.view
-        counts = [] if duration_s is None else [max(1, base_frame_count(duration_s, fps=exact_rate(fps)))]
+        counts = [] if lasts_s is None else [max(1, base_frame_count(lasts_s, fps=exact_rate(fps)))]
         counts += [] if max_frames is None else [max_frames]
         self._limit = max_frames
-        self.frame_count = min(counts, default=None) if duration_s is not None else None
+        self.frame_count = min(counts, default=None) if lasts_s is not None else None
         self._running: Generator[Frame, None, None] | None = None
 
     @property
@@ -147,11 +148,9 @@ class VideoSource(Source):
         elif not self._stamps.ordered and stream.container.format.name == "avi":
             yield "AVI has time stamps of the decoding alone: the n-th frame of the film is shown at the n-th of them"
 
-    def _duration_s(self, container: Any, stream: Any) -> Fraction | None:
+    def _duration_s(self, stream: Any) -> Fraction | None:
         if self._override:
             return stream.frames / self._override if stream.frames else None
         if not self._stamps.usable:
             return stream.frames * self._stamps.period_s or None
-        if stream.duration and stream.time_base:
-            return Fraction(stream.duration * stream.time_base)
-        return Fraction(container.duration, 1_000_000) if container.duration else None
+        return duration_s(stream)

@@ -23,7 +23,7 @@ from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.folder import sequence_files
 from hvt_edge.source.live import LiveSource
 from hvt_edge.source.opening import open_source
-from hvt_edge.source.stream import StreamGrabber
+from hvt_edge.source.stream import StreamGrabber, is_description
 from hvt_scene import Scene
 
 BASE = {"size": (320, 180), "fps": 15.0}
@@ -155,33 +155,6 @@ def test_a_variable_rate_and_a_late_start_are_kept(tmp_path):
     assert shown[:11] == [0, 1, 1, 1, 1, 2, 4, 4, 4, 4, 5]
 
 
-def test_a_sideways_clip_stands_upright(tmp_path):
-    """A phone held upright films sideways; the detector would see cars drive up walls."""
-    path = tmp_path / "plain.mp4"
-    picture = np.full((120, 160, 3), 40, np.uint8)
-    picture[:, :40] = 220  # bright at the left
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=15)
-        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
-        for _ in range(5):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
-        container.mux(stream.encode(None))
-    raw = bytearray(path.read_bytes())
-    # The track header's matrix (ISO/IEC 14496-12, 8.3.2): identity becomes a quarter turn clockwise.
-    one, zero = (0x10000).to_bytes(4, "big"), bytes(4)
-    identity = one + zero * 3 + one + zero * 3 + (0x40000000).to_bytes(4, "big")
-    minus = (-0x10000).to_bytes(4, "big", signed=True)
-    turned = zero + one + zero + minus + zero * 4 + (0x40000000).to_bytes(4, "big")
-    at = raw.index(identity, raw.index(b"tkhd"))
-    raw[at : at + 36] = turned
-    path.write_bytes(raw)
-    source, frames = play(str(path))
-    assert source.view.source_size == (120, 160)
-    upright = frames[0].source_bgr
-    assert upright[:36].mean() > 180  # what was left is now at the top
-    assert upright[60:].mean() < 80
-
-
 def test_a_damaged_clip_plays_as_far_as_it_goes_and_says_so(tmp_path, caplog):
     """A drone that lost power leaves a broken file; its user would get nothing of it, or no warning."""
     clip = write_clip(tmp_path / "whole.ts", count=90, g=10, bf=0)
@@ -195,27 +168,6 @@ def test_a_damaged_clip_plays_as_far_as_it_goes_and_says_so(tmp_path, caplog):
         _, frames = play(str(broken))
     assert 10 < len(frames) < len(whole)
     assert [number_of(f) for f in frames[:10]] == [number_of(f) for f in whole[:10]]
-
-
-def test_a_cut_mp4_warns(tmp_path, caplog):
-    """A half-copied clip would pass for a whole one."""
-    clip = tmp_path / "cut.mp4"
-    write_clip(tmp_path / "whole.mp4", count=90, g=10, bf=0, movflags="faststart")
-    with (
-        av.open(str(tmp_path / "whole.mp4")) as source,
-        av.open(str(clip), "w", options={"movflags": "faststart"}) as target,
-    ):
-        stream = target.add_stream_from_template(source.streams.video[0])
-        for packet in source.demux(video=0):
-            if packet.dts is not None:
-                packet.stream = stream
-                target.mux(packet)
-    raw = clip.read_bytes()
-    clip.write_bytes(raw[: len(raw) * 6 // 10])
-    with caplog.at_level(logging.WARNING):
-        _, frames = play(str(clip))
-    assert 3 < len(frames) < 45
-    assert "cut.mp4" in caplog.text
 
 
 def test_a_clip_plays_twice_and_stops_early(tmp_path):
@@ -561,6 +513,23 @@ def test_unreachable_streams_are_one_sentence_without_the_password(free_port):
     assert "secret" not in sentence
     assert "127.0.0.1" in sentence
     assert "scheme" in refused("gopher://127.0.0.1/x")
+
+
+def test_streams_of_rtmp_and_of_a_description_are_live(tmp_path, free_port):
+    """What a drone sends by RTMP, or by RTP alone, would be no source at all."""
+    assert "cannot be opened within" in refused(f"rtmp://127.0.0.1:{free_port}/live/key")
+    described = tmp_path / "camera.sdp"
+    described.write_text(
+        "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\n"
+        f"m=video {free_port} RTP/AVP 96\na=rtpmap:96 H264/90000\n"
+    )
+    assert is_description(str(described))
+    grabber = StreamGrabber(str(described), open_s=0.2)
+    grabber.open()  # as nothing else than a file of video it could not be read
+    assert not grabber.holds_a_clip
+    grabber.close()
+    assert "does not exist" in refused(str(tmp_path / "other.sdp"))
+    assert "source '' does not exist" in refused("")
 
 
 def test_a_stream_that_never_answers_is_given_up(free_port):

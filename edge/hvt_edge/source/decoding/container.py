@@ -18,7 +18,7 @@ from av.stream import Disposition
 
 from hvt_common.errors import UserError
 from hvt_common.redaction import redacted
-from hvt_edge.source.decoding.timeline import LONG_PAUSE_S, LONG_STEP_S, Stamps, Timeline, presented, surveyed
+from hvt_edge.source.decoding.timeline import LONG_PAUSE_S, LONG_STEP_S, Stamps, presented, surveyed
 
 _log = logging.getLogger(__name__)
 
@@ -155,6 +155,20 @@ def said_rate(stream: Any) -> Fraction | None:
     return Fraction(rate) if rate and rate <= _MOST_FPS else None
 
 
+def duration_s(stream: Any) -> Fraction | None:
+    """How long it lasts, as the container says; None where it does not.
+
+    Matroska says when it ends: a recording that goes on from an earlier one does not begin at 0.
+    """
+    if stream.duration:
+        return _seconds(stream.duration, stream.time_base)
+    whole_s = _seconds(stream.container.duration, Fraction(1, 1_000_000))
+    begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)
+    if not whole_s or "matroska" not in stream.container.format.name:
+        return whole_s or None
+    return whole_s - begin_s if 0 < begin_s < whole_s else whole_s
+
+
 def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
     """The times in the stream's first packets, and its first frame; None if none decodes there."""
     times: list[tuple[Fraction | None, Fraction | None]] = []
@@ -186,8 +200,7 @@ def shown_times(container: Any, stream: Any, *, stamps: Stamps) -> list[Fraction
         for one in _packets(container, stream)
         if not isinstance(one, Exception) and one.size and not one.is_discard
     ]
-    quantum_s = stream.time_base if stamps.usable else None
-    timeline = Timeline(stamps.period_s, quantum_s=quantum_s, long_s=stamps.long_s)
+    timeline = stamps.timeline(stream)
     return [timeline.at(stamp) for stamp in presented(packets, stamps)]
 
 
@@ -198,8 +211,7 @@ def decoded(
 
     Damage is skipped and reported once, at the end; a jump of the time stamps is mended and reported when it comes.
     """
-    quantum_s = stream.time_base if stamps.usable else None
-    timeline = Timeline(stamps.period_s, quantum_s=quantum_s, long_s=stamps.long_s)
+    timeline = stamps.timeline(stream)
     reading = _Reading(container, stream)
     before_s: Fraction | None = None
     paused = False
@@ -270,9 +282,8 @@ class _Reading:
         if container.format.name == "mpegts":
             return "its last packet is cut" if all((self._size or 0) % one for one in _TS_BYTES) else ""
         begin_s = _seconds(stream.start_time, stream.time_base) or Fraction(0)
-        said_s = _seconds(stream.duration, stream.time_base)
-        if said_s is None and len(container.streams) == 1:  # else it may be that of the sound
-            said_s = _seconds(container.duration, Fraction(1, 1_000_000))
+        # That of the container may be that of the sound.
+        said_s = duration_s(stream) if stream.duration or len(container.streams) == 1 else None
         if said_s is not None and self._end_s is not None:
             missing_s = said_s - (self._end_s - begin_s)
             if missing_s > 1 and missing_s > said_s / 50:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from statistics import median
+from typing import Any
 
 LONG_STEP_S = Fraction(10)
 """A step of more than this, and than three usual ones, is a jump where a container may have some (MPEG-TS)."""
@@ -31,6 +32,11 @@ class Stamps:
     """Whether they are of the presentation; else of the decoding, as in AVI: the n-th frame shown has the n-th."""
     long_s: Fraction = LONG_STEP_S
     """A step of more is a jump."""
+
+    def timeline(self, stream: Any) -> Timeline:
+        """For one reading of the stream."""
+        quantum_s = stream.time_base if self.usable else None
+        return Timeline(self.period_s, quantum_s=quantum_s, long_s=self.long_s)
 
 
 def surveyed(
