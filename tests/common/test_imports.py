@@ -26,6 +26,7 @@ HEAVY = {
     [
         ("import hvt_edge.cli", HEAVY),
         ("import hvt_ground.cli", HEAVY),
+        ("import hvt_study.commands.compare", {"sklearn", "matplotlib"}),
         ("from hvt_ground.extras import config_class; config_class()", {"rerun", "onnxruntime", "zenoh"}),
     ],
 )

@@ -17,7 +17,6 @@ from hvt_study.commands.arguments import add_pool_arguments, make_out, open_pool
 from hvt_study.commands.progress import RunProgress
 from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, CompareRow, compare
 from hvt_study.matrix.verdict import Verdict, verdicts
-from hvt_study.report.figures.compare_plot import plot
 from hvt_study.runs.methods import chosen_names
 from hvt_study.runs.spec import ModelChoice
 
@@ -102,6 +101,8 @@ def run(arguments: argparse.Namespace) -> int:
         result = compare(plan, pool=pool, workers=jobs, on_flights=progress.update)
     if not result.rows:
         raise UserError(f"nothing could be flown: {result.missing[0].reason}")
+    from hvt_study.report.figures.compare_plot import plot  # noqa: PLC0415 - Matplotlib, before it says a word
+
     try:
         write_json(file, list(result.rows))
         plot(result, folder / "compare.png")
