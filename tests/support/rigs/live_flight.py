@@ -1,7 +1,8 @@
 """Live video in simulated time: an edge's own parts from its settings, a link with a queue, a ground that reports.
 
 The parts are the real ones, built as `hvt_edge.wiring` builds them: budget, pacer, transmitter, reconfiguration,
-frame decimation, base stage and link control. Simulated are x265 (its sizes), the link and the ground.
+frame decimation, base stage and link control. Simulated are the link, the ground and, unless there are pictures, x265
+(its sizes).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_common.values import AccessUnit, Frame
+from hvt_common.values import AccessUnit, Frame, Image
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
@@ -35,11 +36,12 @@ from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.sending import StillSender
 from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_bytes, minimum_bps
+from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.frame_skip import LimitedFrameSkip
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.wiring.link import make_budget, make_pacer
-from hvt_edge.wiring.video import first_decimation, make_frame_skip, reconfiguration_settings
+from hvt_edge.wiring.video import first_decimation, make_encoder, make_frame_skip, reconfiguration_settings
 from rigs.kept import INFO
 from rigs.messages import feedback
 
@@ -139,7 +141,7 @@ class LiveFlight:
 
     ``late_s(second)`` is how much later a report comes that is made then, None: not at all. ``joins_s`` is when the
     ground comes. ``commands`` are ``(second, budget)``. ``store`` is a folder for what is stored while the link is
-    away. To code a frame takes about ``coding_s``.
+    away. To code a frame takes about ``coding_s``. The real x265 codes ``pictures``, one after the other, for ever.
     """
 
     def __init__(
@@ -154,6 +156,7 @@ class LiveFlight:
         track_bytes: int = 250,
         pose_bytes: int = 60,
         coding_s: float = 0.0,
+        pictures: Sequence[Image] = (),
         loss: float = 0.0,
         seed: int = 0,
         **settings: Any,
@@ -163,7 +166,7 @@ class LiveFlight:
         assert size is not None, "given"
         check_rate(config, size)
         self.link, self.loss, self.late_s, self.joins_s = link, loss, late_s, joins_s
-        self.commands, self.coding_s = list(commands), coding_s
+        self.commands, self.coding_s, self.pictures = list(commands), coding_s, pictures or [_PIXELS]
         self.track_bytes, self.pose_bytes = track_bytes, pose_bytes
         self.chance, self.texture = random.Random(seed), texture
         self.now_ns = _START_NS
@@ -275,8 +278,11 @@ class LiveFlight:
     def _clock(self) -> int:
         return self.now_ns
 
-    def _opened(self, size: tuple[int, int], *, total_bps: int, base_bps: int, decimation: int) -> _Encoder:
+    def _opened(self, size: tuple[int, int], *, total_bps: int, base_bps: int, decimation: int) -> Encoder:
         config = self.config
+        if self.pictures[0] is not _PIXELS:
+            rates = {"total_bps": total_bps, "base_bps": base_bps, "decimation": decimation}
+            return make_encoder(config, size=size, preset="ultrafast", **rates)
         asked = encoder_settings(
             size=size,
             fps=config.nominal_fps / decimation,
@@ -352,7 +358,8 @@ class LiveFlight:
                 if taken_ns < self.now_ns - SECOND_NS / self.config.nominal_fps:
                     continue  # the loop was held up: a camera's frames are gone
                 self._pass(taken_ns)
-                self._frame(Frame(index, taken_ns, _PIXELS, _PIXELS))
+                picture = self.pictures[index % len(self.pictures)]
+                self._frame(Frame(index, taken_ns, picture, picture))
                 if self.now_ns >= status_ns:
                     status_ns = self.now_ns + SECOND_NS
                     self._status()
