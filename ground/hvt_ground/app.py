@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -145,7 +145,9 @@ class Ground:
             self._on_started()
             notify_systemd("READY=1")
             self._say_where(
-                line, pages=(*(() if view is None else (view.page,)), *(page.links if page else ()))
+                line,
+                pages=(*(() if view is None else (view.page,)), *(page.links if page else ())),
+                late={one.part for one in models.failures.now},
             )
             try:
                 self._serve(link, factory, line, watch, models.failures, page, group)
@@ -176,12 +178,13 @@ class Ground:
             recorded=self._config.record is not None,
         )
 
-    def _say_where(self, line: StatusLine, *, pages: Sequence[str]) -> None:
+    def _say_where(self, line: StatusLine, *, pages: Sequence[str], late: Collection[str]) -> None:
         config = self._config
         if config.connect:
             line.note(f"hvt-ground: connecting to {', '.join(config.connect)}")
         if config.listen or not (config.connect or config.zenoh_config):
-            line.note(f"hvt-ground: listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
+            yet = "not yet " * ("listener" in late)
+            line.note(f"hvt-ground: {yet}listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
         for page in filter(None, pages):
             line.note(f"hvt-ground: watch at {page}")
 

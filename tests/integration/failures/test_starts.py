@@ -287,6 +287,7 @@ def test_a_whole_ground_waits_and_serves(link):
     ground = link.ground("--web", page, "--metrics", numbers, *models)
     for part in ("listener", "web page", "metrics"):
         ground.until(f"hvt-ground: {part}: ")
+    assert "hvt-ground: not yet listening on" in ground.said
     for one in holders:
         one.let_go()
     for part in ("listener", "web page", "metrics"):
