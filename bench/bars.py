@@ -23,7 +23,9 @@ def _at_least(limit: float) -> Bar:
 
 BARS = {
     "edge at its defaults on the 1080p demo, peak MB": _at_most(350),
-    "ground of that edge, peak MB": _at_most(400),
+    "ground of that edge, peak MB": _at_most(380),
+    "M0 on a 720p clip, peak MB of the edge": _at_most(300),
+    "M0 on a 720p clip, threads of the edge": _at_most(12),
     "each further edge at the ground, MB": _at_most(45),
     "each further edge at the ground, threads": _at_most(5),
     "capture to overlay p95 over its floor, a core each": _at_most(1.3),

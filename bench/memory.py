@@ -1,4 +1,5 @@
-"""Memory and threads: an edge at its defaults on the demo with a ground, then a ground of one edge and of eight.
+"""Memory and threads at the defaults, whatever is installed: an edge on the demo with a ground, and one of video
+alone; then a ground of one edge and of eight.
 
 The eight are played from this process: access units of 640x360 at 5 fps, coded once, over eight Zenoh sessions.
 """
@@ -13,22 +14,23 @@ import cv2
 
 from bench.bars import measured
 from bench.fleet.played import SIZE, coded, played
-from bench.support.material import frames
+from bench.support.material import clip, frames
 from bench.support.processes import Peaks, free_endpoint, running
 
 _FPS = 5.0
 _EDGES = 8
 _PLAYED_S = 25.0
-# As `pip install hvt[edge]` runs: OpenVINO is an extra.
-_PROVIDER = ("--provider", "cpu")
 
 
 def rows() -> list[dict[str, object]]:
     edge_mb, ground_mb = _demo()
+    clip_mb, clip_threads = _clip()
     (one_mb, one_threads), (all_mb, all_threads) = _played(1), _played(_EDGES)
     return [
         measured("edge at its defaults on the 1080p demo, peak MB", edge_mb),
         measured("ground of that edge, peak MB", ground_mb),
+        measured("M0 on a 720p clip, peak MB of the edge", clip_mb),
+        measured("M0 on a 720p clip, threads of the edge", clip_threads),
         measured("each further edge at the ground, MB", (all_mb - one_mb) / (_EDGES - 1)),
         measured("each further edge at the ground, threads", (all_threads - one_threads) / (_EDGES - 1)),
         measured("ground of one edge of 640x360, peak MB", one_mb),
@@ -42,14 +44,23 @@ def _demo() -> tuple[float, float]:
         record = Path(folder) / "bench.rrd"
         with (
             running(
-                "hvt_ground.cli", *_PROVIDER, "--listen", endpoint, "--once", "--quiet", "--record", record
+                "hvt_ground.cli", "--listen", endpoint, "--once", "--quiet", "--record", record
             ) as ground,
-            running("hvt_edge.cli", *_PROVIDER, "--source", "demo", "--connect", endpoint, "--quiet") as edge,
+            running("hvt_edge.cli", "--source", "demo", "--connect", endpoint, "--quiet") as edge,
         ):
             peaks = Peaks([edge, ground])
             peaks.until_ended(edge, patience_s=180)
             peaks.until_ended(ground, patience_s=60)
     return peaks.mb[0], peaks.mb[1]
+
+
+def _clip() -> tuple[float, int]:
+    """Peak MB and most threads of an edge with video alone, to which nobody listens."""
+    settings = ("--source", clip(), "--method", "M0", "--wait", "0s", "--connect", free_endpoint(), "--quiet")
+    with running("hvt_edge.cli", *settings) as edge:
+        peaks = Peaks([edge])
+        peaks.until_ended(edge, patience_s=180)
+    return peaks.mb[0], peaks.threads[0]
 
 
 def _played(count: int) -> tuple[float, int]:
@@ -62,7 +73,7 @@ def _played(count: int) -> tuple[float, int]:
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         ground = stack.enter_context(
-            running("hvt_ground.cli", *_PROVIDER, "--listen", endpoint, "--quiet", "--record", folder)
+            running("hvt_ground.cli", "--listen", endpoint, "--quiet", "--record", folder)
         )
         peaks = Peaks([ground])
         played(stack, count, endpoint, units, fps=_FPS, lasts_s=_PLAYED_S, on_round=peaks.sample)

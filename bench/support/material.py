@@ -8,7 +8,7 @@ from pathlib import Path
 from hvt_common.values import Frame
 from hvt_edge.source.opening import open_source
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SIZE, FPS = (1280, 720), 15.0
 
 

@@ -34,7 +34,7 @@ def running(module: str, *arguments: object, core: int | None = None) -> Iterato
 
 
 class Peaks:
-    """Most resident memory of each process so far, and its threads at the last sample."""
+    """Most resident memory of each process so far, and its most threads."""
 
     def __init__(self, processes: Sequence[subprocess.Popen]) -> None:
         self._processes = processes
@@ -47,7 +47,8 @@ class Peaks:
             with contextlib.suppress(OSError, TypeError):  # it has ended
                 text = Path(f"/proc/{process.pid}/status").read_text(encoding="ascii")
                 self.mb[index] = int(re.search(r"VmHWM:\s+(\d+)", text)[1]) / 1024
-                self.threads[index] = int(re.search(r"Threads:\s+(\d+)", text)[1])
+                threads = int(re.search(r"Threads:\s+(\d+)", text)[1])
+                self.threads[index] = max(self.threads[index], threads)
 
     def until_ended(self, process: subprocess.Popen, *, patience_s: float) -> None:
         until_s = time.monotonic() + patience_s
