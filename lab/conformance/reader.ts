@@ -733,9 +733,25 @@ function checkStill(vector: any): string | undefined {
   );
 }
 
+// A still that was requested: width and height at which it was coded.
+function codedSize(header: Value[], source: number[]): number[] {
+  const [x, y, width, height, , , , , ...coded] = (field("RoiHeader", header, "place") as bigint[]).map(Number);
+  const [w, h] = coded.length ? coded : [width, height];
+  need(x + width <= source[0] && y + height <= source[1], "a crop beyond the source");
+  need(w <= width && h <= height, "larger than its crop");
+  need(w <= 2048 && h <= 2048, "larger than any still");
+  need(Math.abs(w * height - h * width) <= Math.max(width, height), "of another shape");
+  return [w, h];
+}
+
 // What becomes of a still before a decoder sees it: refused, not shown for want of its base, or the stream that it gets.
 function checkStillCase(vector: any): string | undefined {
   const refused = refusal(() => {
+    if (vector.header) {
+      const size = codedSize(read("RoiHeader", unhex(vector.header), new TextEncoder().encode("a still")), vector.source_size);
+      if (vector.size && canonical(size) !== canonical(vector.size)) throw new Refused(`another size: ${size}`);
+      return;
+    }
     if (vector.base_planes) {
       if (crc32(coded(baseCrop(vector), vector.size[0], vector.size[1])) !== vector.parameters.b) throw new Refused("again");
       return;
@@ -745,6 +761,80 @@ function checkStillCase(vector: any): string | undefined {
   });
   const became = refused === undefined ? "read" : refused.message === "again" ? "again" : "refused";
   return became === vector.becomes ? undefined : `it is ${became}: ${refused?.message}`;
+}
+
+// ---- Backlog ----------------------------------------------------------------------------------------------------
+
+class BacklogReader {
+  private open = new Map<string, { total: number; data: Uint8Array }>();
+  private done = new Map<string, number>();
+  private busy: [string, number, number] | undefined;  // the complete object that is not settled: key, number, total
+
+  // What the next report says of the object, and the object where this chunk completes it.
+  take(data: Uint8Array, payload: Uint8Array): { acknowledged: number[]; object?: string } {
+    const header = read("BacklogHeader", data, payload);
+    const of = (name: string): number => Number(field("BacklogHeader", header, name));
+    const [number, offset, total] = [of("number"), of("offset"), of("total_bytes")];
+    const key = ["session_id", "kind", "number"].map((name) => field("BacklogHeader", header, name)).join();
+    need(payload.length > 0 && offset + payload.length <= total, "a chunk that is none");
+    if (this.done.get(key) === total) return { acknowledged: [number, total] };
+    if (this.busy?.[0] === key) return { acknowledged: [number, this.busy[2] === total ? total - 1 : 0] };
+    let entry = this.open.get(key);
+    if (entry === undefined || entry.total !== total) entry = { total, data: new Uint8Array() };
+    const held = entry.data.length;
+    if (offset <= held && offset + payload.length > held)
+      entry.data = Uint8Array.from([...entry.data, ...payload.subarray(held - offset)]);
+    this.open.set(key, entry);
+    if (entry.data.length < total) return { acknowledged: [number, entry.data.length] };
+    this.open.delete(key);
+    this.busy = [key, number, total];
+    return { acknowledged: [number, total - 1], object: hex(entry.data) };
+  }
+
+  settle(usable: boolean): { acknowledged: number[] } {
+    const [key, number, total] = this.busy!;
+    this.busy = undefined;
+    if (usable) this.done.set(key, total);
+    return { acknowledged: [number, usable ? total : 0] };
+  }
+}
+
+// ---- Reports ----------------------------------------------------------------------------------------------------
+
+class Report {
+  private base = -1;
+  private still = -1;
+  private came = 0;
+  private fromStart = false;
+  private missing = new Map<number, number>();  // number, and when it was first missed
+  private delays: number[] = [];
+
+  take(step: any): object | undefined {
+    if (step.report_at_ms !== undefined) return this.report(step.report_at_ms);
+    if (step.base !== undefined) {
+      this.fromStart ||= step.base === 0;
+      if (step.base > this.base) [this.base, this.came] = [step.base, step.at_ms];
+      if (step.delay_ms !== undefined) this.delays.push(step.delay_ms);
+    } else if (step.stored !== undefined) this.missing.delete(step.stored);
+    else {
+      this.missing.delete(step.still);
+      if (this.still >= 0 || this.fromStart)
+        for (let number = this.still + 1; number < step.still; number++) this.missing.set(number, step.at_ms);
+      this.still = Math.max(this.still, step.still);
+    }
+    return undefined;
+  }
+
+  private report(at: number): object {
+    const missing = [...this.missing].filter(([, since]) => at - since <= 6000).map(([number]) => number);
+    const sorted = this.delays.sort((a, b) => a - b);
+    const [low, high] = [sorted[(sorted.length - 1) >> 1], sorted[sorted.length >> 1]];
+    this.delays = [];
+    return {
+      report_at_ms: at, base_sequence: this.base, base_held_us: this.base < 0 ? 0 : (at - this.came) * 1000,
+      still_sequence: this.still, missing_stills: missing.slice(-32), delay_p50_ms: low === undefined ? -10 : Math.round(5 * (low + high)),
+    };
+  }
 }
 
 // ---- The vectors ------------------------------------------------------------------------------------------------
@@ -807,6 +897,24 @@ const CHECKS: Record<string, (vector: any) => string | undefined> = {
       const became = reader.take(unhex(report.hex));
       const expected = report.damaged ? "damaged" : report.skipped ? "skipped" : report.pose;
       if (canonical(became) !== canonical(expected)) return `report ${number} is ${canonical(became)}`;
+    }
+    return undefined;
+  },
+  "backlog-dialogues.json": (vector) => {
+    const reader = new BacklogReader();
+    for (const [number, step] of vector.steps.entries()) {
+      const { hex: data, payload, usable, refused, ...expected } = step;
+      let became: object | undefined;
+      const why = refusal(() => (became = data === undefined ? reader.settle(usable) : reader.take(unhex(data), unhex(payload))));
+      if (!!why !== !!refused || (!why && canonical(became) !== canonical(expected))) return `step ${number}: ${canonical(became)}`;
+    }
+    return undefined;
+  },
+  "report-traces.json": (vector) => {
+    const reader = new Report();
+    for (const [number, step] of vector.steps.entries()) {
+      const report = reader.take(step);
+      if (report && canonical(report) !== canonical(step)) return `step ${number}: ${canonical(report)}`;
     }
     return undefined;
   },

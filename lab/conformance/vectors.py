@@ -33,6 +33,7 @@ from hvt_common.protocol.messages import (
     parse_backlog_units,
 )
 from hvt_common.protocol.messages.envelope import DEEPEST, MOST_UNKNOWN_FIELDS, WIRE_VERSION
+from lab.conformance.dialogues import backlog_dialogues, report_traces, still_sizes
 from lab.conformance.schema import PATH, name_of, schema
 from lab.conformance.sessions import poses, track_steps
 from lab.conformance.stills import still_cases
@@ -55,7 +56,9 @@ def files() -> dict[str, str]:
         "objects.json": list(_objects()),
         "track-steps.json": list(track_steps()),
         "poses.json": list(poses()),
-        "still-cases.json": list(still_cases()),
+        "still-cases.json": [*still_cases(), *still_sizes()],
+        "backlog-dialogues.json": list(backlog_dialogues()),
+        "report-traces.json": list(report_traces()),
     }
     # A vector a line: a change shows which.
     return {

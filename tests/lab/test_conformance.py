@@ -49,8 +49,8 @@ def test_an_independent_reader_reads_all_of_them(reader):
     done = run(reader, FOLDER)
     assert done.returncode == 0, done.stdout + done.stderr
     assert [line.split(":")[0] for line in done.stdout.splitlines()] == [
-        *("messages.json", "refused.json", "objects.json", "track-steps.json", "poses.json", "stills.json"),
-        "still-cases.json",
+        *("messages.json", "refused.json", "objects.json", "track-steps.json", "poses.json"),
+        *("backlog-dialogues.json", "report-traces.json", "stills.json", "still-cases.json"),
     ]
 
 

@@ -70,7 +70,7 @@ def decode_still(still: ReceivedStill, *, base: Image | YuvPicture | None, view:
         StillError: it cannot be decoded, whatever the base; also a codec that is not known.
     """
     header = still.header
-    size = _coded_size(header, view=view)
+    size = coded_size(header, view=view)
     try:
         codec = still_codec(header.codec)
     except UserError as error:
@@ -83,7 +83,7 @@ def decode_still(still: ReceivedStill, *, base: Image | YuvPicture | None, view:
     return codec.decode(still.data, size=size, parameters=header.parameters, base_bgr=crop)
 
 
-def _coded_size(header: RoiHeader, *, view: View) -> tuple[int, int]:
+def coded_size(header: RoiHeader, *, view: View) -> tuple[int, int]:
     """(width, height) as announced. A still may be shrunk, never be larger than its area in the source."""
     x1, y1, x2, y2 = header.crop_source_px
     size = header.parameters.get("w", x2 - x1), header.parameters.get("h", y2 - y1)
