@@ -15,6 +15,7 @@ import os
 import resource
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from random import Random
@@ -45,24 +46,32 @@ class _Progress:
     slowest_ms: float = 0.0
     rss_kb: list[tuple[int, int]] = field(default_factory=list)
     """(inputs so far, resident memory)."""
-    peak_kb: int = 0
     broke: str = ""
 
 
-class _Watched:
-    """Runs inputs, measures each, and writes the progress now and then."""
+def _peak_kb() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
-    def __init__(self, target: Target, *, runs: int, path: Path) -> None:
-        self._target, self._runs, self._path = target, runs, path
+
+class Watched:
+    """Runs inputs, measures each, and writes the progress now and then.
+
+    ``peak_kb``: the most memory that the process has had. It rises between two inputs too, for those who make them.
+    """
+
+    def __init__(
+        self, target: Target, *, runs: int, path: Path, peak_kb: Callable[[], int] = _peak_kb
+    ) -> None:
+        self._target, self._runs, self._path, self._peak_kb = target, runs, path, peak_kb
         self._progress = _Progress(target.name)
         self._began_s, self._written_s = time.process_time(), time.monotonic()
 
     def __call__(self, data: bytes) -> None:
+        """One input; raises what breaks it, or MemoryError where it takes too much."""
         progress, began_s = self._progress, time.process_time()
         progress.inputs += 1
         try:
-            self._target.run(data)
-            self._check_memory()
+            self._run(data)
         except BaseException as error:
             progress.broke = f"{type(error).__name__}: {error}"[:300]
             self.write()
@@ -71,10 +80,10 @@ class _Watched:
         if progress.inputs >= self._runs or time.monotonic() - self._written_s > _WRITE_EVERY_S:
             self.write()
 
-    def _check_memory(self) -> None:
-        peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        before_kb, self._progress.peak_kb = self._progress.peak_kb, peak_kb
-        risen_mb = (peak_kb - before_kb) // 1024
+    def _run(self, data: bytes) -> None:
+        before_kb = self._peak_kb()
+        self._target.run(data)
+        risen_mb = (self._peak_kb() - before_kb) // 1024
         if self._progress.inputs > _WARM_UP and risen_mb > self._target.most_growth_mb:
             raise MemoryError(f"one input took {risen_mb} MB")
 
@@ -113,7 +122,7 @@ def main() -> None:
     target = TARGETS[arguments.target]
     seeds = checked_seeds(target)
     folders = _prepared(target, arguments.folder, seeds)
-    watched = _Watched(target, runs=arguments.runs, path=arguments.folder / f"{target.name}.json")
+    watched = Watched(target, runs=arguments.runs, path=arguments.folder / f"{target.name}.json")
 
     def mutator(data: bytes, max_size: int, seed: int) -> bytes:
         rng = Random(seed)

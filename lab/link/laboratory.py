@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 import time
@@ -11,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from hvt_fleet.pki.authority import Authority
 from lab.link.carriers.netns import Namespaces
 from lab.link.carriers.relay import Relay
 from lab.link.carriers.sides import GROUND_HOST, Sides
@@ -74,6 +76,7 @@ def run(wanted: Run) -> Outcome:
         old.unlink(missing_ok=True)
     shutil.rmtree(wanted.folder / "store", ignore_errors=True)
     kind, (port,) = wanted.transport, free_ports(1)
+    keys = _keys(wanted.folder / "keys") if kind == "quic" else {"edge": [], "ground": []}
     with _carrier(wanted, script, target_port=port) as link, ExitStack() as stack:
         if isinstance(link, Sides):
             sides, open_to_all = {side: link.prefix(side) for side in link.names}, ["--insecure"]
@@ -83,12 +86,12 @@ def run(wanted: Run) -> Outcome:
             listen, connect = f"{kind}/127.0.0.1:{port}", f"{kind}/127.0.0.1:{link.port}"
         ground = stack.enter_context(Started("ground", wanted.folder, [
             *sides["ground"], sys.executable, "-m", "hvt_ground.cli", "--timing", str(timing), "--listen", listen,
-            *open_to_all, "--record", str(wanted.folder / "run.rrd"), *wanted.ground_arguments,
+            *open_to_all, *keys["ground"], "--record", str(wanted.folder / "run.rrd"), *wanted.ground_arguments,
         ]))  # fmt: skip
         ground.until("listening on", within_s=_START_S)
         edge = stack.enter_context(Started("edge", wanted.folder, [
             *sides["edge"], sys.executable, "-m", "hvt_edge.cli", "--connect", connect, "--wait", "60s",
-            "--source", wanted.source, "--budget", wanted.scenario.budget,
+            *keys["edge"], "--source", wanted.source, "--budget", wanted.scenario.budget,
             "--store-folder", str(wanted.folder / "store"), *wanted.edge_arguments,
         ]))  # fmt: skip
         eventually(lambda: _playing(edge, timing), within_s=_START_S, what="a first frame reaches the ground")
@@ -119,7 +122,26 @@ def _carrier(wanted: Run, script: Script, *, target_port: int) -> Relay | Sides:
         return Namespaces(script)
     if wanted.carrier == "tun":
         return Tunnel(script, seed=wanted.seed)
-    return Relay(script, protocol=wanted.transport, target_port=target_port, seed=wanted.seed)
+    return Relay(
+        script,
+        protocol="tcp" if wanted.transport == "tcp" else "udp",
+        target_port=target_port,
+        seed=wanted.seed,
+    )
+
+
+def _keys(folder: Path) -> dict[str, list[str]]:
+    """A certificate for the ground, which QUIC demands, and the arguments of both sides."""
+    shutil.rmtree(folder, ignore_errors=True)
+    Authority.create(folder).issue("ground", hosts=("127.0.0.1", str(GROUND_HOST)))
+    written = {
+        "edge": {"root_ca_certificate": "ca.pem"},
+        "ground": {"listen_certificate": "ground.pem", "listen_private_key": "ground.key"},
+    }
+    for side, files in written.items():
+        paths = {name: str(folder.absolute() / file) for name, file in files.items()}
+        (folder / f"{side}.json5").write_text(json.dumps({"transport": {"link": {"tls": paths}}}))
+    return {side: ["--zenoh-config", str(folder / f"{side}.json5")] for side in written}
 
 
 def _playing(edge: Started, timing: Path) -> bool:

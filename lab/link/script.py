@@ -20,7 +20,7 @@ from lab.link.timeline import LinkState, Phase, Script
 
 SCENARIOS = Path(__file__).parent / "scenarios"
 Length = Literal["short", "full"]
-Transport = Literal["tcp", "udp"]
+Transport = Literal["tcp", "udp", "quic"]
 LENGTHS: tuple[Length, ...] = ("short", "full")
 
 _WAVE_STEP_S = 0.25
@@ -41,7 +41,7 @@ class Scenario:
     bars: Mapping[str, str]
     """What a measure must be: ``{"decodable frames, %": ">= 97"}``."""
     transport: Transport
-    """``udp`` shows losses as losses; ``tcp`` turns them into delay."""
+    """``udp`` shows losses as losses; ``tcp`` and ``quic`` turn them into delay."""
     _tables: Mapping[str, Mapping[str, Any]] = field(repr=False)
 
     def script(self, length: Length, *, seed: int = 0, lasts: str | None = None) -> Script:
@@ -85,8 +85,8 @@ def _scenario(name: str, content: dict[str, Any]) -> Scenario:
         if not isinstance(bar, str) or bar.split()[0] not in ("<=", ">=", "=="):
             raise UserError(f"{name}: bar {measure!r} is {bar!r}: write '<= 2', '>= 97' or '== 0'")
     transport = content.get("transport", "tcp")
-    if transport not in ("tcp", "udp"):
-        raise UserError(f"{name}: transport {transport!r} is not usable: tcp or udp")
+    if transport not in ("tcp", "udp", "quic"):
+        raise UserError(f"{name}: transport {transport!r} is not usable: tcp, udp or quic")
     scenario = Scenario(name, content["about"], content["budget"], bars, transport, tables)
     for length in LENGTHS:
         scenario.script(length)

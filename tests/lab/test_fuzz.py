@@ -120,3 +120,17 @@ def test_the_fuzzer_finds_a_planted_bug_and_keeps_its_input(tmp_path):
     kept = next((tmp_path / "found").glob("planted-crash-*"))
     with pytest.raises(ValueError, match="here to be found"):
         PLANTED.run(kept.read_bytes())
+
+
+@pytest.mark.skipif(find_spec("atheris") is None, reason="atheris is not installed")
+def test_memory_that_the_fuzzer_takes_is_no_finding(tmp_path):
+    """A target would be left alone for what it never did; and one that takes too much would not be found."""
+    from lab.fuzz.worker import Watched
+
+    mb = 1024
+    taken = iter([0, 0] * 300 + [300 * mb, 301 * mb, 301 * mb, 401 * mb])
+    watched = Watched(PLANTED, runs=1000, path=tmp_path / "planted.json", peak_kb=lambda: next(taken))
+    for _ in range(301):
+        watched(b"")
+    with pytest.raises(MemoryError, match="one input took 100 MB"):
+        watched(b"")

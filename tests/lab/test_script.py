@@ -110,7 +110,7 @@ def test_a_soak_is_a_longer_scenario():
         (('rate = "1Mbps"', 'rate = "1Mbps"\nloss = "95%"'), "loss '95%' is too much"),
         (('rate = "1Mbps"', 'rate = "1Mbps"\nqueue = "1kB"'), "queue '1kB' is not usable"),
         (('rate = "1Mbps"', 'rate = "1Mbps"\ndelay = "9s"'), "delay '9s' is too much"),
-        (("[link]", 'transport = "quic"\n[link]'), "transport 'quic' is not usable: tcp or udp"),
+        (("[link]", 'transport = "sctp"\n[link]'), "transport 'sctp' is not usable: tcp, udp or quic"),
         (('lasts = "10s"', 'lasts = "0s"'), "lasts 0 s is not usable"),
         (
             ('lasts = "10s"', 'lasts = "10s"\ndark = [{ at = "8s", lasts = "3s" }]'),
