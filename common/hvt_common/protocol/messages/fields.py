@@ -141,7 +141,10 @@ class Real(Kind):
 
     def decode(self, raw: Any) -> Any:
         if type(raw) is not float or not math.isfinite(raw):
-            raise WireError(f"{raw!r:.40} in place of a finite float")
+            found = (
+                raw if type(raw) is float else type(raw).__name__
+            )  # what is nested too deep cannot be shown
+            raise WireError(f"{found} in place of a finite float")
         if not self.low <= raw <= self.high:
             raise WireError(f"{raw:g} is outside {self.low:g}…{self.high:g}")
         return raw

@@ -369,6 +369,17 @@ def test_the_version_before_is_read():
         assert (wire_version(sealed([V4, *values])), wire_version(message.pack())) == (V4, WIRE_VERSION)
 
 
+def test_arrays_in_arrays_in_place_of_a_number_are_refused_in_a_sentence():
+    """A stranger's kilobyte would end the thread of an edge: Python shows nothing that is nested so deep."""
+    packed = {name: msgpack.packb(kind.encode(getattr(INFO, name))) for name, kind in kinds(Info)}
+    packed["fps"] = b"\x91" * 1000 + b"\x01"
+    head = msgpack.Packer().pack_array_header(len(packed) + 2)
+    body = b"".join((head, bytes((WIRE_VERSION,)), *packed.values()))
+    data = body + b"\xce" + zlib.crc32(body).to_bytes(4, "big")
+    with pytest.raises(WireError, match=r"Info.fps: list in place of a finite float"):
+        Info.parse(data)
+
+
 def test_oversized_messages_are_not_looked_at():
     """Memory would follow whatever a stranger sends."""
     with pytest.raises(WireError, match="longer than 80"):
