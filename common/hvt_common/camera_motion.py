@@ -67,7 +67,6 @@ class CameraMotion:
 
 
 def _by_flow(previous: _Gray, current: _Gray) -> Affine | None:
-    """Corners of the previous image, followed by pyramidal Lucas-Kanade, and the similarity most agree on."""
     # OpenCV's own types do not say that there may be no corner at all.
     corners = cast(
         "_Points | None",
@@ -105,7 +104,7 @@ def _plausible(affine: Affine) -> bool:
 
 
 def _at_full_size(affine: Affine, *, full_size: tuple[int, int], small_size: tuple[int, int]) -> Affine:
-    """The same motion between full images, whose pixel centres map as ``small = full * k + (k - 1) / 2``."""
+    # The same motion between full images, whose pixel centres map as ``small = full * k + (k - 1) / 2``.
     ratio = np.array(small_size, np.float64) / np.array(full_size, np.float64)
     to_small = np.eye(3)
     to_small[:2, :2] = np.diag(ratio)

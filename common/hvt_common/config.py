@@ -60,7 +60,7 @@ def _path(text: str, *, name: str) -> Path:
 
 
 def _decimal(number: float) -> str:
-    """All digits of a number, without an exponent."""
+    # All digits of a number, without an exponent.
     return format(Decimal(repr(number)).normalize(), "f")
 
 
@@ -236,7 +236,6 @@ def _gone(config_class: type) -> Mapping[str, str]:
 
 
 def _refuse_gone(config_class: type, words: Sequence[str]) -> None:
-    """Raise `UserError` for a flag of an earlier version, with its successor."""
     for word in words:
         name = word.partition("=")[0].removeprefix("--").removeprefix("no-")
         if word.startswith("--") and name in _gone(config_class):
@@ -333,7 +332,7 @@ def _value(field: dataclasses.Field[Any], given: Any, *, name: str) -> Any:
 
 
 def _one(given: Any, *, name: str) -> str:
-    """The text of one plain value; of a list, a table or a truth value there is none."""
+    # The text of one plain value; of a list, a table or a truth value there is none.
     if isinstance(given, list | dict | bool):
         raise UserError(f"{name} {given!r} is not accepted: give one value, as --help shows")
     return str(given)

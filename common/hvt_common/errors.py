@@ -125,7 +125,7 @@ def exit_with_sentence(
 def _traceback_without(
     redaction: Redaction,
 ) -> Callable[[type[BaseException], BaseException, TracebackType | None], None]:
-    """For ``sys.excepthook``: a bug before there is a log."""
+    # For ``sys.excepthook``: a bug before there is a log.
 
     def show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         print(redaction.text("".join(traceback.format_exception(kind, error, trace))), file=sys.stderr)
@@ -134,7 +134,7 @@ def _traceback_without(
 
 
 def _reader_left() -> bool:
-    """Standard output has no reader: discard all further output, also at exit."""
+    # Standard output has no reader: discard all further output, also at exit.
     output = select.poll()
     output.register(sys.stdout.fileno(), 0)
     if not output.poll(0):

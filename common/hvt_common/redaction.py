@@ -82,14 +82,14 @@ def redacted(address: str) -> str:
 
 
 def _path(rest: str, *, hidden: bool) -> str:
-    """The part of a path that may be shown: words as cameras name their streams. RTMP has a stream key there."""
+    # The part of a path that may be shown: words as cameras name their streams. RTMP has a stream key there.
     path = re.split(r"[?#\\]", rest, maxsplit=1)[0]
     parts = (part if not hidden and _is_usual(part) else part and HIDDEN for part in path.split("/"))
     return "/".join(parts) + (f"?{HIDDEN}" if path != rest else "")
 
 
 def _is_usual(part: str) -> bool:
-    """Whether a part of a path has nothing but the words and short numbers of cameras: ``h264Preview_01_main``."""
+    # Whether a part of a path has nothing but the words and short numbers of cameras: ``h264Preview_01_main``.
     runs = re.findall(r"[A-Za-z]+|[0-9]+|.", part, re.DOTALL)
     numbers, usual = [one for one in runs if one.isdigit()], _STREAM_WORDS.split()
     return (
@@ -132,7 +132,7 @@ class Redaction:
 
 
 def _secrets(word: str) -> Iterable[str]:
-    """The secret parts of a word, an address or ``--source=`` and one; of a typing error rather too much."""
+    # The secret parts of a word, an address or ``--source=`` and one; of a typing error rather too much.
     found = _BEGIN.search(word)
     if found is None and not _LIKELY.search(word) and not _PAIR.search(word):
         return

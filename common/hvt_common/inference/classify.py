@@ -109,7 +109,7 @@ class OnnxClassifier:
         return posteriors
 
     def _prepared(self, crop_bgr: Image) -> npt.NDArray[Any]:
-        """The network's input for one crop, without the batch axis."""
+        # The network's input for one crop, without the batch axis.
         crop = as_bgr(crop_bgr)
         shrinks = crop.shape[1] >= self._size[0] and crop.shape[0] >= self._size[1]
         resized = cv2.resize(crop, self._size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
@@ -140,11 +140,7 @@ class OnnxClassifier:
         )
 
     def _try_out(self, names: int | None) -> tuple[int, int, bool]:
-        """Index of the output of scores, number of classes, and whether they are logits.
-
-        Probabilities add up to 1, or are one a class, which stay within 0…1 whatever comes in. Of several outputs the
-        one counts that has as many classes as there are ``names``.
-        """
+        # (output, classes, whether logits): probabilities add up to 1, or lie in 0…1; of several, as many as names.
         batch, (width, height) = self._batch or 1, self._size
         shape = (batch, 3, height, width) if self._channels_first else (batch, height, width, 3)
         noise = np.random.default_rng(0).normal(0, 1, shape)
@@ -178,7 +174,7 @@ class OnnxClassifier:
 
 
 def _geometry(model: OnnxModel) -> tuple[bool, int | None, tuple[int, int]]:
-    """Whether channels come first, the batch (None: free), and the (width, height) of the input."""
+    # Whether channels come first, the batch (None: free), and the (width, height) of the input.
     shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
     if len(shape) != 4 or 3 not in (shape[1], shape[3]):
         raise UserError(_not_a_classifier(model, "its input is not one image of three channels"))
@@ -195,7 +191,7 @@ def _geometry(model: OnnxModel) -> tuple[bool, int | None, tuple[int, int]]:
 
 
 def _is_scores(output: npt.NDArray[Any], batch: int) -> bool:
-    """(batch, C), or (batch, C, 1, 1) as some exports leave it, with at least two classes."""
+    # (batch, C), or (batch, C, 1, 1) as some exports leave it, with at least two classes.
     if not np.issubdtype(output.dtype, np.floating) or output.ndim < 2 or len(output) != batch:
         return False
     return output.shape[1] >= 2 and all(size == 1 for size in output.shape[2:])
@@ -210,7 +206,6 @@ def _not_a_classifier(model: OnnxModel, why: str) -> str:
 
 
 def _preparation(model: OnnxModel, classes: int) -> tuple[Preparation, str]:
-    """How pixels are prepared, and the source of that."""
     said = model.metadata
     if said.get("author") == "Ultralytics" or said.get("task") == "classify":
         usual, why = _ULTRALYTICS, "its metadata say Ultralytics' classify"

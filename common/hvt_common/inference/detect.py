@@ -255,10 +255,7 @@ class OnnxDetector:
         return max(width, cell), max(height, cell)
 
     def _run(self, tensor: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
-        """All outputs; a second input is the size of the picture, in which boxes are then given.
-
-        It is width and height, as RT-DETR's ``orig_target_sizes``; one that is called a shape is height and width.
-        """
+        # A second input is the picture's width and height (``orig_target_sizes``); turned round if called a shape.
         if len(self.model.inputs) == 1:
             return self.model.run(tensor)
         port = self.model.inputs[1]
@@ -267,7 +264,7 @@ class OnnxDetector:
         return self.model.run(tensor, np.array([sides], port.dtype))
 
     def _try_out(self, names: int | None) -> Trial:
-        """Run the network on `trial_pictures`; where its sides are free, at the least multiples that it takes."""
+        # Run the network on `trial_pictures`; where its sides are free, at the least multiples that it takes.
         if self._fixed_size is not None:
             return self._tried(self._fixed_size, names)
         failure: UserError | None = None
@@ -314,7 +311,7 @@ def _is_finite(output: npt.NDArray[Any]) -> bool:
 
 
 def _cells(model: OnnxModel) -> tuple[int, ...]:
-    """Multiples that the sides of a free input may have, likeliest first: ``stride`` of the metadata, if it says."""
+    # Multiples that the sides of a free input may have, likeliest first: ``stride`` of the metadata, if it says.
     text = model.metadata.get("stride", "")
     if text.isascii() and text.isdigit() and int(text) in (8, 16, *_CELLS):
         return (max(_CELL, int(text)),)
@@ -322,13 +319,13 @@ def _cells(model: OnnxModel) -> tuple[int, ...]:
 
 
 def _trained_at(model: OnnxModel) -> int:
-    """The longer side of ``imgsz`` in the metadata, pixels: ``[640, 640]`` or ``640``; 0 where it does not say."""
+    # The longer side of ``imgsz`` in the metadata, pixels: ``[640, 640]`` or ``640``; 0 where it does not say.
     sides = [int(word) for word in re.findall(r"\d{2,4}", model.metadata.get("imgsz", ""))]
     return min(max(sides), _MAX_FREE_SIDE) if 1 <= len(sides) <= 2 else 0
 
 
 def _enlarge_to(model: OnnxModel) -> int:
-    """The longer side in pixels to which small images are enlarged, ``hvt.enlarge_to`` of the metadata; 0: none."""
+    # The longer side in pixels to which small images are enlarged, ``hvt.enlarge_to`` of the metadata; 0: none.
     text = model.metadata.get(_ENLARGE_TO, "0")
     if not (text.isascii() and text.isdigit() and len(text) <= 4 and int(text) <= _MAX_FREE_SIDE):
         raise UserError(
@@ -339,16 +336,13 @@ def _enlarge_to(model: OnnxModel) -> int:
 
 
 def _group_ids(class_names: tuple[str, ...]) -> npt.NDArray[np.int32]:
-    """(C,) the number of the group of each class: one place holds one vehicle, whatever it is called.
-
-    A class without a group stands for itself.
-    """
+    # (C,) one place holds one vehicle, whatever it is called; a class without a group stands for itself.
     groups = [group_of(name) or name for name in class_names]
     return np.array([groups.index(group) for group in groups], np.int32)
 
 
 def _geometry(model: OnnxModel) -> tuple[bool, tuple[int | None, int | None]]:
-    """Whether channels come last, and the (width, height) that the file declares, None where free."""
+    # Whether channels come last, and the (width, height) that the file declares, None where free.
     image, *more = model.inputs
     if len(image.shape) != 4 or (3 not in (image.shape[1], image.shape[3]) and image.shape[1] is not None):
         raise UserError(_not_a_detector(model, "its input is not one (1, 3, height, width) image"))
@@ -371,7 +365,7 @@ def _geometry(model: OnnxModel) -> tuple[bool, tuple[int | None, int | None]]:
 def _fixed_size(
     model: OnnxModel, declared: tuple[int | None, int | None], size: tuple[int, int] | None, cell: int
 ) -> tuple[int, int] | None:
-    """(width, height) of the input, from the model or the user; None where every image chooses its own."""
+    # (width, height) of the input, from the model or the user; None where every image chooses its own.
     width, height = declared
     if size is None:
         # One free side gives a square; with both free, every image chooses.

@@ -143,14 +143,14 @@ class ViewTrust:
 
 
 def _middle_enlarged(image: Image) -> Image:
-    """The middle half of the picture at its full size."""
+    # The middle half of the picture at its full size.
     height, width = image.shape[:2]
     middle = image[height // 4 : height - height // 4, width // 4 : width - width // 4]
     return np.asarray(cv2.resize(middle, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 def _shrunk(image: Image) -> Image:
-    """The picture at half its size, in the middle of grey."""
+    # The picture at half its size, in the middle of grey.
     height, width = image.shape[:2]
     small = cv2.resize(image, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
     whole = np.full_like(image, 114)

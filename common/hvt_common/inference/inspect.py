@@ -118,7 +118,7 @@ def _classifier_text(classifier: OnnxClassifier) -> str:
 
 
 def _short(error: UserError) -> str:
-    """Without the ports and the accepted forms in brackets: the report shows the ports itself."""
+    # Without the ports and the accepted forms in brackets: the report shows the ports itself.
     return str(error).partition(": ")[2].partition(" (")[0] or str(error)
 
 

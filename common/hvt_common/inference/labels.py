@@ -125,7 +125,7 @@ def _written_names(text: str) -> tuple[str, ...] | None:
 
 
 def _unquoted(text: str) -> dict[str, str]:
-    """A table as YAML and others write it: ``{0: car, 1: bus}``. `ValueError` for anything else."""
+    # A table as YAML and others write it: ``{0: car, 1: bus}``. `ValueError` for anything else.
     pairs = [re.fullmatch(r"\s*(\d+)\s*[:=]\s*([^:=]+?)\s*", one) for one in text.strip("{}").split(",")]
     if not all(pairs):
         raise ValueError(text)

@@ -130,7 +130,7 @@ class Letterboxer:
 
 
 def _bits(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The same memory in a type that OpenCV knows."""
+    # The same memory in a type that OpenCV knows.
     return values.view(np.uint16) if values.dtype == np.float16 else values
 
 

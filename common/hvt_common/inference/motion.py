@@ -113,13 +113,13 @@ class MotionDetector:
         self._camera.reset()
 
     def _move_history(self, step: Affine) -> None:
-        """Chain the camera's last step onto the maps of all stored images."""
+        # Chain the camera's last step onto the maps of all stored images.
         moved = [(gray, _compose(step, affine)) for gray, affine in self._history]
         self._history.clear()
         self._history.extend(moved)
 
     def _objects(self, gray: _Gray) -> tuple[_Floats, _Floats]:
-        """Boxes (N, 4) in working pixels and confidences (N,) of at least the wanted confidence."""
+        # Boxes (N, 4) in working pixels and confidences (N,) of at least the wanted confidence.
         settings = self._settings
         if len(self._history) < settings.least_calls:
             return np.empty((0, 4)), np.empty(0)
@@ -135,7 +135,7 @@ class MotionDetector:
         return boxes[sure], confidences[sure]
 
     def _differences(self, gray: _Gray) -> tuple[_Gray, _Gray]:
-        """The second smallest and the lower median of the differences to the stored images, smoothed."""
+        # The second smallest and the lower median of the differences to the stored images, smoothed.
         rank = (len(self._history) - 1) // 2
         smallest = [np.full(gray.shape, 255, np.uint8) for _ in range(rank + 1)]
         for earlier, affine in self._history:
@@ -159,7 +159,7 @@ def _shrunk(image: Image, max_side_px: int) -> Image:
 
 
 def _tolerant_difference(gray: _Gray, earlier: _Gray, affine: Affine) -> _Gray:
-    """How far each pixel lies outside its 3x3 neighbourhood in the earlier image; 0 where that image has no view."""
+    # How far each pixel lies outside its 3x3 neighbourhood in the earlier image; 0 where that image has no view.
     height, width = gray.shape
     edge = np.array([[0, 0], [width, 0], [width, height], [0, height]]) + _INSET_PX
     moved = edge @ affine[:, :2].T + affine[:, 2]
@@ -176,7 +176,7 @@ def _tolerant_difference(gray: _Gray, earlier: _Gray, affine: Affine) -> _Gray:
 
 
 def _noise(difference: _Gray) -> float:
-    """Robust scale of the differences: median plus 1.4826 median absolute deviations, on every fourth pixel."""
+    # Robust scale of the differences: median plus 1.4826 median absolute deviations, on every fourth pixel.
     sample = difference[::4, ::4].astype(np.float32)
     median = np.median(sample)
     return float(median + 1.4826 * np.median(np.abs(sample - median)))
@@ -185,7 +185,7 @@ def _noise(difference: _Gray) -> float:
 def _regions(
     mask: _Gray, seeds: npt.NDArray[np.bool_], excess: npt.NDArray[np.float32], settings: MotionSettings
 ) -> tuple[_Floats, _Floats]:
-    """Boxes and confidences of possible objects; ``excess`` is the difference in units of the threshold."""
+    # Boxes and confidences of possible objects; ``excess`` is the difference in units of the threshold.
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (settings.join_px, settings.join_px))
     closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel), np.uint8)
     _, labels, found, _ = cv2.connectedComponentsWithStats(closed, connectivity=8, ltype=cv2.CV_16U)
@@ -207,7 +207,7 @@ def _regions(
 def _plausible(
     stats: npt.NDArray[np.int32], settings: MotionSettings, image_area_px: int
 ) -> npt.NDArray[np.bool_]:
-    """Which rows of OpenCV's component statistics (left, top, width, height, area) have the size of an object."""
+    # Which rows of OpenCV's component statistics (left, top, width, height, area) have the size of an object.
     shorter, longer = stats[:, 2:4].min(axis=1), stats[:, 2:4].max(axis=1)
     plausible = (stats[:, 4] >= settings.least_area_px) & (shorter >= settings.least_side_px)
     plausible &= (longer <= settings.largest_aspect * shorter) & (
@@ -218,12 +218,12 @@ def _plausible(
 
 
 def _confidence(excess: npt.NDArray[np.float32]) -> float:
-    """Grows with contrast and area: 1 - e^(-mean excess / 1.4), times area / (area + 50 px)."""
+    # Grows with contrast and area: 1 - e^(-mean excess / 1.4), times area / (area + 50 px).
     return float((1 - np.exp(-excess.mean() / 1.4)) * excess.size / (excess.size + 50))
 
 
 def _merged(boxes: _Floats, confidences: _Floats, *, near_share: float) -> tuple[_Floats, _Floats]:
-    """Join boxes that overlap by a third of the smaller one, both grown a little; repeated until none do."""
+    # Join boxes that overlap by a third of the smaller one, both grown a little; repeated until none do.
     while len(boxes) > 1:
         firsts, groups = np.unique(components(_overlapping(boxes, near_share)), return_inverse=True)
         count = len(firsts)
@@ -239,7 +239,7 @@ def _merged(boxes: _Floats, confidences: _Floats, *, near_share: float) -> tuple
 
 
 def _overlapping(boxes: _Floats, near_share: float) -> npt.NDArray[np.bool_]:
-    """(N, N): whether two boxes belong together."""
+    # (N, N): whether two boxes belong together.
     sides = boxes[:, 2:] - boxes[:, :2]
     reach = near_share * sides.min(axis=1)
     low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
@@ -250,5 +250,5 @@ def _overlapping(boxes: _Floats, near_share: float) -> npt.NDArray[np.bool_]:
 
 
 def _compose(second: Affine, first: Affine) -> Affine:
-    """The affine map that does ``first`` and then ``second``, all (2, 3)."""
+    # The affine map that does ``first`` and then ``second``, all (2, 3).
     return np.column_stack([second[:, :2] @ first[:, :2], second[:, :2] @ first[:, 2] + second[:, 2]])

@@ -48,7 +48,7 @@ def suppress(
 
 
 def _greedy(rects: npt.NDArray[np.float64], iou: float) -> npt.NDArray[np.intp]:
-    """Indices of the (N, 4) boxes x, y, width, height, best first, that no better one overlaps with more."""
+    # Indices of the (N, 4) boxes x, y, width, height, best first, that no better one overlaps with more.
     # Scores as ranks: OpenCV sorts again, and a strictly falling sequence leaves it no choice.
     ranks = np.arange(len(rects), 0, -1, dtype=np.float32)
     return np.asarray(cv2.dnn.NMSBoxes(rects, ranks, 0.0, iou), np.intp).reshape(-1)  # type: ignore[arg-type]

@@ -56,7 +56,7 @@ def prepared_as(path: Path, metadata: Mapping[str, str], usual: Preparation) -> 
 def _three_numbers(
     path: Path, metadata: Mapping[str, str], key: str, usual: tuple[float, float, float]
 ) -> tuple[float, float, float]:
-    """One number for all channels or three, separated by spaces or commas, with or without brackets."""
+    # One number for all channels or three, separated by spaces or commas, with or without brackets.
     if key not in metadata:
         return usual
     try:

@@ -64,7 +64,7 @@ def is_calibrated(spec: str, *, role: str) -> bool:
 
 
 def _metadata(spec: str, *, role: str) -> dict[str, str]:
-    """The metadata of a file; the motion detector and plug-ins have none."""
+    # The metadata of a file; the motion detector and plug-ins have none.
     if role == "detector" and (spec == MOTION or plug_in_of(spec) is not None):
         return {}
     path = resolve_model(spec, role=role, words=(MOTION, *plug_in_names()))

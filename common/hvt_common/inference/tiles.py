@@ -46,8 +46,6 @@ _ACROSS: Final = 0.7
 
 @runtime_checkable
 class _Sized(Protocol):
-    """A network: stateless, with a known input size for each picture."""
-
     def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]: ...
 
 
@@ -189,7 +187,7 @@ class TiledDetector:
 
 
 def _truncated(boxes: Boxes, tile: tuple[int, int, int, int], size: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """(N,) True for boxes that touch a border of the tile that is not one of the picture."""
+    # (N,) True for boxes that touch a border of the tile that is not one of the picture.
     x1, y1, x2, y2 = tile
     margin_x, margin_y = (max(1.0, _BORDER_SHARE * side) for side in (x2 - x1, y2 - y1))
     truncated = np.zeros(len(boxes), bool)
@@ -205,7 +203,7 @@ def _truncated(boxes: Boxes, tile: tuple[int, int, int, int], size: tuple[int, i
 
 
 def _merged(parts: list[Detections], truncated: npt.NDArray[np.bool_]) -> Detections:
-    """One list of several over the same pixels, best first."""
+    # One list of several over the same pixels, best first.
     boxes = np.concatenate([part.boxes_xyxy_px for part in parts])
     scores = np.concatenate([part.confidences for part in parts])
     class_ids = np.concatenate([part.class_ids for part in parts])
@@ -224,23 +222,20 @@ def _merged(parts: list[Detections], truncated: npt.NDArray[np.bool_]) -> Detect
 
 
 def _outermost(boxes: Boxes, class_ids: npt.NDArray[np.int32]) -> npt.NDArray[np.intp]:
-    """Of boxes, best first, those that do not lie in a better one of their class, nor hold one."""
+    # Of boxes, best first, those that do not lie in a better one of their class, nor hold one.
     inside = _shared_of_smaller(boxes, boxes) > _INSIDE
     inside &= class_ids[:, None] == class_ids[None, :]
     return _first_come(inside)
 
 
 def _uncovered(partial: Boxes, others: Boxes) -> npt.NDArray[np.intp]:
-    """Of truncated boxes, best first, those that neither the others nor a better one cover by half."""
+    # Of truncated boxes, best first, those that neither the others nor a better one cover by half.
     free = np.flatnonzero(~(_shared_of_smaller(partial, others) > _COVERED).any(axis=1))
     return free[_first_come(_shared_of_smaller(partial[free], partial[free]) > _COVERED)]
 
 
 def _joined(partial: Boxes, class_ids: npt.NDArray[np.int32]) -> tuple[Boxes, npt.NDArray[np.intp]]:
-    """Truncated boxes, best first, joined by object: (M, 4) boxes and (M,) index of the best part of each.
-
-    Parts of one object overlap where their tiles do, and agree in extent along the tile border.
-    """
+    # (M, 4) boxes and (M,) their best part. Parts of one object overlap where tiles do, and agree along the border.
     if not len(partial):
         return partial, np.empty(0, np.intp)
     a, b = partial[:, None, :], partial[None, :, :]
@@ -257,7 +252,7 @@ def _joined(partial: Boxes, class_ids: npt.NDArray[np.int32]) -> tuple[Boxes, np
 
 
 def _first_come(same: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-    """Indices that are the same object as no index chosen before them; ``same`` is (N, N)."""
+    # Indices that are the same object as no index chosen before them; ``same`` is (N, N).
     left = np.ones(len(same), bool)
     for index in range(len(same)):
         if left[index]:
@@ -266,7 +261,7 @@ def _first_come(same: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
 
 
 def _shared_of_smaller(a_xyxy: Boxes, b_xyxy: Boxes) -> npt.NDArray[np.float32]:
-    """(N, M) intersection over the smaller of two boxes."""
+    # (N, M) intersection over the smaller of two boxes.
     a, b = a_xyxy[:, None, :], b_xyxy[None, :, :]
     shared = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(
         -1

@@ -72,6 +72,6 @@ class ClockOffset:
 
 
 def _agree(one: _Sample, other: _Sample) -> bool:
-    """Whether some offset lies within the error of both, drift between them allowed for."""
+    # Whether some offset lies within the error of both, drift between them allowed for.
     drift_ns = _DRIFT_PPM * abs(other.at_ns - one.at_ns) // 1_000_000 + _ROUNDING_NS
     return 2 * abs(one.offset_ns - other.offset_ns) <= one.round_trip_ns + other.round_trip_ns + 2 * drift_ns

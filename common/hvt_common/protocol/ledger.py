@@ -254,7 +254,7 @@ class Ledger:
             self._windows.restart()
 
     def _release(self, *, before_ns: int) -> None:
-        """Pass on, in order of time, messages that no late one can precede any more."""
+        # Pass on, in order of time, messages that no late one can precede any more.
         ready = 0
         while ready < len(self._pending) and self._pending[ready][0] < before_ns:
             self._windows.add(*self._pending[ready])
@@ -267,7 +267,7 @@ _SUMS = (*(channel.value for channel in Account), "total")
 
 @dataclass(slots=True)
 class _Windows:
-    """Rolling sums over messages in order of time, and the largest of each."""
+    # Rolling sums over messages in order of time, and the largest of each.
 
     window_ns: int
     entries: deque[tuple[int, str, int]] = field(default_factory=deque)
@@ -313,5 +313,5 @@ def _ceil(amount: int, part: int) -> int:
 
 
 def _varint_bytes(number: int) -> int:
-    """Bytes that Zenoh's variable-length integer takes, seven bits each."""
+    # Bytes that Zenoh's variable-length integer takes, seven bits each.
     return max(1, _ceil(number.bit_length(), 7))

@@ -100,7 +100,7 @@ class Log:
         self._logger.critical("%s: %s", kind.__name__, error, exc_info=(kind, error, trace))
 
     def _write(self, level: int, message: str, **extra: Any) -> None:
-        """Write past the buffer."""
+        # Write past the buffer.
         record = self._logger.makeRecord(
             self._logger.name, level, __file__, 0, message, (), None, extra=extra
         )
@@ -108,7 +108,7 @@ class Log:
 
 
 class _HeldLog(logging.handlers.MemoryHandler):
-    """Buffers records until `say_on`; without it they are discarded."""
+    # Buffers records until `say_on`; without it they are discarded.
 
     target: logging.Handler
 
@@ -139,7 +139,7 @@ class _HeldLog(logging.handlers.MemoryHandler):
 
 
 def _with_fields(record: logging.LogRecord) -> bool:
-    """In the thread that logs: a line that is buffered may be written by another."""
+    # In the thread that logs: a line that is buffered may be written by another.
     record.hvt_fields = _fields.get()
     return True
 
@@ -154,7 +154,7 @@ class _TextFormatter(logging.Formatter):
 
 
 class _JsonFormatter(logging.Formatter):
-    """``time`` (ISO 8601, UTC), ``level``, ``program``, ``logger``, ``message``, the subject, ``traceback``."""
+    # ``time`` (ISO 8601, UTC), ``level``, ``program``, ``logger``, ``message``, the subject, ``traceback``.
 
     def __init__(self, program: str, fields: Mapping[str, str], redaction: Redaction) -> None:
         super().__init__()

@@ -146,7 +146,6 @@ class NewThreads:
 
 
 def _threads() -> set[str]:
-    """Of this process, where the system says them."""
     try:
         return {one.name for one in Path("/proc/self/task").iterdir()}
     except OSError:
@@ -154,7 +153,7 @@ def _threads() -> set[str]:
 
 
 def _cpu_ns(thread: str) -> int:
-    """Of a thread of this process (proc_pid_schedstat(5)); 0 where that is not known."""
+    # Of a thread of this process (proc_pid_schedstat(5)); 0 where that is not known.
     try:
         return int(Path(f"/proc/self/task/{thread}/schedstat").read_text(encoding="ascii").split()[0])
     except (OSError, ValueError, IndexError):

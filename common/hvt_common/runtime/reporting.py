@@ -84,7 +84,7 @@ class _Console(Console):
 
 @contextlib.contextmanager
 def _going_on(stream: TextIO) -> Iterator[None]:
-    """After a failed write, send the stream to /dev/null and go on."""
+    # After a failed write, send the stream to /dev/null and go on.
     try:
         yield
         if stream is not None:  # None where the process was started with the stream closed

@@ -62,7 +62,7 @@ class LatencyStats:
         return {name: None if value is None else round(value, 2) for name, value in values.items()}
 
     def _order_statistic(self, index: int, rank: int) -> float:
-        """The centre of a bin, except for the two order statistics that are known exactly."""
+        # The centre of a bin, except for the two order statistics that are known exactly.
         if rank == 0:
             return self._min_ms
         if rank == self._count - 1:
@@ -96,7 +96,7 @@ class DistinctIds:
 
 
 def _bin(latency_ms: float) -> int:
-    """Bin 0 holds 0…0.01 ms; bin i holds 0.01 · 1.01^(i-1) … 0.01 · 1.01^i; the last one all that is above."""
+    # Bin 0 holds 0…0.01 ms; bin i holds 0.01 · 1.01^(i-1) … 0.01 · 1.01^i; the last one all that is above.
     if latency_ms <= _LOWEST_MS:
         return 0
     return min(1 + int(math.log(latency_ms / _LOWEST_MS) / _LOG_RATIO), _BINS - 1)

@@ -78,12 +78,12 @@ def pair(similarity: _Floats, tracks: _Mask, free: _Mask, match: _Indices, *, li
 
 
 def _common_length(a_from: _Floats, a_to: _Floats, b_from: _Floats, b_to: _Floats) -> _Floats:
-    """(N, M) length that the intervals of a and b share on one axis."""
+    # (N, M) length that the intervals of a and b share on one axis.
     common = np.minimum.outer(a_to, b_to)
     common -= np.maximum.outer(a_from, b_from)
     return np.maximum(common, 0, out=common)
 
 
 def _areas(corners: _Floats) -> _Floats:
-    """(N,) areas of (4, N) corner rows."""
+    # (N,) areas of (4, N) corner rows.
     return np.asarray((corners[2] - corners[0]) * (corners[3] - corners[1]), np.float64)

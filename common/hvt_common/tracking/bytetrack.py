@@ -198,7 +198,6 @@ class ByteTracker:
         return replace(listed, started=np.zeros(len(listed), bool))
 
     def _advance(self, frame_index: int, image_bgr: Image | None, *, hold_unconfirmed: bool) -> None:
-        """Bring all states to this frame: Kalman steps, then the camera's motion."""
         if self._frame_index is not None and frame_index <= self._frame_index:
             raise ValueError(f"frame_index is {frame_index}, must be above the last one, {self._frame_index}")
         elapsed = 1 if self._frame_index is None else frame_index - self._frame_index
@@ -225,25 +224,17 @@ class ByteTracker:
             kalman.warp(table.states, affine)
 
     def _outdated(self, frame_index: int) -> bool:
-        """Whether the last update lies so far back that no track of it counts."""
         last = self._updated_index
         return last is not None and frame_index - last > self._longest_frames + 1
 
     @property
     def _lost_frames(self) -> int:
-        """How long a lost track is remembered now.
-
-        Where each look comes later than the buffer is long, nothing would be remembered from one to the next.
-        """
+        # Where each look comes later than the buffer is long, nothing would be remembered from one to the next.
         gap = max(self._gaps, default=1)
         return self._buffer_frames if gap <= self._buffer_frames + 1 else _LEAST_DETECTIONS * gap
 
     def _forget_stale(self, frame_index: int) -> None:
-        """Drop lost tracks whose time ran out between two updates; each has had one chance to be found, though.
-
-        The authors' program still matches a lost track up to ``buffer + 2`` frames after it was last seen, since
-        it sweeps out what it removes one update late. Counted in frames, the same holds at any rate of detection.
-        """
+        # The authors' program matches up to ``buffer + 2`` frames (it sweeps one update late): the same at any rate.
         table = self._table
         stale = (table.phase == LOST) & (frame_index - table.seen > self._lost_frames + 2)
         if stale.any():
@@ -256,19 +247,15 @@ class ByteTracker:
             self._table.widen(int(seen.class_ids.max()) + 1)
 
     def _growth(self, frame_index: int) -> float:
-        """By how many of their own lengths boxes grow on every side for a last match of what is left over.
-
-        Until its second detection a track has no velocity, and a small object is out of its own box within a few
-        frames: it would never be confirmed. Larger boxes as a later stage are the idea of C-BIoU (Yang et al.,
-        WACV 2023). To grow them at the first match already mixes up dense crowds.
-        """
+        # Before its second detection a track has no velocity, and a small object leaves its own box: never confirmed.
+        # Larger boxes are of C-BIoU (Yang et al., WACV 2023); at the first match they mix up dense crowds.
         if self._updated_index is None:
             return 0.0
         unsearched = frame_index - self._updated_index - 1
         return min(_MOST_GROWTH, self._settings.search_growth_per_s * unsearched / self._fps)
 
     def _match(self, seen: TrackerInput, frame_index: int, *, growth: float) -> tuple[_Indices, _Indices]:
-        """The detection of each track (-1: none), and the confident detections left that may start tracks."""
+        # The detection of each track (-1: none), and the confident detections left that may start tracks.
         settings, table = self._settings, self._table
         # A detection at exactly the threshold is neither confident nor weak in the authors' program.
         confident = seen.confidences > settings.track_confidence
@@ -294,7 +281,7 @@ class ByteTracker:
         return match, free.nonzero()[0]
 
     def _held(self, frame_index: int) -> _Floats:
-        """The last boxes, moved with the camera alone: meanwhile a vehicle may have stopped."""
+        # The last boxes, moved with the camera alone: meanwhile a vehicle may have stopped.
         states = self._table.states.copy()
         elapsed = (frame_index - self._table.seen)[:, None]
         states[:, kalman.POSITION] -= elapsed * states[:, kalman.VELOCITY]
@@ -304,7 +291,6 @@ class ByteTracker:
         return iou * seen.confidences if self._settings.fuse_scores else iou
 
     def _correct(self, seen: TrackerInput, match: _Indices, frame_index: int, *, gap: int) -> None:
-        """Take each matched detection into its track; ``gap`` frames after the update before."""
         table, settings = self._table, self._settings
         rows = (match >= 0).nonzero()[0]
         columns = match[rows]
@@ -323,7 +309,7 @@ class ByteTracker:
         table.votes[rows] = votes
 
     def _retire(self, match: _Indices, frame_index: int) -> _Mask:
-        """Mark unmatched tracks as lost; return which tracks live on."""
+        # Mark unmatched tracks as lost; return which tracks live on.
         table = self._table
         missed = match < 0
         over = (table.phase == LOST) & (frame_index - table.seen > self._lost_frames + 1)
@@ -347,7 +333,7 @@ class ByteTracker:
         self._table.append(born)
 
     def _duplicates(self, living: _Mask) -> _Mask:
-        """The younger one of each pair of a tracked and a lost track at the same place."""
+        # The younger one of each pair of a tracked and a lost track at the same place.
         table = self._table
         duplicate = np.zeros(len(table), bool)
         present = (living & (table.phase != LOST)).nonzero()[0]

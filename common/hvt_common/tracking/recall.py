@@ -87,5 +87,4 @@ def _share(counts: npt.NDArray[np.float64]) -> float:
 
 
 def _limited(share: float, *, before: float) -> float:
-    """The share as it counts, after it counted as so much ``before``."""
     return min(share, _MOST_SHARE) if share >= (_STILL_SHARE if before else _LEAST_SHARE) else 0.0

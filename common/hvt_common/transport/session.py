@@ -79,7 +79,7 @@ def open_session(settings: LinkSettings, *, failures: Failures | None = None) ->
 def _open_listening_later(
     config: zenoh.Config, listen: tuple[str, ...], why: str, failures: Failures, stop: threading.Event
 ) -> zenoh.Session:
-    """A session that listens as soon as it can; ``failures`` learns when."""
+    # A session that listens as soon as it can; ``failures`` learns when.
     retry = {"period_init_ms": 500, "period_max_ms": 500, "period_increase_factor": 1.0}
     for key, value in (("timeout_ms", -1), ("exit_on_failure", False), ("retry", retry)):
         config.insert_json5(f"listen/{key}", json.dumps(value))
@@ -101,7 +101,7 @@ def _open_listening_later(
 
 
 def _listening_ports() -> set[int]:
-    """Ports that this process listens on, from Linux: Zenoh does not say when its listener has come."""
+    # Ports that this process listens on, from Linux: Zenoh does not say when its listener has come.
     sockets = set()
     for one in Path("/proc/self/fd").iterdir():
         with suppress(OSError):  # closed meanwhile
@@ -258,7 +258,7 @@ def _open_failure(text: str, listen: tuple[str, ...], config: zenoh.Config) -> s
 
 
 def _close(session: zenoh.Session) -> None:
-    """Close without waiting for a link that is dead: Zenoh itself may take 10 s when its queue is stuck."""
+    # Close without waiting for a link that is dead: Zenoh itself may take 10 s when its queue is stuck.
 
     def close() -> None:
         try:

@@ -125,7 +125,6 @@ def key_pair(settings: LinkSettings) -> tuple[Path, Path] | None:
 
 
 def _read_config(path: Path | None) -> tuple[zenoh.Config, dict[str, Any]]:
-    """The user's file as Zenoh reads it, and as plain values."""
     import json5  # noqa: PLC0415 - settings alone need neither
     import zenoh  # noqa: PLC0415
 
@@ -155,7 +154,7 @@ def _read_config(path: Path | None) -> tuple[zenoh.Config, dict[str, Any]]:
 
 
 def _mentions(said: dict[str, Any], path: str) -> bool:
-    """Whether the user's file says anything at this path, or a value in place of one of its parents."""
+    # Whether the user's file says anything at this path, or a value in place of one of its parents.
     value: Any = said
     for part in path.split("/"):
         if not isinstance(value, dict):
@@ -167,7 +166,6 @@ def _mentions(said: dict[str, Any], path: str) -> bool:
 
 
 def _value(said: dict[str, Any], path: str) -> Any:
-    """The value in the user's file at this path; None for nothing."""
     value: Any = said
     for part in path.split("/"):
         value = value.get(part) if isinstance(value, dict) else None
@@ -175,7 +173,7 @@ def _value(said: dict[str, Any], path: str) -> Any:
 
 
 def _endpoints(said: dict[str, Any], side: str) -> tuple[str, ...]:
-    """The endpoints of a file: a list, or one list for each of Zenoh's modes."""
+    # The endpoints of a file: a list, or one list for each of Zenoh's modes.
     listed = _value(said, f"{side}/endpoints")
     groups = listed.values() if isinstance(listed, dict) else [listed]
     return tuple(str(endpoint) for group in groups if isinstance(group, list) for endpoint in group)
@@ -192,7 +190,7 @@ def _max_links(said: dict[str, Any]) -> int:
 
 
 def _split(endpoints: tuple[str, ...]) -> tuple[str, ...]:
-    """Each endpoint once for each range of priorities; one with metadata of its own, or no stream, stays as it is."""
+    # Each endpoint once for each range of priorities; one with metadata of its own, or no stream, stays as it is.
     split: list[str] = []
     for endpoint in endpoints:
         place, hash_sign, settings = endpoint.partition("#")
@@ -240,7 +238,7 @@ def _check_reach(endpoint: str, *, allowed: bool) -> None:
 
 
 def _has_keys(said: dict[str, Any], endpoint: str) -> bool:
-    """Whether whoever connects must show a certificate."""
+    # Whether whoever connects must show a certificate.
     return _value(said, "transport/link/tls/enable_mtls") is True and endpoint.startswith(("tls/", "quic/"))
 
 
@@ -256,7 +254,7 @@ def _located(text: str) -> tuple[str, str]:
 
 
 def _line_of(reason: str, text: str) -> str:
-    """``:LINE`` of the field or value that Zenoh's reason quotes, where it stands in the file only once."""
+    # ``:LINE`` of the field or value that Zenoh's reason quotes, where it stands in the file only once.
     found = re.search(r"`(\w+)`", reason)
     lines = [number for number, line in enumerate(text.splitlines(), 1) if found and found[1] in line]
     return f":{lines[0]}" if len(lines) == 1 else ""

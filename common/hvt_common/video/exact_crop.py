@@ -54,10 +54,7 @@ def _fixed(position_px: float) -> int:
 def _resampled(
     plane: Plane, down: tuple[int, int], across: tuple[int, int], size: tuple[int, int]
 ) -> _Floats:
-    """(H, W) float64 of whole numbers, 64 for a level, 0 to 255 levels.
-
-    All products and sums are whole numbers below 2^53, hence exact in whatever order they are taken.
-    """
+    # (H, W) whole numbers, 64 a level; all sums are below 2^53, hence exact in whatever order.
     top, rows, number_down = _weights(*down, count=size[1], length=plane.shape[0])
     left, columns, number_across = _weights(*across, count=size[0], length=plane.shape[1])
     part = plane[top : top + rows.shape[1], left : left + columns.shape[1]].astype(np.float64)
@@ -67,10 +64,7 @@ def _resampled(
 
 
 def _weights(origin: int, step: int, *, count: int, length: int) -> tuple[int, _Floats, int]:
-    """Of one axis: the first sample that is read, what each pixel takes of the samples from it on, and of how many.
-
-    The row of a pixel adds up to 2^17 times that number.
-    """
+    # First sample, each pixel's weights from it on (a row adds up to 2^17 times the count), and the count.
     number = max(1, -(-step // _ONE))
     index = np.arange(count * number, dtype=np.int64)
     middle = origin + (2 * index + 1) * step // (2 * number) - _ONE // 2

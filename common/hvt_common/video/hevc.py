@@ -127,6 +127,6 @@ class BaseDecoder:
 
 
 def _filled_px(size: tuple[int, int]) -> int:
-    """Samples of a picture of this size with whatever fills it up to whole blocks."""
+    # Samples of a picture of this size with whatever fills it up to whole blocks.
     width, height = (-(-side // _BLOCK_PX) * _BLOCK_PX for side in size)
     return width * height

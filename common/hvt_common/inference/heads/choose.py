@@ -58,13 +58,13 @@ def _named(trial: Trial, name: str, by: str) -> Head:
 
 
 def _says_rt_detr(trial: Trial) -> bool:
-    """Whether ``head``, or in older files ``description``, says RT-DETR, as Ultralytics writes it."""
+    # Whether ``head``, or in older files ``description``, says RT-DETR, as Ultralytics writes it.
     said = trial.metadata.get("head", "") + trial.metadata.get("description", "")
     return "rtdetr" in said.lower().replace("-", "")
 
 
 def _explains(trial: Trial, match: Match) -> bool:
-    """Whether every other output is the head's too: raw levels, or a second branch of the same shape."""
+    # Whether every other output is the head's too: raw levels, or a second branch of the same shape.
     if match.by_name:
         return True
     shapes = {trial.shape(index) for index in match.outputs}

@@ -169,7 +169,7 @@ def cell_grid(input_size: tuple[int, int], strides: Sequence[int]) -> tuple[Arra
 
 
 def _best(scores: Array, objectness: Array | None) -> tuple[Array, npt.NDArray[np.intp]]:
-    """(N,) best score of each row, times objectness, and (N,) its class."""
+    # (N,) best score of each row, times objectness, and (N,) its class.
     class_ids = scores.argmax(axis=1) if scores.shape[1] else np.zeros(len(scores), np.intp)
     best = scores[np.arange(len(scores)), class_ids]
     return (best if objectness is None else best * objectness), class_ids
@@ -190,7 +190,7 @@ def _pixels(boxes: Boxes, input_size: tuple[int, int]) -> Boxes:
 
 
 def _valid(boxes: Boxes, scores: Array, class_ids: npt.NDArray[Any], confidence: float) -> HeadOutput:
-    """Drop boxes that are not finite, have no area or too little confidence; a broken number is no detection."""
+    # Drop boxes that are not finite, have no area or too little confidence; a broken number is no detection.
     valid = np.isfinite(boxes).all(axis=1) & (scores >= confidence) & (scores <= 1.01)
     valid &= np.isfinite(class_ids) & (class_ids >= 0) & (class_ids < _MOST_CLASSES)
     valid &= (boxes[:, 2:] > boxes[:, :2]).all(axis=1)

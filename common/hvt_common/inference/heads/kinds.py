@@ -94,7 +94,7 @@ class Kind:
 
 
 def _tables(trial: Trial, columns: int | None = None) -> list[int]:
-    """Outputs (1, N, K), or (N, K) with so many columns."""
+    # Outputs (1, N, K), or (N, K) with so many columns.
     return [
         index
         for index in range(len(trial.ports))
@@ -111,7 +111,7 @@ def _only(found: list[int]) -> int | None:
 def _of_cells(
     trial: Trial, strides: tuple[tuple[int, ...], ...] = _STRIDES, *, times: int = 1
 ) -> list[tuple[int, tuple[int, ...]]]:
-    """Outputs (1, A, K) with a row for each cell, and the strides of the cells."""
+    # Outputs (1, A, K) with a row for each cell, and the strides of the cells.
     return [
         (index, one)
         for index in _tables(trial)
@@ -122,7 +122,7 @@ def _of_cells(
 
 
 def _is_listed(trial: Trial, index: int) -> bool:
-    """Whether the rows are objects: neither rows nor columns are cells."""
+    # Whether the rows are objects: neither rows nor columns are cells.
     counts = [anchor_count(trial.size, strides) for strides in _STRIDES]
     cells = {*counts, *(_ANCHORS_A_CELL * count for count in counts)}
     return cells.isdisjoint(trial.shape(index)[-2:])
@@ -143,7 +143,7 @@ def _yolox(trial: Trial) -> Match | None:
 
 
 def _with_objectness(trial: Trial, *, constant: bool) -> Match | None:
-    """(1, A, 5+C) in pixels; YOLOv6 has no objectness, and writes 1."""
+    # (1, A, 5+C) in pixels; YOLOv6 has no objectness, and writes 1.
     for index, strides in _of_cells(trial, _YOLOX_STRIDES):
         classes, table = trial.shape(index)[2] - 5, trial.table(index)
         if classes < 1 or not are_probabilities(table[:, 4:]) or _is_raw(trial, index, strides):
@@ -209,7 +209,7 @@ def _scores(trial: Trial, index: int) -> Array:
 
 
 def _is_raw(trial: Trial, index: int, strides: tuple[int, ...]) -> bool:
-    """Whether centres lie nearer to zero, counted in cells, than to their cells in pixels."""
+    # Whether centres lie nearer to zero, counted in cells, than to their cells in pixels.
     grid, stride = cell_grid(trial.size, strides)
     centres = rows_of(trial.runs[0][index].astype(np.float32))[:, :2]
     if float(np.abs(centres).max(initial=0)) == 0:
@@ -238,7 +238,7 @@ def _end_to_end(trial: Trial) -> Match | None:
 
 
 def _rt_detr_rows(trial: Trial) -> Match | None:
-    """(1, N, 6) or (1, N, 4+C), boxes by their centre; as Ultralytics exports RT-DETR."""
+    # (1, N, 6) or (1, N, 4+C), boxes by their centre; as Ultralytics exports RT-DETR.
     index = _only([one for one in _tables(trial) if trial.shape(one)[2] >= _LEAST_COLUMNS])
     if index is None or not _is_listed(trial, index):
         return None
@@ -254,7 +254,7 @@ def _rt_detr_rows(trial: Trial) -> Match | None:
 
 
 def _with_image(trial: Trial, *, score: int, kind: int) -> Match | None:
-    """(N, 7): image, x1 y1 x2 y2, and score and class in either order."""
+    # (N, 7): image, x1 y1 x2 y2, and score and class in either order.
     index = _only([one for one in _tables(trial, 7) if len(trial.shape(one)) == 2])
     if index is None:
         return None
@@ -282,18 +282,17 @@ def _is_score_and_class(trial: Trial, index: int) -> bool:
 
 
 def _shown(table: Array) -> Array:
-    """(N, 4) boxes of the rows that are not padding."""
+    # (N, 4) boxes of the rows that are not padding.
     boxes = table[:, :4]
     return boxes[np.isfinite(boxes).all(axis=1) & (boxes > 0).any(axis=1)]
 
 
 def _are_corners(boxes: Array) -> bool:
-    """Whether x1 y1 x2 y2 can be meant."""
     return bool((boxes[:, 2:] >= boxes[:, :2]).all() and (boxes[:, 2:] > boxes[:, :2]).any())
 
 
 def _shows_centres(boxes: Array) -> bool:
-    """Whether a centre, width and height are meant: shares of the input that cannot be corners."""
+    # Whether a centre, width and height are meant: shares of the input that cannot be corners.
     inside = float(np.abs(boxes).max(initial=0)) <= MOST_RELATIVE
     return bool(len(boxes) and inside and not _are_corners(boxes) and (boxes >= 0).all())
 
@@ -302,7 +301,7 @@ def _shows_centres(boxes: Array) -> bool:
 
 
 def _boxes_and_table(trial: Trial) -> tuple[int, int] | None:
-    """Outputs (1, N, 4) and (1, N, C); of several the last layer's, by DETR's names."""
+    # Outputs (1, N, 4) and (1, N, C); of several the last layer's, by DETR's names.
     tables = _tables(trial)
     pairs = [
         (boxes, scores)
@@ -408,7 +407,7 @@ def _atss(trial: Trial) -> Match | None:
 
 
 def _lists(trial: Trial, *, leave: int | None) -> tuple[int, int, int] | None:
-    """Outputs of boxes (…N, 4), scores (…N) and classes (…N); which is which is told by type, then by name."""
+    # Outputs of boxes (…N, 4), scores (…N) and classes (…N); which is which is told by type, then by name.
     rest = [index for index in range(len(trial.ports)) if index != leave]
     boxes = _only([i for i in rest if len(trial.shape(i)) in (2, 3) and trial.shape(i)[-1] == _BOX])
     if boxes is None:

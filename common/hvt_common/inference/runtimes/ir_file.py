@@ -63,7 +63,7 @@ def ir_metadata(path: Path) -> dict[str, str]:
 
 
 def _yaml_of_ultralytics(path: Path) -> dict[str, str]:
-    """Plain keys, and the table of names as a literal; empty where there is no such file."""
+    # Plain keys, and the table of names as a literal; empty where there is no such file.
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines() if path.is_file() else []
     except (OSError, UnicodeDecodeError):

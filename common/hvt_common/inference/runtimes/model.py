@@ -65,7 +65,7 @@ _ORT_ERRORS = (
 
 
 def _onnxruntime() -> ModuleType:
-    """Loaded with the first model: 20 MB that a flight of video alone does without."""
+    # Loaded with the first model: 20 MB that a flight of video alone does without.
     import onnxruntime  # noqa: PLC0415
 
     module: ModuleType = onnxruntime
@@ -74,11 +74,7 @@ def _onnxruntime() -> ModuleType:
 
 @cache
 def _shares_arena() -> bool:
-    """Whether all networks take their tensors from one arena that begins with one large piece.
-
-    From pieces that double from one network's first tensors on, a picture of 1100x720 takes 32 MB more. Memory that
-    nothing touches takes none.
-    """
+    # From pieces that double from the first tensors on, 1100x720 takes 32 MB more; untouched memory takes none.
     runtime = _onnxruntime()
     where = runtime.OrtMemoryInfo(
         "Cpu", runtime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, runtime.OrtMemType.DEFAULT
@@ -172,12 +168,8 @@ class OnnxModel:
 
 
 class _Background:
-    """Where one network is opened and runs: a thread of this niceness; 0: the caller's.
-
-    It has that after its first run: a start beside other programs waits for it. Where the network has ``workers`` of
-    its own it begins so, since they get the niceness of the thread that starts them. Whoever waits for the answer
-    keeps its own: what it computes with the interpreter's lock held may hold up video.
-    """
+    # A thread of this niceness (0: the caller's), taken after the first run, so that a start waits for no other
+    # program; with ``workers`` before it, since they inherit it. Who waits for the answer may hold up video.
 
     def __init__(self, niceness: int, *, workers: bool) -> None:
         self._niceness = niceness
@@ -199,8 +191,6 @@ class _Background:
 
 @dataclass(frozen=True, slots=True)
 class _InBackground:
-    """Another runner, there."""
-
     background: _Background
     runner: _Runner
 
@@ -260,7 +250,7 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
 
 
 def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
-    """An OpenVINO model, in float32 where the reference is requested."""
+    # An OpenVINO model, in float32 where the reference is requested.
     if settings.provider not in ("auto", "cpu", "openvino"):
         raise UserError(
             f"model {path} is OpenVINO's: --provider {settings.provider} cannot run it; openvino can"
@@ -284,11 +274,7 @@ def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
 
 
 def _quicker(openvino: OnnxModel, path: Path, settings: ModelSettings) -> OnnxModel:
-    """The model on OpenVINO, or on cpu where that is about as quick: its numbers are the finer ones.
-
-    No table could tell: the same network in bf16 takes two thirds of the time on one processor, half as much again on
-    another.
-    """
+    # On cpu where that is about as quick. No table could tell: bf16 takes 2/3 of the time here, 3/2 there.
     plain = _open(path, settings, ProviderChoice("cpu", "", explicit=False))
     shape = [
         size or free
@@ -306,7 +292,7 @@ def _quicker(openvino: OnnxModel, path: Path, settings: ModelSettings) -> OnnxMo
 
 
 def _seconds(model: OnnxModel, feed: npt.NDArray[Any]) -> Iterator[float]:
-    """The time of each of some runs, after one that may compile."""
+    # The time of each of some runs, after one that may compile.
     model.run(feed)
     for _ in range(_TRIALS):
         began_s = time.perf_counter()
@@ -335,7 +321,6 @@ def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxMo
 def _described(
     path: Path, session: ort.InferenceSession, runner: _Runner, choice: ProviderChoice
 ) -> OnnxModel:
-    """With the ports and metadata that onnxruntime finds."""
     return OnnxModel(
         path,
         inputs=tuple(map(_port, session.get_inputs())),
@@ -376,7 +361,6 @@ def _session(
 
 
 def _check_ports(path: Path, inputs: tuple[Port, ...], outputs: tuple[Port, ...]) -> None:
-    """Refuse a model whose ports are out of bounds."""
     for side, ports in (("inputs", inputs), ("outputs", outputs)):
         if not 1 <= len(ports) <= _MOST_PORTS:
             raise UserError(f"model {path} has {len(ports)} {side}; 1 to {_MOST_PORTS} are accepted")
@@ -396,7 +380,7 @@ def _port(value: Any) -> Port:
 
 
 def _cause(path: Path, error: Exception) -> str:
-    """Why onnxruntime does not open a file: the version found, the version supported here, and the remedy."""
+    # Why onnxruntime does not open a file: the version found, the version supported here, and the remedy.
     text = " ".join(str(error).split())
     try:
         (version, producer), opset = onnx_version(path), opset_versions(path).get("", 0)
@@ -441,7 +425,7 @@ _CAUSES: Mapping[str, str] = {
 
 
 def _reason(error: Exception) -> str:
-    """The first line of onnxruntime's message without its code prefix and its files, at most 300 characters."""
+    # The first line of onnxruntime's message without its code prefix and its files, at most 300 characters.
     lines = str(error).strip().splitlines()
     line = lines[0] if lines else type(error).__name__
     line = re.sub(r"^(\[ONNXRuntimeError\] : \d+ : \w+ : )?(/\S+:\d+ .*?\) )?", "", line)

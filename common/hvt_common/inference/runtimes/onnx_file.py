@@ -125,7 +125,7 @@ def _model_fields(data: _Bytes) -> Iterator[int]:
 
 
 def _external_location(data: _Bytes, start: int, end: int, kind: str, *, depth: int) -> str | None:
-    """Where the first tensor with data outside the file says that they are; None where there is none."""
+    # Where the first tensor with data outside the file says that they are; None where there is none.
     if depth > _DEEPEST:
         raise ValueError(f"messages nested {depth} deep")
     if kind == "Tensor":
@@ -153,7 +153,7 @@ def _tensor_location(data: _Bytes, start: int, end: int) -> str | None:
 
 
 def _opset(data: bytes) -> tuple[str, int]:
-    """Decode an OperatorSetIdProto: domain is field 1, version field 2."""
+    # Decode an OperatorSetIdProto: domain is field 1, version field 2.
     domain, version = "", 0
     for field, _, value, begin, end in _fields(data, 0, len(data)):
         if field == 1:
@@ -164,14 +164,14 @@ def _opset(data: bytes) -> tuple[str, int]:
 
 
 def _metadata_entry(data: bytes) -> tuple[str, str]:
-    """Decode a StringStringEntryProto: key is field 1, value field 2."""
+    # Decode a StringStringEntryProto: key is field 1, value field 2.
     entry = {field: data[begin:end] for field, _, _, begin, end in _fields(data, 0, len(data))}
     key, value = (entry.get(field, b"").decode(errors="replace") for field in (1, 2))
     return key, value
 
 
 def _fields(data: _Bytes, start: int, end: int) -> Iterator[tuple[int, int, int, int, int]]:
-    """Number, wire type, value (of a varint), begin and end of each field of a message; ValueError if malformed."""
+    # Number, wire type, value (of a varint), begin and end of each field of a message; ValueError if malformed.
     at = start
     while at < end:
         head = data[at : min(end, at + 20)]
@@ -195,7 +195,7 @@ def _fields(data: _Bytes, start: int, end: int) -> Iterator[tuple[int, int, int,
 
 
 def _varint(data: bytes, start: int) -> tuple[int, int]:
-    """Decode a protobuf varint: (value, position after it)."""
+    # Decode a protobuf varint: (value, position after it).
     value = 0
     for count, byte in enumerate(data[start : start + 10]):
         value |= (byte & 0x7F) << (7 * count)

@@ -114,10 +114,7 @@ def _port(value: Any) -> _Port:
 
 
 def _reason(error: Exception) -> str:
-    """The line of openvino's message that names the cause, at most 200 characters.
-
-    Operators that it does not know stand behind two dashes; of other messages the last line is the most telling.
-    """
+    # Unknown operators stand behind two dashes; of other messages the last line is the most telling.
     lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
     telling = [line.removeprefix("-- ") for line in lines if line.startswith("-- ")] or lines[-1:]
     return telling[0][:200]

@@ -93,7 +93,6 @@ def _one_try(url: str, part: Path, *, size_bytes: int, progress: Progress) -> No
 
 
 def _answer_failed(url: str, part: Path, error: urllib.error.HTTPError, *, offset: int) -> None:
-    """Say whether another try may help after an error status."""
     text = f"answers {error.code} {error.reason}"
     error.close()
     if error.code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE and offset:
@@ -105,7 +104,7 @@ def _answer_failed(url: str, part: Path, error: urllib.error.HTTPError, *, offse
 
 
 def _start_of(url: str, response: http.client.HTTPResponse, *, offset: int, size_bytes: int) -> int:
-    """The offset at which the answer begins; 0 where the server knows no ranges and sends the whole."""
+    # The offset at which the answer begins; 0 where the server knows no ranges and sends the whole.
     if response.status == http.client.PARTIAL_CONTENT:
         words = response.headers.get("Content-Range", "").removeprefix("bytes ").partition("/")
         total = int(words[2]) if words[2].isdecimal() else size_bytes

@@ -107,7 +107,7 @@ def _entry(name: str, table: Any, *, origin: str) -> ModelEntry:
 
 
 def _pin(name: str, table: Any, kind: type[PinnedFile], *, origin: str) -> dict[str, Any]:
-    """The fields of a `PinnedFile` out of a table that holds those of ``kind``."""
+    # The fields of a `PinnedFile` out of a table that holds those of ``kind``.
     known = {field.name for field in fields(kind)} - {"name"}
     if not isinstance(table, dict) or not {"size_bytes", "sha256"} <= table.keys() <= known:
         raise UserError(

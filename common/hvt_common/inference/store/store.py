@@ -142,7 +142,7 @@ class Store:
         before: int,
         pauses_s: Sequence[float],
     ) -> list[str] | None:
-        """None once the pinned file lies at ``path``; else why each address failed."""
+        # None once the pinned file lies at ``path``; else why each address failed.
         from hvt_common.inference.store.download import DownloadError  # noqa: PLC0415 - as above
 
         if path.exists() and not _what_is_wrong(path, file):
@@ -216,7 +216,7 @@ class Store:
         return parse_manifest(text, origin=str(file))
 
     def _note(self, entry: ModelEntry) -> None:
-        """Write ``entry`` into ``added.toml``, whole or not at all."""
+        # Write ``entry`` into ``added.toml``, whole or not at all.
         file = self.folder / _ADDED
         import tomli_w  # noqa: PLC0415 - as above
 
@@ -274,7 +274,7 @@ def _pin_of(file: Path) -> PinnedFile:
 
 
 def _what_is_wrong(path: Path, file: PinnedFile) -> str:
-    """Why this is not the pinned file, as half a sentence; empty where it is."""
+    # Why this is not the pinned file, as half a sentence; empty where it is.
     size_bytes = path.stat().st_size
     if size_bytes != file.size_bytes:
         return f"has {size_bytes} bytes, not the {file.size_bytes} that are pinned,"
@@ -287,7 +287,7 @@ def _what_is_wrong(path: Path, file: PinnedFile) -> str:
 def _from_address(
     url: str, part: Path, file: PinnedFile, *, progress: Callable[[int], None], pauses_s: Sequence[float]
 ) -> None:
-    """Bring ``part`` to the pinned file; `DownloadError` where this address does not give it."""
+    # Bring ``part`` to the pinned file; `DownloadError` where this address does not give it.
     from hvt_common.inference.store.download import DownloadError, download  # noqa: PLC0415 - as above
 
     went_on = part.exists()
@@ -311,7 +311,7 @@ def _copy_file(source: Path, target: Path) -> None:
 
 
 def _put_in_place(part: Path, path: Path) -> None:
-    """Give the whole file its name, in one step and for good."""
+    # Give the whole file its name, in one step and for good.
     try:
         with part.open("rb") as file:
             os.fsync(file.fileno())
@@ -321,11 +321,11 @@ def _put_in_place(part: Path, path: Path) -> None:
 
 
 def _table(entry: ModelEntry) -> dict[str, Any]:
-    """The entry as TOML knows it: without its name and without empty values."""
+    # The entry as TOML knows it: without its name and without empty values.
     return {key: value for key, value in _plain(asdict(entry)).items() if key != "name"}
 
 
 def _plain(table: dict[str, Any]) -> dict[str, Any]:
-    """Lists for tuples, and nothing that is empty, in tables in it too."""
+    # Lists for tuples, and nothing that is empty, in tables in it too.
     lists = {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
     return {key: _plain(value) if isinstance(value, dict) else value for key, value in lists.items() if value}

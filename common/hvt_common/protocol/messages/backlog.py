@@ -151,7 +151,7 @@ def parse_backlog_units(data: bytes) -> tuple[BacklogUnit, ...]:
 
 
 def _exact(kind: type[_T], values: Any) -> _T:
-    """Objects are as they were stored: no field came later, and none is missing."""
+    # Objects are as they were stored: no field came later, and none is missing.
     if type(values) is not list or len(values) != len(kinds(kind)):
         raise WireError(f"a {kind.__name__} that is not an array of {len(kinds(kind))}")
     return from_values(kind, values)

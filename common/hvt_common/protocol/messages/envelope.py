@@ -175,7 +175,7 @@ class PackedMessage:
 
 @cache
 def _packed_defaults(message: type) -> dict[int, bytes]:
-    """By the number of the field, of those that may be left out."""
+    # By the number of the field, of those that may be left out.
     return {
         number: _packed(item.metadata["wire"].encode(item.metadata["default"]))
         for number, item in enumerate(fields(message), 1)
@@ -207,7 +207,7 @@ def _packed(value: Any) -> bytes:
 
 
 def _unpack(data: bytes, name: str) -> list[Any]:
-    """The array in ``data``, its version not checked. Sizes inside are bounded by the length of ``data`` itself."""
+    # The array in ``data``, its version not checked. Sizes inside are bounded by the length of ``data`` itself.
     try:
         array = unpacked(data)
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
@@ -257,7 +257,6 @@ def from_values(message: type[_T], values: list[Any], version: int = WIRE_VERSIO
 
 
 def _too_deep(value: Any, levels: int) -> bool:
-    """Whether arrays and maps in it are nested deeper than so many levels."""
     if type(value) not in (list, dict):
         return False
     return levels < 0 or any(
@@ -267,7 +266,7 @@ def _too_deep(value: Any, levels: int) -> bool:
 
 @cache
 def _layout(message: type, version: int) -> tuple[tuple[tuple[str, Kind], ...], int, Mapping[str, Any]]:
-    """Of the messages of a version: their fields, how many of them the first had, and what the later fields are."""
+    # Of the messages of a version: their fields, how many of them the first had, and what the later fields are.
     there = [item for item in fields(message) if item.metadata["since"] <= version]
     later = {item.name: item.metadata["before"] for item in fields(message) if item not in there}
     table = tuple((item.name, item.metadata["wire"]) for item in there)

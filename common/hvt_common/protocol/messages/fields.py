@@ -393,7 +393,7 @@ def described(kind: dict[str, Any]) -> str:  # noqa: C901, PLR0911 - one return 
 
 
 def _range(low: int, high: int) -> str:
-    """Whole numbers of so many bits by the name that the page explains: ``u32`` is 0…(2^32 - 1)."""
+    # Whole numbers of so many bits by the name that the page explains: ``u32`` is 0…(2^32 - 1).
     bits = high.bit_length()
     if bits >= 32 and high == 2**bits - 1 and low in (0, -1, -high):
         return f"u{bits}" if low == 0 else f"u{bits} or −1" if low == -1 else f"±u{bits}"  # noqa: RUF001

@@ -50,8 +50,6 @@ class PoseReport(Message):
 
 @dataclass(frozen=True, slots=True)
 class _Number:
-    """One whole number of a sample: what it counts, its bounds, and how its change is coded."""
-
     low: int
     high: int
     order: int
@@ -93,8 +91,6 @@ _LEAST_ERROR, _ERROR_RATIO = 0.1, 2**0.5
 
 @dataclass(frozen=True, slots=True)
 class _Sample:
-    """A pose in whole numbers."""
-
     time_ms: int
     place: tuple[int, ...]
     """Latitude and longitude, 1e-7 degrees."""
@@ -235,7 +231,7 @@ def _read_whole(bits: BitReader) -> _Sample:
 def _changes(
     sample: _Sample, number: int, *, last: _Sample, step: tuple[int, ...]
 ) -> tuple[bytes, tuple[int, ...]]:
-    """The changes, as bytes; and the place's step, which the next report builds on."""
+    # The changes, as bytes; and the place's step, which the next report builds on.
     out = BitWriter()
     out.plain(0, 1)
     out.plain(number, 4)
@@ -292,5 +288,5 @@ def _checked(value: int, kind: _Number, name: str) -> int:
 
 
 def _error_step(value: float) -> int:
-    """The first step that is no less; the largest says: or more."""
+    # The first step that is no less; the largest says: or more.
     return next((step for step in range(31) if _LEAST_ERROR * _ERROR_RATIO**step >= value * (1 - 1e-9)), 31)

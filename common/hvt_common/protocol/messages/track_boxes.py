@@ -91,7 +91,7 @@ def read_tracks(data: bytes, *, reference: Sequence[CodedTrack] | None, frames: 
 
 
 class _Walk:
-    """The order in which a step's numbers come. ``wanted`` is None where they are read."""
+    # The order in which a step's numbers come. ``wanted`` is None where they are read.
 
     def __init__(self, coder: Coder, frames: int) -> None:
         self._coder = coder
@@ -156,7 +156,7 @@ class _Walk:
     def _shared_motion(
         self, reference: Sequence[CodedTrack], goals: Sequence[CodedTrack | None]
     ) -> tuple[int, int]:
-        """The camera's motion beyond the prediction: the median over all tracks."""
+        # The camera's motion beyond the prediction: the median over all tracks.
         off = [(0, 0)]
         pairs = [(track, goal) for track, goal in zip(reference, goals, strict=True) if goal is not None]
         if pairs:
@@ -193,7 +193,6 @@ class _Walk:
         )
 
     def _words(self, track: CodedTrack, goal: CodedTrack) -> tuple[int, int]:
-        """Class and confidence, where one of them has changed."""
         off = goal.confidence - track.confidence
         changed = goal.class_id != track.class_id or abs(off) >= _UNSURE
         if not self._coder.bit(self._changed, int(changed)):
@@ -210,14 +209,14 @@ class _Walk:
         return class_id
 
     def _faster(self, velocity: int, off: int) -> int:
-        """Take half of the prediction's error for a change of velocity."""
+        # Take half of the prediction's error for a change of velocity.
         changed = velocity + (off << _VELOCITY_BITS - 1) // self._frames
         return min(max(changed, -_FAST), _FAST)
 
     # Tracks that the reference does not have
 
     def _first_velocity(self, new: Sequence[CodedTrack] | None) -> tuple[int, int]:
-        """The median velocity, which a step without a reference sends in 1/64 of a pixel a frame."""
+        # The median velocity, which a step without a reference sends in 1/64 of a pixel a frame.
         x, y = _common_velocity(new or ())
         step = 1 << _VELOCITY_BITS - 2
         return (
@@ -228,7 +227,7 @@ class _Walk:
     def _born(
         self, before: CodedTrack, common: tuple[int, int], goal: CodedTrack | None, *, moving: bool
     ) -> CodedTrack:
-        """A new track; its numbers are coded as differences from the track ``before`` it."""
+        # A new track; its numbers are coded as differences from the track ``before`` it.
         coder, to = self._coder, goal or before
         track_id = (
             before.track_id + 1 + coder.unsigned(self._id, to.track_id - before.track_id - 1 if goal else 0)
@@ -262,7 +261,6 @@ class _Walk:
         )
 
     def _side_of(self, axis: int, scale: int, side: int, goal: int) -> tuple[int, int]:
-        """Step and side of a new box along one axis."""
         wanted = min(max((goal // _FINENESS).bit_length() - 1, 0), _COARSEST)
         scale += self._coder.signed(self._scale[axis], wanted - scale)
         if not 0 <= scale <= _COARSEST:
@@ -279,7 +277,7 @@ class _Walk:
 
 
 def _common_velocity(tracks: Iterable[CodedTrack]) -> tuple[int, int]:
-    """The median velocity of some tracks: that of the ground as the camera passes over it."""
+    # The median velocity of some tracks: that of the ground as the camera passes over it.
     velocities = [(track.velocity_x, track.velocity_y) for track in tracks]
     if not velocities:
         return 0, 0
@@ -287,7 +285,6 @@ def _common_velocity(tracks: Iterable[CodedTrack]) -> tuple[int, int]:
 
 
 def _nearest(value: int, step: int) -> int:
-    """How many steps are nearest to a value."""
     return (value + step // 2) // step
 
 

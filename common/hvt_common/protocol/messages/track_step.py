@@ -181,7 +181,7 @@ class TrackStepDecoder:
 
 
 def _quantised(tracks: Tracks, count: int) -> list[CodedTrack]:
-    """The ``count`` most confident tracks in whole numbers, ordered by id."""
+    # The ``count`` most confident tracks in whole numbers, ordered by id.
     best = np.sort(np.argsort(-tracks.confidences, kind="stable")[:count])
     boxes = tracks.boxes_xyxy_px[best].astype(np.float64)
     centre = np.rint((boxes[:, :2] + boxes[:, 2:]) * (PER_PX / 2)).astype(np.int64).tolist()

@@ -210,7 +210,7 @@ def _check_ca(path: Path) -> None:
 
 
 def _shown(pair: KeyPair, *, as_server: bool) -> dict[str, Any]:
-    """The pair shown in a handshake in memory to a side that trusts just this certificate, whatever the date."""
+    # The pair shown in a handshake in memory to a side that trusts just this certificate, whatever the date.
     server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname = False
     client.verify_mode = ssl.CERT_NONE

@@ -136,7 +136,6 @@ class LinkWatch:
                 next_visit_s, pause_s = time.monotonic() + pause_s, min(2 * pause_s, _LAST_PAUSE_S)
 
     def _check(self, now_s: float) -> bool:
-        """Whether there is a link; faults at its other end are reported."""
         with self._using:
             if self._stop.is_set():
                 return True
@@ -171,12 +170,12 @@ class LinkWatch:
         return [end for link in self._session.info.links() for end in _ends(link)]
 
     def _names(self, links: list[zenoh.Link]) -> dict[str, bool]:
-        """Who is at the other end of the links, each with whether it is a router."""
+        # Who is at the other end of the links, each with whether it is a router.
         routers = {str(zid) for zid in self._session.info.routers_zid()}
         return {link.auth_identifier: str(link.zid) in routers for link in links if link.auth_identifier}
 
     def _check_second_link(self, links: list[zenoh.Link], now_s: float) -> None:
-        """Zenoh does not reopen one link before all are lost, and says nothing of one that is refused."""
+        # Zenoh does not reopen one link before all are lost, and says nothing of one that is refused.
         if not self._is_halved(links):
             self._halved_s = None
         elif self._halved_s is None:
@@ -190,10 +189,7 @@ class LinkWatch:
             )
 
     def _is_halved(self, links: list[zenoh.Link]) -> bool:
-        """Whether one of two is missing: to a peer that has had two, or that we called twice.
-
-        One that called us, or that we call by another name than its address, may well have one only.
-        """
+        # One that called us, or that we call by another name than its address, may well have one link only.
         if not self._two_links:
             return False
         standing = Counter(str(link.zid) for link in links)
@@ -232,7 +228,6 @@ class LinkWatch:
         return not self._served(name)
 
     def _writes(self, name: str) -> bool:
-        """Whether an edge of that name may send here under its own id."""
         try:
             key = EdgeKeys(name).key(Channel.STATUS)
         except UserError:
@@ -284,5 +279,5 @@ def _ends(link: zenoh.Link) -> list[str]:
 
 
 def _bare(endpoint: str) -> str:
-    """Two links to one place by priority are one place."""
+    # Two links to one place by priority are one place.
     return endpoint.partition("#")[0].partition("?")[0]

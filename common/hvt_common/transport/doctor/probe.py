@@ -178,7 +178,7 @@ def _their_certificate(place: _Place, files: TlsFiles, error: ssl.SSLCertVerific
 
 
 def _shown_certificate(place: _Place, files: TlsFiles) -> Certificate | None:
-    """The other side's certificate, whatever its host and date say; it must be of our CA all the same."""
+    # The other side's certificate, whatever its host and date say; it must be of our CA all the same.
     context = _context(files)
     context.check_hostname = False
     context.verify_flags |= NO_CHECK_TIME
@@ -201,7 +201,6 @@ def _no_tls(place: _Place) -> str:
 
 
 def _alert(error: ssl.SSLError, files: TlsFiles) -> str:
-    """The other side's TLS alert as text; empty for none."""
     alert = (error.reason or "").partition("ALERT_")[2]
     if not alert:
         return ""
@@ -215,7 +214,7 @@ def _alert(error: ssl.SSLError, files: TlsFiles) -> str:
 
 
 def _context(files: TlsFiles) -> ssl.SSLContext:
-    """A TLS context like Zenoh's; UserError for files that have become unusable since the start."""
+    # A TLS context like Zenoh's; UserError for files that have become unusable since the start.
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = files.verify_name
     try:

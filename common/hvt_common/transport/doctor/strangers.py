@@ -90,7 +90,7 @@ def listening_ports(endpoints: Iterable[str]) -> set[int]:
 
 
 def _address(text: str) -> str:
-    """The kernel writes words of four bytes in the machine's own order."""
+    # The kernel writes words of four bytes in the machine's own order.
     words = [int(text[at : at + 8], 16) for at in range(0, len(text), 8)]
     address = ipaddress.ip_address(struct.pack(f"={len(words)}I", *words))
     if isinstance(address, ipaddress.IPv6Address):

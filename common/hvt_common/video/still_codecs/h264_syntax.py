@@ -113,7 +113,7 @@ def _header(kind: int, slice_type: int, picture_set: int, *, qp: int, deblocking
 
 
 def _deblocked(qp: int) -> bool:
-    """Whether x264 deblocks; below it the luma filter would do nothing."""
+    # Whether x264 deblocks; below it the luma filter would do nothing.
     return qp > 15
 
 

@@ -74,7 +74,7 @@ def jpeg_size(data: bytes) -> tuple[int, int]:
 
 
 def _check_scan(data: bytes, start: int, length: int, components: int) -> None:
-    """The scan whose header is at ``start`` must be of all components, and nothing but the end may follow."""
+    # The scan whose header is at ``start`` must be of all components, and nothing but the end may follow.
     if length != 6 + 2 * components or data[start + 2] != components:
         raise StillError(f"JPEG is not one scan of {components} components")
     end = _MARKER_IN_SCAN.search(data, start + length)
@@ -83,7 +83,7 @@ def _check_scan(data: bytes, start: int, length: int, components: int) -> None:
 
 
 def _frame_size(marker: int, header: bytes) -> tuple[tuple[int, int], int]:
-    """(width, height), and the number of components."""
+    # (width, height), and the number of components.
     if marker not in _SEQUENTIAL:
         raise StillError(f"JPEG of kind SOF{marker - 0xC0} is not accepted, only baseline and sequential")
     if len(header) < 6 or header[0] != 8 or header[5] not in (1, 3):

@@ -94,7 +94,6 @@ def _foreign(entry: EntryPoint) -> StillCodec:
 
 
 def _faults(name: str, codec: object) -> str | None:
-    """Reasons why it is no `StillCodec` of that name, as far as can be told without coding anything."""
     said = getattr(codec, "name", None)
     if said != name or not _NAME.fullmatch(name):
         return f"its name is {said!r}, and has to be the entry point's: [a-z0-9-], at most 24 characters"

@@ -82,16 +82,13 @@ def smallest_reaching(
 
 
 def _steps(codec: StillCodec, low_pct: int, high_pct: int) -> list[list[int]]:
-    """The qualities, those together that code alike: ``step_of`` of a codec says which, where it has it."""
+    # The qualities, those together that code alike: ``step_of`` of a codec says which, where it has it.
     step_of: Callable[[int], int] = getattr(codec, "step_of", lambda quality_pct: quality_pct)
     return [list(alike) for _, alike in itertools.groupby(range(low_pct, high_pct + 1), key=step_of)]
 
 
 def _first_above(value: Callable[[int], float], count: int, *, first: int, rise: float) -> int:
-    """The least place (0 … ``count`` - 1) with a value above 0, of values that rise; ``count`` where none is.
-
-    That place and the one before it were tried, where they are in the range.
-    """
+    # Of values that rise; ``count`` where none is above 0. That place and the one before it were tried.
     below, above = (-1, -math.inf), (count, math.inf)
     place, tries, last = first, 0, None
     while above[0] - below[0] > 1:

@@ -74,20 +74,20 @@ def filled_outside(planar: Planar, filling: Planar, *, size: tuple[int, int]) ->
 
 
 def _planes(planar: Planar) -> tuple[Planar, Planar, Planar]:
-    """Views of Y (H, W), Cb and Cr (H/2, W/2)."""
+    # Views of Y (H, W), Cb and Cr (H/2, W/2).
     wide, high = planar.shape[1], planar.shape[0] * 2 // 3
     chroma = planar[high:].reshape(2, high // 2, wide // 2)
     return planar[:high], chroma[0], chroma[1]
 
 
 def _bgr(luma: _Floats, chroma: list[_Floats]) -> _Floats:
-    """Whole levels, rounded half up."""
+    # Whole levels, rounded half up.
     samples = np.stack([16 * luma, *map(_enlarged, chroma)], axis=-1)
     return np.asarray(np.floor((cv2.transform(samples, _BACK) + 2**19) / 2**20), np.float64)
 
 
 def _enlarged(plane: _Floats) -> _Floats:
-    """16 times the plane in twice its width and height: 3 parts of the nearest sample, 1 of the next, both ways."""
+    # 16 times the plane in twice its width and height: 3 parts of the nearest sample, 1 of the next, both ways.
     for axis in (0, 1):
         plane = np.moveaxis(plane, axis, 0)
         padded = np.concatenate((plane[:1], plane, plane[-1:]))

@@ -109,7 +109,7 @@ def _box(kind: bytes, body: bytes) -> bytes:
 
 
 def _length(data: bytes, position: int) -> tuple[int, int]:
-    """Where the unit's body starts, and its length (leb128)."""
+    # Where the unit's body starts, and its length (leb128).
     value = 0
     for index, byte in enumerate(data[position : position + 4]):
         value |= (byte & 0x7F) << 7 * index

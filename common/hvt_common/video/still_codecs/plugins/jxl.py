@@ -84,7 +84,7 @@ def jxl_size(data: bytes) -> tuple[int, int]:
 
 
 class _Bits:
-    """Reads fields, least significant bit first."""
+    # Reads fields, least significant bit first.
 
     def __init__(self, data: bytes) -> None:
         self._left = int.from_bytes(data, "little")
