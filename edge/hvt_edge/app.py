@@ -192,7 +192,6 @@ class Edge:
         heartbeat: Heartbeat,
         line: StatusLine,
     ) -> None:
-        """Take one frame after the other; once a second report."""
         next_status_ns = restarts = 0
         self._counts.begin(source)
         with ExitStack() as stack:
@@ -231,7 +230,7 @@ class Edge:
             )
 
     def _step_pose(self, stages: Stages, frame: Frame | None) -> None:
-        """A slow machine plays a clip longer, and what it shows comes later."""
+        # A slow machine plays a clip longer, and what it shows comes later.
         if stages.pose is None or frame is None:
             return
         stages.pose.step(
@@ -270,7 +269,7 @@ class Edge:
         )
 
     def _wait_until(self, at_ns: int) -> None:
-        """Let the budget's window make room; media time needs no waiting."""
+        # Let the budget's window make room; media time needs no waiting.
         if not self._lockstep and (wait_ns := at_ns - self._world.clock()) > 0:
             self._stop.wait(wait_ns / SECOND_NS)
 
@@ -305,7 +304,7 @@ class Edge:
         )
 
     def _source_when_there(self) -> Source:
-        """Wait for a camera that starts after us; `FlightError` where we are stopped before."""
+        # Wait for a camera that starts after us; `FlightError` where we are stopped before.
         awaited = Awaited(partial(self._world.open_source, self._config), SOURCE_PART, self._failures)
         source = awaited.wait(self._stop)
         if source is None:
@@ -327,7 +326,6 @@ class Edge:
         return HealthServer(address, answers, name="--metrics", failures=self._failures)
 
     def _say_goodbye(self, stages: Stages, link: EdgeLink, status: StatusReporter) -> None:
-        """Say that this was all, and let the ground finish."""
         transmitter = stages.transmitter
         if stages.backlog is not None:
             stages.backlog.send_no_more()

@@ -507,7 +507,6 @@ def stream_text(config: EdgeConfig, size: tuple[int, int]) -> str:
 
 
 def _with_rates(config: EdgeConfig) -> EdgeConfig:
-    """Budget, share and depth where the method or the regime says them."""
     regime = REGIMES[config.regime or "low"]
     policy = method(config.method, **tuning(config.tune))
     share = regime.video_share if config.video_share is None else config.video_share
@@ -519,7 +518,6 @@ def _with_rates(config: EdgeConfig) -> EdgeConfig:
 
 
 def _check_passthrough(config: EdgeConfig) -> None:
-    """Refuse settings that the camera decides."""
     if config.size == AUTO:
         raise UserError(
             "--size auto is not accepted with --encoder passthrough, which sends the camera's own size: leave it out"

@@ -119,7 +119,7 @@ class StatusReporter:
             self._sequence += 1
 
     def _levers_text(self, levers: Levers) -> str:
-        """Where a lever was moved, and now and then: on a thin link a sentence a second is not free."""
+        # Where a lever was moved, and now and then: on a thin link a sentence a second is not free.
         sent = self._reported
         moved = sent is None or (levers.tracks, levers.stills) != (sent.tracks, sent.stills)
         if not levers.says or (not moved and self._sequence - self._reported_sequence < _LEVERS_REST):
@@ -128,10 +128,7 @@ class StatusReporter:
         return fitted_text(levers.says, _LEVERS_BYTES)
 
     def _status(self, state: EdgeState, levers: str, at_ns: int) -> Status:
-        """Totals, outcomes and health at ``at_ns``.
-
-        In lockstep no field depends on this machine's speed: the same input gives the same bytes.
-        """
+        # In lockstep no field depends on this machine's speed: the same input gives the same bytes.
         account = self.ledger.summary(state.duration_s)
         worst, frames, transmitter = account.worst_window_bps, state.frames, self.transmitter
         measured, reported_s = not state.lockstep, state.link.reported_s

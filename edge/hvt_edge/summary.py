@@ -127,7 +127,6 @@ def _failure(one: dict[str, Any]) -> str:
 
 
 def _too_slow(content: dict[str, Any]) -> list[tuple[str, str]]:
-    """The frames that the machine had no time for, and the cores that they would have needed."""
     rows = []
     if skipped := content["frames_unanalyzed"]:
         rows.append(("", f"{skipped} of {content['frames_captured']} frames not analyzed"))

@@ -127,7 +127,7 @@ class Backfill:
                 self._requested.add(one.session_id)
 
     def _late(self, key: ObjectKey, acknowledged_bytes: int) -> None:
-        """The ground had it after all when it was put aside."""
+        # The ground had it after all when it was put aside.
         entry = self._store.find(key)
         data = None if entry is None else self._store.read(entry)
         if entry is not None and data is not None and acknowledged_bytes == len(data):
@@ -214,7 +214,6 @@ class Backfill:
             transfer.sent_bytes = min(transfer.sent_bytes, chunk.offset)
 
     def _begin_again(self, before_ns: int, now_ns: int) -> None:
-        """Send again the objects on which the ground has made no progress for too long."""
         for key, transfer in list(self._line.items()):
             if self._store.find(key) is None:  # evicted meanwhile
                 self._leave(key)
@@ -243,7 +242,7 @@ class Backfill:
             self._refused.add(transfer.entry.key)
 
     def _current(self, now_ns: int) -> _Transfer | None:
-        """The object of which chunks are made now: one that is not all on its way, or the next one."""
+        # The object of which chunks are made now: one that is not all on its way, or the next one.
         for transfer in self._line.values():
             if transfer.sent_bytes < transfer.total_bytes:
                 self._in_hand = transfer.entry.key
@@ -261,7 +260,6 @@ class Backfill:
         return None
 
     def _open_entries(self) -> Iterator[Entry]:
-        """Those that may begin now, in their order."""
         for session_id in sorted(self._requested - self._informed):
             info = self._store.info_of(session_id)
             if info is None:
@@ -281,7 +279,7 @@ class Backfill:
                 yield info
 
     def _bytes_of(self, transfer: _Transfer) -> bytes | None:
-        """The object's bytes, read again where another was read since; None where they are gone."""
+        # The object's bytes, read again where another was read since; None where they are gone.
         key = transfer.entry.key
         if self._data is None or self._data[0] != key:
             data = self._store.read(transfer.entry)

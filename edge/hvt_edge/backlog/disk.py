@@ -359,7 +359,7 @@ class Store:
             return self._db
 
     def _writable(self) -> sqlite3.Connection:
-        """With this session's facts in it."""
+        # With this session's facts in it.
         if self._db is not None and not self._file.exists():
             self._lose()
             raise FileNotFoundError(errno.ENOENT, _REMOVED, str(self._file))
@@ -384,7 +384,7 @@ class Store:
         return db
 
     def _take_over(self, db: sqlite3.Connection) -> None:
-        """Take over the unexpired objects of earlier runs. A full disk refuses that, and can still be read."""
+        # Take over the unexpired objects of earlier runs. A full disk refuses that, and can still be read.
         with contextlib.suppress(sqlite3.OperationalError):
             db.executescript(_ADOPT)
             self._move_times(db)
@@ -406,7 +406,6 @@ class Store:
         self._evict_for(0, db)
 
     def _move_times(self, db: sqlite3.Connection) -> None:
-        """Move the times of earlier runs' objects to the present clock."""
         found = db.execute("SELECT capture_ns, boot, steady_ns FROM stored").fetchone()
         if found is None:  # a version that did not note it, if any
             (newest_ns,) = db.execute("SELECT max(capture_ns) FROM object WHERE kind <> 'info'").fetchone()
@@ -431,13 +430,12 @@ class Store:
                 db.close()
 
     def _lose(self) -> None:
-        """Forget all stored objects until they are found again."""
         self._disconnect()
         self._still_bytes = self._span_ns = self.disk_bytes = self.stills = self.segments = 0
 
     @contextlib.contextmanager
     def _disk(self) -> Iterator[None]:
-        """Errors of the database are errors of the disk; all but want of space end the connection."""
+        # Errors of the database are errors of the disk; all but want of space end the connection.
         try:
             yield
         except sqlite3.Error as error:
@@ -462,7 +460,7 @@ class Store:
 
 
 def _packed(parts: list[tuple[Any, ...]]) -> bytes:
-    """A segment's bytes; none where no ground would read its frames: somebody else has written them."""
+    # A segment's bytes; none where no ground would read its frames: somebody else has written them.
     units = [BacklogUnit(index, at_ns, bool(key), unit) for index, at_ns, key, unit in parts]
     try:
         packed = pack_backlog_units(units)

@@ -171,14 +171,13 @@ class BacklogStage:
         self.state = State.LIVE
 
     def _leave(self) -> None:
-        """The link has gone: messages in flight are stored first."""
+        # The link has gone: messages in flight are stored first.
         self._worker.intake.signal(interrupted=True)
         self._lose_in_flight()
         self._segment_ns = None
         self.state = State.OFFLINE
 
     def _lose_in_flight(self) -> None:
-        """Count everything as lost that no report has named."""
         units = self._in_flight.take()
         self.breaks += 1
         if (
@@ -218,13 +217,12 @@ class BacklogStage:
                 return
 
     def _unfinished(self) -> bool:
-        """Whether anything was admitted that may not have arrived."""
         stored = not (self._worker.intake.idle and self.numbers.empty)
         return bool(stored or self.state is not State.LIVE or self._unnamed)
 
     @property
     def _unnamed(self) -> bool:
-        """Whether something is not acknowledged, by a ground that does acknowledge."""
+        # Whether something is not acknowledged, by a ground that does acknowledge.
         return self._outage.reports and bool(len(self._in_flight) or self._link.stills_in_flight())
 
     def end_in_flight(self) -> None:

@@ -208,7 +208,7 @@ class StoreWorker:
             self._attempt(self._store.end_segment)
 
     def _attempt(self, do: Callable[[], None]) -> bool:
-        """Whether it was done; else nothing is stored until a trial succeeds."""
+        # Whether it was done; else nothing is stored until a trial succeeds.
         try:
             do()
         except OSError as error:
@@ -226,7 +226,7 @@ class StoreWorker:
         self._failures.failed(_PART, reason)
 
     def _attempt_sending(self, do: Callable[[], None]) -> None:
-        """If sending fails for another reason than the disk, the object in hand is set aside, and sending pauses."""
+        # If sending fails for another reason than the disk, the object in hand is set aside, and sending pauses.
         try:
             do()
         except OSError as error:

@@ -45,8 +45,6 @@ Arguments = Mapping[str, int | float | str]
 
 @dataclass(frozen=True, slots=True)
 class _Result:
-    """The answer to an accepted command beside yes."""
-
     still_request: int = -1
     frame_index: int = -1
     tracks: tuple[TrackNow, ...] = ()
@@ -199,14 +197,14 @@ class Commands:
             self.keyframes.require(self.loop_clock())
 
     def _share_for(self, video_only: bool) -> float | None:  # noqa: FBT001 - one caller
-        """The base's share for a method of that kind: all without stills, else the share at the edge's start."""
+        # The base's share for a method of that kind: all without stills, else the share at the edge's start.
         if video_only:
             return 1.0
         began = self.config
         return REGIMES["low"].video_share if method(began.method).video_only else began.fixed_share
 
     def _check_base(self, budget_bps: int, video_share: float | None) -> None:
-        """As `hvt_edge.config.check_rate`, in words for a remote client."""
+        # As `hvt_edge.config.check_rate`, in words for a remote client.
         config, size = self.config, self.base_size
         share = FIRST_SHARE if video_share is None else video_share
         least_bps, what = least_budget_bps(config, size, share=share), stream_text(config, size)
@@ -244,7 +242,7 @@ def _on_demand_request(arguments: Arguments) -> OnDemandRequest:
 
 
 class _Reader:
-    """Takes a command's arguments one by one; a remaining one is one too many."""
+    # Takes a command's arguments one by one; a remaining one is one too many.
 
     def __init__(self, command: str, arguments: Arguments) -> None:
         self._command = command

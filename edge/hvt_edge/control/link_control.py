@@ -130,7 +130,7 @@ class LinkControl:
             self.failures.works(_PART)
 
     def _apply(self, feedback: Feedback, *, now_ns: int) -> None:
-        """Whether the report counts is decided here, once."""
+        # Whether the report counts is decided here, once.
         sent = (self.transmitter.base_sequence, self.transmitter.still_sequence)
         report = self._primary.judge(feedback, sent=sent, now_ns=now_ns)
         self.keyframes.report_losses(feedback.receiver_id, feedback.lost + feedback.corrupt)

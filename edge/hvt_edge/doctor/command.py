@@ -74,7 +74,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 class _Checks:
-    """The checks in the order of the flight; later ones use what earlier ones have opened."""
+    # The checks in the order of the flight; later ones use what earlier ones have opened.
 
     def __init__(self, config: EdgeConfig) -> None:
         self._config = config
@@ -244,7 +244,7 @@ class _Checks:
         return check_link(settings, find_peer, other="ground")
 
     def _coded(self, encoder: Encoder) -> tuple[float, float]:
-        """(processor seconds a frame, frames a second) of it."""
+        # (processor seconds a frame, frames a second) of it.
         began_s, cpu_s = time.monotonic(), time.process_time()
         count = 0
         while time.monotonic() - began_s < _SAMPLE_S / 2:

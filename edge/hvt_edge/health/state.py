@@ -282,7 +282,7 @@ class StateMaker:
         )
 
     def _boxes_age_s(self) -> float | None:
-        """A source that gives no pictures makes no box older than its picture."""
+        # A source that gives no pictures makes no box older than its picture.
         newest_ns = self.loop_clock() if self.config.pace == "lockstep" else self.counts.newest_came_ns
         detected_ns = self.stills.analyzer.detected_ns
         if newest_ns is None or detected_ns is None:
@@ -290,7 +290,7 @@ class StateMaker:
         return max(0.0, (newest_ns - detected_ns) / SECOND_NS)
 
     def _usual_age_s(self) -> float:
-        """Twice the time between two detections, which wait for frames that are coded."""
+        # Twice the time between two detections, which wait for frames that are coded.
         frames = max(self.stills.analyzer.detect_every, self.operating.now.decimation)
         return max(_LEAST_OLD_S, 2 * frames / self.config.nominal_fps)
 
@@ -336,7 +336,7 @@ def _backlog(backlog: BacklogStage) -> BacklogState:
 
 
 def _free_bytes(folder: Path) -> int | None:
-    """Where it will be, before it is made."""
+    # Where it will be, before it is made.
     for path in (folder.absolute(), *folder.absolute().parents):
         try:
             return shutil.disk_usage(path).free

@@ -38,7 +38,7 @@ def _hottest_c(root: Path) -> float | None:
 
 
 def _wireless(path: Path) -> tuple[float | None, float | None]:
-    """Quality and level of the first interface (proc(5)): ``wlan0: 0000  54.  -56.  -256 …``."""
+    # Quality and level of the first interface (proc(5)): ``wlan0: 0000 54. -56. -256 …``.
     with contextlib.suppress(OSError, ValueError, IndexError):
         _, _, rest = path.read_text(encoding="ascii").splitlines()[_HEAD_LINES].partition(":")
         _, quality, level = (float(one) for one in rest.split()[:3])

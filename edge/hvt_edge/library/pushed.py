@@ -131,8 +131,6 @@ class _NothingPushed(Exception):  # noqa: N818 - an event
 
 
 class _PushGrabber:
-    """The newest frame that was pushed and not yet taken."""
-
     name = _NAME
     notes = None
 

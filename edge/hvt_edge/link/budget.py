@@ -110,7 +110,7 @@ class RollingBudget:
         self._loan = VideoLoan(self._loan_ns)
 
     def _adopt(self, settings: BudgetSettings) -> None:
-        """Take over settings with the same total and window; what the base did at another rate is forgotten."""
+        # Take over settings with the same total and window; what the base did at another rate is forgotten.
         self._settings = settings
         self._step_ns = round(SECOND_NS / settings.fps)
         steps = max(1, math.ceil(float(settings.window_ns) / self._step_ns - _ROUNDING))
@@ -249,7 +249,6 @@ class RollingBudget:
     def _first_fit_ns(
         self, events: Sequence[tuple[int, int]], limit: float, line_bytes: int, at_ns: int
     ) -> int:
-        """The first moment from ``at_ns`` at which the window of these events has room."""
         window_ns = self._settings.window_ns
         inside = [event for event in events if event[0] > at_ns - window_ns]
         held = sum(size for _, size in inside)
@@ -365,12 +364,12 @@ class RollingBudget:
         self._tokens_ns = now_ns
 
     def _peak_at(self, at_ns: int) -> float:
-        """The most base bytes that a window which ends then may hold."""
+        # The most base bytes that a window which ends then may hold.
         until_ns, old_peak = self._old_peak
         return max(old_peak, self._base_peak) if at_ns < until_ns else self._base_peak
 
     def _borrowable(self, now_ns: int) -> float:
-        """The part of B_v that neither the base nor a still has taken in the window that ends now."""
+        # The part of B_v that neither the base nor a still has taken in the window that ends now.
         settings = self._settings
         if not settings.borrow_unused or self._last_base_ns is None:
             return 0.0
@@ -386,19 +385,15 @@ class RollingBudget:
         return max(0.0, settings.base_bps * settings.window_ns / 8 / SECOND_NS - taken - borrowed)
 
     def _window_allowance(self, now_ns: int) -> float:
-        """The least room over every window that would contain a message sent now, beside base and metadata."""
+        # The least room over every window that would contain a message sent now, beside base and metadata.
         unspent, ahead_ns = self._unspent(now_ns)
         beside = self._settings.metadata_bps / 8 / SECOND_NS * ahead_ns
         return float((unspent - self._burst - beside).min())
 
     def _unspent(self, now_ns: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-        """The rest of each window that would contain a message sent now, and the end of that window.
-
-        The fullest windows end with a base frame. The one that ends with the ``k``-th from now holds the past bytes
-        younger than the window less the time until then, and ``k`` frames of the base to come, for each ``k`` of the
-        forecast. The first, of ``k`` = 0, ends now and also holds what was recorded for later: with it the room is
-        never more than any window has, whatever the base does.
-        """
+        # The fullest windows end with a base frame: the one with the ``k``-th from now holds past bytes younger than
+        # the window less the time until then, and ``k`` forecast frames. The first, ``k`` = 0, also holds what was
+        # recorded for later, so the room is never more than any window has.
         self._note_query(now_ns)
         due_ns = max(now_ns, (self._last_base_ns or now_ns - self._step_ns) + self._step_ns)
         # A hair later than due, so that by rounding no frame more falls into the window than its rate has.
@@ -411,7 +406,7 @@ class RollingBudget:
         return self._total - spent, ahead_ns
 
     def _recent_bursts(self) -> npt.NDArray[np.float64]:
-        """Bytes that ``k`` base frames in a row may take, for each ``k`` of the forecast."""
+        # Bytes that ``k`` base frames in a row may take, for each ``k`` of the forecast.
         upto = np.cumsum([0, *self._base_steps])
         most = self._forecasts.astype(np.float64) * self.base_step_bytes
         for index, count in enumerate(self._forecasts.tolist()):

@@ -57,10 +57,7 @@ class FeedbackInbox:
             self._changed.notify_all()
 
     def _note(self, result: StillResult) -> None:
-        """Keep a result that is news: one for each track of a still, and one that asks for the still again.
-
-        What one ground could not show another may have classified, so an opinion does not silence a request.
-        """
+        # What one ground could not show another may have classified: an opinion does not silence a request.
         sequence = result.still_sequence
         key = (sequence, -1 if result.again else result.track_id, result.again)
         if sequence > self._done_sequence and key not in self._known:

@@ -337,7 +337,7 @@ class Pacer:
             return now_ns - self._reported_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)
 
     def _give_up(self, now_ns: int, reported_ns: int) -> bool:
-        """Down to the least rate, where no report comes or none names anything; True where that is taken for lost."""
+        # Down to the least rate, where no report comes or none names anything; True where that is taken for lost.
         if now_ns - reported_ns > _SILENCE_NS:
             self._controller.on_silence(now_ns)
             return False
@@ -378,7 +378,7 @@ class Pacer:
         self._controller.forget_path()
 
     def _take_longer(self, sent: Sent, return_ns: int, now_ns: int) -> bool:
-        """Whether reports take longer than before, where one names what was given up; else that stood in a queue."""
+        # Whether reports take longer than before, where one names what was given up; else that stood in a queue.
         longer_ns = 0 if self._return.empty else return_ns - self._return_ns
         if longer_ns <= 0:
             return False

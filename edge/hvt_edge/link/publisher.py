@@ -208,7 +208,7 @@ class EdgeListener:
         return self._answered(Channel.CONTROL, lambda: self.control(request).pack())
 
     def _answered(self, channel: Channel, answer: Callable[[], bytes]) -> bytes | None:
-        """None where that fails: an error in Zenoh's thread would be nobody's."""
+        # None where that fails: an error in Zenoh's thread would be nobody's.
         try:
             data = self.reply(channel, answer())
         except Exception as error:  # noqa: BLE001 - see above

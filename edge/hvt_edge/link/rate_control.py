@@ -167,7 +167,7 @@ class LossCount:
         return lost / messages if messages else 0.0
 
     def _beyond(self, first: tuple[int, int]) -> int:
-        """1 where surely more than the share was lost since then, -1 where surely less, 0 where nobody can tell."""
+        # 1 where surely more than the share was lost since then, -1 where surely less, 0 where nobody can tell.
         messages, lost = self._since(first)
         if messages < _FEW_MESSAGES:
             return 0
@@ -281,7 +281,7 @@ class RateController:
         self._losses.clear()
 
     def _elapsed(self, now_ns: int) -> int:
-        """Time since the last report, bounded: one after a long pause is no reason for a leap."""
+        # Time since the last report, bounded: one after a long pause is no reason for a leap.
         step_ns = 0 if self._last_ns is None else min(max(0, now_ns - self._last_ns), 500 * _MS)
         self._last_ns = now_ns
         return step_ns
@@ -297,7 +297,7 @@ class RateController:
         return max(self._settings.excess_ns, round(2 * _MTU_BITS * SECOND_NS / self._rate))
 
     def _verdict(self) -> list[_Judged]:
-        """The newest judged reports, as few as suffice for a verdict; empty where there are too few."""
+        # The newest judged reports, as few as suffice for a verdict; empty where there are too few.
         chosen: list[_Judged] = []
         for one in reversed(self._recent):
             chosen.append(one)
@@ -316,7 +316,7 @@ class RateController:
         return chosen[-1].excess_ns >= chosen[0].excess_ns - limit_ns // 4  # it empties: wait
 
     def _arriving_bps(self) -> float:
-        """The arrival rate while the queue stood: the link's capacity."""
+        # The arrival rate while the queue stood: the link's capacity.
         chosen = self._verdict() or list(self._recent)
         return _arrival_bps(chosen[0].progress, chosen[-1].progress) or self._rate
 
@@ -356,7 +356,7 @@ class RateController:
         return self._cubic_max * (1 + self._settings.beyond_per_s3 * beyond_s**3)
 
     def _lately_bps(self) -> float:
-        """The arrival rate of about the last second; half the rate if that is not known yet."""
+        # The arrival rate of about the last second; half the rate if that is not known yet.
         last = first = self._recent[-1].progress
         for one in reversed(self._recent):
             first = one.progress
@@ -368,7 +368,7 @@ class RateController:
 
 
 def _arrival_bps(first: Progress, last: Progress) -> float:
-    """Line bits a second that arrived after the first and up to the last; 0 where no time passed."""
+    # Line bits a second that arrived after the first and up to the last; 0 where no time passed.
     span_ns = last.arrived_ns - first.arrived_ns
     return 0.0 if span_ns <= 0 else 8e9 * max(0, last.arrived_bytes - first.arrived_bytes) / span_ns
 

@@ -77,7 +77,7 @@ class PrimaryReceiver:
             self._receiver_id, self._sequence = None, -1
 
     def _begins(self, feedback: Feedback, sent: tuple[int, int], now_ns: int) -> bool | None:
-        """Whether the receiver begins (anew) with this report; None where it does not count."""
+        # Whether the receiver begins (anew) with this report; None where it does not count.
         if self._receiver_id is None:
             return True
         quiet_ns = now_ns - self._reported_ns

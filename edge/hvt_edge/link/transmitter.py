@@ -412,7 +412,7 @@ class Transmitter:
         before_frames: bool = False,
         last: bool = False,
     ) -> bool:
-        """Send what belongs to neither stream, if there is room; only the ``last`` message waits for it."""
+        # Send what belongs to neither stream, if there is room; only the ``last`` message waits for it.
         at_ns = now_ns
         with self._lock:
             if self._ended:
@@ -433,7 +433,6 @@ class Transmitter:
         return True
 
     def _still_at_ns(self, envelope: StillEnvelope, now_ns: int) -> int:
-        """When it may go: now, unless its allowance is gone."""
         header_bytes = self._header_at(envelope, now_ns).size_bytes
         line_bytes = self._line_bytes(
             Channel.ROI, envelope.still.data, header_bytes, encoding=envelope.encoding
@@ -447,7 +446,6 @@ class Transmitter:
         return envelope.header_at(send_ns, flags=self._flags, frame_sent=frame_sent)
 
     def _payload_bytes(self, line_bytes: int, attachment_bytes: int, media_type: str) -> int:
-        """The payload that so many line bytes leave for a still."""
         around = attachment_bytes + overhead_bytes(
             line_bytes, attachment_bytes, key=self._keys.key(Channel.ROI), encoding=media_type
         )
@@ -476,7 +474,6 @@ class Transmitter:
     def _line_bytes(
         self, channel: Channel, payload: bytes, attachment_bytes: int, *, encoding: str = ""
     ) -> int:
-        """Payload, attachment and transport overhead."""
         overhead = overhead_bytes(
             len(payload),
             attachment_bytes,

@@ -74,7 +74,6 @@ def _cores() -> set[int]:
 
 
 def _sample() -> _Sample | None:
-    """None where the system does not say."""
     names = {f"cpu{core}" for core in _cores()}
     try:
         rows = [line.split() for line in _STAT.read_text(encoding="ascii").splitlines()]

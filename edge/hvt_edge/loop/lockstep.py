@@ -119,7 +119,6 @@ class LockstepPace:
             self._in_flight.append((frame.index, coded_index, sent))
 
     def _wait_for_answers(self, *, before: int) -> None:
-        """Wait until the ground is done with the frames before this one, and take in its answers."""
         while self._in_flight and self._in_flight[0][0] < before:
             _, coded_index, sent = self._in_flight.popleft()
             if self._waits:
@@ -132,7 +131,7 @@ class LockstepPace:
         )
 
     def _answered(self, index: int, sent: set[int]) -> bool:
-        """Wait for the ground's answer to a frame and its stills; False where it is gone or never answers."""
+        # Wait for the ground's answer to a frame and its stills; False where it is gone or never answers.
         waited_s = unsubscribed_s = 0.0
         while not self.inbox.wait_for(frame_index=index, stills=sent, timeout_s=_POLL_S):
             waited_s += _POLL_S

@@ -125,10 +125,7 @@ class RealtimePace:
         self._worker.close()
 
     def _by_clip_clock(self, frame: Frame) -> Frame:
-        """The frame of a clip with the time at which it is due, which is later where the machine is too slow.
-
-        What the link took is made up for by dropping frames, at twice the speed of the clip.
-        """
+        # Later where the machine is too slow; what the link took is made up for at twice the clip's speed.
         now_ns = self.clock()
         self._link_late_ns = max(0, self._link_late_ns - (now_ns - self._sent_ns))
         late_ns = now_ns - frame.capture_ns - self.counts.paused_ns - self._link_late_ns
@@ -137,7 +134,7 @@ class RealtimePace:
         return replace(frame, capture_ns=frame.capture_ns + self.counts.paused_ns)
 
     def _in_time(self, frame: Frame) -> bool:
-        """Wait until the frame of a clip is due; False where it is so late that the next is due already."""
+        # Wait until the frame of a clip is due; False where it is so late that the next is due already.
         early_ns = frame.capture_ns - self.clock()
         if early_ns > 0:
             self.stop.wait(early_ns / SECOND_NS)

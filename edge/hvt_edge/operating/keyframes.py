@@ -163,7 +163,7 @@ class KeyframeRequests:
         return max(self.settings.refill_ns, round(self._keyframe_ns / self.settings.request_share))
 
     def _pay(self, now_ns: int, *, last_ns: int) -> str | None:
-        """Take a token; return why not, where there is none. After a loss nobody pays."""
+        # Take a token; return why not, where there is none. After a loss nobody pays.
         settings, cost_ns = self.settings, self._cost_ns
         if settings.refill_ns == 0 or (self._lossy and now_ns - last_ns >= settings.refill_ns):
             return None

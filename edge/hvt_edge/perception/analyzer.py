@@ -179,7 +179,7 @@ class Analyzer:
         return picture
 
     def _due(self, index: int, *, coded: bool) -> bool:
-        """Whether the detector is to run on this frame. By frame counts alone, never by a clock."""
+        # Whether the detector is to run on this frame. By frame counts alone, never by a clock.
         every, last = self._settings.detect_every, self._detected_index
         rested = last is None or index - last >= every
         since_coded = 0 if self._coded_index is None else index - self._coded_index
@@ -189,7 +189,7 @@ class Analyzer:
         return rested and sparse and self._settings.candidates == "source"
 
     def _detect(self, frame: Frame, base_bgr: Sequence[Image]) -> Detections | None:
-        """``base_bgr`` is the one decoded picture, where candidates are of that."""
+        # ``base_bgr`` is the one decoded picture, where candidates are of that.
         if self._settings.candidates == "decoded":
             assert base_bgr, "detection on the decoded stream is due on coded frames only"
             return self._detector.detect(base_bgr[0])

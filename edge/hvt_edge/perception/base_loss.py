@@ -54,7 +54,7 @@ def measure_loss(source_crop: Image, base_crop: Image) -> BaseLoss:
 
 
 def _detail(luma: cv2.typing.MatLike) -> cv2.typing.MatLike:
-    """The Laplacian, at the size at which it counts."""
+    # The Laplacian, at the size at which it counts.
     shrink = max(luma.shape[:2]) / _DETAIL_SIDE_PX
     if shrink > 1:
         size = (max(1, round(luma.shape[1] / shrink)), max(1, round(luma.shape[0] / shrink)))

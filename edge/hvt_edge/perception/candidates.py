@@ -293,13 +293,13 @@ class TrackMemory:
 
 
 def _picture(view: View) -> Box:
-    """Where the source lies inside the base frame, base pixels; letterbox borders are not picture."""
+    # Where the source lies inside the base frame, base pixels; letterbox borders are not picture.
     x1, y1, x2, y2 = view.to_base(np.array([[0, 0, *view.source_size]], np.float32))[0].tolist()
     return max(x1, 0.0), max(y1, 0.0), min(x2, float(view.base_size[0])), min(y2, float(view.base_size[1]))
 
 
 def _note_border(history: _History, box_base_px: Box, *, picture: Box, now_ns: int) -> tuple[bool, bool]:
-    """(touches the border, is leaving); a track leaves while less of it shows than at best since it touched."""
+    # (touches the border, is leaving); a track leaves while less of it shows than at best since it touched.
     low_x, low_y, high_x, high_y = picture
     x1, y1, x2, y2 = box_base_px
     near = _BORDER_PX
@@ -314,10 +314,7 @@ def _note_border(history: _History, box_base_px: Box, *, picture: Box, now_ns: i
 
 
 def _covered_shares(boxes_base_px: Boxes) -> list[float]:
-    """Of each box, the largest share that one other box covers which reaches lower down, hence stands in front.
-
-    Seen from straight above nothing is in front; boxes there hardly overlap either.
-    """
+    # By a box that reaches lower down, hence stands in front; from straight above boxes hardly overlap.
     if not len(boxes_base_px):
         return []
     x1, y1, x2, y2 = boxes_base_px.T
@@ -339,7 +336,7 @@ def _sharpness_of(source_bgr: Image, crop_source_px: tuple[int, int, int, int]) 
 def _loss_of(
     source_bgr: Image, base_bgr: Image, *, crop_source_px: tuple[int, int, int, int], view: View
 ) -> Callable[[], BaseLoss]:
-    """Measures the loss by coding, not by the size of the base: detectors there see its grid and no finer."""
+    # Measures the loss by coding, not by the size of the base: detectors there see its grid and no finer.
     x1, y1, x2, y2 = crop_source_px
     shrink = max(1.0, 1 / view.scale, max(x2 - x1, y2 - y1) / MAX_SIDE_PX)
     size = (max(1, round((x2 - x1) / shrink)), max(1, round((y2 - y1) / shrink)))

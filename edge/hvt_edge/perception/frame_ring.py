@@ -161,7 +161,7 @@ class FrameRing:
             return _nearest(frames, lambda one: abs(one.capture_ns - near.capture_ns))
 
     def _held(self, *, tracked: bool) -> Sequence[RingFrame]:
-        """All that may be requested, oldest first."""
+        # All that may be requested, oldest first.
         newest, frames = self._captured, self._frames
         near = (
             bool(frames) and newest is not None and newest.capture_ns - frames[-1].capture_ns <= _UNCODED_NS
@@ -174,7 +174,6 @@ class FrameRing:
         return max(one.frame_index for one in newest if one is not None)
 
     def _stands_for(self, uncoded: RingFrame) -> bool:
-        """Whether the frame before it is near, and was coded."""
         before = self._frames[-2] if len(self._frames) > 1 else None
         near = before is not None and uncoded.capture_ns - before.capture_ns <= _UNCODED_NS
         return before is not None and before.base is not None and near
@@ -187,7 +186,7 @@ class FrameRing:
             return (self._frames[-1].capture_ns - self._frames[0].capture_ns) / 1e9
 
     def _spacing_ns(self, frame: RingFrame) -> int:
-        """The least time between two frames on the grid, for them to reach back all the seconds."""
+        # The least time between two frames on the grid, for them to reach back all the seconds.
         count = self._settings.max_bytes // (frame.packed_bytes + frame.base_bytes)
         return self._settings.max_age_ns // max(1, count - 1)  # one more is about to grow too old
 
@@ -202,13 +201,13 @@ class FrameRing:
 
 
 def _nearest(frames: Sequence[RingFrame], distance_ns: Callable[[RingFrame], int]) -> RingFrame:
-    """The nearest of the frames that were coded, or of all where none of these is near."""
+    # The nearest of the frames that were coded, or of all where none of these is near.
     coded = [one for one in frames if one.base is not None and distance_ns(one) <= _UNCODED_NS]
     return min(coded or frames, key=distance_ns)
 
 
 def _reach_ns(frames: Sequence[RingFrame]) -> int:
-    """Half a gap before the oldest: what was requested lies nearer to it than to one that is gone."""
+    # Half a gap before the oldest: what was requested lies nearer to it than to one that is gone.
     first = frames[0].capture_ns
     gap_ns = frames[1].capture_ns - first if len(frames) > 1 else 0
     return first - gap_ns // 2

@@ -59,12 +59,12 @@ class SceneChange:
 
 
 def _alike(here: _Thumbnail, there: _Thumbnail) -> float:
-    """Correlation, less where one has far more contrast than the other: Lin's concordance, without means."""
+    # Correlation, less where one has far more contrast than the other: Lin's concordance, without means.
     energy = float(here @ here + there @ there)
     return 2 * float(here @ there) / energy if energy else 1.0
 
 
 def _thumbnail(image_bgr: Image) -> _Thumbnail:
-    """Fractions of a level: rounded means of thousands of pixels would be a flat scene's only contrast."""
+    # Fractions of a level: rounded means of thousands of pixels would be a flat scene's only contrast.
     halfway = cv2.resize(image_bgr, _HALFWAY_PX, interpolation=cv2.INTER_AREA).astype(np.float32)
     return np.asarray(cv2.resize(halfway, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA), np.float32).ravel()

@@ -149,7 +149,7 @@ class Shadow:
         )
 
     def _gain(self, share: float) -> float:
-        """The gain of F1 if only this share of the tracks' changes is true."""
+        # The gain of F1 if only this share of the tracks' changes is true.
         true = self.source_p + self.false_p
         if not true:
             return 0.0
@@ -245,7 +245,7 @@ class ShadowGround:
         return True
 
     def _forget(self) -> None:
-        """Another scene: measurements of the last one say nothing of it."""
+        # Another scene: measurements of the last one say nothing of it.
         self.scene_changes += 1
         self.now, self._last_ns, self._next_ns = UNMEASURED, None, 0
         self._difference.forget()
@@ -291,7 +291,7 @@ class ShadowGround:
         )
 
     def _base_only(self, found: Detections, rows: npt.NDArray[np.int64]) -> tuple[list[float], list[float]]:
-        """The probability that each of these base-only boxes is real, and those of the suppressed ones."""
+        # The probability that each of these base-only boxes is real, and those of the suppressed ones.
         base_only_p, suppressed_p = [], []
         for confidence, class_id in zip(
             found.confidences[rows].tolist(), found.class_ids[rows].tolist(), strict=True

@@ -113,7 +113,7 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
 
 
 def _text(content: bytes) -> str:
-    """In the encoding that its byte order mark says, else UTF-8; what is none is replaced, for it is no number."""
+    # In the encoding that its byte order mark says, else UTF-8; what is none is replaced, for it is no number.
     try:
         text = decoded(content)
     except UnicodeDecodeError:
@@ -122,10 +122,7 @@ def _text(content: bytes) -> str:
 
 
 def _good(rows: Iterable[_Values | UserError], path: Path) -> list[Pose]:
-    """The poses of the rows that hold; the others are counted in the log.
-
-    Raises the first `UserError` where as many are wrong as right: it is another file than it seems.
-    """
+    # Raises the first `UserError` where as many are wrong as right: it is another file than it seems.
     good: list[tuple[int, _Values]] = []
     wrong: list[UserError] = []
     for number, row in enumerate(rows, 1):
@@ -155,7 +152,7 @@ def _good(rows: Iterable[_Values | UserError], path: Path) -> list[Pose]:
 
 
 def _of_one_time(rows: list[_Values], path: Path) -> list[_Values]:
-    """Without UTC times that are days from most: of a receiver before its fix, or with another count of weeks."""
+    # Without UTC times that are days from most: of a receiver before its fix, or with another count of weeks.
     times = sorted(row["utc_s"] for row in rows if "utc_s" in row)
     if not times:
         return rows
@@ -179,7 +176,7 @@ def _of_one_time(rows: list[_Values], path: Path) -> list[_Values]:
 
 
 def _in_order(poses: list[Pose], path: Path) -> list[Pose]:
-    """Sort by time; of two of one time keep the first. `UserError` if no time rises."""
+    # Sort by time; of two of one time keep the first. `UserError` if no time rises.
     ordered = sorted(poses, key=lambda one: one.capture_ns)
     if ordered != poses:
         _log.warning("pose file %s is not in order of time: sorted", path)
@@ -201,7 +198,7 @@ def _in_order(poses: list[Pose], path: Path) -> list[Pose]:
 
 
 def _together(poses: list[Pose], path: Path) -> list[Pose]:
-    """Without single places that nothing that flies can reach from those around them in its time."""
+    # Without single places that nothing that flies can reach from those around them in its time.
     places = np.array([(one.latitude_deg, one.longitude_deg, one.capture_ns / SECOND_NS) for one in poses])
     good = np.zeros(len(poses), bool)
     for step in (1, 2):  # beside one that is wrong stands a good one
@@ -224,7 +221,6 @@ def _together(poses: list[Pose], path: Path) -> list[Pose]:
 
 
 def _check(row: _Values, path: Path, number: int) -> None:
-    """Raise `UserError` for a place that does not exist on earth."""
     for name, value in row.items():
         low, high = _BOUNDS.get(name, _ANY_TIME if name == "utc_s" else (-_FAR, _FAR))
         if not low <= value <= high:
@@ -251,7 +247,7 @@ def _pose(row: _Values, begin_s: float) -> Pose:
 
 
 def _orientation(row: _Values, prefix: str) -> Orientation | None:
-    """None where it is not known which way it points, or how far down; a roll that nobody says is none."""
+    # None where it is not known which way it points, or how far down; a roll that nobody says is none.
     yaw, pitch = row.get(f"{prefix}yaw_deg"), row.get(f"{prefix}pitch_deg")
     if yaw is None or pitch is None or yaw in _UNKNOWN_YAW:
         return None
@@ -293,7 +289,7 @@ def _table_row(line: Mapping[str, str | None], where: str) -> _Values:
 
 
 def _points(text: str, path: Path) -> list[ET.Element]:
-    """Of a track, else of a route, else waypoints; of a file that breaks off those that are whole."""
+    # Of a track, else of a route, else waypoints; of a file that breaks off those that are whole.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise UserError(f"pose file {path} declares a document type, which no GPS track has")
     points: dict[str, list[ET.Element]] = {}

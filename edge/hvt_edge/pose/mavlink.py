@@ -144,7 +144,7 @@ class MavlinkPose:
         return f" ({trouble})" if trouble else ""
 
     def _known(self, *, fresh: bool) -> dict[str, tuple[int, Any]]:
-        """Arrival and newest message by name of the present vehicle; with ``fresh`` only recent ones."""
+        # Arrival and newest message by name of the present vehicle; with ``fresh`` only recent ones.
         now_ns = self._clock()
         with self._lock:
             vehicle, newest = self._vehicle, dict(self._newest)
@@ -160,7 +160,6 @@ class MavlinkPose:
         return known
 
     def _watch_direction(self, camera: Orientation | None) -> None:
-        """Tell once of a camera of which nobody says where it points."""
         now_ns = self._clock()
         if camera is not None:
             self._placed_ns = None
@@ -201,7 +200,6 @@ class MavlinkPose:
                 self._vehicle = whose
 
     def _is_better(self, whose: tuple[int, int], now_ns: int) -> bool:
-        """Whether the place of this one counts from now on."""
         if self._vehicle is None:
             return True
         if not _has_place(self._of(whose, now_ns)):
@@ -219,12 +217,12 @@ class MavlinkPose:
 
 
 def _is_old(name: str, age_ns: int) -> bool:
-    """Receivers may report their fix less often than autopilots their place."""
+    # Receivers may report their fix less often than autopilots their place.
     return age_ns > (_OLD_FIX_NS if name in _FIXES else _OLD_NS)
 
 
 def _has_place(known: dict[str, Any]) -> bool:
-    """Whether a position is one: not where an autopilot without a fix believes to be."""
+    # Whether a position is one: not where an autopilot without a fix believes to be.
     place = known.get("GLOBAL_POSITION_INT")
     if place is None or max(abs(place.lat), abs(place.lon)) < _NOWHERE:
         return False
@@ -249,7 +247,7 @@ def _attitude(known: dict[str, Any]) -> Orientation | None:
 
 
 def _camera(known: dict[str, Any], platform: Orientation | None) -> Orientation | None:
-    """Where the gimbal points; None where its yaw is the platform's and that is not known."""
+    # Where the gimbal points; None where its yaw is the platform's and that is not known.
     device = known.get("GIMBAL_DEVICE_ATTITUDE_STATUS")
     euler = None if device is None else euler_deg(*device.q)
     if device is not None and euler is not None:
@@ -281,7 +279,7 @@ def _orientation(yaw: float, pitch: float, roll: float) -> Orientation | None:
 
 
 def _is_of_the_earth(flags: int) -> bool:
-    """Whether yaw counts from north: gimbals of before the two frame flags say so by their yaw lock (common.xml)."""
+    # Whether yaw counts from north: gimbals of before the two frame flags say so by their yaw lock (common.xml).
     return bool(flags & _YAW_IN_EARTH_FRAME or (not flags & _YAW_IN_VEHICLE_FRAME and flags & _YAW_LOCK))
 
 

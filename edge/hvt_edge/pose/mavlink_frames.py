@@ -37,7 +37,7 @@ class FrameParser:
 
 
 def _parsed(data: bytes) -> tuple[list[Any], bytes]:
-    """The messages in it, and the beginning of one that is not there as a whole."""
+    # The messages in it, and the beginning of one that is not there as a whole.
     parser = ardupilotmega.MAVLink(None)
     parser.robust_parsing = True
     try:

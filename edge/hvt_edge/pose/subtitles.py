@@ -131,7 +131,7 @@ def _latitude_first(places: Sequence[Sequence[tuple[float, str]]], note: Callabl
 
 
 def _numbers(text: str) -> list[tuple[float, str]]:
-    """(value, how it is written) of numbers between commas, with decimal points or decimal commas."""
+    # (value, how it is written) of numbers between commas, with decimal points or decimal commas.
     parts = re.split(r"\s*(?:,\s+|;)\s*", text.strip())
     if len(parts) < 2:
         parts = text.strip().split(",")

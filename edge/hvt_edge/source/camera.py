@@ -108,7 +108,7 @@ class CameraGrabber:
 
 
 def _levels(raw: npt.NDArray[Any], shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
-    """Sixteen-bit levels out of what OpenCV does not convert: the levels, or their bytes in a row."""
+    # Sixteen-bit levels out of what OpenCV does not convert: the levels, or their bytes in a row.
     count = 2 * math.prod(shape)
     data = np.ascontiguousarray(raw).view(np.uint8).reshape(-1)
     if data.size < count:

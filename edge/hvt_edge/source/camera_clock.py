@@ -49,7 +49,6 @@ class CameraClock:
         return self._last_ns
 
     def _ahead_ns(self, delay_ns: int, now_ns: int) -> int:
-        """The correction of the camera's time."""
         if self._delay_ns is not None and abs(delay_ns - self._delay_ns) > _STEP_NS:
             self._least_ns = self._former_ns = None  # one of the two clocks was set
         elif self._least_ns is not None and delay_ns - self._least_ns > _MOST_BEHIND_NS:

@@ -49,7 +49,7 @@ class CameraUnits:
         return CameraUnit(self._with_sets(data, nals), keyframe=True)
 
     def _with_sets(self, data: bytes, nals: list[bytes]) -> bytes:
-        """The keyframe with all its sets, in order: behind the delimiter, which is the first where there is one."""
+        # The keyframe with all its sets, in order: behind the delimiter, which is the first where there is one.
         if self._sets.keys() != PARAMETER_SETS:
             raise ValueError("a keyframe has no VPS, SPS and PPS, and none came before it")
         sets = b"".join(LONG_START + one for kind in sorted(self._sets) for one in self._sets[kind])
@@ -58,7 +58,6 @@ class CameraUnits:
         return LONG_START + nals[0] + sets + b"".join(LONG_START + one for one in nals[1:])
 
     def _note(self, nals: list[bytes]) -> None:
-        """The newest sets of each kind."""
         sets = [one for one in nals if nal_kind(one) in PARAMETER_SETS]
         if len(sets) > _MOST_SETS or any(len(one) > _MOST_SET_BYTES for one in sets):
             raise ValueError("there are more parameter sets, or longer ones, than a camera has")
@@ -67,7 +66,7 @@ class CameraUnits:
 
 
 def _hvcc(header: bytes) -> tuple[int, list[bytes]]:
-    """How many bytes a length has, and the parameter sets. `ValueError` for a header that breaks off."""
+    # How many bytes a length has, and the parameter sets. `ValueError` for a header that breaks off.
     if len(header) <= _HVCC_HEADER_BYTES:
         raise ValueError("the header of its HEVC stream breaks off")
     sets: list[bytes] = []
@@ -84,7 +83,7 @@ def _hvcc(header: bytes) -> tuple[int, list[bytes]]:
 
 
 def _split(packet: bytes, length_bytes: int) -> list[bytes]:
-    """NAL units of a packet with lengths. `ValueError` where they do not add up."""
+    # NAL units of a packet with lengths. `ValueError` where they do not add up.
     nals, at = [], 0
     while at < len(packet):
         begin = at + length_bytes

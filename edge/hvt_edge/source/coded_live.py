@@ -129,7 +129,7 @@ class CodedLiveSource(LiveSource):
             count += 1
 
     def _frame(self, item: _Queued, *, index: int) -> Frame | None:
-        """None where the unit cannot be sent: damaged, or of a picture of which units were missed."""
+        # None where the unit cannot be sent: damaged, or of a picture of which units were missed.
         decoder = item.packet.decoder
         decoded = decoder.decode(item.packet.data)
         if decoded is None:
@@ -163,7 +163,7 @@ class CodedLiveSource(LiveSource):
             self._news.notify_all()
 
     def _first_size(self, grabber: Grabber, size: BaseSize) -> tuple[int, int]:
-        """Look at the camera until its second keyframe."""
+        # Look at the camera until its second keyframe.
         assert isinstance(grabber, CodedStreamGrabber), "the constructor takes no other"
         seen: list[SeenUnit] = []
         began_s, trouble = time.monotonic(), "no keyframe came"

@@ -127,7 +127,7 @@ class CodedVideoSource(Source):
     def _timed(
         self, container: Any, stream: Any, *, say: bool = False
     ) -> Generator[tuple[float, bytes], None, None]:
-        """(seconds, packet) in order; a jump of the time stamps is mended, and told of in the log if ``say``."""
+        # (seconds, packet) in order; a jump of the time stamps is mended, and told of in the log if ``say``.
         timeline = self._stamps.timeline(stream)
         packets = container.demux(stream)
         while True:
@@ -144,7 +144,7 @@ class CodedVideoSource(Source):
 
 
 def _seen(packets: Iterator[tuple[float, bytes]], units: CameraUnits) -> list[SeenUnit]:
-    """Measure the bytes of the clip, without decoding it."""
+    # Measure the bytes of the clip, without decoding it.
     seen: list[SeenUnit] = []
     surveyed_s = before_s = 0.0
     for at_s, packet in packets:

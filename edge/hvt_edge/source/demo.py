@@ -147,7 +147,6 @@ class DemoSource(Source):
         return picture
 
     def _drop_pictures(self) -> None:
-        """Take the pictures that an earlier reader requested and left."""
         while self._pictures_due:
             self._picture()
 

@@ -41,7 +41,6 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def _gaps(files: list[Path]) -> str:
-    """A sentence on missing numbers where most follow each other; else empty."""
     found = [re.findall(r"[0-9]+", file.stem)[-1:] for file in files]
     numbers = [int(digits[0][-15:]) for digits in found if digits]
     steps = [later - earlier for earlier, later in pairwise(numbers)]
@@ -120,10 +119,7 @@ class FolderSource(Source):
 
 
 def _bgr(file: Path, stretch: Stretch, *, at_s: float) -> Image | None:
-    """The image as BGR, 8 bits; None if it cannot be read or decoded. ``at_s`` is when it is shown.
-
-    Deep grey is a sensor's levels.
-    """
+    # ``at_s`` is when it is shown. Deep grey is a sensor's levels.
     try:
         data = np.fromfile(file, np.uint8)
         if not data.size:

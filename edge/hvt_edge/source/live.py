@@ -165,7 +165,6 @@ class LiveSource(Source):
             _log.warning("%s did not answer within %g s and is left behind", self._grabber.name, _JOIN_S)
 
     def _first_size(self, grabber: Grabber, size: BaseSize) -> tuple[int, int]:
-        """(width, height) of the source, from its first picture."""
         del size
         first = grabber.grab().image()
         return first.shape[1], first.shape[0]
@@ -191,7 +190,7 @@ class LiveSource(Source):
             self._end()
 
     def _take(self, shot: Shot, capture_ns: int, *, jitter_ns: int) -> None:
-        """A frame has come (the reader's thread); those of the last ``jitter_ns`` may have come with it."""
+        # A frame has come (the reader's thread); those of the last ``jitter_ns`` may have come with it.
         if not self._gate.accept(capture_ns):
             self.missed += shot.missed
             self.passed_over += 1
@@ -206,7 +205,7 @@ class LiveSource(Source):
         self._failures.works(SOURCE_PART)
 
     def _recover(self, error: Exception) -> None:
-        """Open the grabber again, waiting twice as long after each failure; returns when it is open or we stop."""
+        # Open the grabber again, waiting twice as long after each failure; returns when it is open or we stop.
         while not self._stop.is_set():  # what stops because it is closed has not failed
             reason = str(error) if isinstance(error, SignalLost) else reason_of(error)
             self._pause.failed(self._clock())

@@ -92,10 +92,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
 
 
 def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
-    """Raise `UserError` for a scheme that is not known, or a file or folder that does not exist.
-
-    A file that another program writes may be yet to come: `NotYetError`.
-    """
+    # A file that another program writes may be yet to come: `NotYetError`.
     if scheme:
         known = scheme if re.fullmatch(r"[a-z][a-z0-9+.-]{0,15}", scheme) else HIDDEN
         raise UserError(f"source {shown(spec)!r} has the unknown scheme {known!r}; accepted is {_ACCEPTED}")
@@ -117,7 +114,7 @@ def _is_there(spec: str) -> bool:
 
 
 def _check_coded(spec: str) -> None:
-    """Raise `UserError` for anything but coded video; whether it is HEVC is checked when it is open."""
+    # Raise `UserError` for anything but coded video; whether it is HEVC is checked when it is open.
     kinds = (
         ("the drawn demo", is_demo(spec)),
         ("a device", spec.startswith("/dev/")),

@@ -163,7 +163,7 @@ def _cropped(source: Image, view: View) -> Image:
 
 
 def _scaled(picture: Image, size: tuple[int, int]) -> Image:
-    """Averaged when it shrinks, so that nothing aliases; cubic when it grows."""
+    # Averaged when it shrinks, so that nothing aliases; cubic when it grows.
     high, wide = picture.shape[:2]
     if (wide, high) == size:
         return np.ascontiguousarray(picture)

@@ -111,7 +111,7 @@ class StreamGrabber:
         self._container, self._shots = container, shots
 
     def _read(self, container: Any, stream: Any) -> Iterator[Shot]:
-        """Read from now on; raises UserError if the stream is refused."""
+        # Read from now on; raises UserError if the stream is refused.
         stream.thread_type = "SLICE"
         self._pictures.begin(stream)
         return _decoded(container, stream, self._pictures)
@@ -123,11 +123,7 @@ def is_stamped(container: Any) -> bool:
 
 
 def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
-    """Frames, each with its time by the camera's clock.
-
-    What does not decode is left out: a stream that is joined between two keyframes, or has lost packets. Raises
-    FFmpeg's error where nothing else has come for ten seconds.
-    """
+    # Undecodable packets are left out: joined between keyframes, or losses. FFmpeg's error after ten seconds of them.
     times: dict[Fraction, int] = {}
     whole_s, stamped = time.monotonic(), is_stamped(container)
     for packet in container.demux(stream):
@@ -188,7 +184,7 @@ def _open(url: str, *, open_s: float) -> Any:
 
 
 def _pictures_of(container: Any) -> Any:
-    """The same, if it holds pictures; raises `OSError` where anything else was taken for some."""
+    # The same, if it holds pictures; raises `OSError` where anything else was taken for some.
     codec = next(iter(container.streams.video)).codec_context
     if codec.width and codec.height:
         return container
@@ -197,7 +193,7 @@ def _pictures_of(container: Any) -> Any:
 
 
 def _spelt(url: str) -> str:
-    """How to spell it where a password is likely to have been taken for something else; empty where it is not."""
+    # How to spell it where a password is likely to have been taken for something else; empty where it is not.
     body = url.partition("://")[2]
     odd = set("/?#[]") & set(body.rpartition("@")[0])
     if not odd:

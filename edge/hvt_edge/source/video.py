@@ -127,7 +127,7 @@ class VideoSource(Source):
     def _shown(
         self, frames: Iterable[tuple[Fraction, av.VideoFrame]]
     ) -> Iterator[tuple[Fraction, av.VideoFrame]]:
-        """Without combs; such a frame comes when the next has been seen, and keeps its time."""
+        # Without combs; such a frame comes when the next has been seen, and keeps its time.
         times: deque[Fraction] = deque()
         for at_s, frame in frames:
             times.append(at_s)
@@ -137,7 +137,6 @@ class VideoSource(Source):
             yield times.popleft(), whole
 
     def _about_times(self, stream: Any) -> Iterator[str]:
-        """The decisions about its times, and their reasons."""
         fps = float(1 / self._stamps.period_s)
         if self._override is not None:
             return

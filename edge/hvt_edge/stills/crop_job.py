@@ -152,7 +152,7 @@ def inner_box(box_source_px: Box, crop_px: Crop, size: tuple[int, int]) -> Place
 
 
 def _errors(image: Image, crop: Image, places: tuple[Place, ...]) -> tuple[float, ...]:
-    """Sums of squared differences: colour and luma, over the crop and over each box in it."""
+    # Sums of squared differences: colour and luma, over the crop and over each box in it.
     # Luma of the difference, not difference of the lumas: rounded to bytes these would be off by up to 5 %.
     colour = cv2.subtract(image, crop, dtype=cv2.CV_32F)
     luma = cv2.transform(colour, _BT601)

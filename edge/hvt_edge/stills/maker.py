@@ -166,7 +166,6 @@ class StillMaker:
     def _fitted(
         self, codec: StillCodec, job: CropJob, header: Still, allowance: Allowance
     ) -> tuple[Still, _Fitted] | NoStill:
-        """Code as requested, with this codec, or the best below that is allowed."""
         header = _of_codec(header, codec)
         limit_bytes = allowance(header)
         for _ in range(_TRIES):
@@ -181,7 +180,7 @@ class StillMaker:
         return NoStill("too_large")
 
     def _cheaper(self, built: Still, fitted: _Fitted, job: CropJob, header: Still) -> Still | None:
-        """The fallback's still, where it shows no less than the one built on the base, in fewer bytes."""
+        # The fallback's still, where it shows no less than the one built on the base, in fewer bytes.
         codec = self.without_base
         smaller = _reaching(codec, job, psnr_y_db(fitted.shown_bgr, job.crop_bgr))
         if smaller is None or len(smaller.data) >= len(built.data) or not _beats_base(smaller, job):
@@ -191,7 +190,7 @@ class StillMaker:
         return _filled(_of_codec(header, codec), smaller)
 
     def _best(self, codec: StillCodec, job: CropJob, limit_bytes: int) -> _Fitted | NoStill:
-        """The requested fidelity or quality, or the best below that fits; then upwards until the base is beaten."""
+        # The requested fidelity or quality, or the best below that fits; then upwards until the base is beaten.
         if limit_bytes < self.least_bytes:
             return NoStill("too_large")
         fitted = _reaching(codec, job, self.fidelity_db) if self.fidelity_db else None
@@ -216,7 +215,6 @@ class StillMaker:
     def _best_fitting(
         self, codec: StillCodec, job: CropJob, limit_bytes: int, *, below_pct: int
     ) -> _Fitted | None:
-        """The best quality from the floor to below the requested one that fits."""
         found = best_fitting(
             codec,
             job.crop_bgr,
@@ -229,7 +227,6 @@ class StillMaker:
 
 
 def _reaching(codec: StillCodec, job: CropJob, psnr_db: float) -> _Fitted | None:
-    """The lowest quality that comes this near to the source; None where none does."""
     found = smallest_reaching(
         codec,
         job.crop_bgr,

@@ -68,7 +68,7 @@ def group(
 
 @dataclass(slots=True)
 class _Board:
-    """Stills under way: row ``i`` is the still that request ``i`` leads, until another takes it in."""
+    # Stills under way: row ``i`` is the still that request ``i`` leads, until another takes it in.
 
     cost: CostEstimate
     overhead_bytes: float
@@ -137,7 +137,7 @@ class _Board:
         return replace(lead, also=also, score=score), others
 
     def _savings(self, row: int) -> npt.NDArray[np.float64]:
-        """(N,) line bytes saved by joining this still with each other one; -inf where that may not be."""
+        # (N,) line bytes saved by joining this still with each other one; -inf where that may not be.
         low = np.minimum(self.crops[:, :2], self.crops[row, :2])
         high = np.maximum(self.crops[:, 2:], self.crops[row, 2:])
         sides = high - low

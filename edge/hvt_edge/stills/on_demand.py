@@ -205,7 +205,7 @@ class OnDemand:
         return None
 
     def _code_anew(self, pending: OnDemandStill, most_bytes: int, *, now_ns: int) -> bool:
-        """Code it for what may be carried; False where there is none, and its requester is told why."""
+        # Code it for what may be carried; False where there is none, and its requester is told why.
         codec, job = self._maker.without_base, pending.crop
         height, width = job.crop_bgr.shape[:2]
         expected = CostModel.of_codec(codec.name).estimate().of_px(width * height)
@@ -256,7 +256,7 @@ class OnDemand:
         self._ended = True
 
     def _want_tracks(self, capture_ns: int) -> None:
-        """Tracks are wanted; raises `RefusedError` where there are none because nobody wanted them until now."""
+        # Tracks are wanted; raises `RefusedError` where there are none because nobody wanted them until now.
         self._tracks_requested_ns = capture_ns
         if not self._tracked:
             raise RefusedError(

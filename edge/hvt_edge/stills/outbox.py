@@ -357,7 +357,7 @@ class Outbox:
         return sorted(lost, key=lambda one: -one.utility)
 
     def _unnamed(self) -> list[OutboxStill]:
-        """Sent, and not acknowledged; none where reports do not count."""
+        # Sent, and not acknowledged; none where reports do not count.
         return [one for one in self._sent.values() if one.state is StillState.SENT] if self._reports else []
 
     def _expire(self, pending: OutboxStill, reason: str) -> tuple[OutboxStill, str]:
@@ -384,7 +384,7 @@ class Outbox:
 
 
 def _take_off(pending: OutboxStill, track_ids: set[int]) -> None:
-    """These tracks are named no more; the crop stays as it is."""
+    # These tracks are named no more; the crop stays as it is.
     job, request = pending.crop, pending.request
     assert request is not None, "only stills of the method show several tracks"
     named = tuple(shown for shown in job.header.also if shown[0] not in track_ids)

@@ -105,7 +105,7 @@ def code_requested(
 
 @dataclass(eq=False)
 class _Tries:
-    """Codings of one crop at one size, each once."""
+    # Codings of one crop at one size, each once.
 
     job: CropJob
     codec: StillCodec
@@ -157,7 +157,7 @@ class _Tries:
         return best
 
     def _guess(self, limit_bytes: int, low: int, high: int) -> int:
-        """The quality at which a line through the tries so far crosses the limit, aimed a little below it."""
+        # The quality at which a line through the tries so far crosses the limit, aimed a little below it.
         wanted = math.log(max(1, 0.95 * limit_bytes))
         known = sorted((abs(math.log(one.size_bytes) - wanted), pct) for pct, one in self.done.items())
         if not known:
@@ -173,7 +173,7 @@ class _Tries:
 
 
 def _as_good(tries: _Tries, wanted: _Tried, limit_bytes: int) -> _Tried | None:
-    """At the requested quality, or better up to a plain gain; the best that fits, if it beats the base."""
+    # At the requested quality, or better up to a plain gain; the best that fits, if it beats the base.
     best = None
     for quality_pct in _upwards(wanted.quality_pct):
         one = tries.at(quality_pct)
@@ -186,7 +186,7 @@ def _as_good(tries: _Tries, wanted: _Tried, limit_bytes: int) -> _Tried | None:
 
 
 def _lower(tries: _Tries, wanted: _Tried, limit_bytes: int) -> _Tried | None:
-    """Below the requested quality, if that still beats the base."""
+    # Below the requested quality, if that still beats the base.
     if wanted.size_bytes <= limit_bytes:
         return None
     found = tries.fitting(limit_bytes, most_pct=wanted.quality_pct - 1)
@@ -194,7 +194,7 @@ def _lower(tries: _Tries, wanted: _Tried, limit_bytes: int) -> _Tried | None:
 
 
 def _shrunk(job: CropJob, codec: StillCodec, limit_bytes: int, *, wanted: _Tried) -> _Tried | None:
-    """The largest picture with fewer pixels that fits, if it too is closer to the source."""
+    # The largest picture with fewer pixels that fits, if it too is closer to the source.
     height, width = job.crop_bgr.shape[:2]
     for shrink in _SHRINKS:
         size = max(1, round(width * shrink)), max(1, round(height * shrink))
@@ -231,7 +231,6 @@ def _note(best: _Tried, wanted: _Tried, capacity: Capacity) -> str:
 
 
 def _refusal(tries: _Tries, wanted: _Tried, capacity: Capacity) -> str:
-    """Nothing that is better than the base fits, or nothing is better."""
     better = list(filter(tries.beats_base, tries.done.values()))
     if not better and wanted.size_bytes > capacity.most_bytes:
         better = list(filter(tries.beats_base, [tries.at(_BEST_PCT)]))

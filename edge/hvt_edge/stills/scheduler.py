@@ -122,7 +122,6 @@ class Chooser:
             self._crop(request, analyzed, now_ns=now_ns)
 
     def _unheld(self, candidates: Sequence[Candidate], *, now_ns: int) -> list[Candidate]:
-        """Those that neither suppression nor gate holds back."""
         allowed, held = self.suppression.apply(candidates, now_ns=now_ns)
         for _, reason in held:
             self.on_outcome("deferred", reason)
@@ -206,7 +205,7 @@ class Chooser:
         self._held_up = {track_id: ns for track_id, ns in self._held_up.items() if track_id in held}
 
     def _overdue(self, *, over: float, now_ns: int, allowance: Allowance) -> Iterator[OutboxStill]:
-        """Those to be sent again that are more useful than ``over``, and fit."""
+        # Those to be sent again that are more useful than ``over``, and fit.
         for sent in self.outbox.overdue(now_ns):
             if sent.utility <= over or self.outbox.on_demand is not None:
                 return
@@ -216,7 +215,7 @@ class Chooser:
                 yield sent
 
     def _may_go(self, pending: OutboxStill, job: CropJob, limit_bytes: int, *, now_ns: int) -> bool:
-        """Whether it is allowed as much as it will need, or has waited for that long enough."""
+        # Whether it is allowed as much as it will need, or has waited for that long enough.
         assert pending.request is not None, "it is of the method"
         if limit_bytes < self.maker.least_bytes:
             return False
@@ -235,7 +234,6 @@ class Chooser:
     def _code(
         self, pending: OutboxStill, job: CropJob, *, now_ns: int, allowance: Allowance, store: bool
     ) -> Still | None:
-        """Code it to its allowance; None where no still comes of it."""
         assert pending.request is not None, "it is of the method"
         made = self.maker.code(job, sequence=self.outbox.sequence(store=store), allowance=allowance)
         if isinstance(made, NoStill):
@@ -272,7 +270,7 @@ class Chooser:
         store: bool,
         resend: CropJob | None = None,
     ) -> None:
-        """It goes out, with the number that is next now: while it was coded another may have gone."""
+        # It goes out, with the number that is next now: while it was coded another may have gone.
         if still.sequence != (number := self.outbox.sequence(store=store)):
             still = replace(still, sequence=number)
         if store:
@@ -329,5 +327,5 @@ class Chooser:
         self.on_outcome("dropped", reason)
 
     def _cost_of(self, codec: str) -> CostModel:
-        """Learnt for each codec apart: a residual takes a fraction of the bytes of an intra still."""
+        # Learnt for each codec apart: a residual takes a fraction of the bytes of an intra still.
         return self._costs.setdefault(codec, CostModel.of_codec(codec))

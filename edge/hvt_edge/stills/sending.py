@@ -73,7 +73,7 @@ class StillSender:
         )
 
     def _without_base(self, still: Still, job: CropJob | None) -> Still:
-        """A sent still, coded anew without the base; itself where it is so, or its crop is gone."""
+        # A sent still, coded anew without the base; itself where it is so, or its crop is gone.
         if job is None:
             return still
         most_bytes = self.transmitter.most_still_bytes()

@@ -175,7 +175,6 @@ class StillStage:
             self.levers.take_load(captured, unanalyzed, now_ns=now_ns)
 
     def _decided(self, now_ns: int) -> Levers:
-        """The settings of stills and tracks from this step on."""
         if self.levers is None:
             return _ALL
         if self.shadow is not None:
@@ -189,7 +188,7 @@ class StillStage:
         return self.levers.decide(now_ns)
 
     def _note_change(self, result: StillResult) -> None:
-        """A still changed something where the ground now calls the object other than the edge does."""
+        # A still changed something where the ground now calls the object other than the edge does.
         if self.levers is None or self._latest_tracks is None:
             return
         tracks = self._latest_tracks

@@ -148,10 +148,7 @@ class StillWorker:
         self.failures.failed(_PART, f"perception and stills stopped ({type(error).__name__}: {error})")
 
     def _next(self) -> tuple[Frame, AccessUnit | None, Sequence[AccessUnit]] | None:
-        """Return the next frame; until it comes what is pending is tried again.
-
-        Right behind a base frame the link is busy: with few frames a second there would be no other moment.
-        """
+        # Right behind a base frame the link is busy: with few frames a second pending stills had no other moment.
         while True:
             try:
                 return self._frames.get(timeout=_RETRY_S)

@@ -122,6 +122,6 @@ def _vbv_s(fps: float, *, tight: bool = False) -> float:
 
 
 def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
-    """The part of the base's rate beside x265: headers, framing, ``status``, and its debt of keyframes."""
+    # The part of the base's rate beside x265: headers, framing, ``status``, and its debt of keyframes.
     debt_bps = 8 * usual_keyframe_bytes(size) / _KEYFRAME_EVERY_S
     return base_overhead_bps(line_bps, fps=fps, edge_id=edge_id) + debt_bps

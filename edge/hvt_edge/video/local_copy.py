@@ -110,7 +110,7 @@ class LocalCopy:
 
 
 def _opened(path: Path) -> tuple[Path, IO[bytes]]:
-    """The file by this name, or the first of name-2, name-3 … that is not there; a pipe or device as it is."""
+    # The file by this name, or the first of name-2, name-3 … that is not there; a pipe or device as it is.
     if path.exists() and not path.is_file():
         return path, path.open("wb", buffering=0)
     for number in range(1, _MOST_NAMES):
@@ -121,7 +121,7 @@ def _opened(path: Path) -> tuple[Path, IO[bytes]]:
 
 
 class _MatroskaFile:
-    """One file: a remux, no second encode. Access units go in as they were sent, a keyframe first."""
+    # One file: a remux, no second encode. Access units go in as they were sent, a keyframe first.
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         self.path = path

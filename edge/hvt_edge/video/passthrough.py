@@ -182,7 +182,7 @@ class PassthroughStage:
         return taken or decision.to_link
 
     def _admitted(self, unit: AccessUnit, now_ns: int, *, live: bool) -> bool:
-        """Whether it may go now; where the link is ``live``, or a moment later."""
+        # Whether it may go now; where the link is ``live``, or a moment later.
         until_ns = now_ns + (_PATIENCE_NS if live else 0)
         begins = live and self._sent_index != unit.frame_index - 1
         while True:

@@ -94,7 +94,7 @@ def most_decimation(fps: float, *, least_fps: float = _LEAST_FPS) -> int:
 
 
 def _size_for(bits_per_frame: float, source_size: tuple[int, int]) -> tuple[int, int]:
-    """The largest of the ladder that the bits of a frame fill; the smallest where none is."""
+    # The largest of the ladder that the bits of a frame fill; the smallest where none is.
     sizes = sizes_of(source_size)
     fitting = [size for size in sizes if bits_per_frame / (size[0] * size[1]) >= _SIZE_BITS_PER_PX]
     return fitting[0] if fitting else sizes[-1]

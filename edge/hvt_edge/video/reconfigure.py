@@ -193,14 +193,13 @@ class EncoderReconfiguration:
         self.transmitter.set_rates(now.total_bps, now.base_bps, fps, now_ns=now_ns)
 
     def _base_of(self, total_bps: int) -> int:
-        """The base's part of so much in all; never less than x265 can follow at its lowest frame rate."""
+        # The base's part of so much in all; never less than x265 can follow at its lowest frame rate.
         settings = self.settings
         least_bps = least_base_bps(settings.size, settings.least_fps, edge_id=settings.edge_id)
         return max(least_bps, base_rate_bps(total_bps, self._share, metadata_bps=self._metadata_bps))
 
     @property
     def _share(self) -> float:
-        """The base's, as it is now."""
         commanded = self._commanded[1]
         if commanded is not None:
             return commanded
@@ -208,16 +207,15 @@ class EncoderReconfiguration:
 
     @property
     def _metadata_bps(self) -> int:
-        """The rate reserved for tracks, while they are sent."""
         return self.settings.metadata_bps if self.operating.now.levers.tracks else 0
 
     @property
     def _moving(self) -> bool:
-        """Whether the split tracks the scene: another method may want none."""
+        # Whether the split tracks the scene: another method may want none.
         return self._commanded[1] is None
 
     def _take_command(self) -> bool:
-        """Whether another total or share was commanded since the last keyframe; it holds from now on."""
+        # Whether another total or share was commanded since the last keyframe; it holds from now on.
         now = self.operating.now
         before, self._commanded = self._commanded, (now.budget_bps, now.video_share)
         return before != self._commanded

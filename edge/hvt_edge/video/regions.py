@@ -115,7 +115,7 @@ class TrackRegions:
         return [Region((x1, y1, x2, y2), offset) for x1, y1, x2, y2 in blocks]
 
     def _blocks(self, boxes: Boxes) -> list[tuple[int, int, int, int]]:
-        """The padded boxes on the grid of blocks, inside the picture; those outside it are left out."""
+        # The padded boxes on the grid of blocks, inside the picture; those outside it are left out.
         pad = (boxes[:, 2:] - boxes[:, :2]) * self.padding
         grown = np.concatenate([boxes[:, :2] - pad, boxes[:, 2:] + pad], axis=1)
         limits = np.array([*self.size, *self.size], np.float64)
@@ -126,7 +126,6 @@ class TrackRegions:
         return [(x1, y1, x2, y2) for x1, y1, x2, y2 in whole if x2 > x1 and y2 > y1]
 
     def _covered(self, blocks: Sequence[tuple[int, int, int, int]]) -> float:
-        """Share of the picture's blocks that at least one box touches."""
         width, height = self.size
         mask = np.zeros((math.ceil(height / BLOCK_PX), math.ceil(width / BLOCK_PX)), np.bool_)
         for x1, y1, x2, y2 in blocks:

@@ -131,7 +131,6 @@ class Split:
         return part * (step.cost.of(candidate) + step.still_overhead_bytes)
 
     def _still_share(self) -> float:
-        """The stills' need, within their limits and within the base's reserve."""
         settings = self._settings
         if not self._stills:
             return 0.0
@@ -140,7 +139,7 @@ class Split:
         return max(0.0, min(wanted, 1 - self._metadata_share() - self._floor_bps() / settings.total_bps))
 
     def _floor_bps(self) -> float:
-        """The least for the base: more, the more of the objects it shows by itself."""
+        # The least for the base: more, the more of the objects it shows by itself.
         least = self._settings.least_base_bps
         return least + self._shown * max(0, self._settings.visible_base_bps - least)
 

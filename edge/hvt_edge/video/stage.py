@@ -171,7 +171,7 @@ class BaseStage:
         return self._frame_skip.wants_keyframe(index)
 
     def _within_a_window(self, unit: AccessUnit, frame: Frame) -> AccessUnit:
-        """The unit, or a keyframe of the same picture with so little detail that a window has room for it."""
+        # The unit, or a keyframe of the same picture with so little detail that a window has room for it.
         for factor in _COARSER:
             if self.transmitter.holds(unit):
                 break
@@ -184,7 +184,7 @@ class BaseStage:
         return unit
 
     def _leave_out(self, unit: AccessUnit) -> None:
-        """Nothing has room for it: what follows cannot be shown before another keyframe."""
+        # Nothing has room for it: what follows cannot be shown before another keyframe.
         self._begins_anew = True
         if self.failures is not None:
             what = f"{'a keyframe' if unit.keyframe else 'a frame'} of {len(unit.data) / 1000:.1f} kB"
@@ -214,7 +214,6 @@ class BaseStage:
             return
 
     def _at_keyframe(self, index: int, *, now_ns: int) -> None:
-        """Apply the changes that need a keyframe."""
         before = self._frame_skip.decimation
         decimation = self._frame_skip.at_keyframe(index)
         encoder = None if self.reconfigure is None else self.reconfigure(decimation, now_ns)

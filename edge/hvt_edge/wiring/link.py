@@ -155,7 +155,7 @@ def make_least_link(config: EdgeConfig, *, pacer: Pacer | None, in_flight: BaseI
 
 
 def _camera_needs_bps(config: EdgeConfig, window_bytes: int, share: float) -> int:
-    """The budget that a camera needs whose fullest window has so many line bytes; ``share`` is the base's of it."""
+    # The budget that a camera needs whose fullest window has so many line bytes; ``share`` is the base's of it.
     return needed_bps(window_bytes, window_s=config.window, share=share, metadata_bps=config.metadata_bps)
 
 

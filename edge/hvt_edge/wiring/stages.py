@@ -298,6 +298,5 @@ def build_stages(
 
 
 def _paused(clock: Callable[[], int], wait_until: Callable[[int], None], pause_ns: int) -> int:
-    """Sleep for so long, or until the run is to stop; return the time."""
     wait_until(clock() + pause_ns)
     return clock()

@@ -67,7 +67,7 @@ def shows_details(config: EdgeConfig, view: View) -> bool:
 
 
 def _hidden_pixels(view: View) -> float:
-    """0…1: the share of the source's pixels that the base has no pixel of its own for."""
+    # 0…1: the share of the source's pixels that the base has no pixel of its own for.
     return max(0.0, 1 - view.scale**2)
 
 

@@ -95,7 +95,7 @@ def try_scene(
 
 
 def _preset(spent: Sequence[tuple[int, int]], *, fps: float) -> PresetChoice:
-    """By the cost of the frames after the keyframe; a scene of one frame tells nothing."""
+    # By the cost of the frames after the keyframe; a scene of one frame tells nothing.
     if len(spent) < 2:
         return PresetChoice()
     frame_ns = (spent[-1][0] - spent[0][0]) / (spent[-1][1] - spent[0][1])
@@ -106,7 +106,7 @@ def _preset(spent: Sequence[tuple[int, int]], *, fps: float) -> PresetChoice:
 
 
 def _most_frames(config: EdgeConfig, size: tuple[int, int], decimation: int) -> int:
-    """All frames, or as many as x265 can follow the rate with."""
+    # All frames, or as many as x265 can follow the rate with.
     for fewer in range(1, decimation):
         if config.base_bps >= least_base_bps(size, config.nominal_fps / fewer, edge_id=config.edge_id):
             return fewer
@@ -114,10 +114,7 @@ def _most_frames(config: EdgeConfig, size: tuple[int, int], decimation: int) -> 
 
 
 def _share(config: EdgeConfig, view: View, decimation: int, seen: Shadow = UNMEASURED) -> float:
-    """Where the base hides objects, stills find more of them than the video would by the same bits.
-
-    What it shows in error they do not change: their share would go unused.
-    """
+    # Where the base hides objects, stills find more than video would; what it shows in error they do not change.
     if not config.measures or config.fixed_share is not None:
         return config.share
     share = min(config.share, SPARSE_SHARE) if decimation > 1 else config.share

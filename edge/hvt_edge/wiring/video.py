@@ -82,7 +82,7 @@ def say_size(config: EdgeConfig, view: View) -> None:
 
 
 def _affordable(config: EdgeConfig, size: tuple[int, int]) -> tuple[int, int]:
-    """This size, or the largest below it that the budget carries; where none is, the smallest."""
+    # This size, or the largest below it that the budget carries; where none is, the smallest.
     if config.budget_bps >= least_budget_bps(config, size, share=config.share) or min(size) < LEAST_SIDE_PX:
         return size
     smaller = [one for one in sizes_of(size) if one[0] * one[1] < size[0] * size[1]] or [size]
@@ -127,7 +127,7 @@ def _chosen(
 
 
 def _least_fps(config: EdgeConfig, size: tuple[int, int]) -> float:
-    """The lowest rate of coded frames that is chosen; a thin link may enforce less."""
+    # The lowest rate of coded frames that is chosen; a thin link may enforce less.
     if not config.measures:
         return LEAST_FPS
     keyframes_fps = config.budget_bps / (8 * usual_keyframe_bytes(size))
@@ -292,7 +292,6 @@ def as_the_camera_is(config: EdgeConfig, source: Source) -> EdgeConfig:
 
 
 def _qualify_camera(config: EdgeConfig, source: Source) -> None:
-    """Say what the camera takes; `UserError` where that is more than the budget leaves it."""
     stream, name = source.camera_stream, shown(str(config.source))
     assert stream is not None, "checked by as_the_camera_is"
     limit = allowed(

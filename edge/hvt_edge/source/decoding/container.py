@@ -57,7 +57,7 @@ def name_of(spec: str) -> str:
 
 
 class _GrowingFile:
-    """A file that is still written: a read at its end waits for more."""
+    # A file that is still written: a read at its end waits for more.
 
     def __init__(self, path: str) -> None:
         self._file = os.open(path, os.O_RDONLY)
@@ -234,8 +234,6 @@ def decoded(
 
 
 class _Reading:
-    """One pass over a stream, which counts damaged packets."""
-
     def __init__(self, container: Any, stream: Any) -> None:
         self._container, self._stream = container, stream
         self._size = _size_of(container)
@@ -271,7 +269,7 @@ class _Reading:
             yield f"is unfinished: {why}"
 
     def _unfinished(self) -> str:
-        """Why the played part is not all that there should be; empty if nothing says so."""
+        # Why the played part is not all that there should be; empty if nothing says so.
         container, stream = self._container, self._stream
         if (size := _size_of(container)) != self._size:
             return f"it has grown by {(size or 0) - (self._size or 0)} bytes since: --follow waits for more"
@@ -291,18 +289,18 @@ class _Reading:
         return ""
 
     def _ends_in_fragment(self) -> bool:
-        """Whether an MP4 in fragments, which counts no frames, ends within one."""
+        # Whether an MP4 in fragments, which counts no frames, ends within one.
         return "mp4" in self._container.format.name and not self._stream.frames and self._lacks_bytes()
 
     def _lacks_bytes(self) -> bool:
-        """Whether its index names places beyond its end."""
+        # Whether its index names places beyond its end.
         return bool(self._size) and any(
             one.pos + one.size > (self._size or 0) for one in self._stream.index_entries
         )
 
 
 def _packets(container: Any, stream: Any) -> Iterator[Any]:
-    """All of a stream; where it breaks off, the error is the last."""
+    # All of a stream; where it breaks off, the error is the last.
     packets = container.demux(stream)
     while True:
         try:
@@ -316,14 +314,14 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
 
 
 def _decode(stream: Any, packet: Any) -> list[av.VideoFrame]:
-    """Decode a packet; after an error, the pictures that the decoder has held back."""
+    # Decode a packet; after an error, the pictures that the decoder has held back.
     if isinstance(packet, Exception):
         return list(stream.codec_context.decode(None))
     return list(packet.decode())
 
 
 def _lacks_index(path: Path) -> str:
-    """The fault of an MP4 whose index is missing; empty for anything else (ISO/IEC 14496-12, 4.2)."""
+    # The fault of an MP4 whose index is missing; empty for anything else (ISO/IEC 14496-12, 4.2).
     kinds: list[bytes] = []
     with suppress(OSError), path.open("rb") as file:
         end = path.stat().st_size
@@ -350,7 +348,6 @@ def _seconds(stamp: int | None, base: Fraction | None) -> Fraction | None:
 
 
 def _size_of(container: Any) -> int | None:
-    """Bytes of a file now; None for anything else."""
     name = str(container.name or "")
     with suppress(OSError, ValueError):
         return Path(name.removeprefix("file:")).stat().st_size if name.startswith("file:") else None

@@ -124,7 +124,7 @@ class Pictures:
         return np.asarray(converted.to_ndarray(), np.uint8)
 
     def _square(self, frame: av.VideoFrame) -> tuple[int, int]:
-        """(width, height) with square pixels: one side grows, so that no detail is lost."""
+        # (width, height) with square pixels: one side grows, so that no detail is lost.
         if self._aspect >= 1:
             return max(2, round(frame.width * self._aspect)), frame.height
         return frame.width, max(2, round(frame.height / self._aspect))
@@ -170,7 +170,7 @@ def turn_of(frame: av.VideoFrame) -> str:
 
 
 def _turn_of(frame: av.VideoFrame) -> _Turn:
-    """The turn by the display matrix (ISO/IEC 14496-12, 8.3.2)."""
+    # The turn by the display matrix (ISO/IEC 14496-12, 8.3.2).
     # Not `frame.side_data`: that holds the frame which holds it, and each picture would stay until Python looks for
     # such circles, a hundred megabytes later.
     container: Any = SideDataContainer

@@ -91,7 +91,7 @@ def presented(
 
 
 def _sorted(stamps: list[Fraction | None]) -> Sequence[Fraction | None]:
-    """As they are where some are not known."""
+    # As they are where some are not known.
     known = [stamp for stamp in stamps if stamp is not None]
     return sorted(known) if len(known) == len(stamps) else stamps
 

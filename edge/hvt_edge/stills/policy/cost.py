@@ -93,6 +93,6 @@ class CostModel:
 
 
 def _weighted(area_px: float, size_bytes: float, weight: float) -> npt.NDArray[np.float64]:
-    """(5,): 1, area, size, area², area · size, by weight and relative error."""
+    # (5,): 1, area, size, area², area · size, by weight and relative error.
     w, x, y = weight / max(size_bytes, 1.0) ** 2, area_px, size_bytes
     return np.array((w, w * x, w * y, w * x * x, w * x * y))

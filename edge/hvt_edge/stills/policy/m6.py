@@ -140,13 +140,13 @@ class ExpectedGain:
         return self.unknown_lost if candidate.loss is None else candidate.loss().detail_lost
 
     def _faded(self, candidate: Candidate, *, now_ns: int) -> float:
-        """``1 - k``: 1 where nothing was sent yet."""
+        # ``1 - k``: 1 where nothing was sent yet.
         if candidate.last_sent_ns is None or self.fade_s <= 0:
             return 1.0
         return 1 - math.exp(-max(0, now_ns - candidate.last_sent_ns) / 1e9 / self.fade_s)
 
     def _doubt_left(self, candidate: Candidate) -> float:
-        """P(wrong after the last still): ``1 - exp(-H)`` of the ground's entropy, more where the two disagree."""
+        # P(wrong after the last still): ``1 - exp(-H)`` of the ground's entropy, more where the two disagree.
         class_posterior = candidate.posterior
         if class_posterior is None:
             return min(1.0, self.unanswered)
@@ -157,7 +157,7 @@ class ExpectedGain:
         return doubt
 
     def _better(self, candidate: Candidate) -> float:
-        """0…1: how much more than the last still another would show; 1 for twice the side, or whole at last."""
+        # 0…1: how much more than the last still another would show; 1 for twice the side, or whole at last.
         if candidate.last_sent_at_border and not candidate.touches_border:
             return 1.0
         if not candidate.last_sent_area_px or candidate.area_px <= 0:

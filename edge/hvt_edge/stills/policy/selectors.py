@@ -74,7 +74,7 @@ def _judge(
     class_names: Sequence[str],
     frame_area_px: float,
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """Per detection: passes the filters, score, is small."""
+    # Per detection: passes the filters, score, is small.
     boxes = np.asarray(boxes_xyxy_px, np.float64).reshape(-1, 4)
     width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
     small = width * height / frame_area_px < selector.small_share

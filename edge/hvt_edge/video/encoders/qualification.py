@@ -129,7 +129,6 @@ def headroom_of(
 
 
 def _coded(encoder: Encoder, scene: Iterable[Frame], *, middle: int) -> list[AccessUnit]:
-    """All units of a run, each decoded as a ground would."""
     units: list[AccessUnit] = []
     decoder: BaseDecoder | None = None
     for count, frame in enumerate(scene):
