@@ -252,11 +252,11 @@ class Ground:
         )
 
     def _note_ended(self, session: GroundSession) -> None:
-        """In the thread of its edge: forget the session and remember the numbers of the last ones."""
+        # In the thread of its edge: forget the session and remember the numbers of the last ones.
         self._ended[session.info.edge].append((summary(session), session.sinks))
 
     def _leave_edges(self, ports: list[EdgePort], link: GroundLink) -> None:
-        """The link has left those that never were more than a name, for others, and those that moved."""
+        # The link has left those that never were more than a name, for others, and those that moved.
         for one in [one for one in self._edges.values() if one.sessions.port not in ports]:
             del self._edges[one.sessions.port.edge]
             one.stop()

@@ -240,7 +240,7 @@ def _check_retention(config: GroundConfig) -> None:
 
 
 def _check_files(config: GroundConfig, more: Iterable[tuple[str, Path]]) -> None:
-    """Two files must not be one. Files in a folder have names of their own, and a device takes anything."""
+    # Two files must not be one. Files in a folder have names of their own, and a device takes anything.
     if config.stills is not None and not config.stills.is_dir():
         kind = UserError if config.stills.exists() else NotYetError
         raise kind(f"--stills {config.stills} is no folder: create it, or name one that is there")

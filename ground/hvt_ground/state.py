@@ -241,7 +241,7 @@ class StateMaker:
 
 
 def _left_out(status: Status | None) -> int:
-    """Frames that the link did not carry; of an earlier edge, which does not tell, none."""
+    # Frames that the link did not carry; of an earlier edge, which does not tell, none.
     return 0 if status is None else status.frame_account.groups.get("link", 0)
 
 

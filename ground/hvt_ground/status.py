@@ -212,6 +212,6 @@ def failed_text(one: FailedPart) -> str:
 
 
 def _concerns(part: str, edge: str) -> bool:
-    """Whether a part is this edge's, or nobody's: ``recording of uav-1``, ``timing table``."""
+    # Whether a part is this edge's, or nobody's: ``recording of uav-1``, ``timing table``.
     _, of, whose = part.rpartition(" of ")
     return not of or whose == edge

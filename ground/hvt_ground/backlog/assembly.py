@@ -167,7 +167,7 @@ class BacklogAssembly:
         )
 
     def _entry(self, key: ObjectKey, total_bytes: int) -> _Open:
-        """The object's entry, now the newest; a new one where there is none or it was of another size."""
+        # The object's entry, now the newest; a new one where there is none or it was of another size.
         entry = self._open.get(key)
         if entry is None or (entry.total_bytes != total_bytes and not entry.handed):
             entry = self._open[key] = _Open(total_bytes)
@@ -175,7 +175,6 @@ class BacklogAssembly:
         return entry
 
     def _make_space(self, key: ObjectKey, more_bytes: int) -> bool:
-        """Whether there is room for so much more of this object, which may cost others theirs."""
         while len(self._open) > self._max_objects or self.size_bytes + more_bytes > self._max_bytes:
             victim = next((one for one, entry in self._open.items() if one != key and not entry.handed), None)
             if victim is None:
@@ -192,7 +191,7 @@ class BacklogAssembly:
         self._report(key, total_bytes)
 
     def _report_busy(self, key: ObjectKey, entry: _Open, total_bytes: int) -> None:
-        """Report the object as busy: nothing is here of another object of the same name."""
+        # Report the object as busy: nothing is here of another object of the same name.
         self._report(key, entry.total_bytes - 1 if entry.total_bytes == total_bytes else 0)
 
     def _report(self, key: ObjectKey, acknowledged_bytes: int) -> None:

@@ -142,7 +142,7 @@ class EdgeBacklog:
         return Destination(partial(recordings.acquire, info), recordings.release)
 
     def _done(self, key: ObjectKey, session: int, usable: bool | None) -> None:  # noqa: FBT001 - partial
-        """A job has ended; None: its object was not taken."""
+        # A job has ended; None: its object was not taken.
         with self._lock:
             if session != self._sessions:
                 return

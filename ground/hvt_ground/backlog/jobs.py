@@ -128,7 +128,7 @@ class VideoJob(Job):
             self._destination.release(self._target)
 
     def _finish(self, target: SessionBacklog, usable: bool | None) -> None:  # noqa: FBT001 - as of `done`
-        """Say so when it is written; frames that are lost on the way are missing again."""
+        # Say so when it is written; frames that are lost on the way are missing again.
 
         def end(written: bool) -> None:  # noqa: FBT001 - a receipt
             if not written:
@@ -139,8 +139,6 @@ class VideoJob(Job):
 
 
 class _BoxesJob(Job):
-    """Finds boxes in those frames of a stretch; made while its destination is in use."""
-
     def __init__(
         self, units: Sequence[BacklogUnit], frames: AbstractSet[int], destination: Destination
     ) -> None:

@@ -64,7 +64,7 @@ class BacklogVideo:
                 yield unit, None
 
     def _leading_to(self, frame_index: int) -> list[bytes]:
-        """The units from a keyframe up to the one before ``frame_index``, of the newest run that has some."""
+        # The units from a keyframe up to the one before ``frame_index``, of the newest run that has some.
         with self._lock:
             for run in (self._run, *reversed(self._ends)):
                 if run and run[0][0] < frame_index:

@@ -136,10 +136,7 @@ class Requester:
 
 
 def _link_hint(session: zenoh.Session) -> str:
-    """Where an edge that does not show itself may be stopped: what stands at the other end of our links, by its key.
-
-    Empty where there are no keys. An asker has one link.
-    """
+    # By its key, what stands at the other end; empty without keys. An asker has one link.
     names = sorted({link.auth_identifier for link in session.info.links() if link.auth_identifier})
     if not names:
         return ""
@@ -262,7 +259,7 @@ class RemoteEdge:
         timeout_s: float,
         on_note: Callable[[str], None],
     ) -> tuple[RoiHeader, Received]:
-        """The still of that number; in between the edge is asked whether it is still to come."""
+        # The still of that number; in between the edge is asked whether it is still to come.
         query_s, noted = time.monotonic() + _OUTCOME_S, ""
         while (now_s := time.monotonic()) < until_s:
             item = inbox.get(timeout_s=min(_POLL_S, until_s - now_s))
@@ -282,7 +279,7 @@ class RemoteEdge:
         )
 
     def _note_of(self, number: int) -> str:
-        """The edge's note on a pending still. Raises `RefusedError` if none comes."""
+        # The edge's note on a pending still. Raises `RefusedError` if none comes.
         try:
             outcome = self._commanded(Command.STILL_OUTCOME, {"ask": number})
         except RefusedError:
@@ -298,7 +295,7 @@ class RemoteEdge:
         return "the edge is not there any more: it has ended, or its link is down"
 
     def _commanded(self, command: str, arguments: Mapping[str, int | float | str]) -> ControlAnswer | None:
-        """The answer where the edge accepts; None where there is none in time."""
+        # The answer where the edge accepts; None where there is none in time.
         try:
             question = ControlRequest(session_id=0, command=command, arguments=arguments).pack()
         except ValueError as error:
@@ -395,7 +392,6 @@ def _header(item: Received) -> RoiHeader | None:
 
 
 def _has_ended(item: Received, answer: ControlAnswer) -> bool:
-    """Whether this is the last status of the session that accepted the still."""
     if not item.key.endswith(f"/{Channel.STATUS}"):
         return False
     try:

@@ -38,7 +38,7 @@ def _only_one(edges: EdgeClient) -> str:
 
 
 def _prepare(arguments: argparse.Namespace) -> Callable[[RemoteEdge], None]:
-    """Prepare the command; all arguments are checked before any edge is queried."""
+    # Prepare the command; all arguments are checked before any edge is queried.
     match arguments.command:
         case "still":
             return _still(arguments)

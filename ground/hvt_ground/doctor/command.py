@@ -54,7 +54,6 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _models(config: GroundConfig) -> Finding:
-    """Open them, and look how many edges the detector could serve."""
     detector, classifier = Models(config).take()
     picture = np.full((_USUAL_SIZE[1], _USUAL_SIZE[0], 3), 128, np.uint8)
     began_s = time.monotonic()
@@ -72,7 +71,6 @@ def _models(config: GroundConfig) -> Finding:
 
 
 def _recordings(config: GroundConfig) -> Finding:
-    """The files that will be written, and whether there is room."""
     named = {"--summary": config.summary, "--timing": config.timing}
     if config.tracks is not None and config.tracks.suffix == ".csv" and not config.tracks.is_dir():
         named["--tracks"] = config.tracks

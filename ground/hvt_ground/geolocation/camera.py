@@ -103,7 +103,7 @@ def _focal_px(hfov_deg: float, view: View) -> float:
 def _standing(
     pose: Pose, boxes: npt.NDArray[np.float64], *, focal_px: float, size: tuple[int, int]
 ) -> Points:
-    """The point of each box where its object touches the ground, (N, 2) source pixels."""
+    # The point of each box where its object touches the ground, (N, 2) source pixels.
     assert pose.camera is not None
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2
     depression = np.clip(
@@ -118,14 +118,12 @@ def _standing(
 
 
 def _turned(pose: Pose, **degrees: float) -> Pose:
-    """The pose with its camera's angles so much larger."""
     assert pose.camera is not None
     angles = {name: getattr(pose.camera, name) + step for name, step in degrees.items()}
     return replace(pose, camera=replace(pose.camera, **angles))
 
 
 def _raised(pose: Pose, metres: float) -> Pose:
-    """The pose with its camera so much higher."""
     height_m, altitude_m = (
         None if value is None else value + metres for value in (pose.height_m, pose.altitude_m)
     )
@@ -135,7 +133,7 @@ def _raised(pose: Pose, metres: float) -> Pose:
 def _effects(
     at: Callable[[Pose, Points], Points], pose: Pose, points: Points, *, sides: Points
 ) -> list[Points]:
-    """Metres by which one standard deviation of each source of error moves the places, (N, 2) each."""
+    # Metres by which one standard deviation of each source of error moves the places, (N, 2) each.
     height_step, angle, hfov_deg = pose.height_error_m, pose.angle_error_deg, pose.hfov_deg
     assert hfov_deg is not None, "there is no ray without"
     field_step = hfov_deg * _FIELD_ERROR

@@ -46,7 +46,7 @@ class ModelError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class _Area:
-    """Degrees, WGS 84. East is the larger one: beyond 180 where the area holds the antimeridian."""
+    # Degrees, WGS 84. East is the larger one: beyond 180 where the area holds the antimeridian.
 
     west_deg: float
     south_deg: float
@@ -147,7 +147,7 @@ def _errors() -> Iterator[None]:
 
 
 def _bounds(file: Any) -> _Area:
-    """The bounds of the whole file; longitudes in its own form."""
+    # The bounds of the whole file; longitudes in its own form.
     if file.crs.is_geographic:
         return _Area(*file.bounds)
     if not file.crs.is_projected:
@@ -159,7 +159,7 @@ def _bounds(file: Any) -> _Area:
 
 
 def _cell_deg(file: Any, latitude_deg: float) -> tuple[float, float]:
-    """The sides of a cell, degrees of longitude and latitude."""
+    # The sides of a cell, degrees of longitude and latitude.
     across, down = (abs(one) * file.crs.units_factor[1] for one in file.res)
     if file.crs.is_geographic:
         return math.degrees(across), math.degrees(down)
@@ -168,7 +168,6 @@ def _cell_deg(file: Any, latitude_deg: float) -> tuple[float, float]:
 
 
 def _shape(file: Any, area: _Area) -> tuple[int, int]:
-    """Rows and columns to read it in."""
     across, down = _cell_deg(file, (area.south_deg + area.north_deg) / 2)
     cells = ((area.north_deg - area.south_deg) / down, (area.east_deg - area.west_deg) / across)
     rows, columns = (max(1, min(_MOST_SIDE, round(one))) for one in cells)
@@ -176,7 +175,7 @@ def _shape(file: Any, area: _Area) -> tuple[int, int]:
 
 
 def _cell_in_the_middle(file: Any) -> None:
-    """Read one, so that a model that cannot be read is refused before a flight."""
+    # Read one, so that a model that cannot be read is refused before a flight.
     bounds = _bounds(file)
     latitude, longitude = (
         (bounds.south_deg + bounds.north_deg) / 2,
@@ -188,10 +187,7 @@ def _cell_in_the_middle(file: Any) -> None:
 
 
 def _read(file: Any, area: _Area, shape: tuple[int, int]) -> npt.NDArray[np.float32]:
-    """The first band in cells of WGS 84, NaN where there is none.
-
-    A fine model is thinned out before it is warped: to warp all of it first takes most of a minute.
-    """
+    # NaN where there is none. A fine model is thinned out before it is warped: all of it takes most of a minute.
     found = np.full(shape, np.nan, np.float32)
     window = _window(file, area)
     if window is None:
@@ -214,7 +210,6 @@ def _read(file: Any, area: _Area, shape: tuple[int, int]) -> npt.NDArray[np.floa
 
 
 def _window(file: Any, area: _Area) -> Window | None:
-    """The cells of the file that the area lies in; None where it has none."""
     longitude, latitude = np.meshgrid(
         np.linspace(area.west_deg, area.east_deg, _ALONG),
         np.linspace(area.south_deg, area.north_deg, _ALONG),

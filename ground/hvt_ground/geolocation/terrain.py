@@ -89,7 +89,7 @@ class Terrain:
         )
 
     def _levels_m(self, pose: Pose) -> tuple[float | None, float]:
-        """Above the sea: the camera, None where nothing tells, and the ground below it, NaN where there is none."""
+        # Above the sea: the camera, None where nothing tells, and the ground below it, NaN where there is none.
         tile = self._tile_around(pose)
         ground_m = float(tile.at(np.array([pose.latitude_deg]), np.array([pose.longitude_deg]))[0])
         if math.isnan(ground_m):
@@ -124,7 +124,7 @@ class Terrain:
         return tile
 
     def _note(self, what: str) -> None:
-        """Say once why nothing is placed: who watches the map waits for it."""
+        # Say once why nothing is placed: who watches the map waits for it.
         with self._lock:
             if self._noted:
                 return

@@ -71,7 +71,6 @@ class PoseTrail:
 
 
 def _continued(before: Pose, last: Pose, capture_ns: int) -> Pose:
-    """The pose after the last one, extrapolated from the one before."""
     lasted_ns = last.capture_ns - before.capture_ns
     age_ns = capture_ns - last.capture_ns
     if lasted_ns > STALE_S * SECOND_NS:
@@ -100,7 +99,6 @@ def _continued(before: Pose, last: Pose, capture_ns: int) -> Pose:
 
 
 def _turn_deg(first: Orientation | None, second: Orientation | None) -> float:
-    """The largest change of the three angles."""
     if first is None or second is None:
         return 0.0
     changes = (

@@ -121,7 +121,7 @@ class Listening:
 
 
 class _Events(queue.Queue[Received]):
-    """It is full, too, where its pictures take too much."""
+    # It is full, too, where its pictures take too much.
 
     def __init__(self) -> None:
         super().__init__(_MOST_QUEUED)
@@ -142,7 +142,7 @@ class _Events(queue.Queue[Received]):
 
 
 class _Queue:
-    """The events of one session, decoded, for the program's queue; waits while that is full."""
+    # The events of one session, decoded, for the program's queue; waits while that is full.
 
     path: Path | None = None
 

@@ -166,14 +166,14 @@ class GroundGroup:
         self._token.undeclare()  # type: ignore[no-untyped-call]
 
     def _is_mine(self, edge: str) -> bool:
-        """Under the lock. Who claims takes part, also where its own token has not come yet."""
+        # Under the lock. Who claims takes part, also where its own token has not come yet.
         if edge not in self._mine:
             members = self._members | self._claims.get(edge, set())
             self._mine[edge] = owner_of(edge, members) == self.member
         return self._mine[edge]
 
     def _request_page(self, member: str) -> None:
-        """The answer comes in a callback; where none does it is asked again."""
+        # The answer comes in a callback; where none does it is asked again.
 
         def note(reply: zenoh.Reply) -> None:
             if reply.ok is None or len(reply.ok.payload) > _MOST_PAGE_BYTES:

@@ -187,7 +187,7 @@ class Reassembler:
     # Within the session: a hole waits, then is given up.
 
     def _release(self, now_ns: int) -> list[Arrival]:
-        """Everything that need not wait any longer: at most ``REORDER_UNITS`` units stay behind a hole."""
+        # Everything that need not wait any longer: at most ``REORDER_UNITS`` units stay behind a hole.
         released: list[Arrival] = []
         keyframe = max(
             (sequence for sequence, unit in self._held.items() if unit.header.keyframe), default=-1
@@ -216,7 +216,6 @@ class Reassembler:
         self._synced = False
 
     def _take(self, unit: Arrival, now_ns: int) -> Verdict:
-        """The unit that is due: to the decoder, or skipped until a keyframe."""
         header = unit.header
         self._recent = (self._recent << 1 | 1) & _WINDOW_MASK
         self._next = header.sequence + 1
@@ -235,7 +234,7 @@ class Reassembler:
         return self._judged(unit, "duplicate" if self._has_been(unit.header.sequence) else "stale")
 
     def _has_been(self, sequence: int) -> bool:
-        """Whether this old number is known to have come; of those long ago nothing is known."""
+        # Whether this old number is known to have come; of those long ago nothing is known.
         age = self._next - 1 - sequence  # negative: waiting behind a hole, so it is here already
         return age < 0 or (age < SEQUENCE_SLACK and bool(self._recent >> age & 1))
 
@@ -250,7 +249,6 @@ class Reassembler:
     # Between sessions.
 
     def _is_duplicate(self, session_id: int, now_ns: int) -> bool:
-        """Whether the present session has gone on for a while since that one first came."""
         if self._adopted_ns is None:
             return False
         since_ns = self._outsiders.setdefault(session_id, now_ns)
@@ -262,7 +260,7 @@ class Reassembler:
     def _accept_outsider(
         self, unit: Arrival, refusal: Verdict, *, patience_ns: int, duplicate: bool = False
     ) -> list[Arrival]:
-        """A unit that does not continue the session: adopted with a keyframe when the session is silent."""
+        # A unit that does not continue the session: adopted with a keyframe when the session is silent.
         header, now_ns = unit.header, unit.received_ns
         if header.sequence < self._left.get(header.session_id, 0):
             return [self._judged(unit, "stale")]
@@ -281,7 +279,7 @@ class Reassembler:
         return [*resolved, self._judged(unit, verdict, starts_session=True)]
 
     def _leave(self) -> list[Arrival]:
-        """End the present session, if any; units that waited behind a hole are skipped."""
+        # End the present session, if any; units that waited behind a hole are skipped.
         resolved = [self._judged(unit, "skip") for _, unit in sorted(self._held.items())]
         self._held.clear()
         self._synced = False

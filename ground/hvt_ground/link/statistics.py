@@ -115,7 +115,6 @@ class ReceptionStatistics:
             return since_ns >= _MOST_NS or (self._news and since_ns >= self._interval_ns(now_ns))
 
     def _interval_ns(self, now_ns: int) -> int:
-        """Between two reports while messages arrive."""
         if self._lockstep:
             return _MOST_NS
         self._forget(now_ns)
@@ -141,10 +140,7 @@ class ReceptionStatistics:
             )
 
     def _miss(self, first: int, end: int, *, at_ns: int) -> None:
-        """Those from ``first`` up to ``end`` have not come; of many, the newest count.
-
-        What was sent before this ground was there is not missed.
-        """
+        # Of many, the newest count; what was sent before this ground was there is not missed.
         if self._still_sequence < 0 and not self._from_start:
             return
         self._missing |= dict.fromkeys(range(max(first, end - MAX_MISSING_STILLS), end), at_ns)

@@ -62,7 +62,7 @@ class Models:
         return RetriedDetector(open_one, "detector", self.failures, hint=hint)
 
     def _check(self) -> None:
-        """Refuse a classifier that has nothing to say of the detector's tracks; say which scores mean little."""
+        # Refuse a classifier that has nothing to say of the detector's tracks; say which scores mean little.
         config, (detector, classifier) = self._config, self._set
         if config.detector != MOTION and not is_calibrated(config.detector, role="detector"):
             _log.warning("%s", uncalibrated("detector", config.detector))

@@ -267,7 +267,7 @@ class Pipeline:
         return own
 
     def _own_at(self, frame_index: int) -> Tracks:
-        """Our tracker's list at a frame: as it was, or moved on from the newest frame."""
+        # Our tracker's list at a frame: as it was, or moved on from the newest frame.
         own = self._own
         if own is None:
             return Tracks.none(frame_index)
@@ -285,7 +285,7 @@ class Pipeline:
     # The list
 
     def _show(self, own: Tracks, capture_ns: int) -> None:
-        """Put the list at the frame of ``own`` on record and, where nothing newer has been shown, give it out."""
+        # Put the list at the frame of ``own`` on record and, where nothing newer has been shown, give it out.
         self._carry_merges()
         fused = self._parts.fusion.listed(own)
         self._history.revise_tracks(fused.tracks)

@@ -44,7 +44,7 @@ class Turns:
             self._changed.notify_all()
 
     def _next(self) -> object:
-        """Of those that wait the one that had the fewest turns."""
+        # Of those that wait the one that had the fewest turns.
         return min(self._queue, key=self._had.__getitem__)
 
     def _note(self, who: object) -> None:

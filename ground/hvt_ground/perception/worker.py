@@ -128,7 +128,7 @@ class PerceptionWorker(ABC):
         """Finish the queue, for a second or two; False if the thread did not come back."""
 
     def _is_done(self, job: Job) -> bool:
-        """Do one step of a job; whether it was the last."""
+        # Do one step of a job; whether it was the last.
         try:
             return job.step()
         except Exception as error:  # noqa: BLE001 - the picture of now goes on
@@ -270,7 +270,7 @@ class RealtimeWorker(PerceptionWorker):
                     jobs.popleft().close()
 
     def _work_off(self) -> None:
-        """Analyze the pictures that came before the stills taken here, take the edge's tracks, then read."""
+        # Analyze the pictures that came before the stills taken here, take the edge's tracks, then read.
         with self._lock:
             stills: list[ReceivedStill] = []
             while self._stills and len(stills) < _STILLS_AT_ONCE:
@@ -288,7 +288,7 @@ class RealtimeWorker(PerceptionWorker):
             self._wake.set()
 
     def _take_pictures(self, *, hurry: bool) -> None:
-        """Analyze the pictures that are there: in the newest objects are detected, unless in a ``hurry``."""
+        # Analyze the pictures that are there: in the newest objects are detected, unless in a ``hurry``.
         # Those that come meanwhile are not among them, or on a slow machine stills would wait for ever.
         for _ in range(len(self._pictures)):
             if self._given_up.is_set():
@@ -302,7 +302,7 @@ class RealtimeWorker(PerceptionWorker):
             self._analyze(picture, hurry or newer)
 
     def _do_jobs(self) -> None:
-        """Do jobs that can wait, until something comes that cannot."""
+        # Do jobs that can wait, until something comes that cannot.
         while (jobs := self._jobs or self._last_jobs) and not self._given_up.is_set():
             if self._has_news() and time.monotonic() - self._job_step_s < _JOB_STEP_S:
                 return

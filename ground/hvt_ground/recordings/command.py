@@ -55,7 +55,7 @@ def _wanted(arguments: argparse.Namespace) -> Callable[[RecordingRow], bool]:
 
 
 def _since_ns(text: str) -> int:
-    """Unix time of ``2h`` ago, or of a date, UTC unless it says otherwise."""
+    # Unix time of ``2h`` ago, or of a date, UTC unless it says otherwise.
     try:
         date = datetime.fromisoformat(text)
     except ValueError:

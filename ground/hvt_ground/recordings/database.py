@@ -152,7 +152,7 @@ def _opened(path: Path) -> sqlite3.Connection:
 
 
 def _version(database: sqlite3.Connection, path: Path) -> int:
-    """0 is a new one."""
+    # 0 is a new one.
     version = int(database.execute("PRAGMA user_version").fetchone()[0])
     if version > _VERSION:
         raise UserError(f"{path} is of a newer version of hvt-ground: name another folder")

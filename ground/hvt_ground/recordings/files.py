@@ -105,8 +105,6 @@ def _described(path: Path) -> RecordingRow | None:
 
 
 class _Content:
-    """The content of a recording's chunks, for the index."""
-
     def __init__(self) -> None:
         self.frames = 0
         self.video = False

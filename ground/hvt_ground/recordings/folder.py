@@ -86,7 +86,7 @@ class IndexWriter:
         self._index.close()
 
     def _pass_time(self) -> Moment:
-        """Before anything is noted or judged: by the present clock, all files have the age they have."""
+        # Before anything is noted or judged: by the present clock, all files have the age they have.
         now = Moment(self._now_ns(), *self._since_boot())
         moved_ns = self._index.pass_time(now, most_ns=self._retention.trusted_ns)
         if abs(moved_ns) > _SET_NS:
@@ -211,13 +211,13 @@ class RecordingsFolder:
         self.close()
 
     def _poll(self) -> None:
-        """Files grow old while nobody flies, too."""
+        # Files grow old while nobody flies, too.
         while self._sink is not None and not self._stop.wait(_POLL_S):
             self._sink.log(None)
 
 
 class _InUse:
-    """Which files of a folder are written to: looked up for those in question alone."""
+    # Which files of a folder are written to: looked up for those in question alone.
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -227,5 +227,5 @@ class _InUse:
 
 
 def _is_plain(name: str) -> bool:
-    """Whether a name is one of a file in the folder itself, whatever somebody wrote into the index."""
+    # Whether a name is one of a file in the folder itself, whatever somebody wrote into the index.
     return name == Path(name).name and name.endswith(".rrd") and "\0" not in name

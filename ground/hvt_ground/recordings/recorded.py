@@ -148,7 +148,6 @@ class Recorded:
         return self._located(overlay)
 
     def _located(self, overlay: Overlay) -> Overlay:
-        """The overlay with the places of its tracks, by the poses before and after it."""
         pose = self.trail.at(overlay.capture_ns)
         if pose is None:
             return overlay
@@ -218,8 +217,6 @@ def _recorded(edge: str, session: str, rows: _Rows, surface: Surface, spool: Spo
 
 @dataclass(frozen=True, slots=True)
 class _File:
-    """One file: its edge and session, and its rows by entity and component."""
-
     name: tuple[str, str]
     rows: _Rows
     ours: bool
@@ -232,7 +229,7 @@ class _File:
 
     @property
     def _begins(self) -> tuple[int, int]:
-        """The first frame, and its capture time; zeros without video."""
+        # The first frame, and its capture time; zeros without video.
         samples = self.rows.get((VIDEO, _SAMPLE))
         return samples[0][:2] if samples else (0, 0)
 
@@ -335,7 +332,7 @@ def _is_used(entity: str, component: str) -> bool:
 
 
 def _bytes(value: Any) -> bytes | None:
-    """The bytes of a list with one list of bytes, eight times as large as Python's own; None if it is empty."""
+    # The bytes of a list with one list of bytes, eight times as large as Python's own; None if it is empty.
     if not value.is_valid or not len(value.values):
         return None
     return bytes(memoryview(value.values[0].values.to_numpy()))
@@ -363,7 +360,6 @@ class _StillPlace:
 
 
 def _stills(rows: _Rows) -> Sequence[RecordedStill]:
-    """Pairs of the gallery, stills that were never on the screen, and those on the enhanced picture alone."""
     headers = _Headers(rows.get((STILL_MESSAGES, _MESSAGE), []))
     found, there = [], set()
     of_pictures = [
@@ -400,8 +396,6 @@ def _stills(rows: _Rows) -> Sequence[RecordedStill]:
 
 
 class _Headers:
-    """The messages of stills, by the frame at which each was known."""
-
     def __init__(self, rows: Iterable[Timed]) -> None:
         self._by_frame = defaultdict[int, list[bytes]](list)
         for frame, _, value in rows:

@@ -85,11 +85,7 @@ def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Container
 
 
 def _surplus(ordered: Sequence[RecordingRow], most_bytes: int, in_use: Container[str]) -> Iterator[str]:
-    """Files beyond so many bytes, the oldest first.
-
-    The oldest of all whose edge has more than its share goes. An edge below its share never gets above it here, so
-    one pass finds them; only files in use may be left over, and then others' go as well.
-    """
+    # An edge below its share never gets above it here, so one pass finds them; only files in use may be left over.
     held = Counter[str]()
     for row in ordered:
         held[row.edge] += row.size_bytes
@@ -110,7 +106,7 @@ def _surplus(ordered: Sequence[RecordingRow], most_bytes: int, in_use: Container
 
 
 def _older(row: RecordingRow, limit: Limit, now_ns: int) -> bool:
-    """Whether it is older, by the index's own time and by its name."""
+    # Whether it is older, by the index's own time and by its name.
     limit_ns = (limit.seconds or 0.0) * SECOND_NS
     if now_ns - row.written_ns <= limit_ns:
         return False

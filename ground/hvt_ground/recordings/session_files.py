@@ -106,7 +106,6 @@ class SessionFiles:
     # Which file
 
     def _go_on(self, item: FrameEvent) -> None:
-        """Begin the next file, or leave the former, where it is time to."""
         if self._split is None or _stored(item):
             return
         if self._next is not None:
@@ -141,7 +140,6 @@ class SessionFiles:
         return self._small_left >= 0
 
     def _settle(self, hurry: threading.Event | None) -> None:
-        """The former file ends."""
         if self._next is not None:
             former, self._next = self._recorder.file, self._next
             self._recorder.go_on_in(self._next, at=self._starts[-1])
@@ -149,7 +147,7 @@ class SessionFiles:
             self._close(former, hurry)
 
     def _placed(self, item: FrameEvent) -> tuple[FrameEvent, RecordingFile]:
-        """The file that an event goes into; what came too late for its own is put at the beginning of the newest."""
+        # The file that an event goes into; what came too late for its own is put at the beginning of the newest.
         part = bisect_right(self._starts, item.frame_index, key=lambda start: start[0])
         newest = len(self._starts)
         if part == newest:
@@ -167,7 +165,7 @@ class SessionFiles:
         return replace(item, frame_index=frame, capture_ns=capture_ns), self._next or self._recorder.file
 
     def _late_file(self, part: int) -> RecordingFile | None:
-        """The file beside a former one; None where too many were made."""
+        # The file beside a former one; None where too many were made.
         if part in self._late:
             self._late.move_to_end(part)
             return self._late[part]
@@ -183,7 +181,6 @@ class SessionFiles:
         return self._late[part]
 
     def _numbered(self, number: int) -> Path:
-        """The first name that is free from this number on."""
         base = self._base
         return _free(base.with_name(f"{base.stem}-{one:04d}{base.suffix}") for one in count(number))
 

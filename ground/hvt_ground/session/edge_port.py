@@ -119,7 +119,7 @@ class EdgePort:
         self._query(Channel.INFO, request.pack(), on_answer=note, on_end=on_end)
 
     def _say_version(self, sentence: str) -> None:
-        """Once: it is asked again and again."""
+        # Once: it is asked again and again.
         if not self._version_said:
             self._version_said = True
             _log.warning("%s", sentence)
@@ -182,7 +182,7 @@ class EdgePort:
             on_end()
 
     def _note_control(self, *, answered: bool) -> None:
-        """Say once that nothing is answered: a question without the right to ask is dropped in silence."""
+        # Say once that nothing is answered: a question without the right to ask is dropped in silence.
         self._unanswered = 0 if answered else self._unanswered + 1
         if self._unanswered == _UNANSWERED and self.present.is_set():
             _log.warning("%s", control_unanswered(self.edge))

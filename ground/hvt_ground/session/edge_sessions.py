@@ -180,7 +180,7 @@ class EdgeSessions:
                 self._receiver.wait_for_keyframe()  # should it come back, it starts with a keyframe
 
     def _refresh_clock(self, session: GroundSession, now_ns: int) -> None:
-        """Ask the edge for its time now and then; nothing waits for the answer."""
+        # Ask the edge for its time now and then; nothing waits for the answer.
         while (answer := self.port.take_info()) is not None:
             info = self._learn(answer)
             if info is not None and info.session_id == session.info.session_id:
@@ -272,7 +272,7 @@ class EdgeSessions:
             self._receiver.wait_for_keyframe()
 
     def _goes_on(self, packet: BasePacket) -> bool:
-        """Whether the open session comes back from an interruption that was none of its own."""
+        # Whether the open session comes back from an interruption that was none of its own.
         session, header = self.session, packet.arrival.header
         if session is None or header.session_id != session.info.session_id:
             return False
@@ -341,7 +341,7 @@ class EdgeSessions:
         self.backlog.session_ended(session.info)
 
     def _fail(self, error: Exception) -> None:
-        """End the session that is open; the next begins with a keyframe, not before the pause is over."""
+        # End the session that is open; the next begins with a keyframe, not before the pause is over.
         self._pause.failed(time.monotonic_ns())
         self._say_failed(error, self.session)
         self._end_session()

@@ -148,7 +148,6 @@ def _base_packet(arrival: Arrival, item: Received) -> BasePacket:
 
 
 def _parsed(row: Channel | None, item: Received, versions: Sequence[int]) -> _Message | None:
-    """None for a channel that the ground does not read."""
     kind = None if row is None else _KINDS.get(row)
     if kind is None:
         return None

@@ -466,5 +466,4 @@ class GroundSession:
 
 
 def _decisions(says: str) -> list[str]:
-    """The edge's settings of stills and tracks, without the reasons."""
     return [re.split("[:,]", part)[0] for part in says.split("; ")]

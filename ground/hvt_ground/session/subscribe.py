@@ -111,7 +111,6 @@ class GroundLink:
             _log.warning("%d messages under keys that are not ours were skipped", self.foreign)
 
     def _share(self, group: GroundGroup) -> None:
-        """Begin with the edges that are this member's now, and leave those that are another's."""
         with self._lock:
             known = self._alive | self._ports.keys()
             evicted = self._subscribers.keys() - self._ports.keys()
@@ -153,7 +152,7 @@ class GroundLink:
             port.close()
 
     def _unsubscribe(self, edge: str) -> None:
-        """Not while the lock is held: Zenoh may wait for a callback that wants it."""
+        # Not while the lock is held: Zenoh may wait for a callback that wants it.
         for one in self._subscribers.pop(edge):
             one.undeclare()  # type: ignore[no-untyped-call]
 
@@ -176,7 +175,7 @@ class GroundLink:
             return port
 
     def _make_space(self) -> bool:
-        """Leave one that is not there and never was more than a name."""
+        # Leave one that is not there and never was more than a name.
         for edge, port in self._ports.items():
             if not port.present.is_set() and not port.used.is_set():
                 del self._ports[edge]
@@ -210,7 +209,7 @@ class GroundLink:
             (port.present.set if there else port.present.clear)()
 
     def _note_shared(self, key: str, *, there: bool) -> None:
-        """It may be another's: there is a port for it only if it is served here."""
+        # It may be another's: there is a port for it only if it is served here.
         parsed = parse_key(key)
         if parsed is None or not matches(parsed[0], edges=self._edges):
             self.foreign += 1
@@ -226,7 +225,7 @@ class GroundLink:
             (port.present.set if there else port.present.clear)()
 
     def _fail(self, key: str, error: Exception) -> None:
-        """Hand over the error of a callback: to the edge's thread, which ends its session for it."""
+        # Hand over the error of a callback: to the edge's thread, which ends its session for it.
         parsed = parse_key(key)
         with self._lock:
             port = None if parsed is None else self._ports.get(parsed[0])

@@ -111,7 +111,7 @@ class MessageLog:
 
 
 def _is_info(payload: bytes) -> bool:
-    """Anybody on the link may send other bytes here, and as many as a picture."""
+    # Anybody on the link may send other bytes here, and as many as a picture.
     try:
         Info.parse(payload, versions=READ_VERSIONS)
     except WireError:

@@ -154,7 +154,7 @@ class QueuedSink(Generic[T]):
         return not self._thread.is_alive()
 
     def _fits(self, size: int) -> bool:
-        """Or whether there is no need of any."""
+        # Or whether there is no need of any.
         if self._ending or self._failing or not self._queue:
             return True
         return len(self._queue) < _MOST_ITEMS and self._queued_bytes + size <= _MOST_BYTES
@@ -170,7 +170,7 @@ class QueuedSink(Generic[T]):
                         return
 
     def _use(self, open_sink: Callable[[], SinkWriter[T]]) -> bool:
-        """Make the sink and write until the end; False where that failed."""
+        # Make the sink and write until the end; False where that failed.
         sink: SinkWriter[T] | None = None
         try:
             sink = open_sink()
@@ -205,7 +205,7 @@ class QueuedSink(Generic[T]):
             self.files.append(sink.path)
 
     def _take(self) -> tuple[T, int] | None:
-        """The next item, and how many were dropped before it; None at the end."""
+        # The next item, and how many were dropped before it; None at the end.
         self._give_receipts()
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._ending)
@@ -219,7 +219,6 @@ class QueuedSink(Generic[T]):
             return item, skipped
 
     def _give_receipts(self) -> None:
-        """All that was taken from the queue is written."""
         written: list[Callable[[bool], None]] = []
         with self._changed:
             self._in_hand = False

@@ -118,7 +118,7 @@ def _party(address: str) -> bytes:
 
 
 def _place(url: str) -> tuple[str, ...]:
-    """Host and port of an origin; nothing where it is none."""
+    # Host and port of an origin; nothing where it is none.
     try:
         parts = urlsplit(url)
         port = parts.port or {"http": 80, "https": 443}.get(parts.scheme)

@@ -95,7 +95,7 @@ class SessionFeed:
             self._hub.post(partial(give, frame_index=sample.frame_index, captured_ms=captured_ms))
 
     def _captured_ms(self, capture_ns: int) -> float:
-        """Capture time by the ground's clock. In lockstep capture is media time: there the picture is from now."""
+        # Capture time by the ground's clock. In lockstep capture is media time: there the picture is from now.
         if self._info.pace == "lockstep":
             return self._clock() / _MILLION
         return (capture_ns - self._offset_ns) / _MILLION
@@ -207,7 +207,7 @@ def state_loads(state: GroundState) -> dict[str, tuple[float, float, float, floa
 
 
 def _words(session: SessionState, *, calibrated: bool) -> list[str]:
-    """The session in a few sentences; unknown facts are left out."""
+    # The session in a few sentences; unknown facts are left out.
     words = []
     if session.total_bps is not None:
         words.append(f"{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")
@@ -232,7 +232,6 @@ def _some(count: int, what: str) -> str:
 
 
 def _short(one: EdgeState) -> str:
-    """The state of camera and link on the picture."""
     session = one.session
     if session is None:
         return ""
@@ -244,7 +243,6 @@ def _short(one: EdgeState) -> str:
 
 
 def _why(session: SessionState) -> list[str]:
-    """The outcomes of frames and stills, and the decisions on tracks and stills, in sentences."""
     why = [] if session.edge_frames is None else [f"At the edge {session.edge_frames}."]
     if session.stills_not_sent:
         why.append(f"Not sent as stills: {counts_text(session.stills_not_sent)}.")
@@ -262,6 +260,6 @@ def _edge_failures(one: EdgeState) -> list[str]:
 
 
 def _failure(part: FailedPart) -> str:
-    """Without the reason: it may name files of this machine."""
+    # Without the reason: it may name files of this machine.
     at = time.strftime("%H:%M:%S", time.gmtime(part.since_ns // 1_000_000_000))
     return f"{part.part} does not work since {at} UTC"

@@ -88,7 +88,7 @@ class Muxer:
         return start, fragment
 
     def _expected_s(self, capture_ns: int) -> float:
-        """How long this picture will be shown: as the last ones were."""
+        # How long this picture will be shown: as the last ones were.
         if self._last_ns is not None and capture_ns > self._last_ns:
             low, high = _DURATIONS_S
             self._intervals.append(min(high, max(low, (capture_ns - self._last_ns) / 1e9)))
@@ -96,7 +96,7 @@ class Muxer:
         return median(self._intervals)
 
     def _split(self, data: bytes) -> tuple[tuple[bytes, ...], bytes]:
-        """Parameter sets, the last of each kind in order, and all else with lengths for start codes."""
+        # Parameter sets, the last of each kind in order, and all else with lengths for start codes.
         sets: dict[int, bytes] = {}
         sample = bytearray()
         for unit in nal_units(data):
@@ -162,7 +162,7 @@ def codec_string(codec: Codec, sets: tuple[bytes, ...]) -> str:
 
 
 def _profile(sequence_set: bytes) -> bytes:
-    """``profile_tier_level`` of an HEVC sequence parameter set: 12 bytes behind two of header and one of ids."""
+    # ``profile_tier_level`` of an HEVC sequence parameter set: 12 bytes behind two of header and one of ids.
     return sequence_set.replace(b"\0\0\3", b"\0\0")[3:15]
 
 

@@ -102,7 +102,6 @@ class Pictures:
         self._copied = self._decoder = None
 
     def _remember(self, sample: VideoSample) -> bool:
-        """Whether there is a way from a keyframe to this sample."""
         if sample.keyframe:
             self._gop.clear()
             self._gop_bytes = 0
@@ -125,7 +124,7 @@ class Pictures:
             )
 
     def _decode(self) -> av.VideoFrame | None:
-        """The newest picture; who begins in between decodes all since the keyframe first."""
+        # The newest picture; who begins in between decodes all since the keyframe first.
         new = self._gop[-1:]
         if self._decoder is None:
             self._decoder = BaseDecoder(size=self._info.base_size)

@@ -162,7 +162,7 @@ class WebPage:
             self._loop.close()
 
     async def _served(self) -> None:
-        """Sessions' posts are taken meanwhile."""
+        # Sessions' posts are taken meanwhile.
         bound = await asyncio.to_thread(self._socket.wait, self._stop)
         if bound is not None:
             with bound:
@@ -170,10 +170,7 @@ class WebPage:
 
 
 class _Listener(socket.socket):
-    """Accepts so many connections and closes further ones before TLS: each has a descriptor of the process.
-
-    Who has fewer gets a place of who has most.
-    """
+    # Before TLS: each has a descriptor of the process. Who has fewer gets a place of who has most.
 
     _open: list[tuple[socket.socket, str]] | None = None
 
@@ -194,7 +191,7 @@ class _Listener(socket.socket):
 
 
 class _Server(uvicorn.Server):
-    """One whose handshakes end, and that cuts off who does not take the rest of a closed connection."""
+    # One whose handshakes end, and that cuts off who does not take the rest of a closed connection.
 
     def __init__(self, config: uvicorn.Config) -> None:
         super().__init__(config)
@@ -232,7 +229,7 @@ class _Server(uvicorn.Server):
 
 
 class _NoStall(asyncio.Protocol):
-    """Ends a connection whose other side takes nothing: closing it would wait for it."""
+    # Ends a connection whose other side takes nothing: closing it would wait for it.
 
     transport: asyncio.Transport
     loop: asyncio.AbstractEventLoop
@@ -253,7 +250,7 @@ class _BoundedSocket(_NoStall, WebSocketsSansIOProtocol):
 
 
 class _BoundedProtocol(_NoStall, H11Protocol):
-    """Closes connections that ask for nothing, or never come to the end of it."""
+    # Closes connections that ask for nothing, or never come to the end of it.
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -266,7 +263,7 @@ class _BoundedProtocol(_NoStall, H11Protocol):
         self._await_request(None)
 
     def _take_place(self) -> bool:
-        """That of one of whoever has most; False where that is this client."""
+        # That of one of whoever has most; False where that is this client.
         known: set[Any] = set(self.connections)
         others = {
             one: one.client[0]
@@ -285,7 +282,7 @@ class _BoundedProtocol(_NoStall, H11Protocol):
         self._await_request(answered)
 
     def _await_request(self, before: object) -> None:
-        """A byte now and then is no request."""
+        # A byte now and then is no request.
         self.loop.call_later(REQUEST_S, self._close_silent, before)
 
     def _close_silent(self, before: object) -> None:

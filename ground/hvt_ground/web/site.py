@@ -103,7 +103,7 @@ class Site:
         return Response(status_code=204)
 
     def _edge(self, request: Request) -> str:
-        """Only one that is known: names become keys of the link."""
+        # Only one that is known: names become keys of the link.
         edge: str = request.path_params["edge"]
         if edge not in self._hub.edges:
             raise BadRequestError("there is no such edge")
@@ -135,7 +135,7 @@ class Site:
                 await socket.close(1008)
 
     async def _receive(self, socket: WebSocket, viewer: Viewer) -> None:
-        """Read until it leaves, or sends a message that no page of ours would."""
+        # Read until it leaves, or sends a message that no page of ours would.
         times: deque[float] = deque(maxlen=_MOST_MESSAGES_A_S)
         while True:
             try:
@@ -149,7 +149,7 @@ class Site:
             times.append(now_s)
 
     def _obey(self, viewer: Viewer, message: dict[str, Any]) -> None:
-        """Raises `ValueError` and the like for anything but a message."""
+        # Raises `ValueError` and the like for anything but a message.
         match message["type"]:
             case "watch":
                 edge = message["edge"]
@@ -167,12 +167,11 @@ class Site:
                 raise ValueError("no message")
 
     def _now_ms(self) -> float:
-        """Milliseconds of the clock of all other times on the page."""
         return round(self._clock() / 1e6, 1)
 
 
 async def _send(socket: WebSocket, viewer: Viewer) -> None:
-    """Send the queue as fast as it is taken; one that takes nothing is closed for want of an answer to a ping."""
+    # Send the queue as fast as it is taken; one that takes nothing is closed for want of an answer to a ping.
     with suppress(WebSocketDisconnect, RuntimeError, ConnectionError):
         while True:
             message = await viewer.take()
@@ -181,7 +180,6 @@ async def _send(socket: WebSocket, viewer: Viewer) -> None:
 
 
 async def _json_body(request: Request) -> dict[str, Any]:
-    """The JSON that came; `BadRequestError` where it is none."""
     body = b""
     try:
         async with asyncio.timeout(5):
@@ -210,8 +208,6 @@ def _file(name: str) -> Response:
 
 
 class _Guard:
-    """Lets through who may; adds the headers that hold for every answer."""
-
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
         self._access = access

@@ -128,8 +128,6 @@ class Viewer:
 
 @dataclass(slots=True)
 class _Stream:
-    """The fragments under way on one rung, for new viewers."""
-
     number: int
     start: tuple[str, bytes] | None = None
     fragments: list[bytes] = field(default_factory=list)
@@ -309,7 +307,7 @@ class Hub:
     # Within
 
     def _put_thumbnails(self, viewer: Viewer) -> None:
-        """Those of all edges: of a silent one no other would come."""
+        # Those of all edges: of a silent one no other would come.
         for edge in self.edges.values() if viewer.wall else ():
             if edge.thumbnail is not None:
                 viewer.put_video(edge.thumbnail, begins=True)

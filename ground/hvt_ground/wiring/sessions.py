@@ -162,7 +162,7 @@ class SessionFactory:
         return partial(self._opened, make, names)
 
     def _still_address(self, info: Info, files: QueuedSink[Event] | None) -> Callable[[Refinement], str]:
-        """Where the picture of a still is: on the page, else in the folder of ``--stills``, else nowhere."""
+        # Where the picture of a still is: on the page, else in the folder of ``--stills``, else nowhere.
         page = self._page
 
         def address(still: Refinement) -> str:
@@ -182,7 +182,7 @@ class SessionFactory:
         )
 
     def _opened(self, make: Callable[[Path], S], name: Callable[..., Path]) -> S:
-        """A sink with a file; a name that could not be used is free again."""
+        # A sink with a file; a name that could not be used is free again.
         with self._naming:
             path = name(taken=self._paths)
         with ExitStack() as undo:
@@ -192,7 +192,6 @@ class SessionFactory:
         return sink
 
     def _give_up(self, path: Path) -> None:
-        """The name is free again."""
         self._paths.discard(path)
         config = self._config
         if path not in (config.record, config.tracks, config.stills) and has_nothing(path):

@@ -74,5 +74,5 @@ def _whole(affine: Affine) -> _Floats:
 
 
 def _part(step: _Floats, share: float) -> _Floats:
-    """A share of a small motion: linear in its distance from standing still."""
+    # A share of a small motion: linear in its distance from standing still.
     return step if share == 1 else np.eye(3) + (step - np.eye(3)) * share

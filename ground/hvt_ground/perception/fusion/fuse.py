@@ -228,7 +228,7 @@ class Fusion:
     # Learning
 
     def _patience(self, gap: int) -> int:
-        """How long a step counts, in frames, if the one before it came so many frames earlier."""
+        # How long a step counts, in frames, if the one before it came so many frames earlier.
         usual = self._usual_patience
         return usual if 2 * gap <= usual else min(2 * gap, max(usual, self._forget))
 
@@ -251,7 +251,7 @@ class Fusion:
         entity.edge_vote.update(int(self._edge_classes[step.class_ids[row]]), confidence)
 
     def _welcome(self, step: Tracks, fresh: Sequence[int]) -> None:
-        """Find which of the edge's new tracks continue one that it no longer lists; the others are new entities."""
+        # Find which of the edge's new tracks continue one that it no longer lists; the others are new entities.
         frame_index = step.frame_index
         merged = [
             entity
@@ -278,7 +278,6 @@ class Fusion:
         self._by_edge[edge_id] = entity
 
     def _part(self, own: Tracks, frame_index: int) -> None:
-        """Give an own track that has left the edge's box an entity of its own again."""
         rows = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
         for entity in list(self._entities):
             row = rows.get(entity.own_id) if entity.own_id is not None else None
@@ -295,7 +294,7 @@ class Fusion:
                 entity.part_from_own()
 
     def _note_own(self, own: Tracks, frame_index: int) -> None:
-        """Remember where our own boxes are at this frame: how they move from here moves the edge's box too."""
+        # Remember where our own boxes are at this frame: how they move from here moves the edge's box too.
         centres = (own.boxes_xyxy_px[:, :2] + own.boxes_xyxy_px[:, 2:]).astype(np.float64) / 2
         for row, own_id in enumerate(own.ids.tolist()):
             entity = self._by_own.get(own_id)  # a step that comes late finds tracks merged away since
@@ -314,7 +313,6 @@ class Fusion:
                 self._next_id += 1
 
     def _pair(self, own: Tracks, frame_index: int) -> None:
-        """Join our unmatched tracks with those of others at the same place."""
         rows = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
         theirs = [one for one in self._entities if one.own_id not in rows and self._is_far(one, frame_index)]
         if not theirs:
@@ -328,7 +326,7 @@ class Fusion:
             self._merge(ours[line], theirs[column])
 
     def _merge(self, ours: Entity, theirs: Entity) -> None:
-        """One entity of two; the one with the older id stays."""
+        # One entity of two; the one with the older id stays.
         if ours.id and theirs.id:
             self._merged.append((min(ours.id, theirs.id), max(ours.id, theirs.id)))
         if theirs.own_id is not None:  # a track of ours that was lost
@@ -377,7 +375,7 @@ class Fusion:
 
 
 def _usable(step: Tracks, *, classes: int) -> list[int]:
-    """Rows with a class that the edge has named and a box with an area."""
+    # Rows with a class that the edge has named and a box with an area.
     boxes = step.boxes_xyxy_px
     usable = (step.class_ids >= 0) & (step.class_ids < classes) & np.isfinite(boxes).all(axis=1)
     usable &= (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
@@ -388,7 +386,7 @@ def _usable(step: Tracks, *, classes: int) -> list[int]:
 def _pairs(
     overlaps: npt.NDArray[np.float64], *, bonus: npt.NDArray[np.float64] | float = 0.0
 ) -> list[tuple[int, int]]:
-    """(row, column) of those that belong together, one to one, none below `PAIR_IOU`."""
+    # (row, column) of those that belong together, one to one, none below `PAIR_IOU`.
     cost = np.where(overlaps >= PAIR_IOU, 1 - overlaps - bonus, 2.0)
     rows, columns = assign(cost, limit=1.5)
     return list(zip(rows.tolist(), columns.tolist(), strict=True))

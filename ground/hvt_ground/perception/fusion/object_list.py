@@ -49,8 +49,6 @@ class FusedTracks:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """One entity and our own track of it, if it has one at this frame."""
-
     entity: Entity
     origin: Origin
     row: int | None
@@ -121,7 +119,7 @@ def _lines(entities: Sequence[Entity], own: Tracks, rules: FusionRules, *, doubt
 def _boxes(
     lines: Sequence[_Line], own: Tracks, path: CameraPath, rules: FusionRules
 ) -> npt.NDArray[np.float32]:
-    """(N, 4): ours, theirs, or the mean of both, weighted by confidence and age."""
+    # (N, 4): ours, theirs, or the mean of both, weighted by confidence and age.
     frame_index = own.frame_index
     boxes = np.empty((len(lines), 4))
     observed = [place for place, line in enumerate(lines) if line.observed is not None]
@@ -146,7 +144,7 @@ def _boxes(
 
 
 def _moved_with_ours(entity: Entity, observed: Observation, ours: _Floats, predicted: _Floats) -> _Floats:
-    """The edge's box after the way that ours has gone since; the mean of both ways where it has one of its own."""
+    # The edge's box after the way that ours has gone since; the mean of both ways where it has one of its own.
     then = entity.own_then
     if then is None or then[1] != observed.frame_index:
         return predicted
@@ -166,7 +164,7 @@ def _correction(entity: Entity, frame_index: int, rules: FusionRules) -> _Floats
 def _classes(
     lines: Sequence[_Line], own: Tracks, rules: FusionRules
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """(N,) class ids and their confidences: the side that is surer says."""
+    # (N,) class ids and their confidences: the side that is surer says.
     classes, confidences = np.zeros(len(lines), np.int32), np.zeros(len(lines), np.float32)
     for place, line in enumerate(lines):
         entity = line.entity
@@ -188,7 +186,7 @@ def _once_each(
     classes: npt.NDArray[np.int32],
     confidences: npt.NDArray[np.float32],
 ) -> npt.NDArray[np.bool_]:
-    """(N,) which to list: of two that are one object the better known, then the surer, then the older."""
+    # (N,) which to list: of two that are one object the better known, then the surer, then the older.
     listed = np.ones(len(lines), np.bool_)
     if all(line.observed is None for line in lines):
         return listed

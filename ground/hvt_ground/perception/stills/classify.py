@@ -146,18 +146,14 @@ class Redetection:
         )
 
     def _detect(self, stills: Sequence[DecodedStill], base_bgr: Image) -> Detections:
-        """On the composite; base pixels."""
+        # On the composite; base pixels.
         zoom = self._zoom((base_bgr.shape[1], base_bgr.shape[0]))
         found = self._detector.detect(composite(base_bgr, stills, view=self._view, zoom=zoom))
         boxes = (found.boxes_xyxy_px / zoom).astype(np.float32)
         return Detections(boxes, found.confidences, found.class_ids)
 
     def _zoom(self, base_size: tuple[int, int]) -> float:
-        """As large as the network would make the base picture, and no finer than the source.
-
-        Objects keep the size that the network sees on the base stream. To enlarge them beyond it, a part of the
-        picture at a time, made classes worse.
-        """
+        # Objects keep the size that the network sees on the base: enlarging them beyond it made classes worse.
         detector = self._detector.part if isinstance(self._detector, RetriedDetector) else self._detector
         if not isinstance(detector, OnnxDetector):
             return 1.0
@@ -165,7 +161,6 @@ class Redetection:
         return max(1.0, min(width / base_size[0], height / base_size[1], 1 / self._view.scale))
 
     def _readings(self, found: Detections, overlaps: npt.NDArray[np.float64]) -> list[ObjectReading]:
-        """For each row of ``overlaps`` (an object), the reading of the detections (columns) at its place."""
         if not len(found):
             return [ObjectReading()] * len(overlaps)
         owners = overlaps.argmax(axis=0)
@@ -184,11 +179,7 @@ class Redetection:
         return readings
 
     def _posterior(self, found: Detections, best: int, others: npt.NDArray[np.intp]) -> Posterior:
-        """Over the classes that were seen at an object's place; what is left of 1 is spread evenly over the rest.
-
-        A detector gives one class to a box. Another class with a box of its own at the same place is a second
-        opinion: it counts with its score, but for no more than ``best``, which names the object.
-        """
+        # Another class with a box of its own there is a second opinion: its score counts, for no more than ``best``.
         names, score = self.class_names, float(found.confidences[best])
         scores = np.zeros(len(names), np.float64)
         np.maximum.at(scores, found.class_ids[others], np.minimum(found.confidences[others], score))
@@ -204,7 +195,6 @@ class Redetection:
     def _new(
         self, found: Detections, overlaps: npt.NDArray[np.float64], stills: Sequence[DecodedStill]
     ) -> Detections:
-        """Confident detections that lie inside a still and on no named object."""
         crops = self._view.to_base(np.array([still.crop_source_px for still in stills], np.float32))
         inside = _share_inside(found.boxes_xyxy_px, crops).max(axis=1) >= _INSIDE_SHARE
         unnamed = overlaps.max(axis=0) < _NEW_OBJECT_IOU
@@ -234,7 +224,7 @@ def object_crops(still: DecodedStill, *, view: View) -> list[Image]:
 
 
 def _share_inside(boxes: Boxes, areas: Boxes) -> npt.NDArray[np.float64]:
-    """(N, M): how much of each of N boxes lies in each of M areas, 0…1."""
+    # (N, M): how much of each of N boxes lies in each of M areas, 0…1.
     first = np.maximum(boxes[:, None, :2], areas[None, :, :2])
     last = np.minimum(boxes[:, None, 2:], areas[None, :, 2:])
     shared = np.clip(last - first, 0, None).prod(axis=2)

@@ -67,7 +67,7 @@ def patch_of(still: DecodedStill, *, view: View, zoom: float, size: tuple[int, i
 
 
 def _place(crop_source_px: tuple[int, int, int, int], view: View, zoom: float) -> list[float]:
-    """Where a crop lies in the result: x1 y1 x2 y2, double precision."""
+    # Where a crop lies in the result: x1 y1 x2 y2, double precision.
     offset = view.offset_px * 2
     return [(edge * view.scale + offset[axis]) * zoom for axis, edge in enumerate(crop_source_px)]
 
@@ -81,7 +81,7 @@ def _enlarged(base_bgr: Image, zoom: float) -> Image:
 
 
 def _coverage(centres: npt.NDArray[np.floating[Any]], first: float, last: float) -> npt.NDArray[np.float64]:
-    """How much each pixel of a line shows of the interval ``first``…``last``, rising over the feather."""
+    # How much each pixel of a line shows of the interval ``first``…``last``, rising over the feather.
     depth = np.minimum(centres - first, last - centres) + 0.5
     return np.asarray(np.clip(depth / _FEATHER_PX, 0, 1), np.float64)
 

@@ -123,7 +123,7 @@ class Matcher:
         frame_index: int,
         class_names: Sequence[str],
     ) -> dict[Hashable, TrackMatch]:
-        """One to one among the tracks in ``rows``, by the key of each group's first; finds are remembered."""
+        # One to one among the tracks in ``rows``, by the key of each group's first; finds are remembered.
         heads = [group[0] for group in groups]
         found = {head.key: TrackMatch() for head in heads}
         if not heads or not len(rows):
@@ -149,7 +149,7 @@ class Matcher:
         frame_index: int,
         class_names: Sequence[str],
     ) -> Floats:
-        """(heads, rows) how much each pair is preferred; 0 where the evidence does not reach the threshold."""
+        # (heads, rows) how much each pair is preferred; 0 where the evidence does not reach the threshold.
         wanted_px = np.array([head.box_base_px for head in heads], np.float32)
         evidence = iou(wanted_px, tracks.boxes_xyxy_px[rows])
         same_class = np.zeros(evidence.shape, np.bool_)
@@ -167,7 +167,7 @@ class Matcher:
         return evidence + CLASS_BONUS * (same_class & (evidence > 0))
 
     def _known(self, edge_id: int, ground_id: int, frame_index: int) -> float:
-        """The bonus or penalty of earlier stills for the overlap of this pair."""
+        # The bonus or penalty of earlier stills for the overlap of this pair.
         if edge_id >= 0 and self._ground_of.get(edge_id, (None, 0))[0] == ground_id:
             return KNOWN_BONUS
         owner, since = self._edge_of.get(ground_id, (edge_id, frame_index))
@@ -198,7 +198,7 @@ def _by_edge_track(wanted: Sequence[StillToMatch]) -> list[list[StillToMatch]]:
 
 
 def _ambiguous(preference: Floats, chosen: int, taken: Sequence[int], boxes: Boxes) -> bool:
-    """Whether a free track fits nearly as well and is another object."""
+    # Whether a free track fits nearly as well and is another object.
     near = (preference > 0) & (preference >= preference[chosen] - AMBIGUITY_MARGIN)
     near[[chosen, *taken]] = False
     apart = iou(boxes[chosen : chosen + 1], boxes)[0] < SAME_OBJECT_IOU

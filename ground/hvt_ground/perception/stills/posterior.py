@@ -115,7 +115,7 @@ class TrackPosterior:
 
 
 def _base_log_vote(vocabulary: Vocabulary, *, class_id: int, confidence: float) -> _Floats:
-    """(C,) ``log b`` over the classes of tracks; flat where the detector says only that something moves."""
+    # (C,) ``log b`` over the classes of tracks; flat where the detector says only that something moves.
     count = len(vocabulary.names)
     if count < 2 or vocabulary.names[class_id] == MOVING:
         return np.zeros(count)

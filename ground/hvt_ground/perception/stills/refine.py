@@ -205,7 +205,7 @@ class Refiner:
         now_frame: int,
         known_as: Callable[[int], int | None],
     ) -> list[ResolvedStill]:
-        """Tracks come in the order of frames: once a later frame is there, an absent one never will be."""
+        # Tracks come in the order of frames: once a later frame is there, an absent one never will be.
         resolved: list[ResolvedStill] = []
         for pending in held:
             oldest, newest, frame_index = (
@@ -228,7 +228,7 @@ class Refiner:
     def _by_name(
         self, still: StillSeen, history: History, known_as: Callable[[int], int | None]
     ) -> ResolvedStill | None:
-        """Apply a still of long ago to the track that its edge track is known as now; None where it is not known."""
+        # Apply a still of long ago to the track that its edge track is known as now; None where it is not known.
         edge_id = still.edge_track_id
         if edge_id < 0 or history.newest_tracked is None:
             return None
@@ -257,7 +257,6 @@ class Refiner:
         )
 
     def _apply(self, still: StillSeen, tracks: Tracks, row: int) -> ResolvedStill:
-        """Update the class of a track by a still."""
         track_id = int(tracks.ids[row])
         class_posterior = self._track_posteriors.get(track_id)
         if class_posterior is None:
@@ -318,7 +317,7 @@ class Refiner:
         self._track_posteriors.move_to_end(track_id)
 
     def _forget(self, now_frame: int) -> None:
-        """Drop the posteriors of tracks that ended; the longest unseen stand first."""
+        # Drop the posteriors of tracks that ended; the longest unseen stand first.
         while self._track_posteriors:
             track_id, class_posterior = next(iter(self._track_posteriors.items()))
             if now_frame - class_posterior.last_frame <= self._forget_frames:

@@ -118,7 +118,7 @@ class StillStage:
     # From bytes to readings
 
     def _may_wait(self, header: RoiHeader, now: Progress) -> bool:
-        """Whether its picture may yet come. A residual is nothing without it; others wait for the next frame only."""
+        # Whether its picture may yet come. A residual is nothing without it; others wait for the next frame only.
         if header.frame_index <= now.picture_index:
             return False
         return needs_base(header) or (self._wants_base and header.frame_index >= now.frame_index)
@@ -142,10 +142,7 @@ class StillStage:
                     self._fusion.take_found(readings.found, known=known)
 
     def _out_of_patience(self, now: Progress) -> bool:
-        """Whether so many stills could not be decoded lately that somebody sends them on purpose.
-
-        Each costs a line in the recording and, from libjpeg, one on stderr.
-        """
+        # Sent on purpose, then: each costs a line in the recording and, from libjpeg, one on stderr.
         spoilt = self._spoilt
         return len(spoilt) == _MOST_SPOILT and abs(now.frame_index - spoilt[0]) < _SPOILT_FRAMES
 
@@ -221,11 +218,7 @@ class StillStage:
         return self._vocabulary.vote(reading.posterior, called=called, side_px=side_px)
 
     def _news(self, decoded: DecodedStill) -> float:
-        """How much a still shows that the base did not, 0…1.
-
-        A detector that names the same pixels twice has not seen them twice. On a base near the source the many
-        votes of the track are worth more than one more of a still.
-        """
+        # Pixels named twice were not seen twice; on a base near the source the track's many votes are worth more.
         base_bgr = self._history.frame(decoded.frame_index)
         if base_bgr is None:
             return 1.0
@@ -288,10 +281,7 @@ class StillStage:
     def _answer(
         self, header: RoiHeader, track_id: int, posterior: Posterior | None, *, again: bool = False
     ) -> None:
-        """The edge hears of every still and every track in it, so that it waits for none in vain.
-
-        No name is no opinion. A still that is asked for again is answered once, for all that it shows.
-        """
+        # Every still and track, so that the edge waits for none in vain; no name is no opinion; `again` comes once.
         self._results.append(
             StillResult(
                 still_sequence=header.sequence,
@@ -305,7 +295,6 @@ class StillStage:
         )
 
     def _name_track(self, still: StillSeen, ground_track_id: int) -> None:
-        """Add the track that a still refined to its answer, if that has not been reported yet."""
         for place, result in enumerate(self._results):
             if (result.still_sequence, result.track_id) == (still.sequence, still.edge_track_id):
                 self._results[place] = replace(result, ground_track_id=ground_track_id)
@@ -319,7 +308,7 @@ class StillStage:
 
 
 def _shown(header: RoiHeader) -> list[tuple[int, Box]]:
-    """Edge track and box, source pixels, of each object in a still, the lead's first."""
+    # Edge track and box, source pixels, of each object in a still, the lead's first.
     return [
         (header.track_id, header.box_source_px),
         *((one.track_id, one.box_source_px) for one in header.also),
@@ -327,7 +316,7 @@ def _shown(header: RoiHeader) -> list[tuple[int, Box]]:
 
 
 def _base_crop_at(base_bgr: Image, crop_source_px: tuple[int, int, int, int], *, view: View) -> Image | None:
-    """The same padded box of the base frame, whole pixels, clipped; None where nothing of it is inside."""
+    # The same padded box of the base frame, whole pixels, clipped; None where nothing of it is inside.
     x1, y1, x2, y2 = view.to_base(np.array([crop_source_px], np.float32))[0]
     height, width = base_bgr.shape[:2]
     left, top = max(0, int(np.floor(x1))), max(0, int(np.floor(y1)))

@@ -126,7 +126,7 @@ def _names(detectors: Sequence[str], words: Sequence[str], nothing: str | None) 
 
 
 def _targets(names: tuple[str, ...], reader: tuple[str, ...], *, groups: bool) -> list[frozenset[int]]:
-    """For each class of the reader the classes of ``names`` that it speaks for."""
+    # For each class of the reader the classes of ``names`` that it speaks for.
     if groups:
         grouped = [group_of(name) for name in names]
         return [

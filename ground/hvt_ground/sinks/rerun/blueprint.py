@@ -100,7 +100,6 @@ def _page(
     name: str | None = None,
     located: bool = False,
 ) -> rrb.Horizontal:
-    """All of one edge, whose entities lie below ``root``."""
     plots = _plots(root, clocked=clocked, top_kbps=top_kbps)
     left = rrb.Vertical(_videos(root, base_size, located=located), plots, row_shares=[2.9, 1.0])
     right = rrb.Vertical(_gallery(root), _session(root), _events(root), row_shares=[2.3, 0.67, 0.93])

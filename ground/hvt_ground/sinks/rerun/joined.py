@@ -47,7 +47,7 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
 
 
 def _read(path: Path) -> tuple[str, list[Chunk]]:
-    """The edge's id, and everything but the file's own entities."""
+    # The edge's id, and everything but the file's own entities.
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that there is no footer

@@ -82,7 +82,7 @@ def place_legend(texts: Sequence[str], *, size: tuple[int, int]) -> list[tuple[f
 
 
 def _places(box: _Boxes, text: str, size: tuple[int, int]) -> list[_Boxes]:
-    """Areas of a label: below, above, right, left of its box; within a box that is much larger."""
+    # Areas of a label: below, above, right, left of its box; within a box that is much larger.
     width, height, gap = _width(text, size), points(_HEIGHT, size[0]), points(_GAP, size[0])
     x1, y1, x2, y2 = box.tolist()
     middle = ((x1 + x2 - width) / 2, (y1 + y2 - height) / 2)

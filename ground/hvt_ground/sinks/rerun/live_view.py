@@ -157,7 +157,7 @@ class LiveRecording:
                 del self._recording
 
     def _check(self) -> None:
-        """Look for the viewer once a second: the SDK would keep everything it cannot send, and slow every call."""
+        # Look for the viewer once a second: the SDK would keep everything it cannot send, and slow every call.
         now_s = time.monotonic()
         if now_s < self._next_check_s:
             return

@@ -72,8 +72,6 @@ class LayerUpdate:
 
 @dataclass(frozen=True, slots=True)
 class _Screen:
-    """The values of every track of the last overlay that was written."""
-
     ids: npt.NDArray[np.int64]
     boxes: npt.NDArray[np.float32]
     """(N, 4) centre and half size."""
@@ -231,7 +229,7 @@ class BacklogOverlays:
 
 
 def _held(screen: _Screen, overlay: Overlay) -> _Screen:
-    """The overlay's values on their grids, except where the screen is near enough."""
+    # The overlay's values on their grids, except where the screen is near enough.
     corners = overlay.boxes_base_px
     boxes = np.hstack((corners[:, :2] + corners[:, 2:], corners[:, 2:] - corners[:, :2])) / 2
     percents = np.round(overlay.confidences * 100).astype(np.int64)
@@ -284,7 +282,7 @@ def _same(old: object, new: object) -> bool:
 
 
 def _movement_bytes(old: npt.NDArray[np.float32] | None, new: npt.NDArray[np.float32] | None) -> int:
-    """An estimate after compression: the boxes that differ from the row before, and the row itself."""
+    # An estimate after compression: the boxes that differ from the row before, and the row itself.
     if new is None:
         return 0
     if old is None or len(old) != len(new):
@@ -303,7 +301,7 @@ def _doubted(overlay: Overlay) -> npt.NDArray[np.bool_]:
 
 
 def _labels(overlay: Overlay, screen: _Screen, size: tuple[int, int], chosen: Container[int]) -> list[Label]:
-    """Labels of the tracks that a still renamed or doubts, or that were chosen, as far as there is room."""
+    # Labels of the tracks that a still renamed or doubts, or that were chosen, as far as there is room.
     doubted, reported = _doubted(overlay), _reported(overlay)
     words = []
     for row, track_id in enumerate(screen.ids.tolist()):

@@ -237,7 +237,7 @@ class Recorder:
         self.close()
 
     def _note_shown(self, row: TableRow) -> None:
-        """Stored stills lie before others, and may be shown all the same."""
+        # Stored stills lie before others, and may be shown all the same.
         if row.columns in _MOMENTARY or row.at is None:
             return
         if row.columns == "place":  # moves what is there
@@ -300,7 +300,7 @@ class Recorder:
         return not self._awaits_keyframe and self._decodable(sample)
 
     def _decodable(self, sample: VideoSample) -> bool:
-        """Rerun shows garbage for undecodable units, so begin at a keyframe and never go back."""
+        # Rerun shows garbage for undecodable units, so begin at a keyframe and never go back.
         if self._last_sample is None:
             return sample.keyframe and bool(parameter_sets(sample.data))
         return sample.frame_index > self._last_sample and bool(sample.data)
@@ -313,7 +313,7 @@ class Recorder:
         return rows
 
     def _backlog_overlay(self, overlay: Overlay) -> list[TableRow | Chunk]:
-        """Patches stay away: they ride on tracks of now."""
+        # Patches stay away: they ride on tracks of now.
         timed = self._backlog_overlays.encode(overlay)
         return [
             row for frame, capture_ns, update in timed for row in self._layer(update, at=(frame, capture_ns))
@@ -354,7 +354,6 @@ class Recorder:
         return self._class_ids.setdefault((known, level), len(self._class_ids))
 
     def _new_classes(self, layer: Layer) -> list[Chunk]:
-        """Names and colours, where some are new to the layer."""
         return self._into.new_classes(
             layer, _LAYER_PATHS[layer], self._class_ids, size=self._settings.base_size
         )

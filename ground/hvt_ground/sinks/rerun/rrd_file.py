@@ -111,7 +111,7 @@ class RrdFile:
             del self._stream, self._recording
 
     def _add_footer(self, hurry: threading.Event | None) -> None:
-        """Write all once more through the SDK, which adds a footer; whole or not at all."""
+        # Write all once more through the SDK, which adds a footer; whole or not at all.
         scratch = self.path.with_name(self.path.name + ".part")
         if shutil.disk_usage(self.path.parent).free < 2 * self.size_bytes + _SPARE_BYTES:
             _log.warning("recording %s has no footer: the disk has no room for one", self.path)
@@ -169,7 +169,6 @@ def _chunks(path: Path) -> Iterator[Chunk]:
 
 
 def _messages(stream: bytes) -> bytes:
-    """The SDK's encoded messages, without the stream's header and footer."""
     end = at = _STREAM_HEADER_BYTES
     while at < len(stream):
         kind, length = _MESSAGE_HEADER.unpack_from(stream, at)
@@ -204,7 +203,7 @@ def drop_footer(path: Path) -> None:
 
 
 def _whole_messages(file: int) -> Iterator[tuple[int, int]]:
-    """The kind of each message, and where it ends; not of one that breaks off."""
+    # The kind of each message, and where it ends; not of one that breaks off.
     at, size = _STREAM_HEADER_BYTES, os.fstat(file).st_size
     while len(head := os.pread(file, _MESSAGE_HEADER.size, at)) == _MESSAGE_HEADER.size:
         kind, length = _MESSAGE_HEADER.unpack(head)
@@ -237,7 +236,6 @@ def _created(path: Path) -> int:
 
 
 def _locked(file: int) -> bool:
-    """Lock it; False where somebody else has claimed it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -69,7 +69,7 @@ def _picture(port: int, recording: Path, *, frame: int, settle_s: float) -> byte
 
 
 def _without_menu(png: bytes) -> bytes:
-    """Cut the menu bar: it tells of the machine that took the picture (a software renderer, a container)."""
+    # Cut the menu bar: it tells of the machine that took the picture (a software renderer, a container).
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
         raise UserError("the headless viewer returned no picture")

@@ -63,7 +63,6 @@ def still_picture(refinement: Refinement) -> Coded | None:
 
 
 def _decoded(data: bytes) -> Image | None:
-    """The picture that OpenCV decodes; None if it does not know the format."""
     if not data:
         return None
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)

@@ -101,14 +101,14 @@ class Patches:
         return now_ns - patch.since_ns < FRESH_NS or not self._shift(patch).any()
 
     def _shift(self, patch: _Patch) -> npt.NDArray[np.float64]:
-        """How far the object is from where the still was cut, whole pixels; nothing while it only trembles."""
+        # How far the object is from where the still was cut, whole pixels; nothing while it only trembles.
         shift = self._centres[patch.track_id] - patch.centre_px
         if np.abs(shift).max() <= max(_STEP_PX, _STANDS_SHARE * patch.side_px):
             return np.zeros(2)
         return np.asarray(np.rint(shift), np.float64)
 
     def _slot(self, track_id: int) -> int:
-        """The track's own, else a free one, else that of the oldest."""
+        # The track's own, else a free one, else that of the oldest.
         for slot, patch in self._patches.items():
             if patch.track_id == track_id:
                 return slot

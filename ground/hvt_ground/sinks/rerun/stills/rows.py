@@ -90,7 +90,7 @@ class StillRows:
     def _pair(
         self, refinement: Refinement, base: Coded | None, still: Coded, *, changed: bool
     ) -> list[TableRow]:
-        """Base crop and still in the gallery; nothing where all slots are held, or for lack of room."""
+        # Base crop and still in the gallery; nothing where all slots are held, or for lack of room.
         # A slot's old base crop must not stand beside a new still: the frame's absence is shown as a blank.
         pictures = (("base", base or BLANK), ("still", still))
         cost = sum(len(data) for _, (data, _) in pictures)
@@ -116,7 +116,7 @@ class StillRows:
         return self._pair_bytes + pair_bytes <= share or self._size_limit.has(pair_bytes, ratio=PAIR_RATIO)
 
     def _patch(self, refinement: Refinement, still: Coded) -> list[TableRow]:
-        """The still on the enhanced picture; nothing where its object is not on the screen."""
+        # The still on the enhanced picture; nothing where its object is not on the screen.
         data, size = still
         put = self._patches.put(refinement, size=size)
         if put is None or put.place is None:
@@ -125,7 +125,7 @@ class StillRows:
         return [TableRow(path, "patch", PlacedJpeg(data, put.place), len(data) + _MOVE_BYTES)]
 
     def _hidden(self, refinement: Refinement, base: Coded | None, still: Coded) -> list[TableRow]:
-        """Kept where it can be found but not seen, as far as bytes allow; a still as received always is."""
+        # Kept where it can be found but not seen, as far as bytes allow; a still as received always is.
         path, rows = names.OVERFLOW, []
         for name, picture in (("still", still), ("base", base)):
             if picture is None:
@@ -137,7 +137,7 @@ class StillRows:
 
 
 def _message(refinement: Refinement, still: Coded) -> list[TableRow]:
-    """The still as a message of its own that goes with the JPEG in the recording: its checksum covers the two."""
+    # The still as a message of its own that goes with the JPEG in the recording: its checksum covers the two.
     header, (data, size) = refinement.header, still
     if header is None or len(data) > RoiHeader.MAX_PAYLOAD:
         return []
