@@ -190,6 +190,16 @@ class Pipeline:
         self._parts.fusion.take_own(own)
         self._show(own, picture.capture_ns)
 
+    def pass_over(self, picture: DecodedFrame) -> None:
+        """Take the next frame without a look at it: its list goes on from the newest picture that was looked at.
+
+        Else the boxes of that one would stand on this picture while the camera moves on.
+        """
+        index = picture.frame_index
+        if index > self._now.frame_index and self._own is not None:
+            self._now = Progress(index, picture.capture_ns, self._now.picture_index)
+            self._show(self._own_at(index), picture.capture_ns)
+
     def edge_step(self, step: Tracks, *, capture_ns: int | None = None) -> None:
         """Take what the edge's tracker listed at one frame: ids and class ids the edge's, boxes in base pixels.
 

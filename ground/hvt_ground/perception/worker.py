@@ -147,7 +147,8 @@ class PerceptionWorker(ABC):
 class RealtimeWorker(PerceptionWorker):
     """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still.
 
-    `close` gives it ``finish_s`` for what waits, then ``leave_s`` for what is in hand.
+    ``pass_over`` takes a picture for which there is no time. `close` gives it ``finish_s`` for what waits, then
+    ``leave_s`` for what is in hand.
     """
 
     def __init__(
@@ -157,10 +158,12 @@ class RealtimeWorker(PerceptionWorker):
         read: Read,
         *,
         name: str,
+        pass_over: Callable[[DecodedFrame], None] = lambda _picture: None,
         finish_s: float = 1.5,
         leave_s: float = 1.0,
     ) -> None:
         super().__init__(analyze, step, read)
+        self._pass_over = pass_over
         self._finish_s = finish_s
         self._leave_s = leave_s
         self._lock = threading.Lock()
@@ -278,7 +281,7 @@ class RealtimeWorker(PerceptionWorker):
                     break
                 stills.append(self._stills.popleft())
         self._take_pictures(hurry=False)
-        while self._steps and not self._given_up.is_set():
+        while self._steps and not self._given_up.is_set() and not self._picture_before(self._steps[0][0]):
             self._step(*self._steps.popleft())
         if stills:
             self._take_pictures(hurry=True)  # what came while the detector ran would wait as long again
@@ -286,6 +289,12 @@ class RealtimeWorker(PerceptionWorker):
         self._do_jobs()
         if self._has_news():
             self._wake.set()
+
+    def _picture_before(self, step: Tracks) -> bool:
+        # One that came while the detector ran. Its own list would be older than the step's, and never be shown: the
+        # boxes of a frame before it would stand on its picture, and on those after it, while the camera moves on.
+        with self._lock:
+            return bool(self._pictures) and self._pictures[0][0].frame_index <= step.frame_index
 
     def _take_pictures(self, *, hurry: bool) -> None:
         # Analyze the pictures that are there: in the newest objects are detected, unless in a ``hurry``.
@@ -296,10 +305,12 @@ class RealtimeWorker(PerceptionWorker):
             with self._lock:
                 picture, came_s = self._pictures.popleft()
                 newer = len(self._pictures) > 0
-                if newer and time.monotonic() - came_s > _OLDEST_S:
-                    self.untracked += 1
-                    continue
-            self._analyze(picture, hurry or newer)
+                late = newer and time.monotonic() - came_s > _OLDEST_S
+                self.untracked += late
+            if late:
+                self._pass_over(picture)
+            else:
+                self._analyze(picture, hurry or newer)
 
     def _do_jobs(self) -> None:
         # Do jobs that can wait, until something comes that cannot.

@@ -123,7 +123,11 @@ class GroundSession:
         self._results_lock = threading.Lock()
         self._still_window = StillSequenceWindow()
         if worker_of is None:
-            worker_of = partial(LockstepWorker if self.lockstep else RealtimeWorker, name=info.edge)
+            worker_of = (
+                partial(LockstepWorker, name=info.edge)
+                if self.lockstep
+                else partial(RealtimeWorker, name=info.edge, pass_over=self.pipeline.pass_over)
+            )
         self.worker = worker_of(self._analyze, self._step, self._read)
         outputs = [one for one in self._queued if one.for_backlog]
         self.backlog = SessionBacklog(

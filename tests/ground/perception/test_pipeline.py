@@ -54,6 +54,25 @@ def received(flight: Flight, index: int, sequence: int, **changes) -> ReceivedSt
     return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
 
 
+def test_boxes_go_on_over_pictures_that_were_passed_over(pictures):
+    """They stood still on each picture that the ground had no time for, while the camera moved on."""
+    rig, looked_at = Rig(detect_every=1), Rig(detect_every=1)
+    for picture in pictures[:12]:
+        rig.pipeline.analyze(picture, hurry=False)
+    for picture in pictures[12:15]:
+        rig.pipeline.pass_over(picture)
+    rig.pipeline.analyze(pictures[15], hurry=False)
+    for picture in pictures[:16]:
+        looked_at.pipeline.analyze(picture, hurry=False)
+    seen, expected = rig.of(Overlay), looked_at.of(Overlay)
+    assert [one.frame_index for one in seen] == list(range(16))
+    for one, right, still in zip(seen[12:15], expected[12:15], expected[11:14], strict=True):
+        assert one.track_ids.tolist() == right.track_ids.tolist()
+        off_px = np.abs(one.boxes_base_px - right.boxes_base_px).max()
+        assert off_px < 1.5
+        assert off_px < np.abs(still.boxes_base_px - right.boxes_base_px).max()
+
+
 def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures):
     """Boxes would lag behind the picture or be missing from some frames."""
     rig = Rig(detect_every=3)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hvt_common.protocol.messages import RoiHeader
+from hvt_common.values import Tracks
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import LockstepWorker, RealtimeWorker
@@ -74,6 +75,20 @@ def test_pictures_come_between_the_stills_of_two_frames(flight):
     read = [one for _, which in rest if isinstance(which, list) for one in which]
     assert read == [0, 1, 2, 3]
     assert first == 1, "the first frame's are in hand when it comes, the others wait for it"
+
+
+def test_a_report_of_tracks_lets_the_pictures_before_it_go_first():
+    """The boxes of a former picture stood on all that came while the detector ran."""
+    rig = Rig()
+    rig.worker.picture(picture(1))
+    assert rig.begun.wait(timeout=20)
+    for index in (2, 3):
+        rig.worker.step(Tracks.none(index), index)
+        rig.worker.picture(picture(index))
+    rig.worker.step(Tracks.none(4), 4)
+    order = [which if kind == "step" else -which for kind, which in rig.finish()]  # pictures count below 0
+    assert order[-1] == 4
+    assert all(order.index(-index) < order.index(index) for index in (2, 3))
 
 
 def test_pictures_that_waited_for_long_are_passed_over():

@@ -65,7 +65,9 @@ def test_another_runtime_finds_what_is_there(installed):
     assert len(open_detector("acme-blobs", confidence=0.9).detect(picture())) == 0
     assert open_detector("acme-blobs:small,large").class_names == ("small", "large")
     assert tiled(detector, "auto") is detector
-    with pytest.raises(UserError, match="tiles 2x2 need an ONNX network; motion and plug-ins take whole"):
+    with pytest.raises(
+        UserError, match="tiles 2x2 need an ONNX network; motion, plug-ins and ensembles take whole"
+    ):
         tiled(detector, "2x2")
 
 
