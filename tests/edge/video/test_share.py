@@ -123,7 +123,7 @@ def test_nothing_is_proposed_before_the_scene_is_known_or_for_a_trifle():
     one = split(300_000)
     assert one.propose() is None
     assert one.share == FIRST_SHARE
-    scene = [car(number, lost=0.9, side=60) for number in range(1, 41)]
+    scene = [car(number, lost=0.9, side=60) for number in range(1, 51)]
     after(one, scene, from_source=True)
     settled = one.share
     assert after(one, scene[:-2], start=10, from_source=True) is None
