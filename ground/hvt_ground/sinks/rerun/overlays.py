@@ -94,7 +94,7 @@ class OverlayEncoder:
         self,
         size: tuple[int, int],
         *,
-        share: float = 0.125,
+        share: float = 0.2,
         credit_bytes: int = 16_384,
         afresh: bool = False,
     ) -> None:

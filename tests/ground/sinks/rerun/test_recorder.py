@@ -508,6 +508,15 @@ def test_movement_yields_to_the_allowance_but_news_does_not() -> None:
     assert encoder.encode(overlay(32, boxes + 50, refined=True))
 
 
+def test_a_hundred_boxes_follow_a_camera_that_pans() -> None:
+    """At 800 kbps the boxes of a recording stood on the ground beside their cars for three frames of four."""
+    encoder = OverlayEncoder((1280, 720))
+    boxes = moving_boxes(0, 120, (1280, 720))
+    for frame in range(150):
+        encoder.earn(700_000 // 8 // 15)
+        assert encoder.encode(overlay(frame, boxes + 5.0 * frame)), frame
+
+
 def test_the_gallery_holds_what_one_is_looking_at() -> None:
     """Pairs that flicker by cannot be compared; a changed class is worth the place of one that was confirmed."""
     gallery = Gallery(hold_ns=1_000_000_000)
