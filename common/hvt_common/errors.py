@@ -53,7 +53,10 @@ def may_come(error: OSError) -> bool:
 
 def absent(path: Path) -> type[UserError]:
     """The error of a file that is not there: a folder that does not exist may be of a disk that is mounted later."""
-    return UserError if path.absolute().parent.is_dir() else NotYetError
+    try:
+        return UserError if path.absolute().parent.is_dir() else NotYetError
+    except OSError:  # nobody may look there, or the name is too long
+        return UserError
 
 
 def listening_trouble(error: OSError) -> str:

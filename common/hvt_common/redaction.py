@@ -100,10 +100,14 @@ def _is_usual(part: str) -> bool:
 
 
 class Redaction:
-    """Hides the secrets of a process's ``addresses`` in any text, however a library has quoted them."""
+    """Hides the secrets of a process's ``addresses`` in any text, however a library has quoted them.
 
-    def __init__(self, addresses: Iterable[str] = ()) -> None:
-        words = list(addresses)
+    Of settings with several values, as lists or tuples, each value is an address; other values are read as text.
+    """
+
+    def __init__(self, addresses: Iterable[object] = ()) -> None:
+        several = (one if isinstance(one, list | tuple) else (one,) for one in addresses)
+        words = [str(one) for values in several for one in values]
         self._whole = {
             spelt: redacted(one) for one in words if _BEGIN.search(one) for spelt in _spellings(one)
         }

@@ -44,7 +44,7 @@ def _run(argv: Sequence[str] | None) -> int:
         return doctor.run(words[1:])
     config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
     config = with_profile(config, given=given.values)
-    redaction = Redaction([*words, *(str(one) for one in given.values.values())])
+    redaction = Redaction([*words, *given.values.values()])
     if given.print_config:
         print(redaction.text(to_toml(config)), end="")
         return 0

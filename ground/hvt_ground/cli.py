@@ -73,7 +73,7 @@ def _run(argv: Sequence[str] | None) -> int:
     from hvt_ground.extras import checked, config_class  # noqa: PLC0415
 
     config, requested = load(config_class(), argv, program="hvt-ground", description=_DESCRIPTION)
-    redaction = Redaction([*words, *(str(one) for one in requested.values.values())])
+    redaction = Redaction([*words, *requested.values.values()])
     if requested.print_config:
         print(redaction.text(to_toml(config)), end="")
         return 0

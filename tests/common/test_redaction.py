@@ -205,3 +205,10 @@ def test_neither_log_nor_traceback_nor_sentence_has_it(capsys, form):
     assert "ValueError" in said
     assert "is wrong" in said
     assert SECRET not in said
+
+
+def test_an_option_with_several_addresses_hides_no_host():
+    """Each line of the log had "…" in place of 127.0.0.1, because a list as text is an address mistyped."""
+    redaction = Redaction([["tcp://127.0.0.1:18003", "udp://me:s3cret9@10.0.0.2:1"], ("a",), 5, None])
+    assert redaction.text("CoT tcp://127.0.0.1:18003") == "CoT tcp://127.0.0.1:18003"
+    assert "s3cret9" not in redaction.text("udp://me:s3cret9@10.0.0.2:1 and s3cret9")

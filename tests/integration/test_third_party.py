@@ -127,7 +127,7 @@ def test_another_encoder_flies_within_the_budget(link, scene, acme, name, lowere
     sent, received = edge.finish(), ground.finish(within_s=30)
     assert sent["frames"] == received["frames_decoded"] == FRAMES, "the clip begins anew after the run"
     assert sent["worst_window_bps"]["total"] <= 300_000
-    assert (f"encoder {name} overshoots: it is asked for" in edge.said) == lowered
+    assert (f"encoder {name} overshoots: it is set to" in edge.said) == lowered
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,8 @@ def done(tmp_path, module, words, without):
 )
 def test_a_missing_package_is_one_sentence(tmp_path, module, words, without, install):
     """Who installed hvt[edge] would get a traceback that names a package of somebody else."""
+    (tmp_path / "a.csv").write_text("frame,x,y,w,h,class\n1,0,0,9,9,car\n")
+    (tmp_path / "gt.txt").write_text("1,1,0,0,9,9,1,1,1\n")
     found = done(tmp_path, module, words, without)
     assert found.returncode == 2, found.stderr
     assert f"pip install {install}".replace("hvt[", "'hvt[").replace("]", "]'") in found.stderr

@@ -8,8 +8,8 @@ know different views, and the surest of a cluster counts (docs/embedded-models.m
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -25,6 +25,7 @@ _MOST_PARTS = 3
 _SAME_IOU = 0.55
 """The paper's."""
 _VAGUE_VOTE = 1e-6
+_LEAST_WEIGHT = 1e-9
 
 
 def parts_of(spec: str) -> tuple[str, ...]:
@@ -34,10 +35,12 @@ def parts_of(spec: str) -> tuple[str, ...]:
     is missing or repeated, or there are more than three.
     """
     names, colon, text = spec.partition(":")
-    if _JOIN not in names or Path(spec).exists():
-        return (spec,)
     *parts, last = (part.strip() for part in names.split(_JOIN))
     found = (*parts, f"{last}{colon}{text}")
+    # Path's own `exists` raises where a name is too long.
+    is_path = os.path.exists(os.path.expanduser(spec)) or ("" in found and os.sep in spec)  # noqa: PTH110, PTH111
+    if not parts or is_path:
+        return (spec,)
     what = f"detector {spec!r} is not accepted"
     if "" in found:
         raise UserError(f"{what}: a name is missing beside a {_JOIN}; give NAME{_JOIN}NAME")
@@ -127,8 +130,9 @@ def fuse(
         if not count or overlaps[place] <= _SAME_IOU:
             place, count = count, count + 1
             best[place], group[place] = sure[row], groups[kind]
-        weights[place] += sure[row]
-        merged[place] += (boxes[row] - merged[place]) * (sure[row] / weights[place])
+        weight = max(sure[row], _LEAST_WEIGHT)
+        weights[place] += weight
+        merged[place] += (boxes[row] - merged[place]) * (weight / weights[place])
         votes[place, kind] += sure[row] * (_VAGUE_VOTE if vague[kind] else 1)
     ids = votes[:count].argmax(axis=1).astype(np.int32)
     count = min(

@@ -97,7 +97,7 @@ class FewFoundHint:
         if others:
             _log.warning(
                 "%s found nothing on the first %d pictures, and %s: hvt-models info %s says what it is taken for; "
-                "--tiles or another --size changes the size, --confidence from where detections count",
+                "another --size, and of one network --tiles, changes the size, --confidence what counts",
                 self._detector,
                 _RUNS,
                 ", and ".join(others),
@@ -126,8 +126,7 @@ class ViewTrust:
         self._recent.append((float(np.sum(counted, dtype=np.float64)), len(counted)))
         boxes = sum(count for _, count in self._recent)
         if len(self._recent) < _RUNS or boxes < _LEAST_BOXES:
-            self.unlike = False
-            return
+            return  # too few tell nothing new
         mean = sum(total for total, _ in self._recent) / boxes
         self.unlike = mean < (_LIKE_FROM if self.unlike else _UNLIKE_BELOW)
         if self.unlike and not self._said:

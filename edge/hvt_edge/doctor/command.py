@@ -64,7 +64,7 @@ def run(argv: Sequence[str]) -> int:
     config = check(with_profile(config, given=given.values))
     logging.getLogger("hvt_common.inference.runtimes.model").setLevel(logging.INFO)  # what a network runs on
     checks = _Checks(config)
-    redaction = Redaction([*words, *(str(one) for one in given.values.values())])
+    redaction = Redaction([*words, *given.values.values()])
     findings = {
         name: replace(one, found=redaction.text(one.found), todo=redaction.text(one.todo))
         for name, one in run_checks(checks.by_name).items()

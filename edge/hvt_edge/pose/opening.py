@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from hvt_common.errors import absent, needs_extra
+from hvt_common.errors import UserError, absent, needs_extra
 from hvt_edge.pose.contract import PoseSource
 from hvt_edge.pose.files import read_poses
 from hvt_edge.pose.fixed import FixedPose
 
 __all__ = ["PoseSource", "open_pose"]
+
+_FILES = (".csv", ".srt", ".gpx", ".vtt")
 
 
 def open_pose(spec: str, *, hfov_deg: float | None, clock: Callable[[], int]) -> PoseSource:
@@ -30,7 +32,9 @@ def open_pose(spec: str, *, hfov_deg: float | None, clock: Callable[[], int]) ->
     except OSError as error:  # a name that is too long, or a folder that others may not read
         found, reason = False, f" ({error.strerror})"
     if not found:
-        raise absent(Path(spec))(
+        is_file = Path(spec).suffix.lower() in _FILES  # else it is a word mistyped
+        refusal = absent(Path(spec)) if is_file else UserError
+        raise refusal(
             f"--pose {spec:.200} is no file{reason}; accepted is FILE.csv, FILE.srt (DJI), FILE.gpx, "
             "fixed:LAT,LON,HEIGHT,AZIMUTH,TILT, mavlink:udpin:HOST:PORT, or demo with --source demo"
         )

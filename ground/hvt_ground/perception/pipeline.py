@@ -190,15 +190,14 @@ class Pipeline:
         self._parts.fusion.take_own(own)
         self._show(own, picture.capture_ns)
 
-    def pass_over(self, picture: DecodedFrame) -> None:
-        """Take the next frame without a look at it: its list goes on from the newest picture that was looked at.
+    def pass_over(self, index: int, capture_ns: int) -> None:
+        """Take the next frame without its picture: its list goes on from the newest picture that was looked at.
 
         Else the boxes of that one would stand on this picture while the camera moves on.
         """
-        index = picture.frame_index
         if index > self._now.frame_index and self._own is not None:
-            self._now = Progress(index, picture.capture_ns, self._now.picture_index)
-            self._show(self._own_at(index), picture.capture_ns)
+            self._now = Progress(index, capture_ns, self._now.picture_index)
+            self._show(self._own_at(index), capture_ns)
 
     def edge_step(self, step: Tracks, *, capture_ns: int | None = None) -> None:
         """Take what the edge's tracker listed at one frame: ids and class ids the edge's, boxes in base pixels.
@@ -306,7 +305,7 @@ class Pipeline:
             shown = self._parts.refiner.shown(fused.tracks)
             self.doubted = int(shown.doubted.sum())
             if self._parts.trust.unlike:  # of our detector: what the edge's alone sees is its own affair
-                ours = np.array(["base" in origin for origin in fused.origins], np.bool_)
+                ours = np.array([origin == "base" for origin in fused.origins], np.bool_)
                 shown = replace(shown, doubted=shown.doubted | ours & ~shown.refined)
             self._emit(_overlay(fused, shown, capture_ns, base_size=self._base_size))
 

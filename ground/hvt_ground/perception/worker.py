@@ -24,6 +24,7 @@ _log = logging.getLogger(__name__)
 _MOST_PICTURES, _MOST_PICTURE_BYTES = 12, 48 * 2**20
 """How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked. The newest waits,
 however large."""
+_MOST_PASSED = 64
 _OLDEST_S = 0.6
 """A frame that has waited for longer goes untracked, if there is a newer one: a ground of too many edges would show
 all of them ever later."""
@@ -147,8 +148,8 @@ class PerceptionWorker(ABC):
 class RealtimeWorker(PerceptionWorker):
     """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still.
 
-    ``pass_over`` takes a picture for which there is no time. `close` gives it ``finish_s`` for what waits, then
-    ``leave_s`` for what is in hand.
+    ``pass_over`` takes frame and capture time of a picture for which there is no time. `close` gives it ``finish_s``
+    for what waits, then ``leave_s`` for what is in hand.
     """
 
     def __init__(
@@ -158,7 +159,7 @@ class RealtimeWorker(PerceptionWorker):
         read: Read,
         *,
         name: str,
-        pass_over: Callable[[DecodedFrame], None] = lambda _picture: None,
+        pass_over: Callable[[int, int], None] = lambda _frame_index, _capture_ns: None,
         finish_s: float = 1.5,
         leave_s: float = 1.0,
     ) -> None:
@@ -169,6 +170,8 @@ class RealtimeWorker(PerceptionWorker):
         self._lock = threading.Lock()
         self._pictures: deque[tuple[DecodedFrame, float]] = deque()
         """Each with the moment at which it came."""
+        self._passed: deque[tuple[int, int]] = deque(maxlen=_MOST_PASSED)
+        """Frame and capture time of pictures that found no room, all older than the pictures."""
         self._stills: deque[ReceivedStill] = deque()
         self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_MOST_STEPS)
         self._jobs: deque[Job] = deque()
@@ -209,7 +212,9 @@ class RealtimeWorker(PerceptionWorker):
             while len(self._pictures) >= _MOST_PICTURES or (
                 self._pictures and queued_bytes > _MOST_PICTURE_BYTES
             ):
-                queued_bytes -= self._pictures.popleft()[0].picture.nbytes
+                oldest, _ = self._pictures.popleft()
+                queued_bytes -= oldest.picture.nbytes
+                self._passed.append((oldest.frame_index, oldest.capture_ns))
                 self.untracked += 1
             self._pictures.append((picture, time.monotonic()))
         self._wake.set()
@@ -302,13 +307,15 @@ class RealtimeWorker(PerceptionWorker):
         for _ in range(len(self._pictures)):
             if self._given_up.is_set():
                 break
+            while self._passed:
+                self._pass_over(*self._passed.popleft())
             with self._lock:
                 picture, came_s = self._pictures.popleft()
                 newer = len(self._pictures) > 0
                 late = newer and time.monotonic() - came_s > _OLDEST_S
                 self.untracked += late
             if late:
-                self._pass_over(picture)
+                self._pass_over(picture.frame_index, picture.capture_ns)
             else:
                 self._analyze(picture, hurry or newer)
 

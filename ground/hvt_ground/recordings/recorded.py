@@ -141,11 +141,25 @@ class Recorded:
             base_classes=tuple(row.base_class for row, _ in rows),
             classes=tuple(row.class_name for row, _ in rows),
             confidences=np.array([row.confidence for row, _ in rows], np.float32),
-            refined=np.array([path in (REFINED, DOUBTED) for _, path in rows], np.bool_),
+            refined=np.array([self._is_refined(row.track_id, path, frame) for row, path in rows], np.bool_),
             origins=tuple(row.origin for row, _ in rows),
             doubted=np.array([path == DOUBTED for _, path in rows], np.bool_),
         )
         return self._located(overlay)
+
+    def _is_refined(self, track_id: int, path: str, frame: int) -> bool:
+        # Stills may doubt a track, or the ground its whole view: then no still of it was shown.
+        return path == REFINED or (path == DOUBTED and self._read_from.get(track_id, frame + 1) <= frame)
+
+    @cached_property
+    def _read_from(self) -> Mapping[int, int]:
+        # By track, the frame of its first still; a caption begins with its track.
+        first: dict[int, int] = {}
+        for one in self.stills:
+            track = one.caption.partition(" ")[0]
+            if track.isdigit():
+                first.setdefault(int(track), one.frame_index)
+        return first
 
     def _located(self, overlay: Overlay) -> Overlay:
         pose = self.trail.at(overlay.capture_ns)

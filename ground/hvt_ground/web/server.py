@@ -106,6 +106,7 @@ class WebPage:
             ws=_BoundedSocket,
             loop="asyncio",
             lifespan="off",
+            proxy_headers=False,  # anybody may write them: one viewer would come from any number of addresses
             log_config=None,
             access_log=False,
             ws_max_size=MOST_MESSAGE_BYTES,

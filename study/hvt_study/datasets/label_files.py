@@ -16,6 +16,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -36,7 +37,7 @@ _LABELS = (
 _OTHER = {"annotations.xml": "CVAT for images", "label_2": "KITTI", "labelTxt": "DOTA", "ann": "Supervisely"}
 _OTHER_FILES = (".json", ".csv", ".odgt", ".xml")
 _OTHER_WORDS = re.compile(
-    rb"bbox|xmin|x_min|box2d|gtboxes|shape_attributes|coordinates|rectanglelabels|\"(?:shapes|labels|annotations)\""
+    rb"bbox|xmin|x_min|box2d|gtboxes|shape_attributes|rectanglelabels|\"(?:shapes|annotations)\""
 )
 """In the first bytes of files that hold labels of a kind that is not read."""
 _LOOKED_AT = 65536
@@ -98,7 +99,7 @@ def check_strange(place: Path, pictures: Sequence[Path]) -> None:
     for folder in dict.fromkeys((place, *(one.parent for one in pictures))):
         for file in sorted(folder.iterdir()):
             if file.suffix.lower() in _OTHER_FILES and file.is_file():
-                with file.open("rb") as opened:
+                with suppress(OSError), file.open("rb") as opened:
                     if _OTHER_WORDS.search(opened.read(_LOOKED_AT)):
                         strange.append((file, "labels, it seems"))
     for path, what in strange:
@@ -149,8 +150,13 @@ def yaml_folders(path: Path) -> list[Path]:
     root = path.parent / said.pop("path", ".").strip()
     if root != path.parent and root.is_dir():
         return [root]
-    places = dict.fromkeys(root / one.strip() for one in said.values())
-    return [path.parent] if pictures_below(path.parent) else [one for one in places if one.is_dir()] or [root]
+    places = dict.fromkeys(
+        place for one in said.values() if (place := (root / one.strip()).resolve()).is_dir()
+    )
+    outer = [one for one in places if places.keys().isdisjoint(one.parents)]
+    here = path.parent.resolve()
+    elsewhere = any(here not in (one, *one.parents) for one in outer)
+    return outer if elsewhere else [path.parent] if pictures_below(path.parent) else outer or [root]
 
 
 def keypoint_columns(path: Path | None) -> int:

@@ -11,7 +11,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector
-from hvt_common.inference.ensemble import EnsembleDetector, on_scale_of
+from hvt_common.inference.ensemble import EnsembleDetector, on_scale_of, parts_of
 from hvt_common.inference.scores import declared_class_names, default_confidence, is_calibrated
 from hvt_common.inference.store.store import Store
 from hvt_common.values import Detections, Image
@@ -146,3 +146,12 @@ def test_the_embedded_model_flies_with_one_of_the_open_model_zoo(
     centre = np.array([x1 + width / 2, y1 + height / 2])
     boxes = found.boxes_xyxy_px[found.class_ids == 5]
     assert ((boxes[:, :2] < centre) & (centre < boxes[:, 2:])).all(axis=1).any()
+
+
+def test_a_plus_in_a_path_joins_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model in a folder of C++ could not be named, and a long name was a traceback."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "a+b.onnx").touch()
+    assert parts_of("~/a+b.onnx") == ("~/a+b.onnx",)
+    assert parts_of("/data/c++/missing.onnx") == ("/data/c++/missing.onnx",)
+    assert parts_of(f"{'x' * 300}+b") == ("x" * 300, "b")

@@ -541,6 +541,9 @@ def test_the_time_of_a_frame_that_was_sent_is_not_sent_again():
     lost = replace(headers[0], frame_index=9)
     assert captures.filled(lost, otherwise_ns=7).capture_ns == NOW_NS + 3, "that of the nearest"
     assert captures.filled(headers[1], otherwise_ns=7) is headers[1]
+    assert captures.filled(replace(headers[0], session_id=9), otherwise_ns=2**64).capture_ns == 2**63 - 1
+    captures.note(replace(BaseHeader.parse(*base), frame_index=5, capture_ns=NOW_NS + 203))
+    assert captures.filled(lost, otherwise_ns=7).capture_ns == NOW_NS + 603, "by the rate of the two nearest"
 
 
 @settings(max_examples=60, deadline=None)

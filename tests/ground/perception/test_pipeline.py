@@ -60,7 +60,7 @@ def test_boxes_go_on_over_pictures_that_were_passed_over(pictures):
     for picture in pictures[:12]:
         rig.pipeline.analyze(picture, hurry=False)
     for picture in pictures[12:15]:
-        rig.pipeline.pass_over(picture)
+        rig.pipeline.pass_over(picture.frame_index, picture.capture_ns)
     rig.pipeline.analyze(pictures[15], hurry=False)
     for picture in pictures[:16]:
         looked_at.pipeline.analyze(picture, hurry=False)

@@ -349,12 +349,12 @@ def test_sessions_that_begin_again_and_again_are_bounded(flight):
     edge, now_ns = Flight(1), time.time_ns()
     with Rig(clock=lambda: now_ns) as rig:
         rig.port.flight = edge
-        for number in range(16):
+        for number in range(42):
             edge.session_id = 7000 + number
             rig.put(replace(edge.base(0), received_ns=now_ns))
             rig.settle()
             now_ns += 1_100_000_000
-        assert len(rig.opened) == 13  # ten at once, then one in five seconds
+        assert len(rig.opened) == 39  # thirty at once, then one in five seconds
         assert rig.receiver.unusable == 3
         rig.port.flight = flight
         now_ns += 5_000_000_000

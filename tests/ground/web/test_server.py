@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from itertools import count
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
@@ -409,8 +410,10 @@ def test_who_takes_all_places_makes_room_for_others(public, state_folder, monkey
 
     def watch(source: str) -> ClientConnection:
         raw = socket.create_connection(("127.0.0.1", public), timeout=10, source_address=(source, 0))
-        return joined(public, sock=raw, additional_headers=cookie)
+        said = {"X-Forwarded-For": f"10.9.8.{next(made_up)}"}  # anybody may write it: it must not count
+        return joined(public, sock=raw, additional_headers=cookie | said)
 
+    made_up = count(1)
     monkeypatch.setattr(site, "MOST_VIEWERS", 3)
     with watch("127.0.0.1") as first, watch("127.0.0.1") as second, watch("127.0.0.1") as third:
         with pytest.raises(InvalidStatus, match="503"):

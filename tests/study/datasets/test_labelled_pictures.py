@@ -489,3 +489,25 @@ def test_an_xml_is_read_in_its_encoding_and_difficult_objects_do_not_count(
     (_, first), (_, second) = read(tmp_path)
     assert first.class_names == ("lärm",)
     assert (len(second), second.ignored_xyxy_px.tolist()) == (0, [BOX])
+
+
+def test_folders_of_a_yaml_that_lie_in_each_other_count_once(tmp_path: Path) -> None:
+    """Each picture of both would count twice; a shot beside the YAML would be the whole set."""
+    for where in ("train", "more"):
+        picture(tmp_path / f"data/images/{where}/{where}.jpg")
+        text(tmp_path / f"data/labels/{where}/{where}.txt", ROW)
+    yaml = text(
+        tmp_path / "settings" / "a.yaml",
+        f"train: {tmp_path}/data/images\nval: {tmp_path}/data/images/train\nnames: [car, bus]\n",
+    )
+    picture(tmp_path / "settings" / "shot.png")
+    assert sorted(one.path.name for one, _ in read(yaml)) == ["more.jpg", "train.jpg"]
+
+
+def test_a_table_or_a_route_beside_pictures_is_no_label(tmp_path: Path) -> None:
+    """Pictures of a flight could not be looked at beside the flight's own log."""
+    picture(tmp_path / "0.png")
+    text(tmp_path / "flight.csv", "time,latitude,coordinates,alt\n1,2,3,4\n")
+    text(tmp_path / "route.json", '{"type": "Point", "coordinates": [8, 47]}')
+    text(tmp_path / "meta.json", '{"labels": ["day"]}')
+    assert len(find_pictures(tmp_path, classes=None)) == 1

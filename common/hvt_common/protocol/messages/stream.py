@@ -92,6 +92,7 @@ class AlsoShown:
 STILL_CODEC_WORDS = ("jpeg", "webp", "avif", "jxl", "h264-intra", "residual")
 """Their positions are sent; another codec by its name. A new one stands last."""
 STILL_REASON_WORDS = ("gain", "due", "new", "uncertain", "small", "utility", "asked", "again", "stored")
+_LAST_NS = 2**63 - 1
 _MOST_CAPTURES = 1024
 _PER_PX = 8
 _PLACE = Int(-2 * _PER_PX * _FAR_PX, 2 * _PER_PX * _FAR_PX)
@@ -250,12 +251,26 @@ class CaptureTimes:
         return (session_id, frame_index) in self._known
 
     def filled(self, header: RoiHeader, *, otherwise_ns: int) -> RoiHeader:
-        """The header with its time: that of its frame, of the nearest where that was lost, or ``otherwise_ns``."""
+        """The header with its time: that of its frame; where that was lost, reckoned from the two nearest frames.
+
+        Of one frame that is known the time is its; where none is, ``otherwise_ns``.
+        """
         if header.capture_ns >= 0:
             return header
         capture_ns = self._known.get((header.session_id, header.frame_index))
         if capture_ns is None:
-            near = [one for one in self._known if one[0] == header.session_id]
-            nearest = min(near, key=lambda one: abs(one[1] - header.frame_index), default=None)
-            capture_ns = max(0, otherwise_ns) if nearest is None else self._known[nearest]
-        return replace(header, capture_ns=capture_ns)
+            capture_ns = self._reckoned(header.session_id, header.frame_index, otherwise_ns)
+        return replace(header, capture_ns=min(max(0, capture_ns), _LAST_NS))
+
+    def _reckoned(self, session_id: int, frame_index: int, otherwise_ns: int) -> int:
+        near = sorted(
+            (
+                (abs(index - frame_index), index, at)
+                for (one, index), at in self._known.items()
+                if one == session_id
+            )
+        )
+        if len(near) < 2:
+            return near[0][2] if near else otherwise_ns
+        (_, first, first_ns), (_, second, second_ns) = near[:2]
+        return first_ns + (frame_index - first) * (second_ns - first_ns) // (second - first)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -27,8 +28,8 @@ _TEXT_CODECS = frozenset({"ansi", "bintext", "xbin", "idf"})
 _PICTURE_CODECS = frozenset({"mjpeg", "png", "bmp", "gif", "tiff", "webp", "jpegxl"})
 _NO_FILM = Disposition.attached_pic | Disposition.still_image | Disposition.timed_thumbnails
 _OPEN_S, _READ_S = 10.0, 10.0
-_THREAD_PX = 1280 * 720
-"""What one thread decodes beside all else that it does: 9 ms of H.264 at 8 Mbit/s."""
+_THREAD_PX, _THREAD_FPS = 1280 * 720, 30
+"""What one thread decodes beside all else that it does: 9 ms a picture of H.264 at 8 Mbit/s."""
 _NO_STAMPS = 0x80
 """``AVFMT_NOTIMESTAMPS`` of libavformat: a raw stream, whose times FFmpeg invents at 25 frames a second."""
 _MAY_JUMP = 0x200
@@ -102,7 +103,8 @@ def open_video(
     stream.thread_type = "AUTO"
     codec = stream.codec_context
     # Each thread decodes a picture of its own, and holds it and what it builds on.
-    threads = -(-codec.width * codec.height // _THREAD_PX)
+    quick = max(1.0, float(said_rate(stream) or 0) / _THREAD_FPS)
+    threads = math.ceil(codec.width * codec.height * quick / _THREAD_PX)
     codec.thread_count = max(1, min(threads, os.cpu_count() or 1))
     return container, stream
 

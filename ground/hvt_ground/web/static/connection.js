@@ -62,6 +62,7 @@ export class Connection {
 
   /** @param {Message} message @param {Uint8Array} payload */
   take(message, payload) {
+    if (message.type === "hello") this.ahead = message.now - (performance.timeOrigin + performance.now()); // until it is known better
     if (message.type !== "time") {
       this.onMessage(message, payload);
       return;
