@@ -109,14 +109,14 @@ def test_a_network_learns_what_it_never_knew(tmp_path, data):
         start=data / "models" / "yolox_nano.onnx",
         out=out,
         settings=FineTuneSettings(
-            steps=40, budget_s=600, check_every=20, batch=4, side=128, rate=2e-3, threads=1
+            steps=100, budget_s=600, check_every=20, batch=4, side=128, rate=2e-3, threads=1
         ),
         measure=found,
         on_step=lambda step, quality: told.append((step, quality)),
     )
     measured = [quality for _, quality in told if quality is not None]
     assert max(measured) == found(out) >= 0.75, told
-    assert told[-1][0] == tuned.steps == 40
+    assert told[-1][0] == tuned.steps == 100
     assert open_detector(str(out)).class_names == NAMES
     metadata, fitted = open_model(out).metadata, tuned.calibration
     if fitted is None:  # every box is right: there is nothing to fit
@@ -209,7 +209,9 @@ def test_what_cannot_be_is_one_sentence(tmp_path, water, capsys):
     pytest.importorskip("onnx")
     data, out = ("--data", f"yolo:{water}"), ("--out", tmp_path / "b.onnx")
     assert "yolo:FOLDER or coco:FILE.json is" in refused(capsys, "--data", water, *out)
-    assert "holds no pictures" in refused(capsys, "--data", f"yolo:{tmp_path}", *out)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "holds no pictures" in refused(capsys, "--data", f"yolo:{empty}", *out)
     assert "COCO's JSON is expected" in refused(capsys, "--data", f"coco:{tmp_path}/none.json", *out)
     assert "name ends with .onnx" in refused(capsys, *data, "--out", tmp_path / "b.pt")
     assert "there is no folder" in refused(capsys, *data, "--out", tmp_path / "no/b.onnx")
