@@ -118,7 +118,8 @@ class Site:
             if crowd is None:
                 await socket.send_denial_response(PlainTextResponse("too many viewers", 503))
                 return
-            next(one for one in viewers if one.address == crowd).give_up()
+            crowded = next(one for one in viewers if one.address == crowd)
+            crowded.give_up("too many viewers: one from another address took this place")
         await socket.accept()
         role: Role = socket.scope["role"]
         viewer.put(text("hello", role=role, rungs=RUNGS, now=self._now_ms()))
@@ -132,7 +133,7 @@ class Site:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             with suppress(RuntimeError, WebSocketDisconnect):
-                await socket.close(1008)
+                await socket.close(1008, viewer.reason)
 
     async def _receive(self, socket: WebSocket, viewer: Viewer) -> None:
         # Read until it leaves, or sends a message that no page of ours would.

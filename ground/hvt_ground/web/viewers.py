@@ -53,6 +53,8 @@ class Viewer:
         """Messages of video that it was too slow for."""
         self.hopeless = False
         """It takes nothing at all any more: nothing is kept for it, and `take` raises."""
+        self.reason = ""
+        """Of its end, in words for whoever looks at the page; at most 120 bytes."""
         self._queue: deque[tuple[str | bytes, bool]] = deque()
         self._bytes = 0
         self._texts = self._text_bytes = 0
@@ -62,7 +64,7 @@ class Viewer:
     def put(self, message: str | bytes) -> None:
         """Queue a message that must not be lost."""
         if self._texts >= _MOST_TEXTS or self._text_bytes + len(message) > _MOST_TEXT_BYTES:
-            self.give_up()
+            self.give_up("it does not take what is sent")
         if self.hopeless:
             return
         self._texts += 1
@@ -83,9 +85,9 @@ class Viewer:
         self._waits_for_keyframe = False
         self._add(message, video=True)
 
-    def give_up(self) -> None:
-        """It is closed: it takes nothing, or has to make room."""
-        self.hopeless = True
+    def give_up(self, reason: str) -> None:
+        """It is closed, and told the reason: it takes nothing, or has to make room."""
+        self.hopeless, self.reason = True, reason
         self._queue.clear()
         self._bytes = self._texts = self._text_bytes = 0
         self._there.set()

@@ -420,11 +420,10 @@ def test_who_takes_all_places_makes_room_for_others(public, state_folder, monkey
             watch("127.0.0.1")
         with watch("127.0.0.2") as other:
             assert json.loads(other.recv(timeout=10))["type"] == "hello"
-            eventually(
-                lambda: sum(map(hung_up, (first, second, third))) == 1,
-                within_s=20,
-                what="one of the three has gone",
-            )
+            three = (first, second, third)
+            eventually(lambda: sum(map(hung_up, three)) == 1, within_s=20, what="one of the three has gone")
+            (gone,) = filter(hung_up, three)
+            assert gone.close_reason == "too many viewers: one from another address took this place"
     where = ("127.0.0.1", public)
     for bound in ("MOST_CONNECTIONS", "MOST_OPEN"):
         with ExitStack() as held, monkeypatch.context() as few:

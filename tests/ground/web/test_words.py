@@ -18,8 +18,8 @@ from hvt_common.protocol.still_words import STILL_WORDS
 STATIC = Path(hvt_ground.web.__file__).parent / "static"
 NODE = shutil.which("node")
 LIVE = {
-    "connected": True, "goneMs": 0, "link": "up", "silentMs": 100, "chosen": True, "shown": True, "follows": True,
-    "plays": True, "ageMs": 300, "sinceMs": 80, "periodMs": 100, "lastMs": 300, "lockstep": False,
+    "connected": True, "refused": False, "goneMs": 0, "link": "up", "silentMs": 100, "chosen": True, "shown": True,
+    "follows": True, "plays": True, "ageMs": 300, "sinceMs": 80, "periodMs": 100, "lastMs": 300, "lockstep": False,
 }  # fmt: skip
 
 
@@ -57,6 +57,7 @@ def test_what_is_not_live_never_says_live():
         ({"link": "ended", "ageMs": 61_000}, "ENDED, picture 61 s old"),
         ({"link": "ended", "shown": False}, "ENDED"),
         ({"connected": False, "goneMs": 9_000}, "NO GROUND 9 s"),
+        ({"connected": False, "goneMs": 9_000, "refused": True}, "REFUSED 9 s"),
         ({"shown": False}, "waiting for a picture"),
         ({"shown": False, "lastMs": None}, "waiting for a picture"),
         ({"shown": False, "lastMs": 94_000}, "NO PICTURE 94 s"),

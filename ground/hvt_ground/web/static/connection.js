@@ -18,6 +18,8 @@ export class Connection {
     this.socket = null;
     this.tries = 0;
     this.heard = 0;
+    /** Why the ground ended the last connection, in its words. */
+    this.why = "";
     /** Of the exchanges so far: the shortest, and what it said. */
     this.roundTrip = Infinity;
     this.ahead = 0;
@@ -42,6 +44,7 @@ export class Connection {
     this.heard = performance.now();
     socket.onopen = () => {
       this.tries = 0;
+      this.why = "";
       this.roundTrip = Infinity;
       this.onState("connected", "");
       this.askTime();
@@ -51,10 +54,11 @@ export class Connection {
       if (typeof event.data === "string") this.take(JSON.parse(event.data), NOTHING);
       else this.take(...unpacked(event.data));
     };
-    socket.onclose = () => {
+    socket.onclose = (event) => {
       if (this.socket !== socket) return;
       this.socket = null;
-      this.onState("waiting", "");
+      if (event.code === 1008) this.why = event.reason;
+      this.onState("waiting", this.why);
       if (performance.now() - this.heard < 1000) this.askWhy();
       setTimeout(() => this.open(), PAUSES_MS[Math.min(this.tries++, PAUSES_MS.length - 1)]);
     };
@@ -80,7 +84,7 @@ export class Connection {
   async askWhy() {
     try {
       const reply = await fetch("/ws", { method: "POST" });
-      if ((reply.status === 401 || reply.status === 403) && !this.socket) this.onState("waiting", (await reply.text()).slice(0, 300));
+      if ((reply.status === 401 || reply.status === 403) && !this.socket) this.onState("waiting", (this.why = (await reply.text()).slice(0, 300)));
     } catch {
       // there is no ground at all
     }

@@ -40,6 +40,7 @@ const asked = new Map();
  */
 let periods = [];
 let connected = false;
+let refused = false;
 let connectedAt = performance.now();
 let stateAt = -Infinity;
 /**
@@ -68,6 +69,7 @@ wall.mark("");
 /** @param {"connected" | "waiting"} state @param {string} why */
 function onState(state, why) {
   connected = state === "connected";
+  refused = Boolean(why);
   if (connected) connectedAt = performance.now();
   showAge();
   by("connection").textContent = connectionWords(connected, why);
@@ -230,6 +232,7 @@ function showAge() {
   const jpeg = rungs[0] === "jpeg";
   const { state: name, words, live } = standing({
     connected: connected && (now - stateAt < STATE_OLD_MS || now - connectedAt < STATE_OLD_MS),
+    refused,
     goneMs: now - Math.max(stateAt, 0),
     link: state?.link ?? "",
     silentMs: state ? connection.now() - state.since : null,

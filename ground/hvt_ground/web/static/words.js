@@ -1,11 +1,11 @@
 // What the page says of the picture, in one place: pure functions of what is known. What is not known is not said.
 
 /**
- * @typedef {{connected: boolean, goneMs: number, link: string, silentMs: number | null, chosen: boolean,
+ * @typedef {{connected: boolean, refused: boolean, goneMs: number, link: string, silentMs: number | null, chosen: boolean,
  *    shown: boolean, follows: boolean, plays: boolean, ageMs: number, sinceMs: number, periodMs: number,
  *    lastMs: number | null, lockstep: boolean}} Facts
- * Whether the ground answers and since when not; the link and for how long nothing has come; whether a picture is
- * shown, follows the newest, plays on; its age, when it was shown, what usually lies between two; the age of the newest
+ * Whether the ground answers or refuses this page, and since when not; the link and for how long nothing has come;
+ * whether a picture is shown, follows the newest, plays on; its age, when it was shown, what usually lies between two; the age of the newest
  * one of this edge, wherever it is shown.
  */
 
@@ -44,7 +44,7 @@ const age = (ms) => (ms < -LEAST_GAP_MS ? "age not known" : seconds(Math.max(0, 
  */
 export function standing(facts) {
   const { shown, ageMs, sinceMs } = facts;
-  if (!facts.connected) return { state: "gone", words: `NO GROUND ${whole(facts.goneMs)}`, live: false };
+  if (!facts.connected) return { state: "gone", words: `${facts.refused ? "REFUSED" : "NO GROUND"} ${whole(facts.goneMs)}`, live: false };
   if (facts.link === "ended") return { state: "ended", words: shown ? `ENDED, picture ${seconds(ageMs)} old` : "ENDED", live: false };
   if (facts.link === "lost") return { state: "lost", words: `LINK LOST ${whole(facts.silentMs ?? sinceMs)}`, live: false };
   if (!shown && (facts.lastMs ?? 0) > MOST_GAP_MS) return { state: "stale", words: `NO PICTURE ${whole(facts.lastMs ?? 0)}`, live: false };
