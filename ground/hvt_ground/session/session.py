@@ -303,9 +303,7 @@ class GroundSession:
         if self.not_sent:
             self.note("info", f"stills that the edge did not send: {counts_text(self.not_sent)}", last=True)
         ended = self.last_status is not None and self.last_status.state == "ended"
-        self.note(
-            "info", "the flight has ended" if ended else "the recording of this session ends here", last=True
-        )
+        self.note("info", "the flight has ended" if ended else "this session has ended", last=True)
 
     # What is known of it
 
