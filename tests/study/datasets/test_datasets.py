@@ -234,7 +234,7 @@ def test_uavdt_labels(tmp_path):
     labels = sequence.labels(2)
     assert labels.boxes_xyxy_px.tolist() == [xyxy(*square_xywh(2))]
     assert (labels.class_names, labels.ids.tolist()) == (("bus",), [1])
-    assert labels.ignored_xyxy_px.tolist() == [[100, 0, 160, 20]]
+    assert labels.ignored_xyxy_px.tolist() == [[100, 0, 160, 20], [0, 0, 30, 10]], "both, of one number"
 
 
 def test_uavdt_without_classes_or_regions(tmp_path):

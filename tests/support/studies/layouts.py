@@ -57,7 +57,7 @@ def write_uavdt(root: Path, name: str = "M0203", *, count: int = 6, whole: bool 
     (truth / f"{name}_gt.txt").write_text(
         "".join(f"{n},1,{x},{y},{w},{h},1,1,-1\n" for n, x, y, w, h in boxes)
     )
-    (truth / f"{name}_gt_ignore.txt").write_text("3,1,100,0,70,20,1,-1,-1\n")
+    (truth / f"{name}_gt_ignore.txt").write_text("3,1,100,0,70,20,1,-1,-1\n3,1,0,0,30,10,1,-1,-1\n")
     (root / "M_attr" / "test").mkdir(parents=True, exist_ok=True)
     (root / "M_attr" / "test" / f"{name}_attr.txt").write_text("0,0,1,1,0,0,0,1,1,0\n")
 

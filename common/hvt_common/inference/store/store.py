@@ -199,10 +199,14 @@ class Store:
                         weights=more[0] if more else None,
                     )
                 )
-            for source, (path, pin) in zip(brought, self._files(name).items(), strict=True):
+            files = self._files(name)
+            for source, (path, pin) in zip(brought, files.items(), strict=True):
                 part = self._part(path, pin)
                 _copy_file(source, part)
                 _put_in_place(part, path)
+            for suffix in (".onnx", ".xml", ".bin"):  # of the format that the name had before
+                if (old := self.folder / f"{name}{suffix}") not in files:
+                    old.unlink(missing_ok=True)
         return self.verified(name)
 
     def _added(self) -> dict[str, ModelEntry]:

@@ -113,7 +113,7 @@ def _regions(path: Path) -> Regions:
     if not path.is_file():  # some copies of the dataset come without
         empty = np.empty(0, np.int64)
         return Regions(empty, np.empty((0, 4), np.float32), empty.astype(np.bool_))
-    rows = read_rows(path, columns="frame,id,x,y,w,h", least=6, of_dataset=True)
+    rows = read_rows(path, columns="frame,region,x,y,w,h", least=6, of_dataset=True)
     return Regions(rows["frame"].astype(np.int64), rows.boxes(), np.ones(len(rows), np.bool_))
 
 

@@ -454,6 +454,11 @@ def test_an_openvino_model_is_brought_by_hand_with_its_weights(folder: Path, tmp
     weights.write_bytes(b"changed")
     with pytest.raises(UserError, match="is pinned for own"):
         store.add(file, name="own")
+    other = tmp_path / "theirs.onnx"
+    other.write_bytes(b"onnx")
+    Store(folder).add(other, name="own", sha256=hashlib.sha256(b"onnx").hexdigest())
+    left = sorted(one.name for one in folder.iterdir() if one.name.startswith("own."))
+    assert left == ["own.onnx"], "nothing of the format before"
 
 
 @pytest.mark.realdata
