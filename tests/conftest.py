@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from programs.golden import once
 from programs.processes import free_ports
 from rigs.drawn_flight import DrawnFlight, fly_into_all_sinks
 
@@ -42,8 +43,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         key=lambda item: (item.get_closest_marker("integration") is None, "study" not in item.path.parts)
     )
     for item in items:
-        if not item.get_closest_marker("xdist_group"):  # one process for all tests of a file
-            item.add_marker(pytest.mark.xdist_group(str(item.path.relative_to(ROOT))))
         if item.get_closest_marker("realtime"):
             item.add_marker("nightly")
         if item.get_closest_marker("nightly") and not config.getoption("nightly"):
@@ -67,8 +66,8 @@ def data() -> Path:
 
 @pytest.fixture(scope="session")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> DrawnFlight:
-    """The flight that the tests marked ``xdist_group("drawn")`` read, and nobody changes."""
-    return fly_into_all_sinks(tmp_path_factory.mktemp("drawn"))
+    """A flight of the drawn scene into all sinks, that tests of several files read and nobody changes."""
+    return once(tmp_path_factory, "drawn", fly_into_all_sinks)
 
 
 @pytest.fixture

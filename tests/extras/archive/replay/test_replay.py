@@ -30,7 +30,7 @@ from hvt_ground.recordings.recorded import read_recordings
 from hvt_ground.sinks.message_log import MessageLog, read_log
 from rigs.drawn_flight import FRAMES
 
-pytestmark = [pytest.mark.integration, pytest.mark.xdist_group("drawn")]
+pytestmark = pytest.mark.integration
 
 SETTINGS = ("--provider", "cpu", "--quiet")
 RECORDED = Path(__file__).parent / "recorded" / "wire-4.hvtlog"

@@ -12,7 +12,7 @@ from hvt_ground.recordings.recorded import read_recordings
 from media.klv_reader import read_stream
 from rigs.drawn_flight import FRAMES, VIEW
 
-pytestmark = [pytest.mark.integration, pytest.mark.xdist_group("drawn"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
 
 
 def units(data: bytes) -> list[bytes]:
