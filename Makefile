@@ -89,20 +89,20 @@ bench-compare: setup ## what the ground sees at each bitrate, method by method, 
 	@$(BIN)/python -m bench.compare
 
 link: setup      ## edge and ground over bad links; STRICT=1 fails where a bar is missed; SCENARIO= CLIP= LENGTH=short LASTS=60min CARRIER=netns|tun SEED=
-	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link $(SCENARIO) $(if $(CLIP),--clip $(CLIP)) $(if $(LENGTH),--length $(LENGTH)) \
+	@$(BIN)/python -m lab.link $(SCENARIO) $(if $(CLIP),--clip $(CLIP)) $(if $(LENGTH),--length $(LENGTH)) \
 		$(if $(LASTS),--lasts $(LASTS)) $(if $(CARRIER),--carrier $(CARRIER)) $(if $(SEED),--seed $(SEED)) $(if $(STRICT),--strict)
 
 soak: setup      ## an hour of fading link: memory, descriptors, threads, account; LASTS=60min CLIP=
-	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link drone-fade --name soak --lasts $(or $(LASTS),60min) $(if $(CLIP),--clip $(CLIP)) $(if $(STRICT),--strict)
+	@$(BIN)/python -m lab.link drone-fade --name soak --lasts $(or $(LASTS),60min) $(if $(CLIP),--clip $(CLIP)) $(if $(STRICT),--strict)
 
 kills: setup     ## kill -9 of edge or ground in the air: what is left is readable; COUNT=50 SEED=
-	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link.kills $(if $(COUNT),--count $(COUNT)) $(if $(SEED),--seed $(SEED)) $(if $(STRICT),--strict)
+	@$(BIN)/python -m lab.link.kills $(if $(COUNT),--count $(COUNT)) $(if $(SEED),--seed $(SEED)) $(if $(STRICT),--strict)
 
 failures: setup  ## a flight of the demo scene loses disk, model, viewer and link, one after the other: watch it (the disk needs root)
-	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.failures
+	@$(BIN)/python -m lab.failures
 
 fuzz: setup      ## coverage-guided fuzzing of all that comes from outside: RUNS=1000000 TARGET=NAME; needs atheris
-	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.fuzz $(if $(RUNS),--runs $(RUNS)) $(if $(TARGET),--target $(TARGET))
+	@$(BIN)/python -m lab.fuzz $(if $(RUNS),--runs $(RUNS)) $(if $(TARGET),--target $(TARGET))
 
 bench-peers: setup ## the tracker beside roboflow trackers, which get an environment of their own (they are large)
 	@test -x build/peers/bin/python || $(PYTHON) -m venv build/peers

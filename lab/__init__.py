@@ -1,1 +1,8 @@
 """Programs that try HVT hard: bad links (`link`), failing parts (`failures`), fuzzers of foreign input (`fuzz`)."""
+
+import sys
+from pathlib import Path
+
+sys.path.append(
+    str(Path(__file__).parents[1] / "tests" / "support")
+)  # what tests are made of serves here too

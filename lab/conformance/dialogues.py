@@ -50,6 +50,9 @@ _SIZES: tuple[tuple[str, tuple[int, int, int, int], tuple[int, int] | None], ...
     ("as large as a still may be", (0, 0, 2048, 2048), None),
     ("a pixel too wide", (0, 0, 2049, 100), None),
     ("a pixel too high", (0, 0, 100, 2049), None),
+    ("as large as one that nobody requested may be", (0, 0, 512, 512), None),
+    ("a pixel too wide for one that nobody requested", (0, 0, 513, 100), None),
+    ("a pixel too high for one that nobody requested", (0, 0, 100, 513), None),
     ("of another shape by just as much as may be", (0, 0, 100, 50), (52, 25)),
     ("of another shape by a little more", (0, 0, 100, 50), (53, 25)),
 )
@@ -189,10 +192,12 @@ def backlog_dialogues() -> Iterator[dict[str, Any]]:
 
 
 def still_sizes() -> Iterator[dict[str, Any]]:
-    """A requested still whose header says where it is and how large it was coded: read or refused undecoded."""
+    """A still whose header says where it is and how large it was coded: read or refused undecoded."""
     view = View(_SOURCE, (1000, 750), 0.25, (0.0, 0.0))
     for what, crop, size in _SIZES:
-        parameters = {"ask": 1} | ({} if size is None else {"w": size[0], "h": size[1]})
+        parameters = ({} if "nobody" in what else {"ask": 1}) | (
+            {} if size is None else {"w": size[0], "h": size[1]}
+        )
         x1, y1, x2, y2 = map(float, crop)
         header = replace(
             ROI,

@@ -328,8 +328,9 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("a crop may end below the source", " && y + height <= source[1]", ""),
     Mutant("a still may be wider than its crop", "w <= width && h <= height", "h <= height"),
     Mutant("a still may be higher than its crop", "w <= width && h <= height", "w <= width"),
-    Mutant("a still may be of any width", "w <= 2048 && h <= 2048", "h <= 2048"),
-    Mutant("a still may be of any height", "w <= 2048 && h <= 2048", "w <= 2048"),
+    Mutant("a still may be of any width", "w <= most && h <= most", "h <= most"),
+    Mutant("a still may be of any height", "w <= most && h <= most", "w <= most"),
+    Mutant("who requested nothing gets any size", "? 2048 : 512", "? 2048 : 2048"),
     Mutant("a still may be of any shape", "<= Math.max(width, height)", "<= 1e9"),
     Mutant("the shape has a bound below the one", "<= Math.max(width, height)", "< Math.max(width, height)"),
     # Reports

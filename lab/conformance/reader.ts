@@ -733,13 +733,15 @@ function checkStill(vector: any): string | undefined {
   );
 }
 
-// A still that was requested: width and height at which it was coded.
+// Width and height at which a still was coded.
 function codedSize(header: Value[], source: number[]): number[] {
   const [x, y, width, height, , , , , ...coded] = (field("RoiHeader", header, "place") as bigint[]).map(Number);
   const [w, h] = coded.length ? coded : [width, height];
   need(x + width <= source[0] && y + height <= source[1], "a crop beyond the source");
   need(w <= width && h <= height, "larger than its crop");
-  need(w <= 2048 && h <= 2048, "larger than any still");
+  const parameters = field("RoiHeader", header, "parameters");
+  const most = parameters instanceof Map && parameters.has("ask") ? 2048 : 512;
+  need(w <= most && h <= most, "larger than such a still");
   need(Math.abs(w * height - h * width) <= Math.max(width, height), "of another shape");
   return [w, h];
 }

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import MAX_STILL_CODECS, RoiHeader
 from hvt_common.values import Image, View
-from hvt_common.video.base_crop import MAX_REQUESTED_SIDE_PX, base_crop
+from hvt_common.video.base_crop import MAX_REQUESTED_SIDE_PX, MAX_SIDE_PX, base_crop
 from hvt_common.video.hevc import YuvPicture
 from hvt_common.video.still_codecs import BaseMissingError, StillError, still_codec, still_codec_names
 
@@ -99,8 +99,7 @@ def coded_size(header: RoiHeader, *, view: View) -> tuple[int, int]:
         raise StillError(f"size {width}x{height} is not the shape of what it shows")
     if max((x2 - x1) / width, (y2 - y1) / height) * view.scale > _MOST_BASE_PX:
         raise StillError(f"size {width}x{height} is far smaller than what the base shows of it")
-    if max(width, height) > MAX_REQUESTED_SIDE_PX:
-        raise StillError(
-            f"size {width}x{height} is larger than any still, whose sides are up to {MAX_REQUESTED_SIDE_PX}"
-        )
+    most = MAX_REQUESTED_SIDE_PX if "ask" in header.parameters else MAX_SIDE_PX
+    if max(width, height) > most:
+        raise StillError(f"size {width}x{height} is larger than such a still, whose sides are up to {most}")
     return width, height
