@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -47,37 +48,43 @@ def filmed(ground: np.ndarray, noise: float, rng: np.random.Generator) -> Image:
 
 
 SCENES = {
-    "land": structured(30, 110, noise=2, seed=7),
-    "calm sea": plain(100.5, noise=3, boats=1),
-    "sea without noise": plain(60.5, noise=0, boats=1),
-    "waves": plain(140, noise=3, boats=3, waves=8),
-    "snow": plain(235.4, noise=2, boats=2),
-    "white": plain(254, noise=3),
-    "fog": structured(5, 170, noise=3, seed=5),
-    "night": structured(1, 4, noise=3, seed=6),
-    "dark": plain(2, noise=3),
+    "land": partial(structured, 30, 110, noise=2, seed=7),
+    "calm sea": partial(plain, 100.5, noise=3, boats=1),
+    "sea without noise": partial(plain, 60.5, noise=0, boats=1),
+    "waves": partial(plain, 140, noise=3, boats=3, waves=8),
+    "snow": partial(plain, 235.4, noise=2, boats=2),
+    "white": partial(plain, 254, noise=3),
+    "fog": partial(structured, 5, 170, noise=3, seed=5),
+    "night": partial(structured, 1, 4, noise=3, seed=6),
+    "dark": partial(plain, 2, noise=3),
 }
 
 # Of the two dark ones nobody sees which it is: they are a level apart.
 CUTS = [cut for cut in itertools.permutations(SCENES, 2) if set(cut) != {"dark", "night"}]
 
 
+@cache
+def scene(name: str) -> list[Image]:
+    """Its pictures."""
+    return SCENES[name]()
+
+
 def changes(pictures: list[Image], *, step_ns: int = STEP_NS) -> list[int]:
     """The places at which another scene began."""
-    scene = SceneChange()
-    return [k for k, one in enumerate(pictures) if scene.take(one, capture_ns=(k + 1) * step_ns)]
+    change = SceneChange()
+    return [k for k, one in enumerate(pictures) if change.take(one, capture_ns=(k + 1) * step_ns)]
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_of_little_contrast_is_one_scene(name):
     """Over water, snow and fog what was measured would be forgotten at each step: no tracks are ever sent."""
-    assert changes(SCENES[name]) == []
+    assert changes(scene(name)) == []
 
 
 @pytest.mark.parametrize(("before", "after"), CUTS)
 def test_a_cut_is_seen_in_each(before, after):
     """What was measured of the scene before would hold levers for seconds."""
-    assert 6 in changes(SCENES[before][:6] + SCENES[after][:6])
+    assert 6 in changes(scene(before)[:6] + scene(after)[:6])
 
 
 def test_a_fast_flight_is_one_scene():
@@ -96,4 +103,4 @@ def test_exposure_is_no_other_scene():
 
 def test_after_a_pause_nothing_is_compared():
     """A moving camera shows other ground by then, of the same scene."""
-    assert changes(SCENES["land"][:6] + SCENES["snow"][:6], step_ns=2 * SECOND_NS) == []
+    assert changes(scene("land")[:6] + scene("snow")[:6], step_ns=2 * SECOND_NS) == []

@@ -22,9 +22,14 @@ from hvt_scene import Scene
 from programs.processes import Link, free_ports
 
 FPS, FRAMES, SEED = 15, 75, 3
-SCENE = Scene(SEED)
 SIZE = (640, 360)
 VIEW = View.fitted((1920, 1080), SIZE, fit="letterbox")
+
+
+@functools.cache
+def scene() -> Scene:
+    """What is flown over; to paint it takes seconds."""
+    return Scene(SEED)
 
 
 @dataclass(frozen=True)
@@ -109,8 +114,8 @@ def fly_into_all_sinks(folder: Path) -> DrawnFlight:
 @functools.lru_cache(maxsize=FRAMES)
 def _truth(frame: int) -> tuple[np.ndarray, list[np.ndarray]]:
     """Boxes in base pixels and places (latitude, longitude) of all that is there."""
-    truth, middles = SCENE.truth((frame - 1) / FPS), SCENE.places((frame - 1) / FPS)
-    places = [np.array(SCENE.geographic(*middles[one])) for one in truth.ids.tolist()]
+    truth, middles = scene().truth((frame - 1) / FPS), scene().places((frame - 1) / FPS)
+    places = [np.array(scene().geographic(*middles[one])) for one in truth.ids.tolist()]
     return VIEW.to_base(truth.boxes_source_px), places
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from hvt_common.geodesy import metres_per_degree
 from programs.processes import Link, free_ports
-from rigs.drawn_flight import FPS, FRAMES, SCENE, fly, off_m, receiving
+from rigs.drawn_flight import FPS, FRAMES, fly, off_m, receiving, scene
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
 
@@ -34,7 +34,7 @@ def test_the_camera_is_where_the_scene_has_it(drawn):
     """Its wedge would lie beside the objects that it sees."""
     platform = [one for one in drawn.events if one.attrib["uid"] == "hvt-uav-1"]
     assert platform
-    way = [SCENE.pose(t_s) for t_s in np.linspace(0, FRAMES / FPS, 200)]
+    way = [scene().pose(t_s) for t_s in np.linspace(0, FRAMES / FPS, 200)]
     for event in platform:
         place = np.array([float(event.find("point").attrib[name]) for name in ("lat", "lon")])
         near = min(
