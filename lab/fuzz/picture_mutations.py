@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from random import Random
 
+from hvt_codecs.avif import av1_data, av1_size, avif_file
 from hvt_common.video.still_codecs import StillError
-from hvt_common.video.still_codecs.plugins.avif import av1_data, av1_size, avif_file
 from lab.fuzz.mutate import Bytes, Mutator
 
 _Change = Callable[[bytes, Random, Bytes], bytes]

@@ -58,11 +58,27 @@ def test_a_removed_codec_names_its_successor(name):
         still_codec(name)
 
 
+@pytest.mark.parametrize(("name", "package"), [("webp", "edge"), ("avif", "edge"), ("jxl", "jxl")])
+def test_without_the_extra_a_codec_names_what_to_install(name, package, monkeypatch):
+    """It would be a codec that nobody knows."""
+    still_codec.cache_clear()
+    monkeypatch.setattr(plug_ins, "entry_points", lambda **_group: ())
+    plug_ins.installed.cache_clear()
+    try:
+        assert still_codec_names() == ("jpeg", "h264-intra", "residual")
+        with pytest.raises(UserError) as refused:
+            still_codec(name)
+    finally:
+        plug_ins.installed.cache_clear()
+    assert str(refused.value) == (
+        f"still codec '{name}' is of an extra that is not installed: pip install 'hvt[{package}]'"
+    )
+
+
 def test_what_is_not_installed_names_its_extra(monkeypatch):
     """A user without JPEG XL would not learn how to get it."""
     still_codec.cache_clear()
-    monkeypatch.setitem(sys.modules, "pillow_jxl", None)
-    monkeypatch.setattr("hvt_common.video.still_codecs.plugins.jxl.find_spec", lambda _name: None)
+    monkeypatch.setattr("hvt_codecs.jxl.find_spec", lambda _name: None)
     assert "jxl" not in still_codec_names()
     with pytest.raises(UserError, match=r"'jxl' is not available: it comes with the extra hvt\[jxl\]"):
         still_codec("jxl")

@@ -11,13 +11,6 @@ from hvt_common.values import Image
 from hvt_common.video.still_codecs.contract import StillError
 
 
-def lacking(ending: str) -> str | None:
-    """Why this OpenCV cannot code pictures of that file ending, or None where it can."""
-    if cv2.haveImageWriter(f"still{ending}"):
-        return None
-    return f"OpenCV {cv2.__version__} is built without {ending[1:]}; opencv-python-headless 4.11 and later have it"
-
-
 def imencoded(ending: str, image_bgr: Image, flags: Sequence[int]) -> bytes:
     """The picture as a file; RuntimeError where the encoder refuses, which no crop makes it do."""
     done, data = cv2.imencode(ending, image_bgr, flags)

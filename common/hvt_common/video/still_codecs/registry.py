@@ -1,8 +1,8 @@
-"""Every still codec by its name on the wire: HVT's own, and those that other packages install.
+"""Every still codec by its name on the wire: the core's, and those that extras and other packages install.
 
-A third party's codec is an entry point of the group ``hvt.still_codecs``: its name is the codec's name on the wire,
-its object satisfies `contract.StillCodec`, or is called without arguments to give one. A third party's package is
-imported when its codec is requested by name, so that a broken plug-in matters only where it is used.
+Such a codec is an entry point of the group ``hvt.still_codecs``: its name is the codec's name on the wire, its object
+satisfies `contract.StillCodec`, or is called without arguments to give one. A third party's package is imported when
+its codec is requested by name, so that a broken plug-in matters only where it is used.
 """
 
 from __future__ import annotations
@@ -35,62 +35,56 @@ _BUILT_IN: Mapping[str, str] = MappingProxyType(
         "residual": f"{_PACKAGE}.residual:ResidualCodec",
     }
 )
-_PLUGINS: Mapping[str, str] = MappingProxyType(
-    {
-        "webp": f"{_PACKAGE}.plugins.webp:WebpCodec",
-        "avif": f"{_PACKAGE}.plugins.avif:AvifCodec",
-        "jxl": f"{_PACKAGE}.plugins.jxl:JxlCodec",
-    }
-)
-"""These need a library that may be missing; ``lacking`` of the class says which."""
+_BROUGHT_BY = {"webp": "edge", "avif": "edge", "jxl": "jxl"}
+"""Codecs of the extra that comes with HVT, and the package to install for each. They need a library that may be
+missing; ``lacking`` of the class says which."""
 _REMOVED = ("jpeg-lite", "avif-lite", "hevc-intra")
 """Codecs of earlier versions; h264-intra takes their place."""
 
 
 def still_codec_names() -> tuple[str, ...]:
-    """The names that `still_codec` takes on this machine: HVT's own, then plug-ins by name; loads none."""
-    own = [*_BUILT_IN, *(name for name, target in _PLUGINS.items() if _loaded(target).lacking() is None)]
-    return (*own, *sorted(installed(GROUP).keys() - _BUILT_IN.keys() - _PLUGINS.keys()))
+    """The names that `still_codec` takes on this machine: HVT's own, then plug-ins by name; loads none of these."""
+    found = installed(GROUP)
+    own = [name for name in _BROUGHT_BY if name in found and _part(found[name][0])[1] is None]
+    return (*_BUILT_IN, *own, *sorted(found.keys() - _BUILT_IN.keys() - _BROUGHT_BY.keys()))
 
 
 @cache
 def still_codec(name: str) -> StillCodec:
     """The codec of that name; `UserError` where there is none, or where it does not work here."""
-    target = _BUILT_IN.get(name) or _PLUGINS.get(name)
+    target = _BUILT_IN.get(name)
     entry = the_one(GROUP, name, what=_WHAT, built_in=target is not None)
     if target is not None:
-        return _own(name, target)
+        module, _, attribute = target.partition(":")
+        codec: StillCodec = getattr(import_module(module), attribute)()
+        return codec
     if entry is not None:
-        return _foreign(entry)
+        return _plugged_in(entry)
+    if name in _BROUGHT_BY:
+        raise UserError(
+            f"still codec {name!r} is of an extra that is not installed: pip install 'hvt[{_BROUGHT_BY[name]}]'"
+        )
     if name in _REMOVED:
         raise UserError(f"still codec {name!r} is no longer part of HVT: use h264-intra")
     raise UserError(f"still codec {name!r} is not known: choose one of {', '.join(still_codec_names())}")
 
 
-def _loaded(target: str) -> Any:
-    module, _, attribute = target.partition(":")
-    return getattr(import_module(module), attribute)
+def _part(entry: EntryPoint) -> tuple[Any, str | None]:
+    # The entry's object, and why it does not work on this machine, if it tells.
+    part = loaded(entry, lambda part: part, what=_WHAT)
+    return part, part.lacking() if hasattr(part, "lacking") else None
 
 
-def _own(name: str, target: str) -> StillCodec:
-    codec_class = _loaded(target)
-    lacking = codec_class.lacking() if name in _PLUGINS else None
+def _plugged_in(entry: EntryPoint) -> StillCodec:
+    part, lacking = _part(entry)
     if lacking is not None:
-        raise UserError(f"still codec {name!r} is not available: {lacking}")
-    codec: StillCodec = codec_class()
-    return codec
-
-
-def _foreign(entry: EntryPoint) -> StillCodec:
-    def made(part: Any) -> Any:
-        return part() if isinstance(part, type) or not hasattr(part, "encode") else part
-
-    codec = loaded(entry, made, what=_WHAT)
+        raise UserError(f"still codec {entry.name!r} is not available: {lacking}")
+    made = isinstance(part, type) or not hasattr(part, "encode")
+    codec: StillCodec = loaded(entry, lambda part: part() if made else part, what=_WHAT)
     wrong = _faults(entry.name, codec)
     if wrong:
         raise UserError(f"still codec {entry.name!r} of {origin(entry)} breaks the contract: {wrong}")
-    chosen: StillCodec = codec
-    return chosen
+    return codec
 
 
 def _faults(name: str, codec: object) -> str | None:

@@ -6,7 +6,7 @@ import cv2
 
 from hvt_common.values import Image
 from hvt_common.video.still_codecs.contract import IntraCodec, StillError, on_ladder
-from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded, lacking
+from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded
 
 _QUALITY = ((1, 1), (5, 2), (20, 17), (35, 36), (50, 52), (65, 71), (80, 82), (90, 90), (97, 98), (100, 100))
 """(quality in percent, WebP's own), at equal Y-PSNR; WebP has nothing as coarse as JPEG below 15."""
@@ -31,7 +31,14 @@ class WebpCodec(IntraCodec):
     @staticmethod
     def lacking() -> str | None:
         """Why it does not work on this machine, or None."""
-        return lacking(".webp")
+        return lacks(".webp")
+
+
+def lacks(ending: str) -> str | None:
+    """Why this OpenCV cannot code pictures of that file ending, or None where it can."""
+    if cv2.haveImageWriter(f"still{ending}"):
+        return None
+    return f"OpenCV {cv2.__version__} is built without {ending[1:]}; opencv-python-headless 4.11 and later have it"
 
 
 def webp_size(data: bytes) -> tuple[int, int]:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import cv2
 
+from hvt_codecs.webp import lacks
 from hvt_common.values import Image
 from hvt_common.video.still_codecs.bits import BitReader
 from hvt_common.video.still_codecs.contract import IntraCodec, StillError, on_ladder
-from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded, lacking
+from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded
 
 _QUALITY = ((1, 1), (5, 4), (20, 36), (35, 46), (50, 52.5), (65, 59), (80, 68), (90, 81), (97, 94), (100, 98))
 """(quality in percent, libavif's own), at equal Y-PSNR; libavif's 100 is lossless, which is another format."""
@@ -40,7 +41,7 @@ class AvifCodec(IntraCodec):
     @staticmethod
     def lacking() -> str | None:
         """Why it does not work on this machine, or None."""
-        return lacking(".avif")
+        return lacks(".avif")
 
 
 def av1_data(file: bytes) -> bytes:

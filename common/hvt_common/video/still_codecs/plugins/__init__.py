@@ -1,1 +1,0 @@
-"""The still codecs that no profile uses, loaded by name like a third party's: `webp`, `avif`, `jxl`."""
