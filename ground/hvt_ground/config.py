@@ -9,10 +9,9 @@ from pathlib import Path
 
 from hvt_common.config import BYTES, DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
 from hvt_common.errors import NotYetError, UserError
-from hvt_common.inference.ensemble import parts_of
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
-from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
+from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, parts_of
 from hvt_common.protocol.channels import GroupKeys
 from hvt_common.runtime.log import LOG_FORMATS
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT

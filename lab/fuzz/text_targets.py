@@ -10,13 +10,13 @@ from pathlib import Path
 from hvt_common import config, units
 from hvt_common.errors import UserError
 from hvt_common.inference.labels import metadata_labels, read_labels
-from hvt_common.inference.store.manifest import parse_manifest
 from hvt_common.protocol.channels import check_edge_pattern, matches
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_fleet.pki.roster import GroundMember, Roster, RouterMember
 from hvt_ground.config import GroundConfig
+from hvt_models.manifest import parse_manifest
 from lab.fuzz.contract import Target, scratch
 
 

@@ -6,6 +6,9 @@ import pytest
 
 from hvt_common.config import load
 from hvt_common.errors import UserError
+from hvt_common.inference.detect import OnnxDetector, open_detector
+from hvt_common.inference.heads.choose import HEAD_NAMES
+from hvt_common.inference.store import library_part
 from hvt_ground.cli import main
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import all_extras, config_class
@@ -41,4 +44,43 @@ def test_a_command_of_an_extra_that_is_absent(command, monkeypatch, capsys):
     assert main([command]) == 2
     assert capsys.readouterr().err == (
         f"hvt-ground: hvt-ground {command} is of an extra that is not installed: pip install 'hvt[ground]'\n"
+    )
+
+
+def test_the_names_of_heads_are_those_that_the_library_reads():
+    """A head of ``--help`` would be refused, or one could not be named."""
+    assert tuple(library_part("heads") or ()) == HEAD_NAMES
+
+
+def test_the_embedded_detector_needs_no_library(monkeypatch):
+    """A flight with the defaults would need the extra."""
+    whole = open_detector("aerial-nano")
+    monkeypatch.setattr("hvt_common.inference.store.installed", lambda _group: {})
+    monkeypatch.setattr("hvt_common.inference.detect.plug_in_of", lambda _spec, **_taken: None)
+    alone = open_detector("aerial-nano")
+    assert isinstance(whole, OnnxDetector)
+    assert isinstance(alone, OnnxDetector)
+    assert (alone.head.name, alone.head.why, alone.pixels) == (whole.head.name, whole.head.why, whole.pixels)
+
+
+@pytest.mark.parametrize(
+    ("detector", "head", "says"),
+    [
+        (
+            "yolox-s",
+            None,
+            "detector 'yolox-s' is not known: give one of motion, aerial-nano, aerial-cls, or an",
+        ),
+        ("aerial-nano+motionless", None, "detector 'aerial-nano+motionless' is not available: "),
+        ("aerial-nano", "yolov8", "head yolov8 is not available: "),
+    ],
+)
+def test_a_model_of_the_library_that_is_absent(detector, head, says, monkeypatch):
+    """It would be a model that nobody knows."""
+    monkeypatch.setattr("hvt_common.inference.store.installed", lambda _group: {})
+    with pytest.raises(UserError) as refused:
+        open_detector(detector, head=head)
+    assert says in str(refused.value)
+    assert "the model library is an extra that is not installed: pip install 'hvt[edge]'" in str(
+        refused.value
     )

@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import group_of
-from hvt_common.inference.ensemble import EnsembleDetector, on_scale_of, parts_of
 from hvt_common.inference.heads.choose import HEAD_NAMES, check_head_name, choose_head
 from hvt_common.inference.heads.contract import Head
 from hvt_common.inference.heads.trial import Trial, trial_pictures
@@ -26,7 +25,7 @@ from hvt_common.inference.preparation import Preparation, prepared_as
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
 from hvt_common.inference.scores import USUAL_CONFIDENCE, default_confidence
-from hvt_common.inference.store import model_names, resolve_model
+from hvt_common.inference.store import model_names, needed_part, parts_of, resolve_model
 from hvt_common.values import Detections, Image
 
 _log = logging.getLogger(__name__)
@@ -116,23 +115,18 @@ def open_detector(
     return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size, head=head)
 
 
-def _open_ensemble(
-    parts: tuple[str, ...], *, confidence: float, settings: Mapping[str, Any]
-) -> EnsembleDetector:
+def _open_ensemble(parts: tuple[str, ...], *, confidence: float, settings: Mapping[str, Any]) -> Detector:
+    name = "+".join(parts)
     if MOTION in parts:
         raise UserError(
-            f"detector {'+'.join(parts)!r} is not accepted: {MOTION} looks at several pictures, and stands alone"
+            f"detector {name!r} is not accepted: {MOTION} looks at several pictures, and stands alone"
         )
-    owns = [default_confidence(part) for part in parts]
-    least = np.array([confidence], np.float32)
-    return EnsembleDetector(
-        [
-            open_detector(part, confidence=float(on_scale_of(least, owns[0], own)[0]), **settings)
-            for part, own in zip(parts, owns, strict=True)
-        ],
-        owns,
+    ensemble: Detector = needed_part("ensemble", f"detector {name!r}")(
+        lambda part, confidence: open_detector(part, confidence=confidence, **settings),
+        {part: default_confidence(part) for part in parts},
         confidence=confidence,
     )
+    return ensemble
 
 
 def detect_every(given: int | None, *, fps: float) -> int:

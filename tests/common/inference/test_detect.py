@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, detect_every, open_detector
-from hvt_common.inference.heads.decode import Dense, Listed, YoloxCells
+from hvt_common.inference.heads.decode import YoloxCells
 from hvt_common.inference.heads.trial import anchor_count
 from hvt_common.inference.letterbox import Letterbox, Letterboxer, as_bgr
 from hvt_common.inference.motion import MotionDetector
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
 from hvt_common.inference.preparation import Preparation
 from hvt_common.inference.runtimes.model import open_model
+from hvt_models.forms import Dense, Listed
 from media.head_models import family_model
 from media.onnx_models import STRIDES, cells, colour_classifier, colour_detector, constant_model
 

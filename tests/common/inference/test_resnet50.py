@@ -19,11 +19,11 @@ from onnx import helper, numpy_helper
 
 from hvt_common.inference.class_names import IMAGENET_NAMES, kind_of
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
-from hvt_common.inference.cli import main
 from hvt_common.inference.labels import first_synonym, read_labels
 from hvt_common.inference.runtimes.openvino_model import find_openvino
-from hvt_common.inference.store.manifest import builtin_manifest
 from hvt_common.values import Image
+from hvt_models.command import main
+from hvt_models.manifest import builtin_manifest
 
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 PARAMETERS = 25_557_032  # torchvision's count for resnet50: weights, and gain and bias of each normalisation

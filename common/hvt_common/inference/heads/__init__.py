@@ -1,5 +1,5 @@
-"""Heads read the outputs of detector networks: others use `choose`, `contract`.
+"""Heads read the outputs of detector networks: others use `choose`, `contract`; the extra `hvt_models` has more heads.
 
-`trial` holds what a network answered to a few pictures, `kinds` the heads that are known, `decode` how their numbers
-become boxes.
+`trial` holds what a network answered to a few pictures, `kind` the marks of a head, `decode` how its numbers become
+boxes.
 """

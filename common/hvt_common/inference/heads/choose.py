@@ -4,11 +4,31 @@ from __future__ import annotations
 
 from hvt_common.errors import UserError
 from hvt_common.inference.heads.contract import Head
-from hvt_common.inference.heads.kinds import KINDS, Kind, Match
+from hvt_common.inference.heads.kind import YOLOX, Kind, Match
 from hvt_common.inference.heads.trial import Trial
+from hvt_common.inference.store import MISSING, library_part, needed_part
 
-HEAD_NAMES = tuple(KINDS)
-"""The values of ``--head``."""
+HEAD_NAMES = (
+    "yolox",
+    "yolox-decoded",
+    "yolov5",
+    "yolov6",
+    "yolov8",
+    "yolov8-rows",
+    "end-to-end",
+    "yolov7-rows",
+    "yolo-nas",
+    "nas-rows",
+    "nms-lists",
+    "rt-detr",
+    "rt-detr-rows",
+    "rf-detr",
+    "labels-boxes-scores",
+    "ssd",
+    "atss",
+    "tf-lists",
+)
+"""The values of ``--head``; all but the first are of the model library, and ``--help`` is not to load it."""
 _RT_DETR = ("rt-detr-rows", "rt-detr")
 _RAW_AXES = 5
 """(1, 3, H, W, 5+C): YOLOv5's levels, beside all of them decoded."""
@@ -16,8 +36,8 @@ _RAW_AXES = 5
 
 def check_head_name(name: str | None) -> None:
     """`UserError` for a name that no head has."""
-    if name is not None and name not in KINDS:
-        raise UserError(f"--head '{name}' is not known: choose one of {', '.join(KINDS)}")
+    if name is not None and name not in HEAD_NAMES:
+        raise UserError(f"--head '{name}' is not known: choose one of {', '.join(HEAD_NAMES)}")
 
 
 def choose_head(trial: Trial, *, wanted: str | None = None) -> Head:
@@ -28,12 +48,13 @@ def choose_head(trial: Trial, *, wanted: str | None = None) -> Head:
     """
     check_head_name(wanted)
     said = trial.metadata.get("head", "")
-    if wanted is not None or said in KINDS:
+    if wanted is not None or said in HEAD_NAMES:
         return _named(trial, wanted or said, "--head" if wanted else "its metadata: head")
-    kinds: dict[str, Kind] = dict(KINDS)
+    library = library_part("heads")
+    kinds: dict[str, Kind] = {"yolox": YOLOX} if library is None else dict(library)
     why = ""
-    if _says_rt_detr(trial):
-        kinds = {name: KINDS[name] for name in _RT_DETR}
+    if library is not None and _says_rt_detr(trial):
+        kinds = {name: kinds[name] for name in _RT_DETR}
         why = f"its metadata say {'head ' + said if said else 'RT-DETR'}: "
     found = {name: match for name, kind in kinds.items() if (match := kind.fits(trial)) is not None}
     certain = {name: match for name, match in found.items() if match.proof and _explains(trial, match)}
@@ -43,14 +64,15 @@ def choose_head(trial: Trial, *, wanted: str | None = None) -> Head:
         ((name, match),) = certain.items()
         return kinds[name].head(name, match, why + (match.proof or "its shape fits"))
     if not found:
-        raise UserError("its outputs fit no head that is known")
+        more = "" if library is not None else f"; of other heads, {MISSING}"
+        raise UserError(f"its outputs fit no head that is known{more}")
     likely = [name for name, match in found.items() if match.possible and _explains(trial, match)]
     could = " or ".join(certain or likely or found)
     raise UserError(f"its outputs could be {could}, which --head NAME decides")
 
 
 def _named(trial: Trial, name: str, by: str) -> Head:
-    kind = KINDS[name]
+    kind: Kind = YOLOX if name == "yolox" else needed_part("heads", f"head {name}")[name]
     match = kind.fits(trial)
     if match is None:
         raise UserError(f"its outputs are not those of {by} {name}, which is {kind.text}")

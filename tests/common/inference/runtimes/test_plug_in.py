@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.inference.cli import main as models
 from hvt_common.inference.detect import open_detector, warm_up
 from hvt_common.inference.scores import uncalibrated
 from hvt_common.inference.tiles import tiled
 from hvt_common.runtime import plug_ins
+from hvt_models.command import main as models
 from hvt_study.cli import main as study
 from media.third_party import BLOBS, install
 

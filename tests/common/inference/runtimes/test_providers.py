@@ -15,7 +15,6 @@ from onnx import helper
 
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
-from hvt_common.inference.cli import main
 from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.runtimes import model as runtime
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
@@ -26,6 +25,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.wiring import make_detector
 from hvt_ground.config import GroundConfig
 from hvt_ground.wiring import Models
+from hvt_models.command import main
 from media.onnx_models import colour_classifier, colour_detector, constant_model, save
 
 CPU = ("AzureExecutionProvider", "CPUExecutionProvider")

@@ -1,129 +1,45 @@
-"""The known heads, and the marks of each.
-
-A head *fits* where the outputs have its shape. It is *proven* where the values of the trial, the names of the outputs
-or the number of class names leave no other: then `Match.proof` says what. With ``--head`` a fit is enough.
-
-A is the number of cells of all strides for the input size, which no number of classes or objects equals by accident.
-"""
+"""The heads of foreign exports, and the marks of each; see `hvt_common.inference.heads.kind`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
 
-from hvt_common.inference.heads.contract import Array, Decoder, Head
-from hvt_common.inference.heads.decode import (
-    MOST_RELATIVE,
-    Corners,
-    Dense,
-    Listed,
-    Parallel,
-    PerQuery,
-    YoloxCells,
-    cell_grid,
-    rows_of,
+from hvt_common.inference.heads.contract import Array
+from hvt_common.inference.heads.decode import MOST_RELATIVE, rows_of
+from hvt_common.inference.heads.kind import (
+    BGR_255,
+    LEAST_COLUMNS,
+    STRIDES,
+    YOLOX,
+    YOLOX_STRIDES,
+    Kind,
+    Match,
+    is_raw,
+    of_cells,
+    tables,
 )
-from hvt_common.inference.heads.trial import (
-    Trial,
-    anchor_count,
-    are_probabilities,
-    are_scores,
-    are_whole,
-)
-from hvt_common.inference.letterbox import Anchor
+from hvt_common.inference.heads.trial import Trial, anchor_count, are_probabilities, are_scores, are_whole
 from hvt_common.inference.preparation import Preparation
+from hvt_models.forms import Corners, Dense, Listed, Parallel, PerQuery
 
-__all__ = ["KINDS", "Kind", "Match"]
-
-_STRIDES: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32), (16, 32))
-_YOLOX_STRIDES: tuple[tuple[int, ...], ...] = (*_STRIDES[:2], (8, 16, 32, 12, 24, 48))
 _ANCHORS_A_CELL = 3
 """Anchors a cell of YOLOv5 and YOLOv7."""
-_LEAST_COLUMNS, _BOX = 5, 4
+_BOX = 4
 
-_BGR_255 = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=False)
 _RGB_1 = Preparation(mean=(0.0,) * 3, scale=(1 / 255,) * 3)
 _RGB_255 = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3)
-
-
-@dataclass(frozen=True, slots=True)
-class Match:
-    """The outputs have the shape of a head."""
-
-    outputs: tuple[int, ...]
-    classes: int | None
-    decoder: Decoder
-    proof: str | None
-    """The evidence that excludes all other heads; None if the shape alone fits."""
-    possible: bool = True
-    """False where the values speak against it, and only the user can know better."""
-    by_name: bool = False
-    """The names of its outputs tell it, whatever other outputs there are."""
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """One head by its name."""
-
-    text: str
-    """Whose it is, and the shape of its outputs."""
-    match: Callable[[Trial], Match | None]
-    anchor: Anchor
-    preparation: Preparation
-    suppresses: bool = True
-
-    def fits(self, trial: Trial) -> Match | None:
-        """Whether the outputs have its shape, judged by the pictures in the range of its pixels."""
-        return self.match(trial.up_to(255 if self.preparation.scale[0] == 1 else 1))
-
-    def head(self, name: str, match: Match, why: str) -> Head:
-        """The head that a match means."""
-        return Head(
-            name,
-            match.classes,
-            match.outputs,
-            self.anchor,
-            self.preparation,
-            self.suppresses,
-            match.decoder,
-            why,
-        )
-
-
-def _tables(trial: Trial, columns: int | None = None) -> list[int]:
-    # Outputs (1, N, K), or (N, K) with so many columns.
-    return [
-        index
-        for index in range(len(trial.ports))
-        for shape in [trial.shape(index)]
-        if (len(shape) == 3 and shape[0] == 1 and columns in (None, shape[2]))
-        or (len(shape) == 2 and columns is not None and shape[1] == columns)
-    ]
 
 
 def _only(found: list[int]) -> int | None:
     return found[0] if len(found) == 1 else None
 
 
-def _of_cells(
-    trial: Trial, strides: tuple[tuple[int, ...], ...] = _STRIDES, *, times: int = 1
-) -> list[tuple[int, tuple[int, ...]]]:
-    # Outputs (1, A, K) with a row for each cell, and the strides of the cells.
-    return [
-        (index, one)
-        for index in _tables(trial)
-        for one in strides
-        if trial.shape(index)[1] == times * anchor_count(trial.size, one)
-        and trial.shape(index)[2] >= _LEAST_COLUMNS
-    ]
-
-
 def _is_listed(trial: Trial, index: int) -> bool:
     # Whether the rows are objects: neither rows nor columns are cells.
-    counts = [anchor_count(trial.size, strides) for strides in _STRIDES]
+    counts = [anchor_count(trial.size, strides) for strides in STRIDES]
     cells = {*counts, *(_ANCHORS_A_CELL * count for count in counts)}
     return cells.isdisjoint(trial.shape(index)[-2:])
 
@@ -131,22 +47,11 @@ def _is_listed(trial: Trial, index: int) -> bool:
 # --- a row a cell ---------------------------------------------------------------------------------------------------
 
 
-def _yolox(trial: Trial) -> Match | None:
-    for index, strides in _of_cells(trial, _YOLOX_STRIDES):
-        classes = trial.shape(index)[2] - 5
-        if classes < 1 or not are_probabilities(trial.table(index)[:, 4:]):
-            continue
-        raw = _is_raw(trial, index, strides)
-        proof = "a row a cell, x and y counted from it" if raw else None
-        return Match((index,), classes, YoloxCells(strides), proof, possible=raw)
-    return None
-
-
 def _with_objectness(trial: Trial, *, constant: bool) -> Match | None:
     # (1, A, 5+C) in pixels; YOLOv6 has no objectness, and writes 1.
-    for index, strides in _of_cells(trial, _YOLOX_STRIDES):
+    for index, strides in of_cells(trial, YOLOX_STRIDES):
         classes, table = trial.shape(index)[2] - 5, trial.table(index)
-        if classes < 1 or not are_probabilities(table[:, 4:]) or _is_raw(trial, index, strides):
+        if classes < 1 or not are_probabilities(table[:, 4:]) or is_raw(trial, index, strides):
             continue
         if trial.has_angles(index, 5):
             continue
@@ -163,9 +68,9 @@ def _with_objectness(trial: Trial, *, constant: bool) -> Match | None:
 
 
 def _yolov8_rows(trial: Trial) -> Match | None:
-    for index, strides in _of_cells(trial):
+    for index, strides in of_cells(trial):
         classes, table = trial.shape(index)[2] - 4, trial.table(index)
-        if not are_probabilities(table[:, 4:]) or _is_raw(trial, index, strides):
+        if not are_probabilities(table[:, 4:]) or is_raw(trial, index, strides):
             continue
         if trial.has_angles(index, 4):
             continue
@@ -176,7 +81,7 @@ def _yolov8_rows(trial: Trial) -> Match | None:
 
 
 def _yolov5(trial: Trial) -> Match | None:
-    for index, _ in _of_cells(trial, times=_ANCHORS_A_CELL):
+    for index, _ in of_cells(trial, times=_ANCHORS_A_CELL):
         classes, table = trial.shape(index)[2] - 5, trial.table(index)
         if classes >= 1 and are_probabilities(table[:, 4:]):
             return Match(
@@ -186,13 +91,13 @@ def _yolov5(trial: Trial) -> Match | None:
 
 
 def _yolov8(trial: Trial) -> Match | None:
-    counts = [anchor_count(trial.size, strides) for strides in _STRIDES]
+    counts = [anchor_count(trial.size, strides) for strides in STRIDES]
     found = [
         index
-        for index in _tables(trial)
+        for index in tables(trial)
         for shape in [trial.shape(index)]
         if shape[2] in counts
-        and shape[1] >= _LEAST_COLUMNS
+        and shape[1] >= LEAST_COLUMNS
         and are_probabilities(_scores(trial, index))
         and not trial.has_angles(index, 4, transposed=True)
     ]
@@ -208,22 +113,11 @@ def _scores(trial: Trial, index: int) -> Array:
     return np.concatenate([run[index][0, 4:].astype(np.float32) for run in trial.runs], axis=1)
 
 
-def _is_raw(trial: Trial, index: int, strides: tuple[int, ...]) -> bool:
-    # Whether centres lie nearer to zero, counted in cells, than to their cells in pixels.
-    grid, stride = cell_grid(trial.size, strides)
-    centres = rows_of(trial.runs[0][index].astype(np.float32))[:, :2]
-    if float(np.abs(centres).max(initial=0)) == 0:
-        return True
-    as_shares = np.abs(centres * np.array(trial.size, np.float32) / stride - grid - 0.5).mean()
-    as_pixels = np.abs(centres / stride - grid - 0.5).mean()
-    return bool(np.abs(centres).mean() <= min(as_shares, as_pixels))
-
-
 # --- a row an object ------------------------------------------------------------------------------------------------
 
 
 def _end_to_end(trial: Trial) -> Match | None:
-    index = _only(_tables(trial, 6))
+    index = _only(tables(trial, 6))
     if index is None or not _is_score_and_class(trial, index):
         return None
     proof = None
@@ -239,7 +133,7 @@ def _end_to_end(trial: Trial) -> Match | None:
 
 def _rt_detr_rows(trial: Trial) -> Match | None:
     # (1, N, 6) or (1, N, 4+C), boxes by their centre; as Ultralytics exports RT-DETR.
-    index = _only([one for one in _tables(trial) if trial.shape(one)[2] >= _LEAST_COLUMNS])
+    index = _only([one for one in tables(trial) if trial.shape(one)[2] >= LEAST_COLUMNS])
     if index is None or not _is_listed(trial, index):
         return None
     table, columns = trial.table(index), trial.shape(index)[2]
@@ -255,7 +149,7 @@ def _rt_detr_rows(trial: Trial) -> Match | None:
 
 def _with_image(trial: Trial, *, score: int, kind: int) -> Match | None:
     # (N, 7): image, x1 y1 x2 y2, and score and class in either order.
-    index = _only([one for one in _tables(trial, 7) if len(trial.shape(one)) == 2])
+    index = _only([one for one in tables(trial, 7) if len(trial.shape(one)) == 2])
     if index is None:
         return None
     table = trial.table(index)
@@ -302,11 +196,11 @@ def _shows_centres(boxes: Array) -> bool:
 
 def _boxes_and_table(trial: Trial) -> tuple[int, int] | None:
     # Outputs (1, N, 4) and (1, N, C); of several the last layer's, by DETR's names.
-    tables = _tables(trial)
+    found = tables(trial)
     pairs = [
         (boxes, scores)
-        for boxes in tables
-        for scores in tables
+        for boxes in found
+        for scores in found
         if boxes != scores
         and trial.shape(boxes)[2] == _BOX
         and trial.shape(boxes)[1] == trial.shape(scores)[1]
@@ -389,7 +283,7 @@ def _tf_lists(trial: Trial) -> Match | None:
 
 
 def _atss(trial: Trial) -> Match | None:
-    boxes = _only([*_tables(trial, 5)])
+    boxes = _only([*tables(trial, 5)])
     if boxes is None:
         return None
     kinds = _only([i for i in range(len(trial.ports)) if i != boxes and trial.whole(i)])
@@ -433,9 +327,9 @@ _letterboxed = partial(Kind, anchor="centre", preparation=_RGB_1)
 _stretched = partial(Kind, anchor="stretch", preparation=_RGB_1, suppresses=False)
 
 KINDS: Mapping[str, Kind] = {
-    "yolox": Kind("YOLOX, raw: (1, A, 5+C)", _yolox, "top-left", _BGR_255),
+    "yolox": YOLOX,
     "yolox-decoded": Kind(
-        "YOLOX in pixels: (1, A, 5+C)", partial(_with_objectness, constant=False), "top-left", _BGR_255
+        "YOLOX in pixels: (1, A, 5+C)", partial(_with_objectness, constant=False), "top-left", BGR_255
     ),
     "yolov5": _letterboxed("YOLOv5 and YOLOv7: (1, 3A, 5+C)", _yolov5),
     "yolov6": _letterboxed("YOLOv6: (1, A, 5+C), objectness 1", partial(_with_objectness, constant=True)),
@@ -474,10 +368,10 @@ KINDS: Mapping[str, Kind] = {
         _labels_boxes_scores,
     ),
     "ssd": _stretched(
-        "SSD of the Open Model Zoo: (1, 1, N, 7) image class score x1 y1 x2 y2", _ssd, preparation=_BGR_255
+        "SSD of the Open Model Zoo: (1, 1, N, 7) image class score x1 y1 x2 y2", _ssd, preparation=BGR_255
     ),
     "atss": _stretched(
-        "ATSS of the Open Model Zoo: boxes (N, 5) x1 y1 x2 y2 score, labels (N)", _atss, preparation=_BGR_255
+        "ATSS of the Open Model Zoo: boxes (N, 5) x1 y1 x2 y2 score, labels (N)", _atss, preparation=BGR_255
     ),
     "tf-lists": _stretched(
         "TensorFlow: detection_boxes (1, N, 4) y1 x1 y2 x2, _scores, _classes from 1",
@@ -485,4 +379,4 @@ KINDS: Mapping[str, Kind] = {
         preparation=_RGB_255,
     ),
 }
-"""The heads by the name of ``--head``."""
+"""The heads by the name of ``--head``, in the order of `HEAD_NAMES`."""

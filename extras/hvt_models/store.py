@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError
-from hvt_common.inference.store.manifest import (
+from hvt_models.manifest import (
     MAX_SIZE_BYTES,
     ModelEntry,
     PinnedFile,
@@ -71,6 +71,16 @@ class Store:
             near = difflib.get_close_matches(name, entries, n=2) or sorted(entries)
             raise UserError(f"model '{name}' is not known: did you mean {' or '.join(near)}?")
         return entries[name]
+
+    def known_classes(self, path: Path) -> str:
+        """The classes of a file as the built-in manifest that pins it says: ``COCO, 80``, or names; "" for others."""
+        try:
+            size_bytes = path.stat().st_size
+        except OSError:
+            return ""
+        entries = [entry for entry in self._builtin.values() if entry.size_bytes == size_bytes]
+        same = [entry for entry in entries if file_digest(path) == entry.sha256]
+        return same[0].classes if same else ""
 
     def path(self, name: str) -> Path:
         """The path of the model of this name, there or not; of an OpenVINO model the .xml."""
@@ -143,7 +153,7 @@ class Store:
         pauses_s: Sequence[float],
     ) -> list[str] | None:
         # None once the pinned file lies at ``path``; else why each address failed.
-        from hvt_common.inference.store.download import DownloadError  # noqa: PLC0415 - as above
+        from hvt_models.download import DownloadError  # noqa: PLC0415 - as above
 
         if path.exists() and not _what_is_wrong(path, file):
             return None
@@ -292,7 +302,7 @@ def _from_address(
     url: str, part: Path, file: PinnedFile, *, progress: Callable[[int], None], pauses_s: Sequence[float]
 ) -> None:
     # Bring ``part`` to the pinned file; `DownloadError` where this address does not give it.
-    from hvt_common.inference.store.download import DownloadError, download  # noqa: PLC0415 - as above
+    from hvt_models.download import DownloadError, download  # noqa: PLC0415 - as above
 
     went_on = part.exists()
     download(url, part, size_bytes=file.size_bytes, progress=progress, pauses_s=pauses_s)

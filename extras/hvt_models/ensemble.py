@@ -8,48 +8,20 @@ know different views, and the surest of a cluster counts (docs/embedded-models.m
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.errors import UserError
 from hvt_common.inference.class_names import group_of, kind_of
 from hvt_common.inference.nms import MAX_DETECTIONS
 from hvt_common.values import Detections, Image
 
-_JOIN = "+"
-_MOST_PARTS = 3
 _SAME_IOU = 0.55
 """The paper's."""
 _VAGUE_VOTE = 1e-6
 _LEAST_WEIGHT = 1e-9
-
-
-def parts_of(spec: str) -> tuple[str, ...]:
-    """The detectors that ``A+B`` or ``A+B+C`` names; of any other ``spec`` that one alone.
-
-    A file of such a name is that file; after a colon (of a plug-in) a plus is text. Raises `UserError` where a part
-    is missing or repeated, or there are more than three.
-    """
-    names, colon, text = spec.partition(":")
-    *parts, last = (part.strip() for part in names.split(_JOIN))
-    found = (*parts, f"{last}{colon}{text}")
-    # Path's own `exists` raises where a name is too long.
-    is_path = os.path.exists(os.path.expanduser(spec)) or ("" in found and os.sep in spec)  # noqa: PTH110, PTH111
-    if not parts or is_path:
-        return (spec,)
-    what = f"detector {spec!r} is not accepted"
-    if "" in found:
-        raise UserError(f"{what}: a name is missing beside a {_JOIN}; give NAME{_JOIN}NAME")
-    if len(set(found)) < len(found):
-        twice = next(part for part in found if found.count(part) > 1)
-        raise UserError(f"{what}: it names {twice} twice; each part may be named once")
-    if len(found) > _MOST_PARTS:
-        raise UserError(f"{what}: it names {len(found)} detectors; at most {_MOST_PARTS} are merged")
-    return found
 
 
 def on_scale_of(confidences: npt.NDArray[np.float32], own: float, wanted: float) -> npt.NDArray[np.float32]:
@@ -62,6 +34,18 @@ def on_scale_of(confidences: npt.NDArray[np.float32], own: float, wanted: float)
     factor = wanted / (1 - wanted) * (1 - own) / own
     sure = confidences.astype(np.float64)
     return (sure * factor / (1 - sure + sure * factor)).astype(np.float32)
+
+
+def open_ensemble(
+    opened: Callable[[str, float], _Part], owns: Mapping[str, float], *, confidence: float
+) -> EnsembleDetector:
+    """The ensemble of the parts that ``owns`` names, with their confidences of use.
+
+    ``opened`` opens one, with the least confidence of a detection on the part's own scale.
+    """
+    first, least = next(iter(owns.values())), np.array([confidence], np.float32)
+    parts = [opened(part, float(on_scale_of(least, first, own)[0])) for part, own in owns.items()]
+    return EnsembleDetector(parts, list(owns.values()), confidence=confidence)
 
 
 class _Part(Protocol):

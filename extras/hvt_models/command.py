@@ -20,8 +20,8 @@ from hvt_common.inference.store import (
     embedded_models,
     resolve_model,
 )
-from hvt_common.inference.store.manifest import ModelEntry
-from hvt_common.inference.store.store import Store, file_digest
+from hvt_models.manifest import ModelEntry
+from hvt_models.store import Store, file_digest
 
 _PROGRAM = "hvt-models"
 _INTERRUPTED = 130
@@ -175,7 +175,7 @@ def _add(arguments: argparse.Namespace) -> int:
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    from hvt_common.inference.inspect import inspect_model  # noqa: PLC0415  (the other commands open no model)
+    from hvt_models.inspect import inspect_model  # noqa: PLC0415  (the other commands open no model)
 
     report = inspect_model(
         resolve_model(arguments.file),

@@ -20,14 +20,14 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
-from hvt_common.inference.cli import main
 from hvt_common.inference.detect import OnnxDetector, open_detector
-from hvt_common.inference.heads.kinds import KINDS
-from hvt_common.inference.inspect import inspect_model
 from hvt_common.inference.runtimes.model import open_model
 from hvt_common.inference.store import embedded_models, resolve_model
-from hvt_common.inference.store.manifest import builtin_manifest, parse_manifest
-from hvt_common.inference.store.store import Store, cache_folder
+from hvt_models.command import main
+from hvt_models.heads import KINDS
+from hvt_models.inspect import inspect_model
+from hvt_models.manifest import builtin_manifest, parse_manifest
+from hvt_models.store import Store, cache_folder
 from media.onnx_models import colour_classifier, colour_detector, constant_model
 
 CONTENT = np.random.default_rng(7).bytes(300_000)
@@ -319,7 +319,7 @@ def test_a_full_disk_is_one_sentence_and_keeps_what_came(origin: Origin, folder:
     """A fetch that fills the disk would leave a file that looks whole."""
     store = known(folder, origin.url)
     # -B: a .pyc that the limit cut off would break every later Python of this environment.
-    command = f"ulimit -f 200; exec {sys.executable} -B -m hvt_common.inference.cli fetch made"
+    command = f"ulimit -f 200; exec {sys.executable} -B -m hvt_models.command fetch made"
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "made-" in done.stderr
@@ -336,7 +336,7 @@ def test_two_processes_fetch_one_model_once(origin: Origin, folder: Path) -> Non
     origin.plan = ["hold"]
 
     def start() -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "hvt_common.inference.cli", "fetch", "made"]
+        command = [sys.executable, "-m", "hvt_models.command", "fetch", "made"]
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     first = start()

@@ -11,10 +11,11 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector
-from hvt_common.inference.ensemble import EnsembleDetector, on_scale_of, parts_of
 from hvt_common.inference.scores import declared_class_names, default_confidence, is_calibrated
-from hvt_common.inference.store.store import Store
+from hvt_common.inference.store import parts_of
 from hvt_common.values import Detections, Image
+from hvt_models.ensemble import EnsembleDetector, on_scale_of
+from hvt_models.store import Store
 from media.onnx_models import colour_detector
 
 PICTURE = np.zeros((64, 128, 3), np.uint8)
