@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from media.pictures import write_scene
 from programs.golden import once
 from programs.processes import free_ports
 from rigs.drawn_flight import DrawnFlight, fly_into_all_sinks
@@ -68,6 +69,21 @@ def data() -> Path:
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> DrawnFlight:
     """A flight of the drawn scene into all sinks, that tests of several files read and nobody changes."""
     return once(tmp_path_factory, "drawn", fly_into_all_sinks)
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of pictures that lasts 30 s at 10 a second; the drawn demo would take seconds to begin."""
+    return once(tmp_path_factory, "scene", lambda folder: write_scene(folder, frames=300))
+
+
+@pytest.fixture(scope="session")
+def long_scene(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pictures of the scene over and over, for five minutes."""
+    folder, pictures = tmp_path_factory.mktemp("long"), sorted(scene.iterdir())
+    for number in range(3000):
+        (folder / f"{number:06d}.jpg").symlink_to(pictures[number % len(pictures)])
+    return folder
 
 
 @pytest.fixture

@@ -42,7 +42,7 @@ def told(address: str) -> tuple[set[str], set[str]]:
 
 
 @pytest.mark.integration
-def test_every_metric_that_is_asked_for_is_told_in_flight(tmp_path):
+def test_every_metric_that_is_asked_for_is_told_in_flight(tmp_path, long_scene):
     """An alert on a name that is misspelt, or that never has a value, never fires."""
     asked = {name for query in queries() for name in _METRIC.findall(query)}
     assert len(asked) > 25
@@ -51,7 +51,7 @@ def test_every_metric_that_is_asked_for_is_told_in_flight(tmp_path):
         link.ground("--detector", "motion", "--classifier", "none", "--metrics", at_ground)
         flight = (
             "--source",
-            "demo",
+            str(long_scene),
             "--size",
             "640x360",
             "--fps",

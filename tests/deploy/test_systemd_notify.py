@@ -37,10 +37,12 @@ def test_a_ground_is_ready_and_goes_on_telling_that_it_lives(systemd: socket.soc
         ground.stop()
 
 
-def test_an_edge_is_ready_before_any_ground_is_there(systemd: socket.socket, tmp_path: Path) -> None:
+def test_an_edge_is_ready_before_any_ground_is_there(
+    systemd: socket.socket, tmp_path: Path, scene: Path
+) -> None:
     """A drone that boots before its ground would hang in its start."""
     with Link(tmp_path) as link:
-        edge = link.edge("--source", "demo", "--method", "M0")
+        edge = link.edge("--source", str(scene), "--method", "M0")
         assert systemd.recv(64) == b"READY=1"
         systemd.settimeout(10)
         assert [systemd.recv(64) for _ in range(3)] == [b"WATCHDOG=1"] * 3, "it waits for a ground"

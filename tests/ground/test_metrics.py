@@ -18,7 +18,7 @@ from programs.processes import Link, eventually, free_ports
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
-EDGE = ("--source", "demo", "--fps", "5", "--size", "640x360", "--detector", "motion", "--method", "M0")
+EDGE = ("--fps", "5", "--size", "640x360", "--detector", "motion", "--method", "M0")
 
 
 def read(address: str, path: str) -> bytes:
@@ -45,12 +45,13 @@ def status(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.nightly
-def test_a_ground_in_service_can_be_watched(tmp_path):
+def test_a_ground_in_service_can_be_watched(tmp_path, long_scene):
     """A team would learn of a lost link from the one who looks at the screen."""
     address = f"127.0.0.1:{free_ports(1)[0]}"
     with Link(tmp_path) as link:
         ground = link.ground("--metrics", address, "--detector", "motion", "--classifier", "none")
-        edge = link.edge(*EDGE, "--edge-id", "uav-1", "--pose", "fixed:48.1,11.5,120,90,-45", "--fov", "60")
+        pose = ("--pose", "fixed:48.1,11.5,120,90,-45", "--fov", "60")
+        edge = link.edge("--source", str(long_scene), *EDGE, "--edge-id", "uav-1", *pose)
         received = ("hvt_frames_received_total", "uav-1")
 
         def flies() -> bool:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from media.pictures import write_scene
 from programs.fleet_keys import Fleet
 from programs.processes import Link
 
@@ -17,23 +16,6 @@ def link(tmp_path: Path) -> Iterator[Link]:
     """A ground and its edges on free ports, killed at the end of the test."""
     with Link(tmp_path) as link:
         yield link
-
-
-@pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of pictures that lasts 30 s at 10 a second."""
-    folder = tmp_path_factory.mktemp("scene")
-    write_scene(folder, frames=300)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def long_scene(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The pictures of the scene over and over, for five minutes."""
-    folder, pictures = tmp_path_factory.mktemp("long"), sorted(scene.iterdir())
-    for number in range(3000):
-        (folder / f"{number:06d}.jpg").symlink_to(pictures[number % len(pictures)])
-    return folder
 
 
 @pytest.fixture(scope="session")

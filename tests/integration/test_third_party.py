@@ -140,9 +140,9 @@ def test_another_encoder_flies_within_the_budget(link, scene, acme, name, lowere
         ),
     ],
 )
-def test_an_encoder_that_does_not_qualify_is_one_sentence(link, acme, name, says):
+def test_an_encoder_that_does_not_qualify_is_one_sentence(link, scene, acme, name, says):
     """A flight would begin whose picture is late, or garbage, all the time."""
-    edge = with_encoder(link, "demo", name)
+    edge = with_encoder(link, str(scene), name)
     assert edge.wait(within_s=60) == 2
     (line,) = edge.said.splitlines()
     assert says in line

@@ -15,16 +15,7 @@ pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
 JSON = ("--log-format", "json")
 SMALL = (
-    "--fps",
-    "5",
-    "--size",
-    "320x192",
-    "--detector",
-    "motion",
-    "--edge-id",
-    "uav-1",
-    "--max-frames",
-    "40",
+    *("--fps", "5", "--size", "320x192", "--detector", "motion", "--edge-id", "uav-1", "--max-frames", "15"),
 )
 
 
@@ -33,11 +24,11 @@ def lines(said: str) -> list[dict]:
     return [json.loads(line) for line in said.splitlines()]
 
 
-def test_a_flight_is_told_in_objects_on_both_sides(tmp_path):
+def test_a_flight_is_told_in_objects_on_both_sides(tmp_path, scene):
     """A collector of logs would have to guess at what people read."""
     with Link(tmp_path) as link:
         ground = link.ground("--detector", "motion", "--classifier", "none", "--once", *JSON)
-        edge = link.edge("--source", "demo", *SMALL, *JSON)
+        edge = link.edge("--source", str(scene), *SMALL, *JSON)
         summary = edge.finish()
         ground.finish()
     flown, received = lines(edge.said), lines(ground.said)

@@ -31,15 +31,15 @@ def examined(capsys, *words: str) -> tuple[int, dict[str, dict[str, str]]]:
     return code, {row["check"]: row for row in json.loads(capsys.readouterr().out)}
 
 
-def test_all_is_well_where_a_ground_listens(tmp_path, capsys):
+def test_all_is_well_where_a_ground_listens(tmp_path, capsys, scene):
     """The engineer would look for a fault that is not there."""
     with Link(tmp_path) as link:
         link.ground("--detector", "motion", "--classifier", "none")
-        code, found = examined(capsys, "--source", "demo", *CHEAP, "--connect", link.ground_endpoint)
+        code, found = examined(capsys, "--source", str(scene), *CHEAP, "--connect", link.ground_endpoint)
     assert code == 0
     assert found["link"]["found"] == "a ground listens"
     assert {one["state"] for name, one in found.items() if name not in ("clock", "processor")} == {"ok"}
-    assert "1920x1080, sent as 640x360" in found["source"]["found"]
+    assert "960x540, sent as 640x360" in found["source"]["found"]
     assert "cores" in found["processor"]["found"]
 
 

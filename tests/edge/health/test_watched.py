@@ -70,11 +70,11 @@ def address() -> str:
     return f"127.0.0.1:{free_ports(1)[0]}"
 
 
-def test_an_edge_says_how_it_is_from_its_start_to_its_flight(tmp_path, address):
+def test_an_edge_says_how_it_is_from_its_start_to_its_flight(tmp_path, address, long_scene):
     """A team would learn of an edge only what reaches the ground."""
     with Link(tmp_path) as link:
         store = ("--store", "20MB", "--store-folder", str(tmp_path / "store"))
-        edge = link.edge("--source", "demo", "--wait", "60", "--metrics", address, *SMALL, *store)
+        edge = link.edge("--source", str(long_scene), "--wait", "60", "--metrics", address, *SMALL, *store)
         eventually(lambda: state(address), within_s=60, what="it answers")
         waits = state(address)
         assert (waits["state"], waits["frames"]["account"]["came"]) == ("waiting", 0)
@@ -114,7 +114,7 @@ def test_an_edge_says_how_it_is_from_its_start_to_its_flight(tmp_path, address):
         assert json.loads(status("--at", address, "--json").stdout)["session"] == now["session"]
         nobody = status("--at", f"127.0.0.1:{free_ports(1)[0]}")
         assert (nobody.returncode, "no edge answers at" in nobody.stderr) == (1, True)
-        busy = link.edge("--source", "demo", "--metrics", address, name="busy")
+        busy = link.edge("--source", str(long_scene), "--metrics", address, name="busy")
         busy.until(f"--metrics {address} cannot be listened on")
         busy.kill()
         edge.stop()
@@ -173,12 +173,12 @@ class HangingWorld(World):
         return Hanging(super().open_source(config), self._end)
 
 
-def test_a_loop_that_hangs_tells_nobody_that_it_lives(tmp_path, address, free_port, monkeypatch):
+def test_a_loop_that_hangs_tells_nobody_that_it_lives(tmp_path, address, free_port, monkeypatch, long_scene):
     """Nobody would ever start it again, and the picture stand still until somebody lands the drone."""
     name = str(tmp_path / "notify")
     config = check(
         EdgeConfig(
-            source="demo",
+            source=str(long_scene),
             fps=5.0,
             size=(320, 192),
             method="M0",
@@ -235,11 +235,11 @@ class SlowWorld(World):
         return SlowDetector()
 
 
-def test_a_machine_too_slow_to_detect_says_how_old_its_boxes_are(address, free_port, capsys):
+def test_a_machine_too_slow_to_detect_says_how_old_its_boxes_are(address, free_port, capsys, long_scene):
     """Boxes of seconds ago would be taken for those of now, or none for a scene without objects."""
     config = check(
         EdgeConfig(
-            source="demo",
+            source=str(long_scene),
             fps=5.0,
             size=(320, 192),
             method="M2",

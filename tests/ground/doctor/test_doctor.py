@@ -15,10 +15,10 @@ def examined(capsys, *words: str) -> tuple[int, dict[str, dict[str, str]]]:
     return code, {row["check"]: row for row in json.loads(capsys.readouterr().out)}
 
 
-def test_it_names_the_edges_that_are_there(tmp_path, capsys):
+def test_it_names_the_edges_that_are_there(tmp_path, capsys, long_scene):
     """A ground that hears nobody would be searched for a fault of its own."""
     with Link(tmp_path) as link:
-        cheap = ("--source", "demo", "--size", "640x360", "--fps", "5", "--detector", "motion")
+        cheap = ("--source", str(long_scene), "--size", "640x360", "--fps", "5", "--detector", "motion")
         link.edge(*cheap, "--edge-id", "uav-7", listens=True).until("ground")
         words = (
             "--connect",

@@ -187,20 +187,20 @@ def stays(before: Use, after: Use) -> None:
     eventually(lambda: Use(after.pid).files <= before.files + 2, within_s=20, what="files are closed")
 
 
-FLIGHT = ("--source", "demo", "--fps", "5", "--size", "640x360", "--max-frames", "10", "--detector", "motion")
+FLIGHT = ("--fps", "5", "--size", "640x360", "--max-frames", "10", "--detector", "motion")
 """Two seconds."""
 
 
 @pytest.mark.nightly
 @pytest.mark.timeout(1200)
-def test_sixty_flights_of_two_seconds(tmp_path: Path) -> None:
+def test_sixty_flights_of_two_seconds(tmp_path: Path, scene: Path) -> None:
     """The same with real edges, as processes that are started and end."""
     flights, warm = 60, 20
     with Link(tmp_path) as link:
         ground = link.ground("--record", "recordings", "--detector", "motion", "--classifier", "none")
         before = None
         for number in range(flights):
-            edge = link.edge(*FLIGHT, name=f"edge-{number}")
+            edge = link.edge("--source", str(scene), *FLIGHT, name=f"edge-{number}")
             assert edge.finish()["frames"] >= 1
             if number == warm:
                 before = Use(ground.process.pid)

@@ -278,7 +278,7 @@ def test_an_autopilot_that_starts_later_is_waited_for(kind, caplog):
         assert not source.trouble
 
 
-def test_a_whole_ground_waits_and_serves(link):
+def test_a_whole_ground_waits_and_serves(link, scene):
     """All of it at once, as a service meets it after a boot."""
     holders = [Holder() for _ in range(3)]
     link.port = holders[0].port
@@ -292,7 +292,7 @@ def test_a_whole_ground_waits_and_serves(link):
         one.let_go()
     for part in ("listener", "web page", "metrics"):
         ground.until(f"{part}: works again")
-    edge = link.edge("--source", "demo", "--max-frames", "20", "--fps", "5", "--detector", "motion")
+    edge = link.edge("--source", str(scene), "--max-frames", "20", "--fps", "5", "--detector", "motion")
     assert edge.wait(within_s=120) == 0
     ground.kill()
 

@@ -12,7 +12,7 @@ from programs.processes import Link, eventually
 pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(180)]
 
 EDGE = (
-    *("--source", "demo", "--edge-id", "uav-1", "--size", "640x360", "--fps", "5", "--preset", "ultrafast"),
+    *("--edge-id", "uav-1", "--size", "640x360", "--fps", "5", "--preset", "ultrafast"),
     *("--budget", "400kbps", "--video-share", "0.6", "--method", "permissive", "--gate", "0", "--wait", "0s"),
     *(
         "--still-codec",
@@ -33,10 +33,10 @@ def info(session: zenoh.Session, *codecs: str, requester: int) -> Info:
     return Info.parse(answer(session, "hvt/uav-1/info", request.pack()) or b"")
 
 
-def test_an_edge_sends_only_what_every_ground_reads(tmp_path):
+def test_an_edge_sends_only_what_every_ground_reads(tmp_path, long_scene):
     """A ground without the codec would show no still, and all of their bits would be for nothing."""
     with Link(tmp_path) as link:
-        edge = link.edge(*EDGE, listens=True)
+        edge = link.edge("--source", str(long_scene), *EDGE, listens=True)
         edge.until("no ground yet")
         with joined(link.edge_endpoint) as session:
             eventually(lambda: answer(session, "hvt/uav-1/info"), within_s=20, what="the edge answers info")

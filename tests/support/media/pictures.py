@@ -11,7 +11,7 @@ WIDTH, HEIGHT = 960, 540
 _THINGS = 6
 
 
-def write_scene(folder: Path, *, frames: int) -> None:
+def write_scene(folder: Path, *, frames: int) -> Path:
     """Write ``frames`` JPEGs: a still ground with fine texture, and six striped things that move over it."""
     rng = np.random.default_rng(7)
     coarse = rng.integers(60, 180, (HEIGHT // 12, WIDTH // 12, 3), np.uint8)
@@ -26,3 +26,4 @@ def write_scene(folder: Path, *, frames: int) -> None:
             y = 20 + 85 * number
             picture[y : y + high, x : x + wide] = thing
         cv2.imwrite(str(folder / f"{index:06d}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    return folder
