@@ -28,7 +28,7 @@ from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
-from hvt_edge.operating.point import LoopClock
+from hvt_edge.operating import LoopClock
 from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.perception.guarded_detector import GuardedDetector
 from hvt_edge.source.contract import Source

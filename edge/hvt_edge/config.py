@@ -35,7 +35,7 @@ from hvt_common.runtime.log import LOG_FORMATS
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import bitrate_text
 from hvt_common.video.still_codecs import still_codec
-from hvt_edge.operating.point import base_rate_bps
+from hvt_edge.operating import base_rate_bps
 from hvt_edge.profiles import PROFILES, REGIMES
 from hvt_edge.source.contract import check_shape
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
@@ -350,7 +350,7 @@ class EdgeConfig:
 
     @property
     def measures(self) -> bool:
-        """Whether tracks and stills are sent only while they are measured to pay (`hvt_edge.operating.levers`)."""
+        """Whether tracks and stills are sent only while they are measured to pay (`hvt_edge.perception.levers`)."""
         return self.profile == "auto"
 
     @property

@@ -25,7 +25,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.health.heartbeat import Heartbeat
 from hvt_edge.health.state import EdgeState, LinkState
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.point import Levers, LoopClock, Operating
+from hvt_edge.operating import Levers, LoopClock, Operating
 
 _PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
 _LEVERS_REST = 10

@@ -24,7 +24,7 @@ from hvt_edge.backlog.entry import FIRST_STORED, SEGMENT_NS, Entry
 from hvt_edge.backlog.intake import IntakeStill
 from hvt_edge.backlog.outage import SILENCE_NS, BaseInFlight, Outage
 from hvt_edge.backlog.worker import ChunkAllowance, StoreNumbers, StoreWorker
-from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.keyframes import Keyframes
 
 _STEADY_NS = 2 * SECOND_NS
 """The link is back for so long before stored objects are sent: the picture comes first."""
@@ -80,7 +80,7 @@ class BacklogStage:
         live: bool,
         link: BacklogLink,
         in_flight: BaseInFlight,
-        keyframes: KeyframeRequests,
+        keyframes: Keyframes,
         clock: Callable[[], int],
         on_outcome: Callable[[str, str], None],
         failures: Failures,

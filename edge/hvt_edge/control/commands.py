@@ -17,8 +17,8 @@ from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest,
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, least_budget_bps, stream_text
-from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.point import Operating
+from hvt_edge.keyframes import Keyframes
+from hvt_edge.operating import Operating
 from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.on_demand_crop import OnDemandRequest, RefusedError
@@ -63,7 +63,7 @@ class Commands:
     _: KW_ONLY
     operating: Operating
     session_id: int
-    keyframes: KeyframeRequests
+    keyframes: Keyframes
     on_demand: OnDemand
     chooser: Chooser
     make_method: Callable[[str], Method]

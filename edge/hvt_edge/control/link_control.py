@@ -13,11 +13,11 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogStage
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.sending import StillSender
 from hvt_edge.video.reconfigure import EncoderReconfiguration
@@ -42,7 +42,7 @@ class LinkControl:
     has_subscriber: Callable[[], bool]
     session_id: int
     transmitter: Transmitter
-    keyframes: KeyframeRequests
+    keyframes: Keyframes
     inbox: FeedbackInbox
     reconfiguration: EncoderReconfiguration
     clock: Callable[[], int]

@@ -24,13 +24,13 @@ from hvt_common.values import View
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
 from hvt_edge.health.system import SystemReading, read_system
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.cpu import Cores
-from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.point import Levers, LoopClock, Operating
+from hvt_edge.operating import Levers, LoopClock, Operating
 from hvt_edge.stills.stage import StillStage
 
 _LEAST_OLD_S = 1.0
@@ -203,7 +203,7 @@ class StateMaker:
     operating: Operating
     ledger: Ledger
     counts: FrameCounts
-    keyframes: KeyframeRequests
+    keyframes: Keyframes
     transmitter: Transmitter
     stills: StillStage
     backlog: BacklogStage | None

@@ -17,10 +17,10 @@ from types import TracebackType
 from typing import Self
 
 from hvt_common.values import Frame
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
-from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.point import LoopClock
+from hvt_edge.operating import LoopClock
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.video.passthrough import VideoStage
@@ -48,7 +48,7 @@ class LockstepPace:
     stills: StillStage
     _: KW_ONLY
     inbox: FeedbackInbox
-    keyframes: KeyframeRequests
+    keyframes: Keyframes
     clock: LoopClock
     fps: float
     counts: FrameCounts

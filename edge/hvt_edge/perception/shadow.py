@@ -35,9 +35,9 @@ import numpy.typing as npt
 from hvt_common.tracking.recall import EDGE_ONLY_CONFIDENCE, Recall
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
-from hvt_edge.operating.levers import Measured
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.detected import Detected, GroundDifference
+from hvt_edge.perception.levers import Measured
 from hvt_edge.perception.scene_change import SceneChange
 
 _LEAST_MORE = 0.5

@@ -9,13 +9,13 @@ from dataclasses import KW_ONLY, dataclass
 from hvt_common.inference.class_names import same_kind
 from hvt_common.protocol.messages import StillResult
 from hvt_common.values import AccessUnit, Frame, Tracks
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.levers import LeverControl
-from hvt_edge.operating.point import Levers
+from hvt_edge.operating import Levers
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
 from hvt_edge.perception.detected import Detected
+from hvt_edge.perception.levers import LeverControl
 from hvt_edge.perception.shadow import ShadowGround
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser, Coded
@@ -38,7 +38,7 @@ class StillStage:
     outbox: Outbox
     sender: StillSender
     transmitter: Transmitter
-    keyframes: KeyframeRequests
+    keyframes: Keyframes
     reporter: TrackReporter | None = None
     shadow: ShadowGround | None = None
     tracks_used: bool = True

@@ -14,8 +14,8 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage, State
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeState
 from hvt_edge.video.encoders.camera_rates import LeastLink
 from hvt_edge.video.encoders.passthrough import unit_of
 from hvt_edge.video.frame_decision import Action, FrameDecision
@@ -87,7 +87,7 @@ class PassthroughStage:
     ``least_link`` holds a keyframe that follows a break. ``local_copy`` has all that the camera gave, sent or not.
     """
 
-    keyframes: KeyframeRequests
+    keyframes: Keyframes
     transmitter: Transmitter
     _: KW_ONLY
     failures: Failures
@@ -103,7 +103,6 @@ class PassthroughStage:
     def __post_init__(self) -> None:
         self._sent_index = self._stored_index = self._copied_index = -2
         """The frames sent last, stored last, copied last."""
-        self._keyframes = 0
         self._paused_ns = 0
         self._held_by: FrameGroup = "unreadable"
         """Why the chain of units is broken: up to the next keyframe that is sent, for that none can be shown."""
@@ -156,8 +155,7 @@ class PassthroughStage:
             self._sent_index = unit.frame_index
         self._held_by = "unreadable"  # what does not come next was lost before
         if unit.keyframe:
-            self._keyframes += 1
-            self.keyframes.publish(KeyframeState(0, now_ns, sent=self._keyframes))
+            self.keyframes.done(now_ns)
         if decision.resumes and self.backlog is not None:
             self.backlog.resume()
         return unit

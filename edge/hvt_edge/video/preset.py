@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from hvt_common.units import SECOND_NS
-from hvt_edge.operating.point import Operating
+from hvt_edge.operating import Operating
 
 _log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from typing import Protocol
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import ReconfigurationTrigger
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.point import Operating, base_rate_bps
+from hvt_edge.operating import Operating, base_rate_bps
 from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import Step
 from hvt_edge.video.encoder_settings import least_base_bps, most_keyframe_bytes

@@ -15,12 +15,11 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage, State
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.frame_decision import Action, FrameDecision, FrameInputs, decide
 from hvt_edge.video.frame_skip import FrameSkip
-from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.regions import TrackRegions
 
@@ -48,7 +47,7 @@ class BaseStage:
     encoder: Encoder
     _: KW_ONLY
     encoder_name: str = "x265"
-    keyframes: KeyframeRequests
+    keyframes: Keyframes
     transmitter: Transmitter
     local_copy: LocalCopy | None
     first_keyframe_bytes: int
@@ -63,7 +62,6 @@ class BaseStage:
     failures: Failures | None = None
 
     def __post_init__(self) -> None:
-        self._plan = KeyframePlan(self.keyframes)
         self._keyframe_bytes = self.first_keyframe_bytes
         self._frame_skip = self.frame_skip or FrameSkip()
         self._failed_ns: deque[int] = deque(maxlen=_MOST_FAILURES)
@@ -78,7 +76,7 @@ class BaseStage:
         fits = self.transmitter.keyframe_fits(keyframe_bytes, now_ns=now_ns)
         if not self.keyframes.requested:  # one of the schedule: a requested still goes before it
             fits = fits and not self.transmitter.yielding(now_ns)
-        keyframe_due = self._plan.now(now_ns, fits=fits) or self._begins_anew
+        keyframe_due = self.keyframes.now(now_ns, fits=fits) or self._begins_anew
         line_bytes = keyframe_bytes if keyframe_due else self.transmitter.frame_bytes
         backlog = self.backlog
         due, admitted = self._frame_skip.codes(frame.index), self.admits(now_ns, line_bytes, self._coding_ns)
@@ -128,7 +126,7 @@ class BaseStage:
         self._begins_anew = False
         self._frame_skip.coded(frame.index, keyframe=unit.keyframe, mean_qp=self.encoder.mean_qp)
         if decision.meets_plan:
-            self._plan.done(now_ns)
+            self.keyframes.done(now_ns)
         if decision.resumes and self.backlog is not None:
             self.backlog.resume()
         if self.local_copy is not None:

@@ -13,8 +13,8 @@ from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.operating.levers import LeverControl, LeverSettings
-from hvt_edge.operating.point import Operating
+from hvt_edge.operating import Operating
+from hvt_edge.perception.levers import LeverControl, LeverSettings
 from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder_settings import least_base_bps
 from hvt_edge.video.encoders.camera_rates import CameraRates, LeastLink, needed_bps

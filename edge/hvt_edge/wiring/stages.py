@@ -16,13 +16,13 @@ from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
 from hvt_edge.control.commands import Commands
 from hvt_edge.control.link_control import LinkControl
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.link.still_readers import StillReaders
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.point import LoopClock, Operating, base_rate_bps
+from hvt_edge.operating import LoopClock, Operating, base_rate_bps
 from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.pose.contract import PoseSource
 from hvt_edge.pose.stage import PoseStage
@@ -71,7 +71,7 @@ class Stages:
     commands: Commands
     reconfiguration: EncoderReconfiguration
     operating: Operating
-    keyframes: KeyframeRequests
+    keyframes: Keyframes
     backlog: BacklogStage | None
     info: InfoReporter
     still_readers: StillReaders

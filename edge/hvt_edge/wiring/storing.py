@@ -14,8 +14,8 @@ from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import EdgeConfig
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.stills.outbox import Outbox
 
 
@@ -75,7 +75,7 @@ def make_backlog(
     transmitter: Transmitter,
     in_flight: BaseInFlight,
     outbox: Outbox,
-    keyframes: KeyframeRequests,
+    keyframes: Keyframes,
     clock: Callable[[], int],
     info: Callable[[], bytes],
     failures: Failures,

@@ -15,13 +15,14 @@ from hvt_common.runtime.log import START_LOGGER
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Fit, Frame, View
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, least_budget_bps
+from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.loop.cpu import processors
-from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
-from hvt_edge.operating.point import Operating
+from hvt_edge.operating import Operating
 from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, shown
 from hvt_edge.video.encoder_settings import (
     encoder_settings,
+    keyframe_interval_s,
     keyframe_total_bps,
     payload_bps,
     usual_keyframe_bytes,
@@ -31,7 +32,6 @@ from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
 from hvt_edge.video.encoders.qualification import allowed, headroom_of, run_frames
 from hvt_edge.video.encoders.registry import X265, open_encoder
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
-from hvt_edge.video.keyframes import keyframe_interval_s
 from hvt_edge.video.preset import SLOWEST, PresetControl, share_of
 from hvt_edge.video.rate_model import LEAST_SIDE_PX, PROMPT, SPARING, choose_base, most_decimation, sizes_of
 from hvt_edge.video.reconfigure import OpenEncoder, ReconfigurationSettings
@@ -339,13 +339,13 @@ def make_regions(config: EdgeConfig, size: tuple[int, int]) -> TrackRegions | No
     return TrackRegions(size, depth=config.roi_depth) if config.roi_depth else None
 
 
-def make_keyframes(config: EdgeConfig, source: Source) -> KeyframeRequests:
+def make_keyframes(config: EdgeConfig, source: Source) -> Keyframes:
     """The control of keyframes, on a long schedule and on demand; a camera makes its own."""
     if config.passes_through:
         assert source.camera_stream is not None, "checked by as_the_camera_is"
         every_s = source.camera_stream.keyframe_s
-        return KeyframeRequests(KeyframeSettings(interval_ns=0, camera_every_s=every_s))
+        return Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=every_s))
     interval_s = config.keyframe_interval
     if isinstance(interval_s, str):
         interval_s = keyframe_interval_s(config.fixed_size or DEFAULT_SIZE, config.base_bps)
-    return KeyframeRequests(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
+    return Keyframes(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))

@@ -189,7 +189,7 @@ def test_another_budget_counts_from_a_keyframe_that_comes_at_once():
     """An operator whose link got thin could not say so, or would wait ten seconds for it."""
     rig = Rig("800kbps")
     rig.run(20)
-    rig.plan.done(rig.now_ns)  # so fresh that a request for a picture would be answered by it
+    rig.keyframes.done(rig.now_ns)  # so fresh that a request for a picture would be answered by it
     assert rig.ask("set-budget", bps=500_000).accepted
     assert rig.keyframes.due(rig.now_ns)
     encoder = rig.reconfiguration(1, rig.now_ns)

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from hvt_common.protocol.frame_account import FRAME_GROUPS, FrameAccount
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failures
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
-from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.point import LoopClock
+from hvt_edge.operating import LoopClock
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.frame_decision import Action, FrameDecision
 from hvt_edge.video.frame_skip import FrameSkip
@@ -89,7 +89,7 @@ class Flight:
     def __init__(self, *, lockstep: bool, decimation: int) -> None:
         self.counts, self.has_viewer, self.held_by = FrameCounts(), True, None
         self.unreadable = self.passed_over = self.missed = 0
-        keyframes, inbox = KeyframeRequests(), FeedbackInbox()
+        keyframes, inbox = Keyframes(), FeedbackInbox()
         self.stage = BaseStage(
             encoder(),
             keyframes=keyframes,

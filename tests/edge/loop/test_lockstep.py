@@ -9,13 +9,13 @@ import pytest
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
-from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.point import LoopClock
+from hvt_edge.operating import LoopClock
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.stage import BaseStage
@@ -82,7 +82,7 @@ class Stills:
 @pytest.mark.timeout(60)
 def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
     """With ``--fps auto`` a run in lockstep would stand still for 20 s at the first frame that was never sent."""
-    ground, stills, counts, keyframes = Ground(), Stills(), FrameCounts(), KeyframeRequests()
+    ground, stills, counts, keyframes = Ground(), Stills(), FrameCounts(), Keyframes()
     stage = BaseStage(
         BaseEncoder(EncoderSettings(size=SIZE, fps=5.0, bitrate_bps=100_000, preset="ultrafast")),
         keyframes=keyframes,

@@ -16,12 +16,12 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.realtime import RealtimePace
-from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.skipped_units import SkippedUnits
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.stage import BaseStage
@@ -83,7 +83,7 @@ def base_stage(out: Out) -> BaseStage:
     """That sends there."""
     return BaseStage(
         BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=100_000, preset="ultrafast")),
-        keyframes=KeyframeRequests(),
+        keyframes=Keyframes(),
         transmitter=Transmitter(
             out,
             ledger=Ledger(),

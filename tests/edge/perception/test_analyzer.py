@@ -19,13 +19,12 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
 from hvt_common.video.hevc import YuvPicture
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.worker import StillWorker
-from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from media.clips import framed, smooth_pictures
 from programs.processes import eventually
@@ -234,7 +233,7 @@ class Rig:
 
     def __init__(self, *, detector=None) -> None:
         self.out, self.outcomes = Out(), Counter()
-        self.memory, self.keyframes, self.ledger = TrackMemory(), KeyframeRequests(), Ledger()
+        self.memory, self.keyframes, self.ledger = TrackMemory(), Keyframes(), Ledger()
         sender = Transmitter(
             self.out,
             ledger=self.ledger,
@@ -253,8 +252,7 @@ class Rig:
             class_names=CLASSES,
             memory=self.memory,
         )
-        self.plan = KeyframePlan(self.keyframes)
-        self.plan.done(FRAMES[0].capture_ns)
+        self.keyframes.done(FRAMES[0].capture_ns)
 
     def class_of_track(self) -> str | None:
         """What is remembered that a ground made of the only track."""
@@ -290,7 +288,7 @@ def test_while_a_keyframe_is_due_stills_are_held():
     assert rig.keyframes.request(FRAMES[0].capture_ns + 500_000_000) is None
     rig.run()
     assert rig.out.stills == []
-    rig.plan.done(FRAMES[-1].capture_ns)
+    rig.keyframes.done(FRAMES[-1].capture_ns)
     assert rig.stage.pending == 1
     rig.stage.close()
     assert rig.outcomes["dropped", "ended"] == 1

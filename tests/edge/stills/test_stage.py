@@ -19,15 +19,14 @@ from hvt_common.values import Frame, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import JpegCodec, StillCodec
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand_crop import OnDemandRequest
 from hvt_edge.stills.worker import StillWorker
-from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from media.base_coded import StandIn
 from media.clips import framed, smooth_pictures
@@ -88,7 +87,7 @@ class Rig:
         codec: StillCodec | None = None,
         ring: FrameRing | None = None,
     ) -> None:
-        self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframeRequests()
+        self.out, self.outcomes, self.keyframes = Out(), Counter(), Keyframes()
         self.sender = Transmitter(
             self.out,
             ledger=Ledger(),
@@ -109,8 +108,7 @@ class Rig:
             reporter=self if reports else None,
             ring=ring,
         )
-        self.plan = KeyframePlan(self.keyframes)
-        self.plan.done(FRAMES[0].capture_ns)
+        self.keyframes.done(FRAMES[0].capture_ns)
 
     def report(self, seen, *, now_ns) -> None:
         """Report the tracks, as the edge's reporter does."""

@@ -14,13 +14,12 @@ from hvt_common.protocol.ledger import Ledger
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import View
 from hvt_common.video.still_codecs import JpegCodec
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.x265 import BaseEncoder
 from media.base_coded import StandIn
 from media.clips import framed, smooth_pictures
@@ -50,7 +49,7 @@ def test_from_the_analyzed_frame_to_the_link_a_still_enters_few_files():
     unit = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast")).encode(
         frame
     )
-    out, keyframes, view = Out(), KeyframeRequests(), View.fitted(SIZE, SIZE, fit="letterbox")
+    out, keyframes, view = Out(), Keyframes(), View.fitted(SIZE, SIZE, fit="letterbox")
     transmitter = Transmitter(
         out,
         ledger=Ledger(),
@@ -70,7 +69,7 @@ def test_from_the_analyzed_frame_to_the_link_a_still_enters_few_files():
         class_names=CLASSES,
         maker=StillMaker(codec=StandIn(), fallback=JpegCodec()),
     )
-    KeyframePlan(keyframes).done(frame.capture_ns)
+    keyframes.done(frame.capture_ns)
     analyzed = stage.analyze(frame, unit)
     entered: set[str] = set()
 

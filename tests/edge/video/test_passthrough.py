@@ -16,9 +16,9 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.backlog.stage import State
+from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
 from hvt_edge.source.opening import open_source
 from hvt_edge.video.frame_decision import Action, FrameDecision
 from hvt_edge.video.local_copy import LocalCopy
@@ -97,7 +97,7 @@ class Rig:
     ) -> None:
         self.kept, self.failures, self.ledger = Kept(), Failures(time.time_ns), Ledger()
         self.now_ns = START_NS
-        self.keyframes = KeyframeRequests(KeyframeSettings(interval_ns=0, camera_every_s=2.0))
+        self.keyframes = Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=2.0))
         self.stage = PassthroughStage(
             self.keyframes,
             Transmitter(

@@ -15,9 +15,9 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import CameraUnit, Frame
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import EdgeConfig, check
+from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
-from hvt_edge.operating.point import Operating
+from hvt_edge.operating import Operating
 from hvt_edge.source.contract import CameraStream, SeenUnit
 from hvt_edge.video.passthrough import PassthroughStage
 from hvt_edge.video.reconfigure import EncoderReconfiguration
@@ -93,7 +93,7 @@ class Flight:
             config, stream, reconfiguration=self.reconfiguration, operating=self.operating, pacer=self.pacer
         )
         self.stage = PassthroughStage(
-            KeyframeRequests(KeyframeSettings(interval_ns=0, camera_every_s=stream.keyframe_s)),
+            Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=stream.keyframe_s)),
             self.transmitter,
             failures=Failures(lambda: self.now_ns),
             reconfigure=rates,

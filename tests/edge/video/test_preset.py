@@ -10,7 +10,7 @@ import pytest
 from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.operating.point import Operating
+from hvt_edge.operating import Operating
 from hvt_edge.video.preset import PresetControl, choose_preset, share_of
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.x265 import BaseEncoder

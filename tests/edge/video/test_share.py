@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_edge.operating.point import Levers, Operating
+from hvt_edge.operating import Levers, Operating
 from hvt_edge.perception.base_loss import BaseLoss
 from hvt_edge.perception.candidates import Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import Step

@@ -17,9 +17,9 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, least_budget_bps
+from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
 from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.local_copy import LocalCopy
@@ -66,7 +66,7 @@ class Rig:
         self.opened: list[int] = []
         self.ledger = Ledger()
         self.frame_skip = frame_skip or FrameSkip()
-        self.keyframes = KeyframeRequests(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
+        self.keyframes = Keyframes(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
         self.stage = BaseStage(
             BaseEncoder(replace(SETTINGS, fps=15.0 / self.frame_skip.decimation)),
             keyframes=self.keyframes,
@@ -283,7 +283,7 @@ def test_the_least_budget_that_is_accepted_holds_in_every_second_to_the_byte(siz
     )
     stage = BaseStage(
         BaseEncoder(settings),
-        keyframes=KeyframeRequests(),
+        keyframes=Keyframes(),
         transmitter=Transmitter(
             kept,
             ledger=ledger,

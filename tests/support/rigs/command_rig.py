@@ -16,10 +16,10 @@ from hvt_common.values import Frame, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.commands import Commands
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.point import Operating
+from hvt_edge.operating import Operating
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
@@ -30,7 +30,6 @@ from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.sending import StillSender
 from hvt_edge.stills.suppression import Suppression
-from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
 from media.base_coded import StandIn
@@ -68,7 +67,7 @@ class Rig:
     def __init__(self, budget="400kbps", *, share=0.75, name="M1", codec="jpeg", ring_s=5.0) -> None:
         argv = {"source": "demo", "size": BASE, "budget": parse_bitrate(budget, name="b"), "method": name}
         self.config = check(EdgeConfig(**argv, video_share=share, preset="ultrafast"))
-        self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframeRequests()
+        self.out, self.outcomes, self.keyframes = Out(), Counter(), Keyframes()
         self.budget = RollingBudget(BudgetSettings(self.config.budget_bps, self.config.base_bps, fps=15))
         self.ledger = Ledger()
         self.sender = Transmitter(
@@ -103,7 +102,6 @@ class Rig:
             on_outcome=lambda *outcome: self.outcomes.update([outcome]),
             on_demand=self.on_demand,
         )
-        self.plan = KeyframePlan(self.keyframes)
         self.operating = Operating(
             budget_bps=self.config.budget_bps,
             video_share=self.config.fixed_share,
@@ -132,7 +130,7 @@ class Rig:
             clock=lambda: self.request_ns,
             loop_clock=lambda: self.now_ns,
         )
-        self.plan.done(START_NS)
+        self.keyframes.done(START_NS)
 
     @property
     def now_ns(self) -> int:

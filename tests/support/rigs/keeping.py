@@ -30,13 +30,13 @@ from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.link_control import LinkControl
+from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
-from hvt_edge.operating.point import Operating
+from hvt_edge.operating import Operating
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxStill
@@ -172,7 +172,7 @@ class Rig:
     ) -> None:
         self.path, self.out, self.now_ns = folder, Out(), START_NS
         self.linked = True
-        self.keyframes = KeyframeRequests(KeyframeSettings(interval_ns=60 * S))
+        self.keyframes = Keyframes(KeyframeSettings(interval_ns=60 * S))
         self.in_flight, self.outbox, self.ledger = BaseInFlight(), Outbox(), Ledger()
         pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))) if adapt else None
         self.pacer = pacer

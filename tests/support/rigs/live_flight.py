@@ -28,10 +28,10 @@ from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import EdgeConfig, check, check_rate
 from hvt_edge.control.link_control import LinkControl
+from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
-from hvt_edge.operating.point import Operating
+from hvt_edge.operating import Operating
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.sending import StillSender
@@ -176,7 +176,7 @@ class LiveFlight:
         self.rates: list[tuple[float, int]] = []
         self._left: list[tuple[float, float]] = []
         """(second at which a message was sent, second at which it had left)."""
-        self.keyframes = KeyframeRequests(KeyframeSettings(interval_ns=60 * SECOND_NS))
+        self.keyframes = Keyframes(KeyframeSettings(interval_ns=60 * SECOND_NS))
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._count = itertools.count()
         self._in_loop = False

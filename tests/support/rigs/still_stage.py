@@ -6,8 +6,8 @@ from collections import Counter
 
 from hvt_common.values import View
 from hvt_edge.backlog.stage import BacklogStage
+from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing
@@ -25,7 +25,7 @@ def make_still_stage(
     transmitter: Transmitter,
     analyzer: Analyzer,
     *,
-    keyframes: KeyframeRequests,
+    keyframes: Keyframes,
     outcomes: Counter[tuple[str, str]],
     view: View,
     class_names: tuple[str, ...],

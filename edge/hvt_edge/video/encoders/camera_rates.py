@@ -17,7 +17,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import BASE_PEAK
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.operating.point import Operating
+from hvt_edge.operating import Operating
 from hvt_edge.video.encoders.qualification import line_bytes
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 

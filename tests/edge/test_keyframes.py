@@ -9,30 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
-from hvt_edge.video.keyframes import KeyframePlan
+from hvt_edge.keyframes import Keyframes, KeyframeSettings
 
 MS = 1_000_000
 STEP_NS = 66_666_667
 
 
-class Both:
-    """Requests, and the plan that takes them."""
-
-    def __init__(self, settings: KeyframeSettings) -> None:
-        self.requests = KeyframeRequests(settings)
-        self.plan = KeyframePlan(self.requests)
-        self.request, self.due = self.requests.request, self.requests.due
-        self.report_losses, self.note_cost = self.requests.report_losses, self.requests.note_cost
-        self.now, self.done = self.plan.now, self.plan.done
-
-    @property
-    def sent(self) -> int:
-        """Keyframes so far."""
-        return self.requests.sent
-
-
-def play(plan: Both, steps: int, *, fits=lambda _n: True, asked=lambda _n: False) -> list[int]:
+def play(plan: Keyframes, steps: int, *, fits=lambda _n: True, asked=lambda _n: False) -> list[int]:
     """Numbers of the frames that became keyframes."""
     keyframes = []
     for number in range(steps):
@@ -47,7 +30,7 @@ def play(plan: Both, steps: int, *, fits=lambda _n: True, asked=lambda _n: False
 
 def test_the_first_frame_is_one_whatever_the_budget():
     """Nobody could decode anything."""
-    plan = Both(KeyframeSettings(interval_ns=0))
+    plan = Keyframes(KeyframeSettings(interval_ns=0))
     assert plan.due(0)
     assert play(plan, 300, fits=lambda _n: False) == [0]
     assert plan.sent == 1
@@ -55,17 +38,17 @@ def test_the_first_frame_is_one_whatever_the_budget():
 
 def test_the_schedule_is_kept_and_waits_for_room():
     """A recording could not be entered in its middle; or the keyframe would not wait for its budget."""
-    plan = Both(KeyframeSettings(interval_ns=1_000 * MS))
+    plan = Keyframes(KeyframeSettings(interval_ns=1_000 * MS))
     assert play(plan, 50) == [0, 15, 30, 45]
-    plan = Both(KeyframeSettings(interval_ns=1_000 * MS, scheduled_patience_ns=400 * MS))
+    plan = Keyframes(KeyframeSettings(interval_ns=1_000 * MS, scheduled_patience_ns=400 * MS))
     assert play(plan, 40, fits=lambda n: n % 20 == 19) == [0, 19, 39]  # due at 15 and 34, room at 19 and 39
-    plan = Both(KeyframeSettings(interval_ns=1_000 * MS, scheduled_patience_ns=400 * MS))
+    plan = Keyframes(KeyframeSettings(interval_ns=1_000 * MS, scheduled_patience_ns=400 * MS))
     assert play(plan, 40, fits=lambda _n: False) == [0, 21]
 
 
 def test_while_one_is_due_stills_know_it():
     """Stills would go on taking the room that the keyframe waits for."""
-    plan = Both(KeyframeSettings(interval_ns=0))
+    plan = Keyframes(KeyframeSettings(interval_ns=0))
     plan.done(0)
     assert not plan.due(1_000 * MS)
     assert plan.request(1_000 * MS) is None
@@ -79,13 +62,13 @@ def test_while_one_is_due_stills_know_it():
 
 def test_a_request_that_crossed_a_keyframe_is_answered_by_it():
     """One loss would cost two keyframes, and the second would push pictures and stills aside for nothing."""
-    plan = Both(KeyframeSettings(interval_ns=0))
+    plan = Keyframes(KeyframeSettings(interval_ns=0))
     plan.done(0)
     assert plan.request(200 * MS) is None
     assert not plan.due(250 * MS)
     assert plan.request(400 * MS) is None
     assert plan.due(400 * MS)
-    assert plan.requests.served == 2
+    assert plan.served == 2
 
 
 def test_a_ground_that_joins_right_after_a_keyframe_sees_a_picture_within_a_second():
@@ -93,7 +76,7 @@ def test_a_ground_that_joins_right_after_a_keyframe_sees_a_picture_within_a_seco
     settings = KeyframeSettings(interval_ns=0)
     second_ask_ns = 300 * MS  # as the reassembler repeats it
     for joined_ns in range(0, 300 * MS, 10 * MS):
-        plan = Both(settings)
+        plan = Keyframes(settings)
         plan.done(0)
         asks = {joined_ns, joined_ns + second_ask_ns}
         for now_ns in range(0, 3_000 * MS, 10 * MS):
@@ -112,7 +95,7 @@ def test_a_ground_that_joins_right_after_a_keyframe_sees_a_picture_within_a_seco
 def test_every_request_is_answered_in_time_and_not_more_often(asks, room, interval_s):
     """A ground would wait for a picture; or many grounds together would make the stream all keyframes."""
     settings = KeyframeSettings(interval_ns=interval_s * 1_000 * MS, refill_ns=0)
-    keyframes = play(Both(settings), 240, fits=lambda n: n in room, asked=lambda n: n in asks)
+    keyframes = play(Keyframes(settings), 240, fits=lambda n: n in room, asked=lambda n: n in asks)
     for ask in asks:
         near = [
             one
@@ -126,7 +109,7 @@ def test_every_request_is_answered_in_time_and_not_more_often(asks, room, interv
         assert because_asked or (interval_s and (second - first) * STEP_NS >= settings.interval_ns)
 
 
-def ask_at_twenty_a_second(plan: Both, *, takes_ms: int, losses: bool) -> tuple[int, list[str]]:
+def ask_at_twenty_a_second(plan: Keyframes, *, takes_ms: int, losses: bool) -> tuple[int, list[str]]:
     """Keyframes and refusals of a minute."""
     keyframes, refusals = 0, []
     for number, now_ns in enumerate(range(0, 60_000 * MS, 50 * MS)):
@@ -152,17 +135,17 @@ def ask_at_twenty_a_second(plan: Both, *, takes_ms: int, losses: bool) -> tuple[
 )
 def test_a_commander_cannot_make_the_stream_all_keyframes(takes_ms, losses, most):
     """Whoever may command could push pictures and stills aside with three keyframes a second, for ever."""
-    plan = Both(KeyframeSettings(interval_ns=0))
+    plan = Keyframes(KeyframeSettings(interval_ns=0))
     keyframes, refusals = ask_at_twenty_a_second(plan, takes_ms=takes_ms, losses=losses)
     assert 30 < keyframes <= most, "three a second would be 180"
-    assert plan.requests.served == 1200 - len(refusals)
+    assert plan.served == 1200 - len(refusals)
     assert "the last keyframe came" in refusals[-1]
     assert "ask again in" in refusals[-1]
 
 
 def test_recovery_after_losses_is_never_refused():
     """The picture would stay dark because a ground asked for what it needed: six losses in six seconds, then rest."""
-    plan = Both(KeyframeSettings(interval_ns=0))
+    plan = Keyframes(KeyframeSettings(interval_ns=0))
     plan.done(0)
     plan.note_cost(470 * MS)
     for start_ns in (1_000 * MS, 30_000 * MS):
@@ -178,7 +161,7 @@ def test_recovery_after_losses_is_never_refused():
 
 def test_a_reported_loss_is_a_reason_once():
     """One old loss would be a ticket to as many keyframes as somebody cares to ask for."""
-    plan = Both(KeyframeSettings(interval_ns=0, burst=1))
+    plan = Keyframes(KeyframeSettings(interval_ns=0, burst=1))
     plan.done(0)
     plan.note_cost(3_500 * MS)  # the next in ten seconds
     assert plan.request(20_000 * MS) is None
@@ -196,25 +179,25 @@ def test_a_reported_loss_is_a_reason_once():
 
 def test_the_edges_own_requests_come_from_any_thread_and_cost_nothing():
     """A change of rate, or a link that comes back, would wait for the schedule; or be refused."""
-    both = Both(KeyframeSettings(interval_ns=0, burst=1))
+    both = Keyframes(KeyframeSettings(interval_ns=0, burst=1))
     both.done(0)
     both.note_cost(60_000 * MS)
-    threads = [threading.Thread(target=both.requests.require, args=[400 * MS + n]) for n in range(8)]
+    threads = [threading.Thread(target=both.require, args=[400 * MS + n]) for n in range(8)]
     for one in threads:
         one.start()
     for one in threads:
         one.join()
     assert both.due(401 * MS)
     assert both.now(500 * MS, fits=True)
-    both.requests.require(510 * MS)
+    both.require(510 * MS)
     both.done(520 * MS)
     assert not both.due(530 * MS), "what was requested while it was made is met by it"
-    assert (both.sent, both.requests.served) == (2, 0)
+    assert (both.sent, both.served) == (2, 0)
 
 
 def test_the_plan_publishes_what_it_waits_for():
     """Stills would take the room of a scheduled keyframe that waits for its own."""
-    both = Both(KeyframeSettings(interval_ns=1_000 * MS))
+    both = Keyframes(KeyframeSettings(interval_ns=1_000 * MS))
     both.done(0)
     assert not both.due(999 * MS)
     assert both.due(1_000 * MS)

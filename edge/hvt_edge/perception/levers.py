@@ -19,7 +19,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS
-from hvt_edge.operating.point import Levers, Operating
+from hvt_edge.operating import Levers, Operating
 
 
 @dataclass(frozen=True, slots=True)

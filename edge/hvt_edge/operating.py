@@ -2,7 +2,7 @@
 
 Settings are frozen; what commands, the link and measurements change lives here. Three write:
 `hvt_edge.control.commands` what a ground commanded, the frame loop (`hvt_edge.video.reconfigure`) what the link
-allows and what x265 was opened for and with, and `hvt_edge.operating.levers` what is worth sending beside the video.
+allows and what x265 was opened for and with, and `hvt_edge.perception.levers` what is worth sending beside the video.
 The encoder, the budget, ``info``, status and summary all read the same.
 """
 

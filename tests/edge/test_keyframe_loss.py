@@ -8,8 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
-from hvt_edge.video.keyframes import KeyframePlan
+from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_ground.link.reassemble import Reassembler
 
 MS = 1_000_000
@@ -69,8 +68,7 @@ class Minute:
     refused: int = 0
 
     def __post_init__(self) -> None:
-        self.requests = KeyframeRequests(self.settings)
-        self.plan = KeyframePlan(self.requests)
+        self.requests = Keyframes(self.settings)
         self.sees = [Ground(number, loss=self.loss, seed=self.seed) for number in range(self.grounds)]
         asks: list[tuple[int, tuple[int, int] | None]] = []
         self.sent, next_ns = 0, 0
@@ -92,9 +90,9 @@ class Minute:
                     asks.append((now_ns + ROUND_TRIP_NS // 2, told))
 
     def _frame(self, now_ns: int) -> None:
-        keyframe = self.plan.now(now_ns, fits=True)
+        keyframe = self.requests.now(now_ns, fits=True)
         if keyframe:
-            self.plan.done(now_ns)
+            self.requests.done(now_ns)
             self.requests.note_cost(self.takes_ms * MS)
         header = Header(1, self.sent, self.sent, keyframe)
         self.sent += 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvt_edge.operating.point import LoopClock, Operating, base_rate_bps
+from hvt_edge.operating import LoopClock, Operating, base_rate_bps
 
 
 def operating() -> Operating:

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from hvt_edge.operating.levers import LeverControl, LeverSettings, Measured
-from hvt_edge.operating.point import Operating
+from hvt_edge.operating import Operating
+from hvt_edge.perception.levers import LeverControl, LeverSettings, Measured
 
 SECOND_NS = 1_000_000_000
 SETTINGS = LeverSettings(tracks_bps=8_000)

@@ -1,6 +1,10 @@
-"""Requests for a keyframe: from grounds, from the link, from the store, from a reconfiguration.
+"""When a keyframe comes: at the start, on a long schedule, and on request of grounds, of the link, of the store.
 
-Any thread adds a request; the frame loop's plan (`hvt_edge.video.keyframes`) takes them and publishes its state.
+Any thread requests one; the frame loop decides (`Keyframes.now`). A keyframe is the largest message there is, so it
+is announced: while one is due stills are held, and it is sent as soon as it fits the budget's window. A scheduled one
+may wait ``scheduled_patience_ns`` for that, a requested one ``patience_ns``, so that a ground that joins late sees a
+picture within a second.
+
 A ground's requests are limited by a token bucket, so that whoever may command cannot make the stream all keyframes:
 one costs the time in which its bytes are ``request_share`` of the budget. After reported losses a request is free: on
 a lossy link a refused keyframe is a dark screen.
@@ -38,35 +42,18 @@ class KeyframeSettings:
     """The camera makes its own keyframes, about so far apart, and none on request; None: the edge makes them."""
 
 
-@dataclass(frozen=True, slots=True)
-class KeyframeState:
-    """The published state of the plan."""
-
-    interval_ns: int
-    last_ns: int | None = None
-    """When the newest keyframe was encoded; None before the first."""
-    due_ns: int | None = None
-    """The time since which one is due; None if none is."""
-    sent: int = 0
-    requested: bool = False
-    """Whether the one that is due was requested, and is no mere one of the schedule."""
-
-    def due(self, now_ns: int) -> bool:
-        """Whether a keyframe is to come: the first, one that was requested, or one of the schedule."""
-        if self.last_ns is None or self.due_ns is not None:
-            return True
-        return self.interval_ns > 0 and now_ns - self.last_ns >= self.interval_ns
-
-
-class KeyframeRequests:
-    """Thread-safe; time is an argument."""
+class Keyframes:
+    """Thread-safe; time is an argument. `now`, `done` and `note_cost` are for the frame loop."""
 
     def __init__(self, settings: KeyframeSettings = KeyframeSettings()) -> None:
         self.settings = settings
         self._lock = threading.Lock()
-        self._state = KeyframeState(settings.interval_ns)
+        self._last_ns: int | None = None
+        """When the newest keyframe was encoded; None before the first."""
+        self._due_ns: int | None = None
+        """The time since which the frame loop waits for room for one; None if it does not."""
         self._requested_ns: int | None = None
-        """The oldest request that the plan has not taken."""
+        """The oldest request that no keyframe has met."""
         self._paid_ns = -(2**63)
         """Requests are paid for up to this time: `_cost_ns` each."""
         self._keyframe_ns = 0
@@ -75,25 +62,23 @@ class KeyframeRequests:
         """Losses by receiver, as of its last report."""
         self._lossy = False
         """Whether somebody has lost more since the last keyframe."""
+        self.sent = 0
+        """Keyframes so far."""
         self.served = 0
         """Requests of grounds that were met by a keyframe of their own, or one that was due or fresh."""
 
     # Anybody
 
-    @property
-    def sent(self) -> int:
-        """Keyframes so far."""
-        return self._state.sent
-
     def due(self, now_ns: int) -> bool:
         """Whether a keyframe is to come: stills are held from now on until it has gone."""
-        return self._requested_ns is not None or self._state.due(now_ns)
+        with self._lock:
+            return self._requested_ns is not None or self._due_ns is not None or self._scheduled(now_ns)
 
     @property
     def requested(self) -> bool:
         """Whether a keyframe is to come that somebody or something needs: not even a requested still goes before."""
-        state = self._state
-        return self._requested_ns is not None or state.requested or state.last_ns is None
+        with self._lock:
+            return self._requested_ns is not None or self._last_ns is None
 
     def request(self, now_ns: int) -> str | None:
         """A ground wants a keyframe; return why it gets none now, in a sentence, or None where it is served.
@@ -107,11 +92,11 @@ class KeyframeRequests:
                 f"next comes by itself, one each {self.settings.camera_every_s:.1f} s or so"
             )
         with self._lock:
-            state = self._state
-            fresh = state.last_ns is not None and now_ns - state.last_ns < self.settings.rest_ns
-            pending = self._requested_ns is not None or state.due_ns is not None
-            if not fresh and not pending and state.last_ns is not None:
-                refusal = self._pay(now_ns, last_ns=state.last_ns)
+            last_ns = self._last_ns
+            fresh = last_ns is not None and now_ns - last_ns < self.settings.rest_ns
+            pending = self._requested_ns is not None or self._due_ns is not None
+            if not fresh and not pending and last_ns is not None:
+                refusal = self._pay(now_ns, last_ns=last_ns)
                 if refusal is not None:
                     return refusal
             self.served += 1
@@ -136,20 +121,25 @@ class KeyframeRequests:
             self._losses[receiver_id] = count
             self._lossy = True
 
-    # The plan
+    # The frame loop
 
-    def take(self) -> int | None:
-        """Return when the oldest request came that was not taken yet, and forget all; None where there is none."""
+    def now(self, now_ns: int, *, fits: bool) -> bool:
+        """Tell whether this very frame is to be the keyframe; ``fits``: the budget's window has room for it."""
         with self._lock:
-            requested_ns, self._requested_ns = self._requested_ns, None
-            return requested_ns
+            if self._due_ns is None:
+                self._due_ns = (
+                    now_ns if self._requested_ns is None and self._scheduled(now_ns) else self._requested_ns
+                )
+            if self._last_ns is None:
+                return True
+            return self._due_ns is not None and (fits or not self._waits(self._due_ns, now_ns))
 
-    def publish(self, state: KeyframeState) -> None:
-        """The plan's state from now on. With another keyframe, losses before it are no reason any more."""
+    def done(self, now_ns: int) -> None:
+        """A keyframe has just been encoded; it also answers what was requested meanwhile."""
         with self._lock:
-            if state.sent != self._state.sent:
-                self._lossy = False
-            self._state = state
+            self._last_ns, self._due_ns, self._requested_ns = now_ns, None, None
+            self._lossy = False  # losses before it are no reason any more
+            self.sent += 1
 
     def note_cost(self, keyframe_ns: int) -> None:
         """A keyframe has been sent that takes the whole budget for so long."""
@@ -157,6 +147,15 @@ class KeyframeRequests:
 
     def _add(self, now_ns: int) -> None:
         self._requested_ns = now_ns if self._requested_ns is None else self._requested_ns
+
+    def _scheduled(self, now_ns: int) -> bool:
+        interval_ns = self.settings.interval_ns
+        return self._last_ns is None or (interval_ns > 0 and now_ns - self._last_ns >= interval_ns)
+
+    def _waits(self, due_ns: int, now_ns: int) -> bool:
+        if self._requested_ns is not None:
+            return now_ns - self._requested_ns < self.settings.patience_ns
+        return now_ns - due_ns < self.settings.scheduled_patience_ns
 
     @property
     def _cost_ns(self) -> int:
