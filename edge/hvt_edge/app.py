@@ -78,7 +78,7 @@ class Edge:
         self._on_started = on_started
         self._world = world or World()
         self._lockstep = config.pace == "lockstep"
-        self._loop_clock = LoopClock(self._world.clock, lockstep=self._lockstep)
+        self._loop_clock = LoopClock(self._world.clock, lockstep=self._lockstep, wait=stop.wait)
         self._counts = FrameCounts()
         self._failures = self._world.failures
         self._heartbeat: Heartbeat | None = None
@@ -146,7 +146,6 @@ class Edge:
                 failures=self._failures,
                 clock=world.clock,
                 loop_clock=self._loop_clock,
-                wait_until=self._wait_until,
                 beginning=beginning,
                 headroom=headroom,
             )
@@ -267,11 +266,6 @@ class Edge:
             before_frame=stages.link_control.before_frame,
             has_viewer=partial(link.has_subscriber, Channel.BASE),
         )
-
-    def _wait_until(self, at_ns: int) -> None:
-        # Let the budget's window make room; media time needs no waiting.
-        if not self._lockstep and (wait_ns := at_ns - self._world.clock()) > 0:
-            self._stop.wait(wait_ns / SECOND_NS)
 
     def _state_maker(self, stages: Stages, link: EdgeLink, view: View) -> StateMaker:
         return StateMaker(

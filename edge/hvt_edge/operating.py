@@ -9,8 +9,11 @@ The encoder, the budget, ``info``, status and summary all read the same.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+
+from hvt_common.units import SECOND_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +118,17 @@ class Operating:
 
 
 class LoopClock:
-    """The time that the budget's windows go by: the wall clock, or in lockstep the newest frame's capture time."""
+    """The time that the budget's windows go by: the wall clock, or in lockstep the newest frame's capture time.
 
-    def __init__(self, clock: Callable[[], int], *, lockstep: bool) -> None:
+    ``wait(seconds)`` sleeps; in lockstep nothing is waited for.
+    """
+
+    def __init__(
+        self, clock: Callable[[], int], *, lockstep: bool, wait: Callable[[float], object] = time.sleep
+    ) -> None:
         self._clock = clock
         self._lockstep = lockstep
+        self._wait = wait
         self._media_ns = 0
 
     def __call__(self) -> int:
@@ -129,6 +138,16 @@ class LoopClock:
     def advance(self, capture_ns: int) -> None:
         """The loop has come to this frame."""
         self._media_ns = capture_ns
+
+    def wait_until(self, at_ns: int) -> None:
+        """Sleep until then, as the budget's window makes room."""
+        if not self._lockstep and (wait_ns := at_ns - self._clock()) > 0:
+            self._wait(wait_ns / SECOND_NS)
+
+    def pause(self, pause_ns: int) -> int:
+        """Sleep for so long; return the time then."""
+        self.wait_until(self() + pause_ns)
+        return self()
 
 
 def base_rate_bps(total_bps: int, share: float, *, metadata_bps: int) -> int:

@@ -39,6 +39,8 @@ import numpy.typing as npt
 from hvt_common.units import SECOND_NS
 from hvt_edge.link.loan import MOST_SHARE, VideoLoan
 
+BASE_ATTACHMENT_BYTES = 48
+"""The largest `BaseHeader`."""
 _MEMORY_WINDOWS = 5
 """How many windows of the base's recent behaviour the forecast looks back on."""
 _FORECASTS = 30

@@ -7,7 +7,7 @@ from collections import deque
 
 from hvt_common.protocol.messages import StillResult
 from hvt_edge.link.receivers import Report
-from hvt_edge.perception.detected import Detected
+from hvt_edge.perception.shadow import Detected
 
 _MAX_RESULTS = 1024
 

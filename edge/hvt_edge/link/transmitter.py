@@ -39,9 +39,8 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.outage import BaseInFlight
-from hvt_edge.link.budget import RollingBudget
+from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, RollingBudget
 from hvt_edge.link.envelope import StillEnvelope
-from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES
 from hvt_edge.link.pacer import Pacer
 
 STILL_ATTACHMENT_BYTES = 60

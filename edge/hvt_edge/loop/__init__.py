@@ -1,4 +1,1 @@
-"""One frame after the other: `realtime`, or `lockstep` with media time; `counts` of frames, `cpu` they would take.
-
-`perception_rest` says when perception rests for video.
-"""
+"""One frame after the other: `realtime`, or `lockstep` with media time; `counts` of frames, `cpu` they would take."""

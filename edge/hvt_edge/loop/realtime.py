@@ -13,7 +13,6 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
-from hvt_edge.loop.perception_rest import PerceptionRest
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.passthrough import VideoStage
@@ -27,6 +26,35 @@ _MOST_LINK_LATE_NS = 10 * SECOND_NS
 _LINK_BOUND_NS = SECOND_NS // 100
 _BEHIND_SHARE = 0.5
 """Share of the time between two frames: beyond it the loop is late."""
+_FIRST_REST_NS = SECOND_NS // 8
+_LONGEST_REST_NS = SECOND_NS // 2
+"""If video goes on losing frames whatever perception does, boxes are still made twice a second."""
+_STEADY_NS = 5 * SECOND_NS
+
+
+class PerceptionRest:
+    """Has perception rest after each frame that video lost, twice as long while it goes on losing some.
+
+    Pure: time is an argument.
+    """
+
+    def __init__(self) -> None:
+        self._lost = 0
+        self._lost_ns: int | None = None
+        self._rest_ns = 0
+        self._taken_ns: int | None = None
+
+    def lets(self, lost: int, *, now_ns: int) -> bool:
+        """Whether perception may take the frame of now; ``lost``: so many frames video has lost until now."""
+        if lost > self._lost:
+            steady = self._lost_ns is None or now_ns - self._lost_ns > _STEADY_NS
+            self._rest_ns = _FIRST_REST_NS if steady else min(_LONGEST_REST_NS, 2 * self._rest_ns)
+            self._lost, self._lost_ns = lost, now_ns
+        rests = self._lost_ns is not None and now_ns - self._lost_ns < self._rest_ns
+        if rests and self._taken_ns is not None and now_ns - self._taken_ns < _LONGEST_REST_NS:
+            return False
+        self._taken_ns = now_ns
+        return True
 
 
 @dataclass(eq=False)

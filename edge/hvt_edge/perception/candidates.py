@@ -14,8 +14,7 @@ import numpy as np
 
 from hvt_common.values import Boxes, Image, Tracks, View
 from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop, coded_size
-from hvt_edge.perception.base_loss import BaseLoss, measure_loss
-from hvt_edge.perception.crop import PADDING, crop_box
+from hvt_edge.perception.crop import PADDING, BaseLoss, crop_box, measure_loss
 
 Box = tuple[float, float, float, float]
 

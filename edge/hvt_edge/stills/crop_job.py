@@ -15,8 +15,7 @@ from hvt_common.values import Image, Still
 from hvt_common.video.base_crop import coded_size
 from hvt_common.video.still_codecs import StillCodec, psnr_y_db
 from hvt_edge.perception.crop import crop_box
-from hvt_edge.stills.policy.base import Request
-from hvt_edge.stills.policy.cost import CostEstimate
+from hvt_edge.stills.policy.base import CostEstimate, Request
 
 Box = tuple[float, float, float, float]
 Crop = tuple[int, int, int, int]

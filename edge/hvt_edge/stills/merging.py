@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from hvt_common.video.base_crop import MAX_SIDE_PX
 from hvt_edge.perception.crop import crop_box
-from hvt_edge.stills.policy.base import Request
-from hvt_edge.stills.policy.cost import CostEstimate
+from hvt_edge.stills.policy.base import CostEstimate, Request
 
 ALSO_BYTES = 17.0
 """Bytes of the header for each further track: its id and its box in eighths of a pixel."""

@@ -33,7 +33,7 @@ from hvt_edge.stills.on_demand_crop import (
     frame_for,
 )
 from hvt_edge.stills.outbox import Outbox, OutboxStill
-from hvt_edge.stills.policy.cost import CostModel
+from hvt_edge.stills.policy.base import CostModel
 from hvt_edge.stills.requested_coding import Capacity, CodedRequest, NothingCloser, code_requested
 
 REQUEST_PARAMETER = "ask"

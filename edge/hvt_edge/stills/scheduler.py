@@ -18,8 +18,7 @@ from hvt_edge.stills.maker import Allowance, NoStill, StillMaker
 from hvt_edge.stills.merging import group
 from hvt_edge.stills.on_demand import OnDemand, OnDemandStill
 from hvt_edge.stills.outbox import Outbox, OutboxStill
-from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, Method, Request, Step
-from hvt_edge.stills.policy.cost import CostModel
+from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, CostModel, Method, Request, Step
 from hvt_edge.stills.suppression import Gate, Suppression
 
 Coded = Generator[OutboxStill, None, None]

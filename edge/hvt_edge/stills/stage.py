@@ -14,9 +14,8 @@ from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import Levers
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
-from hvt_edge.perception.detected import Detected
 from hvt_edge.perception.levers import LeverControl
-from hvt_edge.perception.shadow import ShadowGround
+from hvt_edge.perception.shadow import Detected, ShadowGround
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser, Coded
 from hvt_edge.stills.sending import StillSender

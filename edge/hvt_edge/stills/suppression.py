@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hvt_edge.perception.base_loss import BaseLoss
 from hvt_edge.perception.candidates import Candidate
+from hvt_edge.perception.crop import BaseLoss
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from hvt_edge.link.overhead import base_overhead_bps
+from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
+from hvt_common.protocol.ledger import overhead_bytes
+from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES
 
 PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium")
 VBV_S = 0.15
@@ -33,6 +35,8 @@ _KEYFRAME_EVERY_S = 5.0
 x265 gets so much less, for the first keyframe, one each ten seconds, and some that grounds ask for."""
 _KEYFRAME_SHARE = 0.005
 """Of the base's bytes, at most, for keyframes of the schedule."""
+STATUS_BYTES = 320
+"""The size of a `Status`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +90,18 @@ def keyframe_total_bps(size: tuple[int, int], *, window_s: float, metadata_bps: 
 def minimum_bps(size: tuple[int, int], fps: float) -> int:
     """The lowest payload rate that x265 can follow at this size and frame rate, keyframes apart."""
     return round(fps * (_FRAME_FLOOR_BITS + size[0] * size[1] * _FRAME_FLOOR_BITS_PER_PX))
+
+
+def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
+    """The share of headers, framing and ``status`` in ``base_bps``: the encoder gets the rest."""
+    payload = round(base_bps / 8 / fps)
+    key = EdgeKeys(edge_id).key(Channel.BASE)
+    encoding = DELIVERIES[Channel.BASE].encoding
+    per_frame = BASE_ATTACHMENT_BYTES + overhead_bytes(
+        payload, BASE_ATTACHMENT_BYTES, key=key, encoding=encoding
+    )
+    per_second = STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=EdgeKeys(edge_id).key(Channel.STATUS))
+    return 8 * (per_frame * fps + per_second)
 
 
 def encoder_settings(

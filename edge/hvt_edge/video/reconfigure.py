@@ -68,6 +68,8 @@ class EncoderReconfiguration:
     def __post_init__(self) -> None:
         self._trigger = ReconfigurationTrigger()
         self._lock = threading.Lock()
+        settings = self.settings
+        self._least_base_bps = least_base_bps(settings.size, settings.least_fps, edge_id=settings.edge_id)
         now = self.operating.now
         self._opened = {"total_bps": now.budget_bps, "base_bps": now.base_bps, "decimation": now.decimation}
         """The rate for which x265 was last opened."""
@@ -194,9 +196,9 @@ class EncoderReconfiguration:
 
     def _base_of(self, total_bps: int) -> int:
         # The base's part of so much in all; never less than x265 can follow at its lowest frame rate.
-        settings = self.settings
-        least_bps = least_base_bps(settings.size, settings.least_fps, edge_id=settings.edge_id)
-        return max(least_bps, base_rate_bps(total_bps, self._share, metadata_bps=self._metadata_bps))
+        return max(
+            self._least_base_bps, base_rate_bps(total_bps, self._share, metadata_bps=self._metadata_bps)
+        )
 
     @property
     def _share(self) -> float:

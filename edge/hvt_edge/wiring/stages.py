@@ -92,7 +92,6 @@ def build_stages(
     failures: Failures,
     clock: Callable[[], int],
     loop_clock: LoopClock,
-    wait_until: Callable[[int], None],
     beginning: Beginning,
     headroom: float = 1.0,
 ) -> Stages:
@@ -133,7 +132,7 @@ def build_stages(
         edge_id=config.edge_id,
         session_id=session_id,
         lockstep=lockstep,
-        wait_until=wait_until,
+        wait_until=loop_clock.wait_until,
         pacer=pacer,
         in_flight=None if lockstep else in_flight,
     )
@@ -214,7 +213,7 @@ def build_stages(
             least_link=make_least_link(config, pacer=pacer, in_flight=in_flight),
             admits=link_control.admits,
             holder=link_control.holder,
-            pause=None if lockstep else partial(_paused, clock, wait_until),
+            pause=None if lockstep else loop_clock.pause,
             backlog=backlog,
         )
     else:
@@ -295,8 +294,3 @@ def build_stages(
         still_readers,
         pose,
     )
-
-
-def _paused(clock: Callable[[], int], wait_until: Callable[[int], None], pause_ns: int) -> int:
-    wait_until(clock() + pause_ns)
-    return clock()

@@ -32,7 +32,7 @@ from hvt_common.values import Fit, Frame
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.publisher import EdgeLink
-from hvt_edge.perception.detected import Detected
+from hvt_edge.perception.shadow import Detected
 from hvt_edge.source.resample import Resizer
 from hvt_edge.wiring import base_size
 from hvt_edge.world import World

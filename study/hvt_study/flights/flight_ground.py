@@ -24,7 +24,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
-from hvt_edge.perception.detected import Detected
+from hvt_edge.perception.shadow import Detected
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.link.packets import BasePacket

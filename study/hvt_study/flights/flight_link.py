@@ -13,7 +13,7 @@ from hvt_common.protocol.messages import BaseHeader, CaptureTimes, RoiHeader, St
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.transport.inbox import Received
 from hvt_edge.link.feedback import FeedbackInbox
-from hvt_edge.perception.detected import Detected
+from hvt_edge.perception.shadow import Detected
 from hvt_study.serial_link import SerialLink
 
 START_NS = 1_700_000_000_000_000_000

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from hvt_common.protocol.messages import Feedback, StillResult
 from hvt_edge.link.feedback import FeedbackInbox
-from hvt_edge.perception.detected import Detected
+from hvt_edge.perception.shadow import Detected
 from rigs.footprint import footprint_bytes
 from rigs.messages import counted, feedback
 

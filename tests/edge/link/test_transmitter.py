@@ -16,12 +16,12 @@ from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import MAX_ALSO, BaseHeader, CaptureTimes, Flags, Health, RoiHeader, Status
 from hvt_common.values import AccessUnit, Still
-from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES, STATUS_BYTES, base_overhead_bps
+from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.video.encoder_settings import STATUS_BYTES, base_overhead_bps
 from rigs.messages import feedback
 
 SECOND_NS = 1_000_000_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 from hvt_common.units import SECOND_NS
-from hvt_edge.loop.perception_rest import PerceptionRest
+from hvt_edge.loop.realtime import PerceptionRest
 
 FPS = 15
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hvt_edge.perception.detected import Detected, GroundDifference
+from hvt_edge.perception.shadow import Detected, GroundDifference
 
 SECOND_NS = 1_000_000_000
 FPS = 15

@@ -12,8 +12,7 @@ from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Detections, Frame, Tracks
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer, AnalyzerSettings
-from hvt_edge.perception.detected import Detected
-from hvt_edge.perception.shadow import Shadow, ShadowGround, ShadowSettings
+from hvt_edge.perception.shadow import Detected, Shadow, ShadowGround, ShadowSettings
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder

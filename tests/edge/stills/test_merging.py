@@ -15,8 +15,7 @@ from hvt_edge.perception.candidates import Candidate
 from hvt_edge.perception.crop import crop_box
 from hvt_edge.stills.crop_job import expected_bytes, union_crop
 from hvt_edge.stills.merging import ALSO_BYTES, group
-from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, Request
-from hvt_edge.stills.policy.cost import CostEstimate
+from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, CostEstimate, Request
 
 SOURCE = (1280, 720)
 PADDING = 0.15

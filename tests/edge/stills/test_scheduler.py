@@ -19,8 +19,7 @@ from hvt_edge.perception.candidates import Candidate, TrackMemory
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxSettings, OutboxStill
-from hvt_edge.stills.policy.base import Request, Step
-from hvt_edge.stills.policy.cost import CostModel
+from hvt_edge.stills.policy.base import CostModel, Request, Step
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Gate, Suppression
 from media.base_coded import StandIn

@@ -6,8 +6,14 @@ import pytest
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
-from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES, STATUS_BYTES
-from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings, least_base_bps, minimum_bps
+from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES
+from hvt_edge.video.encoder_settings import (
+    STATUS_BYTES,
+    EncoderSettings,
+    encoder_settings,
+    least_base_bps,
+    minimum_bps,
+)
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, hard_pictures, real_pictures
 

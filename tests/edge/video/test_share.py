@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_edge.operating import Levers, Operating
-from hvt_edge.perception.base_loss import BaseLoss
 from hvt_edge.perception.candidates import Candidate, ClassPosterior
-from hvt_edge.stills.policy.base import Step
-from hvt_edge.stills.policy.cost import CostEstimate
+from hvt_edge.perception.crop import BaseLoss
+from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.video.reconfigure import EncoderReconfiguration, ReconfigurationSettings
 from hvt_edge.video.share import FIRST_SHARE, Split, SplitSettings
 

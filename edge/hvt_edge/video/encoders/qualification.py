@@ -18,8 +18,7 @@ from hvt_common.runtime.failures import reason_of
 from hvt_common.units import bitrate_text
 from hvt_common.values import AccessUnit, Frame
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.link.budget import BASE_PEAK
-from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES
+from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, BASE_PEAK
 from hvt_edge.video.encoder_settings import usual_keyframe_bytes
 from hvt_edge.video.encoders.contract import Encoder
 

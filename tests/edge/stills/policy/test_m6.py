@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_edge.perception.base_loss import BaseLoss
 from hvt_edge.perception.candidates import Candidate, ClassPosterior
-from hvt_edge.stills.policy.base import Step
-from hvt_edge.stills.policy.cost import CostEstimate
+from hvt_edge.perception.crop import BaseLoss
+from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.stills.policy.m6 import ExpectedGain
 from hvt_edge.stills.policy.registry import METHODS, method
 

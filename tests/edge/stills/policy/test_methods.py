@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_edge.perception.candidates import Candidate, ClassPosterior
-from hvt_edge.stills.policy.base import Step
-from hvt_edge.stills.policy.cost import CostEstimate, CostModel
+from hvt_edge.stills.policy.base import CostEstimate, CostModel, Step
 from hvt_edge.stills.policy.paper import Small, Utility
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
 

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_edge.perception.candidates import Candidate
-from hvt_edge.stills.policy.base import Step
-from hvt_edge.stills.policy.cost import CostEstimate
+from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.policy.selectors import SELECTORS, select
 
