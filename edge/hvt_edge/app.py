@@ -34,8 +34,7 @@ from hvt_edge.perception.guarded_detector import GuardedDetector
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.source.live import SOURCE_PART, closing_on
-from hvt_edge.status import StatusReporter, status_text
-from hvt_edge.summary import summary
+from hvt_edge.status import StatusReporter, status_text, summary
 from hvt_edge.wiring import (
     Stages,
     as_the_camera_is,

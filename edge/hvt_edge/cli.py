@@ -51,7 +51,7 @@ def _run(argv: Sequence[str] | None) -> int:
     config = check(config)
     from hvt_common.runtime.reporting import print_table, write_json  # noqa: PLC0415
     from hvt_edge.app import Edge  # noqa: PLC0415
-    from hvt_edge.summary import in_vain, table, title  # noqa: PLC0415
+    from hvt_edge.status import in_vain, table, title  # noqa: PLC0415
     from hvt_edge.world import World  # noqa: PLC0415
 
     limit_malloc_arenas()

@@ -6,7 +6,7 @@ from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failure
 from hvt_edge.loop.cpu import Cores
-from hvt_edge.summary import in_vain, summary, table, title
+from hvt_edge.status import in_vain, summary, table, title
 
 
 def summary_of(**changed):
