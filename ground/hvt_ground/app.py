@@ -93,7 +93,8 @@ class Ground:
         """Serve edges until ``stop`` is set, or with ``--once`` until they have ended; return a summary a session.
 
         Raises `UserError` before anything is received, where a setting, a file or a port cannot be used, and
-        `FlightError` after that.
+        `FlightError` after that. Models are opened beside the link: one that cannot be used ends the run within
+        seconds.
         """
         config = self._config
         check_edge_pattern(config.edges)
@@ -150,9 +151,11 @@ class Ground:
                 late={one.part for one in models.failures.now},
             )
             try:
-                self._serve(link, factory, line, watch, models.failures, page, group)
+                self._serve(link, factory, line, watch, models, page, group)
                 self._close_edges()
             except Exception as error:
+                if models.error is not None:
+                    raise models.error from None
                 raise FlightError(f"the ground cannot go on: {reason_of(error)}") from error
             finally:
                 self._stop_edges()
@@ -207,7 +210,7 @@ class Ground:
         factory: SessionFactory,
         line: StatusLine,
         watch: LinkWatch,
-        failures: Failures,
+        models: Models,
         page: WebPage | None,
         group: GroundGroup | None,
     ) -> None:
@@ -217,7 +220,8 @@ class Ground:
             detector=Path(config.detector).name,
             classifier=Path(config.classifier or "none").name,
             calibrated=stills_calibrated(config),
-            failures=failures,
+            failures=models.failures,
+            loading=lambda: models.loading,
             group=group,
         )
         while not self._stop.wait(_POLL_S):
@@ -229,6 +233,8 @@ class Ground:
                 if port.edge not in self._edges:
                     self._edges[port.edge] = self._serve_edge(port, factory)
                     self._say_rights(port, line, watch)
+            if models.error is not None:
+                raise models.error
             self._raise_error()
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
@@ -236,7 +242,7 @@ class Ground:
                 if page is not None:
                     page.show(self._state)
                 line.show(status_text(self._state) or ("no link" if watch.trouble else "no edge yet"))
-            if config.once and self._all_ended():
+            if config.once and self._all_ended(loading=models.loading):
                 return
 
     def _serve_edge(self, port: EdgePort, factory: SessionFactory) -> EdgeThread:
@@ -276,12 +282,12 @@ class Ground:
                 "keyframes or stills on demand, and no changes of its settings"
             )
 
-    def _all_ended(self) -> bool:
+    def _all_ended(self, *, loading: bool) -> bool:
         edges = [one.sessions for one in self._edges.values()]
         gone = all(one.idle and not one.port.present.is_set() for one in edges)
         if not any(one.ended for one in edges):  # nobody came, or who came left without a picture
             waited_s = time.monotonic() - self._began_s
-            return gone and 0 < self._config.wait < waited_s
+            return gone and not loading and 0 < self._config.wait < waited_s
         return gone
 
     def _close_edges(self) -> None:

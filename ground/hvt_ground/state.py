@@ -143,6 +143,8 @@ class GroundState:
     """Of the messages on the wire."""
     detector: str
     classifier: str
+    loading: bool
+    """They are not open yet: video is recorded and shown, without boxes of this ground."""
     calibrated: bool
     """Whether a still's probability of a class is one: it was fitted to how often it is right."""
     edges: tuple[EdgeState, ...]
@@ -173,12 +175,14 @@ class StateMaker:
         classifier: str = "",
         calibrated: bool = False,
         failures: Failures | None = None,
+        loading: Callable[[], bool] = lambda: False,
         group: GroundGroup | None = None,
     ) -> None:
         self._clock = clock
         self._group = group
         self._detector, self._classifier, self._calibrated = detector, classifier, calibrated
         self._failures = failures
+        self._loading = loading
         self._links: dict[str, tuple[LinkState, int]] = {}
         self._left_out: dict[str, tuple[str, int, int]] = {}
         """By edge: session, frames that the link did not carry, and when that last rose."""
@@ -197,6 +201,7 @@ class StateMaker:
             schema_version=WIRE_VERSION,
             detector=self._detector,
             classifier=self._classifier,
+            loading=self._loading(),
             calibrated=self._calibrated,
             edges=made,
             member=None if self._group is None else self._group.member,
@@ -257,7 +262,7 @@ def _pose(session: GroundSession, now_ns: int) -> PoseState | None:
 
 
 def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState, now_ns: int) -> SessionState:
-    info, pipeline, counters, status = session.info, session.pipeline, session.counters, session.last_status
+    info, pipeline, counters, status = session.info, session.perceived, session.counters, session.last_status
     now: Traffic | None = None if link == "lost" else session.traffic(now_ns)
     delayed = now is not None and not session.lockstep
     captured_ns = None if session.lockstep else session.newest_captured_ns

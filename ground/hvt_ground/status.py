@@ -19,7 +19,8 @@ from hvt_ground.state import EdgeState, GroundState
 def status_text(state: GroundState) -> str:
     """The status line: the traffic of each edge now, and the failed parts; empty without any."""
     elsewhere = [f"{edge}: at {one.member}" for edge, one in state.elsewhere.items()]
-    return " | ".join([*map(_edge_text, state.edges), *elsewhere, *map(failed_text, state.failed)])
+    loading = ["detector loading"] * state.loading
+    return " | ".join([*map(_edge_text, state.edges), *elsewhere, *loading, *map(failed_text, state.failed)])
 
 
 def _edge_text(one: EdgeState) -> str:
@@ -46,7 +47,7 @@ def _edge_text(one: EdgeState) -> str:
 
 def summary(session: GroundSession) -> dict[str, Any]:
     """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do."""
-    info, pipeline, counters = session.info, session.pipeline, session.counters
+    info, pipeline, counters = session.info, session.perceived, session.counters
     account = session.ledger.summary(session.duration_s)
     status = session.last_status
     worst = account.worst_window_bps

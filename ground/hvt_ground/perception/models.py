@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import threading
+from concurrent.futures import Future
 from functools import partial
 
 from hvt_common.inference.classify import Classifier, open_classifier
@@ -27,9 +29,10 @@ ModelSet = tuple[Detector, Classifier | None]
 
 
 class Models:
-    """Opens detector and classifier once; all sessions take turns with them.
+    """Opens detector and classifier once, in a thread of its own; all sessions take turns with them.
 
-    Two pictures at once would each have half the cores, and take twice the memory and threads.
+    A runtime may compile for many seconds: video is received, recorded and shown meanwhile. Two pictures at once
+    would each have half the cores, and take twice the memory and threads.
     """
 
     def __init__(self, config: GroundConfig) -> None:
@@ -38,12 +41,36 @@ class Models:
         """Models whose run raised."""
         self.turns = Turns()
         """With the detector."""
-        self._set = self._open()
-        self._check()
+        stills_calibrated(config), track_confidence(config)  # a file that is not there is refused at once
+        self._opened: Future[ModelSet] = Future()
+        threading.Thread(target=self._load, name="hvt-models", daemon=True).start()
+
+    @property
+    def loading(self) -> bool:
+        """Whether they are not open yet."""
+        return not self._opened.done()
+
+    @property
+    def error(self) -> BaseException | None:
+        """Why they cannot be opened; None while that is not known."""
+        return None if self.loading else self._opened.exception()
 
     def take(self) -> ModelSet:
-        """A detector, and a classifier where one is wanted; a motion detector is a new one: it remembers pictures."""
-        return (self._open_detector(), self._set[1]) if self._config.detector == MOTION else self._set
+        """A detector, and a classifier where one is wanted, once they are open; each `MOTION` detector is a new one.
+
+        It remembers pictures. Raises `UserError` where a setting or a file of them cannot be used.
+        """
+        opened = self._opened.result()
+        return (self._open_detector(), opened[1]) if self._config.detector == MOTION else opened
+
+    def _load(self) -> None:
+        try:
+            opened = self._open()
+            self._check(opened)
+        except BaseException as error:  # noqa: BLE001 - raised where they are taken
+            self._opened.set_exception(error)
+        else:
+            self._opened.set_result(opened)
 
     def _open_detector(self) -> Detector:
         config = self._config
@@ -61,9 +88,9 @@ class Models:
         hint = FewFoundHint(config.detector, confidence=track_confidence(config))
         return RetriedDetector(open_one, "detector", self.failures, hint=hint)
 
-    def _check(self) -> None:
+    def _check(self, opened: ModelSet) -> None:
         # Refuse a classifier that has nothing to say of the detector's tracks; say which scores mean little.
-        config, (detector, classifier) = self._config, self._set
+        config, (detector, classifier) = self._config, opened
         if config.detector != MOTION and not is_calibrated(config.detector, role="detector"):
             _log.warning("%s", uncalibrated("detector", config.detector))
         if classifier is None or config.classifier is None:

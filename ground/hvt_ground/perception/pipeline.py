@@ -29,7 +29,7 @@ from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 from hvt_ground.perception.turns import Turns
 
-__all__ = ["DecodedFrame", "Pipeline", "PipelineParts", "ReceivedStill"]
+__all__ = ["DecodedFrame", "NothingPerceived", "Pipeline", "PipelineParts", "ReceivedStill"]
 
 _FARTHEST_S = 5
 """A step further ahead of all that is known is not plausible: nothing that comes after it could be shown."""
@@ -83,6 +83,16 @@ class PipelineParts:
     """Of the detector, in this session's video."""
     patient: bool = False
     """Wait for a turn, however long: what is due is always detected, as lockstep needs it."""
+
+
+class NothingPerceived:
+    """The counts of a `Pipeline` that is not made yet."""
+
+    tracks = refined = class_changes = stills_pending = detections_run = doubted = 0
+
+    def __init__(self) -> None:
+        self.outcomes: Counter[str] = Counter()
+        self.stills_dropped: Counter[str] = Counter()
 
 
 class Pipeline:

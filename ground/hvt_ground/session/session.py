@@ -41,7 +41,7 @@ from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.sequence_window import StillSequenceWindow
 from hvt_ground.link.statistics import ReceptionStatistics, SessionAccount
-from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
+from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session_log import Level, SessionLog
@@ -62,11 +62,12 @@ class GroundSession:
     """Fed by the receiving thread in order; a worker analyzes, so that decoding never waits for detection.
 
     In real time the worker passes over what comes too fast. In lockstep nothing is skipped, and the same input
-    gives the same tracks. ``pipeline_of`` and ``worker_of`` make perception and its worker; without ``reports``
-    nothing is reported, and the edge's clock is this one (Unix nanoseconds without steps).
+    gives the same tracks. ``pipeline_of`` and ``worker_of`` make perception and its worker; ``later``: perception
+    waits for models, and the worker makes it once they are there. Without ``reports`` nothing is reported, and the
+    edge's clock is this one (Unix nanoseconds without steps).
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0915
         self,
         info: Info,
         *,
@@ -77,6 +78,7 @@ class GroundSession:
         backlog_perception: BacklogPerception | None = None,
         worker_of: WorkerFactory | None = None,
         surface: Surface = FLAT_GROUND,
+        later: bool = False,
     ) -> None:
         self.sinks = sinks
         self._queued = [one for one in sinks if isinstance(one, QueuedSink)]
@@ -90,7 +92,8 @@ class GroundSession:
         self.ledger = self._account.ledger
         self.receive_latency = self._account.receive_latency
         self.overlay_latency = self._account.overlay_latency
-        self.pipeline = pipeline_of(self._emit)
+        self._make_pipeline = partial(pipeline_of, self._emit)
+        self._pipeline = None if later else self._make_pipeline()
         self.frames_decoded = self.frames_received = self.stills_received = 0
         self.steps_received = 0
         """Reports of the edge's tracks."""
@@ -126,7 +129,7 @@ class GroundSession:
             worker_of = (
                 partial(LockstepWorker, name=info.edge)
                 if self.lockstep
-                else partial(RealtimeWorker, name=info.edge, pass_over=self.pipeline.pass_over)
+                else partial(RealtimeWorker, name=info.edge, pass_over=self._pass_over)
             )
         self.worker = worker_of(self._analyze, self._step, self._read)
         outputs = [one for one in self._queued if one.for_backlog]
@@ -185,7 +188,7 @@ class GroundSession:
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
         self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, picture))
         if self._account.traffic_due(header):
-            self._account.traffic(header, tracks=self.pipeline.tracks, tracks_refined=self.pipeline.refined)
+            self._account.traffic(header, tracks=self.perceived.tracks, tracks_refined=self.perceived.refined)
         return True
 
     def still(self, header: RoiHeader, item: Received) -> None:
@@ -293,8 +296,8 @@ class GroundSession:
             try:
                 ended = self.worker.close()
             finally:
-                if ended:
-                    self.pipeline.end()
+                if ended and self._pipeline is not None:
+                    self._pipeline.end()
         self.raise_error()
 
     def _note_end(self) -> None:
@@ -306,6 +309,18 @@ class GroundSession:
         self.note("info", "the flight has ended" if ended else "this session has ended", last=True)
 
     # What is known of it
+
+    @property
+    def pipeline(self) -> Pipeline:
+        """Its perception; for the worker's thread, which waits here until the models are open."""
+        if self._pipeline is None:
+            self._pipeline = self._make_pipeline()
+        return self._pipeline
+
+    @property
+    def perceived(self) -> Pipeline | NothingPerceived:
+        """The counts of perception, also while it waits for its models."""
+        return self._pipeline or NothingPerceived()
 
     @property
     def newest_index(self) -> int:
@@ -379,7 +394,7 @@ class GroundSession:
     @property
     def stills_dropped(self) -> Counter[str]:
         """Stills of which nothing was made, by reason."""
-        return +(self.pipeline.stills_dropped + self.worker.dropped)
+        return +(self.perceived.stills_dropped + self.worker.dropped)
 
     @property
     def idle(self) -> bool:
@@ -448,6 +463,9 @@ class GroundSession:
         self._collect_results()
         if self.lockstep:
             self.report()
+
+    def _pass_over(self, frame_index: int, capture_ns: int) -> None:
+        self.pipeline.pass_over(frame_index, capture_ns)
 
     def _step(self, tracks: Tracks, capture_ns: int) -> None:
         self.pipeline.edge_step(tracks, capture_ns=capture_ns)

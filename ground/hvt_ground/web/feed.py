@@ -182,7 +182,10 @@ def state_message(state: GroundState, *, recorded: bool | None = None) -> str:
             if recorded is None or one.session is None
             else recorded and not failing & {f"recording of {one.edge}", "recording"},
             "why": [] if one.session is None else _why(one.session),
-            "words": [] if one.session is None else _words(one.session, calibrated=state.calibrated),
+            "words": []
+            if one.session is None
+            else ["the detector is loading: boxes of this ground come then"] * state.loading
+            + _words(one.session, calibrated=state.calibrated),
             "failed": [*map(_failure, one.failed), *_edge_failures(one)],
         }
         for one in state.edges

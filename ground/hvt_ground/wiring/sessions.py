@@ -143,6 +143,7 @@ class SessionFactory:
             reports=reports,
             backlog_perception=make_backlog_perception(config, models, info=info),
             surface=surface,
+            later=models.loading,
         )
 
     def open_backlog(self, info: Info) -> BacklogRecording:

@@ -1,0 +1,90 @@
+"""Networks that take long to load: a ground receives, records and shows video meanwhile."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures
+from hvt_ground.app import Ground
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.perception import models as ground_models
+from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.sinks import Outputs
+from hvt_ground.state import StateMaker
+from hvt_ground.status import status_text, summary
+from hvt_ground.wiring import Models, SessionFactory
+from programs.processes import eventually
+from programs.rrd import Recording
+from rigs.flight import Flight, Port, RedSquares
+
+FRAMES = 6
+
+
+class Compiler:
+    """A runtime that loads until it is `done`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.done = threading.Event()
+        self.error: Exception | None = None
+        monkeypatch.setattr(ground_models, "open_detector", self.open)
+
+    def open(self, *_: object, **__: object) -> RedSquares:
+        """Wait for it."""
+        self.done.wait(60)
+        if self.error is not None:
+            raise self.error
+        return RedSquares()
+
+
+@pytest.fixture
+def compiler(monkeypatch: pytest.MonkeyPatch):
+    """It ends with the test."""
+    compiler = Compiler(monkeypatch)
+    yield compiler
+    compiler.done.set()
+
+
+def test_video_is_recorded_while_the_detector_loads_and_boxes_come_with_it(compiler, tmp_path: Path) -> None:
+    """A viewer on a busy machine saw nothing for 40 s, and nothing of them was recorded."""
+    config = check(GroundConfig(classifier="none", record=tmp_path / "a.rrd"))
+    outputs, models = Outputs(Failures(time.time_ns)), Models(config)
+    factory = SessionFactory(config, models, clock=time.time_ns, outputs=outputs, view=None)
+    ended, flight, port = [], Flight(FRAMES), Port()
+    port.flight = flight
+    sessions = EdgeSessions(port, open_session=factory.open_session, on_ended=ended.append)
+    maker = StateMaker(time.time_ns, loading=lambda: models.loading)
+    for index in range(FRAMES - 1):
+        sessions.handle(flight.base(index))
+    state = maker.make([("uav-1", sessions)])
+    assert state.edges[0].session.frames_decoded == FRAMES - 1
+    assert state.edges[0].session.tracks == 0
+    assert status_text(state).endswith("detector loading")
+    compiler.done.set()
+    eventually(lambda: not models.loading, within_s=20, what="loaded")
+    sessions.handle(flight.base(FRAMES - 1))
+    eventually(lambda: sessions.session.perceived.tracks == 1, within_s=20, what="a box")
+    assert "loading" not in status_text(maker.make([("uav-1", sessions)]))
+    sessions.close()
+    outputs.close()
+    assert summary(ended[0])["tracks"] == 1
+    assert len(Recording(tmp_path / "a.rrd").video()) == FRAMES
+
+
+def test_the_link_is_open_before_the_detector(compiler, free_port: int) -> None:
+    """An edge would find nobody, and fly its first minute for no one."""
+    stop = threading.Event()
+    config = check(GroundConfig(listen=(f"tcp/127.0.0.1:{free_port}",), classifier="none", quiet=True))
+    assert Ground(config, stop=stop, on_started=stop.set).run() == []
+
+
+def test_a_detector_that_is_none_after_all_ends_the_run_with_its_sentence(compiler, free_port: int) -> None:
+    """The ground would go on for hours without a box."""
+    compiler.error = UserError("d.onnx is not a detector")
+    config = check(GroundConfig(listen=(f"tcp/127.0.0.1:{free_port}",), classifier="none", quiet=True))
+    with pytest.raises(UserError, match=r"d\.onnx is not a detector"):
+        Ground(config, stop=threading.Event(), on_started=compiler.done.set).run()
