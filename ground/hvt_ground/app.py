@@ -29,14 +29,14 @@ from hvt_ground.link.group import GroundGroup
 from hvt_ground.perception.models import stills_calibrated
 from hvt_ground.recordings.folder import RecordingsFolder
 from hvt_ground.recordings.retention import Retention
+from hvt_ground.report.state import GroundState, StateMaker
+from hvt_ground.report.status import completed, status_text, summary
 from hvt_ground.session.edge_port import EdgePort
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
-from hvt_ground.state import GroundState, StateMaker
-from hvt_ground.status import completed, status_text, summary
 from hvt_ground.wiring import (
     Models,
     OpenSink,
@@ -195,7 +195,7 @@ class Ground:
 
     def _health_server(self, address: str, failures: Failures) -> HealthServer:
         with needs_extra("'hvt[metrics]'"):
-            from hvt_ground.metrics import metrics_text  # noqa: PLC0415 - who is not watched needs no Prometheus
+            from hvt_ground.report.metrics import metrics_text  # noqa: PLC0415 - who is not watched needs no Prometheus
 
         answers = state_answers(
             lambda: self._state, clock=self._clock, stuck_s=_STUCK_S, metrics_text=metrics_text

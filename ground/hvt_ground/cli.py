@@ -100,7 +100,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 def _print(sessions: list[dict[str, Any]]) -> None:
     from hvt_common.runtime.reporting import print_table, say  # noqa: PLC0415
-    from hvt_ground.status import table  # noqa: PLC0415
+    from hvt_ground.report.status import table  # noqa: PLC0415
 
     for content in sessions:
         print_table(f"{content['edge']}: received", table(content))

@@ -149,9 +149,6 @@ class GroundConfig:
     timing: Path | None = _FILES_RARE.option(
         PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
     )
-    terrain: Path | None = _FILES_RARE.option(
-        PATH, None, "place tracks on this elevation model, a GeoTIFF, in place of flat ground (docs/pose.md)"
-    )
     view: bool = _FILES.switch("also open the Rerun viewer")
     serve: bool = _FILES.switch("also serve the Rerun web viewer on this machine")
     web: str | None = _FILES.option(

@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, cast
 
+from hvt_common.errors import UserError
 from hvt_common.runtime.plug_ins import installed, loaded
 from hvt_ground.config import GroundConfig, check
 
@@ -19,13 +20,15 @@ if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no reco
     from hvt_common.protocol.messages import Info
     from hvt_common.runtime.checkup import Finding
     from hvt_ground.events import Event, Refinement
-    from hvt_ground.geolocation.surface import Surface
+    from hvt_ground.poses import Locator
     from hvt_ground.recordings.recorded import Recorded
     from hvt_ground.sinks import Outputs, SinkWriter
 
 _GROUP = "hvt.ground"
-_BROUGHT_BY = {"cot": "cot", "cot-types": "cot", "mcap": "mcap", "ts": "ground"}
+_BROUGHT_BY = {"cot": "cot", "cot-types": "cot", "mcap": "mcap", "terrain": "terrain", "ts": "ground"}
 """Settings of the extras that come with HVT, and the package to install for each."""
+
+_ABSENT = "is of an extra that is not installed: pip install 'hvt[{}]'"
 
 NewFile = Callable[[Path, str, "Callable[[Path], SinkWriter[Event]]"], "Callable[[], SinkWriter[Event]]"]
 """Opens a file, or one of the suffix in a folder, by a name that no other session of this ground has."""
@@ -36,8 +39,8 @@ class Flight:
     """One session of an edge, for an extra's sinks."""
 
     info: Info
-    surface: Surface
-    """The surface under its tracks."""
+    locator: Locator
+    """What places its tracks."""
     clock: Callable[[], int]
     """The ground's steady clock, nanoseconds."""
     new_file: NewFile
@@ -88,6 +91,10 @@ class Extra:
         """Open the parts that all sessions share; return the function that opens the sinks of one, here none."""
         return lambda _flight: ()
 
+    def locators(self, terrain: Path | None) -> Callable[[str], Locator] | None:  # noqa: ARG002
+        """What places the flight of an edge, by its name, on an elevation model or flat ground; here nothing."""
+        return None
+
 
 @cache
 def all_extras() -> tuple[Extra, ...]:
@@ -104,13 +111,21 @@ def config_class(extras: tuple[Extra, ...] | None = None) -> type[GroundConfig]:
     options = [extra.options for extra in (all_extras() if extras is None else extras)]
     whole = make_dataclass("GroundConfig", (), bases=(*options, GroundConfig), frozen=True)
     known = {field.name.replace("_", "-") for field in fields(whole)}
-    absent = {
-        name: f"is of an extra that is not installed: pip install 'hvt[{package}]'"
-        for name, package in _BROUGHT_BY.items()
-        if name not in known
-    }
+    absent = {name: _ABSENT.format(package) for name, package in _BROUGHT_BY.items() if name not in known}
     whole.GONE = absent  # type: ignore[attr-defined]
     return cast("type[GroundConfig]", whole)
+
+
+def locators(terrain: Path | None) -> Callable[[str], Locator]:
+    """What places the flight of an edge, by the edge's name; `UserError` for a model without the extra for it."""
+    from hvt_ground.poses import NOWHERE  # noqa: PLC0415 - ``--help`` is to load no numpy
+
+    for extra in all_extras():
+        if (found := extra.locators(terrain)) is not None:
+            return found
+    if terrain is not None:
+        raise UserError(f"--terrain {_ABSENT.format(_BROUGHT_BY['terrain'])}")
+    return lambda _flight: NOWHERE
 
 
 def checked(config: GroundConfig) -> GroundConfig:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from hvt_common.config import load
@@ -11,12 +13,18 @@ from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.store import library_part
 from hvt_ground.cli import main
 from hvt_ground.config import GroundConfig, check
-from hvt_ground.extras import all_extras, config_class
+from hvt_ground.extras import all_extras, config_class, locators
+from hvt_ground.poses import NOWHERE
 
 
 @pytest.mark.parametrize(
     ("words", "package"),
-    [(["--cot", "udp://239.2.3.1:6969"], "cot"), (["--mcap=a.mcap"], "mcap"), (["--ts", "a.ts"], "ground")],
+    [
+        (["--cot", "udp://239.2.3.1:6969"], "cot"),
+        (["--mcap=a.mcap"], "mcap"),
+        (["--ts", "a.ts"], "ground"),
+        (["--terrain", "a.tif"], "terrain"),
+    ],
 )
 def test_a_setting_of_an_extra_that_is_absent(words, package):
     """It would be an unknown argument, as if there were no such thing."""
@@ -33,7 +41,7 @@ def test_a_setting_of_an_extra_that_is_absent(words, package):
 def test_extras_bring_what_the_core_has_not():
     """Two of one name would hide each other."""
     settings = [one for extra in all_extras() for one in vars(extra.options)["__annotations__"]]
-    assert sorted(settings) == ["cot", "cot_types", "mcap", "ts"]
+    assert sorted(settings) == ["cot", "cot_types", "mcap", "terrain", "ts"]
     assert not set(settings) & set(GroundConfig.__annotations__)
 
 
@@ -84,3 +92,11 @@ def test_a_model_of_the_library_that_is_absent(detector, head, says, monkeypatch
     assert "the model library is an extra that is not installed: pip install 'hvt[edge]'" in str(
         refused.value
     )
+
+
+def test_without_geolocation_nothing_is_placed_and_a_model_names_its_extra(monkeypatch):
+    """A ground without it would not start, or fly with an elevation model that nobody reads."""
+    monkeypatch.setattr("hvt_ground.extras.all_extras", tuple)
+    assert locators(None)("uav-1") is NOWHERE
+    with pytest.raises(UserError, match=r"--terrain is of an extra .*: pip install 'hvt\[terrain\]'"):
+        locators(Path("dem.tif"))

@@ -17,9 +17,8 @@ from hvt_archive.exports.video import CONTAINERS, write_video
 from hvt_archive.exports.whole import whole_file, whole_folder
 from hvt_common.errors import Parser, UserError, check_not_read
 from hvt_common.runtime.reporting import say
-from hvt_ground.extras import all_extras
+from hvt_ground.extras import all_extras, locators
 from hvt_ground.recordings.recorded import Recorded, read_recordings
-from hvt_ground.wiring import make_surfaces
 
 _FOLDERS: dict[str, Callable[[Recorded, Path], None]] = {"coco": write_coco, "stills": write_stills}
 _SUFFIXES = {"mot": ".txt"}
@@ -53,8 +52,8 @@ def run(argv: Sequence[str]) -> int:
     out = given.out or _beside(given.recordings[0], kind)
     reads = [*given.recordings, *([] if given.terrain is None else [given.terrain])]
     check_not_read(out, reads, name="--out")
-    surface = make_surfaces(given.terrain)(given.recordings[0].name)
-    recorded = read_recordings(given.recordings, surface=surface)
+    locator = locators(given.terrain)(given.recordings[0].name)
+    recorded = read_recordings(given.recordings, locator=locator)
     if kind in _FOLDERS:
         with whole_folder(out) as part:
             _FOLDERS[kind](recorded, part)

@@ -33,13 +33,13 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.extras import checked, config_class
 from hvt_ground.perception.models import Models
 from hvt_ground.recordings.recorded import read_recordings
+from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import InfoAnswer
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.message_log import read_log
 from hvt_ground.sinks.rerun.live_view import LiveView
-from hvt_ground.status import completed, summary, table
 from hvt_ground.wiring import SessionFactory, check_outputs, make_record_folder
 
 _Messages = Callable[[], Iterator[Received]]

@@ -67,7 +67,7 @@ class TransportStreamExtra(Extra):
 
         def sinks(flight: Flight) -> Iterable[Opening]:
             info = flight.info
-            platform = Platform(info.edge, f"{info.session_id:016x}", info.view, flight.surface)
+            platform = Platform(info.edge, f"{info.session_id:016x}", info.view, flight.locator)
             if isinstance(where, Path):
                 opens = flight.new_file(where, ".ts", partial(stream_file, platform=platform, fps=info.fps))
             else:

@@ -31,7 +31,7 @@ from hvt_gateways.transport_stream.moments import Moment, Moments
 from hvt_gateways.transport_stream.timeline import TIME_BASE, Timeline
 from hvt_gateways.transport_stream.uas import Platform, uas_local_set
 from hvt_ground.events import Event, Overlay, PoseUpdate, VideoSample
-from hvt_ground.geolocation.trail import PoseTrail
+from hvt_ground.poses import PoseTrail
 from hvt_ground.sinks.decodable import DecodableRun
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ def write_recorded(recorded: Recorded, path: Path) -> None:
         with av.open(io.BytesIO(recorded.decodable_video()[0].data), format="hevc") as probe:
             size = probe.streams.video[0].width, probe.streams.video[0].height
         view = View.fitted(size, size, fit="letterbox")
-    platform = Platform(recorded.edge, recorded.session, view, recorded.surface)
+    platform = Platform(recorded.edge, recorded.session, view, recorded.locator)
     stream = stream_file(path, platform=platform, fps=_USUAL_FPS, trail=recorded.trail)
     items: Iterator[VideoSample | Overlay] = heapq.merge(
         recorded.video, recorded.overlays(), key=lambda one: one.frame_index

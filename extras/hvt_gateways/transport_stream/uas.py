@@ -15,8 +15,7 @@ from hvt_common.values import Orientation, Pose, View
 from hvt_gateways.transport_stream.klv import item, packet, signed, unsigned
 from hvt_gateways.transport_stream.vmti import vmti_local_set
 from hvt_ground.events import Overlay
-from hvt_ground.geolocation.footprint import Footprint, fields_of_view, footprint
-from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
+from hvt_ground.poses import NOWHERE, Footprint, Locator
 
 KEY: Final = bytes.fromhex("060e2b34020b01010e01030101000000")
 _VERSION: Final = 16
@@ -37,7 +36,7 @@ class Platform:
     edge: str
     session: str
     view: View
-    surface: Surface = FLAT_GROUND
+    locator: Locator = NOWHERE
 
 
 def uas_local_set(
@@ -57,13 +56,22 @@ def uas_local_set(
     ]
     ground = None
     if pose is not None:
-        ground = footprint(pose, platform.view, surface=platform.surface)
+        ground = platform.locator.footprint(pose, platform.view)
         items += [item(tag, value) for tag, value in _pose_items(pose, platform.view, ground) if value]
     if overlay is not None:
         centre = None if ground is None else ground.centre
         nested = vmti_local_set(overlay, size=platform.view.base_size, centre=centre, time=time)
         items.append(item(74, nested))
     return packet(KEY, items)
+
+
+def fields_of_view(pose: Pose, view: View) -> tuple[float, float] | None:
+    """The fields of view of the base picture, degrees: across and up; None if the pose lacks that of the source."""
+    if pose.hfov_deg is None:
+        return None
+    half = math.tan(math.radians(pose.hfov_deg) / 2) / (view.source_size[0] / 2)
+    across, up = (math.degrees(2 * math.atan(side / view.scale / 2 * half)) for side in view.base_size)
+    return across, up
 
 
 def sensor_angles(camera: Orientation, platform: Orientation) -> tuple[float, float, float]:

@@ -24,9 +24,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireError
 from hvt_common.video.annex_b import is_keyframe, parameter_sets
 from hvt_ground.events import Notice, Overlay, PoseUpdate, VideoSample
-from hvt_ground.geolocation.camera import places_of_boxes
-from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
-from hvt_ground.geolocation.trail import PoseTrail
+from hvt_ground.poses import NOWHERE, Locator, PoseTrail
 from hvt_ground.recordings.drawn_layer import TRACK_COMPONENTS, DrawnLayer
 from hvt_ground.recordings.spool import Mapped, Spool, SpooledRows, Timed
 from hvt_ground.sinks.rerun.blueprint import (
@@ -87,8 +85,8 @@ class Recorded:
     stills: Sequence[RecordedStill]
     notices: Sequence[Notice]
     poses: Sequence[PoseUpdate]
-    surface: Surface
-    """The surface that tracks stand on."""
+    locator: Locator
+    """What places its tracks."""
     _layers: Mapping[str, DrawnLayer] = field(repr=False)
     _samples: SpooledRows = field(repr=False)
 
@@ -165,15 +163,11 @@ class Recorded:
         pose = self.trail.at(overlay.capture_ns)
         if pose is None:
             return overlay
-        return replace(
-            overlay,
-            places=places_of_boxes(
-                pose, overlay.boxes_base_px, view=self.poses[0].view, surface=self.surface
-            ),
-        )
+        places = self.locator.places(pose, overlay.boxes_base_px, self.poses[0].view)
+        return replace(overlay, places=places)
 
 
-def read_recordings(paths: Sequence[Path], *, surface: Surface = FLAT_GROUND) -> Recorded:
+def read_recordings(paths: Sequence[Path], *, locator: Locator = NOWHERE) -> Recorded:
     """Read the files of one session; their order does not matter.
 
     Raises:
@@ -200,14 +194,14 @@ def read_recordings(paths: Sequence[Path], *, surface: Surface = FLAT_GROUND) ->
             f"{', '.join(map(str, paths))}: no recording of one edge: give the files that hvt-ground wrote"
         )
     try:
-        return _recorded(*names.pop(), rows, surface, spool)
+        return _recorded(*names.pop(), rows, locator, spool)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise UserError(
             f"{', '.join(map(str, paths))}: not as hvt-ground writes a recording ({type(error).__name__}: {error})"
         ) from None
 
 
-def _recorded(edge: str, session: str, rows: _Rows, surface: Surface, spool: Spool) -> Recorded:
+def _recorded(edge: str, session: str, rows: _Rows, locator: Locator, spool: Spool) -> Recorded:
     layers = {path: DrawnLayer() for path in _LAYERS}
     for (entity, component), found in rows.items():
         if entity in layers:
@@ -223,7 +217,7 @@ def _recorded(edge: str, session: str, rows: _Rows, surface: Surface, spool: Spo
         stills=_stills(rows),
         notices=_notices(rows),
         poses=_poses(rows),
-        surface=surface,
+        locator=locator,
         _layers=layers,
         _samples=samples,
     )

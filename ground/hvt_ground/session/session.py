@@ -35,14 +35,13 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
-from hvt_ground.geolocation.locate import Geolocation
-from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.sequence_window import StillSequenceWindow
 from hvt_ground.link.statistics import ReceptionStatistics, SessionAccount
 from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
+from hvt_ground.poses import NOWHERE, Locator, SessionPoses
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session_log import Level, SessionLog
 from hvt_ground.sinks import QueuedSink, Sink
@@ -77,7 +76,7 @@ class GroundSession:
         reports: ReceiverReports | None = None,
         backlog_perception: BacklogPerception | None = None,
         worker_of: WorkerFactory | None = None,
-        surface: Surface = FLAT_GROUND,
+        locator: Locator = NOWHERE,
         later: bool = False,
     ) -> None:
         self.sinks = sinks
@@ -109,7 +108,7 @@ class GroundSession:
         self._statistics = ReceptionStatistics(lockstep=self.lockstep)
         self._decoder = BaseDecoder(size=info.base_size)
         self._step_decoder = TrackStepDecoder()
-        self.geolocation = Geolocation(info.view, surface=surface)
+        self.poses = SessionPoses(info.view, locator=locator)
         """Where the camera is, and where tracks are on the ground."""
         self.last_status: Status | None = None
         self.levers = ""
@@ -222,10 +221,10 @@ class GroundSession:
     def pose(self, report: PoseReport, item: Received) -> None:
         """Take a report of where the camera is. Raises `WireError` where its bits make no sense."""
         self._account.count(Channel.POSE, Account.META, item, at_ns=report.send_ns)
-        pose = self.geolocation.report(report)
+        pose = self.poses.report(report)
         self._account.time(Channel.POSE, item, report, handled=pose is not None)
         if pose is not None:
-            self.worker.pose(partial(self.geolocation.use, pose), pose.capture_ns)
+            self.worker.pose(partial(self.poses.use, pose), pose.capture_ns)
             self._emit(PoseUpdate(max(0, self._last_index), pose.capture_ns, pose, self.info.view))
             self._note_stale(pose.capture_ns)
 
@@ -446,7 +445,7 @@ class GroundSession:
             self._results = (self._results + self.pipeline.take_results())[-_MOST_RESULTS:]
 
     def _note_stale(self, capture_ns: int) -> None:
-        stale = self.geolocation.turned_stale(capture_ns)
+        stale = self.poses.turned_stale(capture_ns)
         if stale:
             self.note(
                 "warning", "the pose is stale: nothing is placed on the ground until there is a new one"
@@ -482,8 +481,8 @@ class GroundSession:
     def _emit(self, event: Event) -> None:
         if isinstance(event, Refinement):
             self.backlog.note(event)
-        if self.geolocation.has_pose and isinstance(event, Overlay) and not event.stored:
-            event = self.geolocation.located(event)
+        if self.poses.has_pose and isinstance(event, Overlay) and not event.stored:
+            event = self.poses.located(event)
         for sink in self.sinks:
             sink.log(event)
 

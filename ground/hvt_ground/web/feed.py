@@ -15,8 +15,8 @@ from hvt_common.runtime.failures import FailedPart
 from hvt_common.runtime.process import lower_priority
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_ground.events import Event, MessageTiming, Notice, Overlay, Refinement, VideoSample
+from hvt_ground.report.state import EdgeState, GroundState, SessionState
 from hvt_ground.sinks.palette import class_colour
-from hvt_ground.state import EdgeState, GroundState, SessionState
 from hvt_ground.web.pictures import Pictures, jpeg
 from hvt_ground.web.viewers import EdgePage, Hub, text
 

@@ -28,7 +28,7 @@ from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.runtime.host_names import host_and_port, is_loopback
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Refinement
-from hvt_ground.state import GroundState
+from hvt_ground.report.state import GroundState
 from hvt_ground.web.access import Access, crowding, own_tokens
 from hvt_ground.web.feed import SessionFeed, state_loads, state_message, still_name
 from hvt_ground.web.requests import EdgeRequests

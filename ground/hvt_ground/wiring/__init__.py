@@ -5,7 +5,6 @@ from hvt_ground.wiring.files import check_outputs, make_record_folder, output_pa
 from hvt_ground.wiring.link import make_link_settings
 from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline
 from hvt_ground.wiring.sessions import OpenSink, SessionFactory
-from hvt_ground.wiring.terrain import make_surfaces
 
 __all__ = [
     "Models",
@@ -16,6 +15,5 @@ __all__ = [
     "make_link_settings",
     "make_pipeline",
     "make_record_folder",
-    "make_surfaces",
     "output_path",
 ]

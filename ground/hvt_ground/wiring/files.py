@@ -18,7 +18,7 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
     """Refuse files that cannot be written, or are read (``reads``, too), before anything is received; `UserError`."""
     given = (
         *(config.detector, config.classifier, config.labels, config.detector_labels),
-        *(config.zenoh_config, config.terrain),
+        *(config.zenoh_config,),
     )
     reads = [*reads, *(Path(one) for one in given if one is not None)]
     for extra in all_extras():

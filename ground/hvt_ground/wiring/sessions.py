@@ -18,7 +18,7 @@ from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.recordings import BacklogRecording
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Refinement
-from hvt_ground.extras import Flight, all_extras
+from hvt_ground.extras import Flight, all_extras, locators
 from hvt_ground.perception.models import Models
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
@@ -34,7 +34,6 @@ from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.sinks.tracks_table import TrackTable
 from hvt_ground.wiring.files import backlog_path, free_path, output_path
 from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline
-from hvt_ground.wiring.terrain import make_surfaces
 
 if TYPE_CHECKING:  # who serves no page needs no web server
     from hvt_ground.web import WebPage
@@ -79,7 +78,7 @@ class SessionFactory:
         self._paths: set[Path] = set()
         """Taken by this process."""
         self._naming = threading.Lock()
-        self._surface_of = make_surfaces(config.terrain)
+        self._locator_of = locators(getattr(config, "terrain", None))
         self._extras = [extra.start(config, outputs) for extra in all_extras()]
         self._timing: QueuedSink[str] | None = None
         if config.timing is not None:
@@ -97,7 +96,7 @@ class SessionFactory:
         config, models, edge = self._config, self._models, info.edge
         stamp = time.strftime("%Y%m%d-%H%M%S")
         settings = self._recorder_settings(info)
-        surface = self._surface_of(edge)
+        locator = self._locator_of(edge)
         # In lockstep the edge waits, so that nothing need be lost to a slow disk.
         wait_s = _LOCKSTEP_WAIT_S if info.pace == "lockstep" else 0.0
         sinks: list[Sink[Event]] = []
@@ -126,7 +125,7 @@ class SessionFactory:
         sinks += files.values()
         flight = Flight(
             info,
-            surface=surface,
+            locator=locator,
             clock=self._clock,
             new_file=partial(self._new_file, edge=edge, stamp=stamp),
             still_address=self._still_address(info, files.get("stills")),
@@ -142,7 +141,7 @@ class SessionFactory:
             clock=self._clock,
             reports=reports,
             backlog_perception=make_backlog_perception(config, models, info=info),
-            surface=surface,
+            locator=locator,
             later=models.loading,
         )
 

@@ -31,6 +31,7 @@ from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job, RealtimeWorker
+from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
@@ -38,7 +39,6 @@ from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.stills.gallery import SLOTS
 from hvt_ground.sinks.timing import SessionTiming, timing_table
-from hvt_ground.status import completed, summary, table
 from programs.rrd import Recording
 from programs.small_disk import small_disk
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object

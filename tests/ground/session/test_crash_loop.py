@@ -19,13 +19,13 @@ from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig, check
+from hvt_ground.report.state import StateMaker
+from hvt_ground.report.status import status_text, summary
 from hvt_ground.session.edge_port import EdgePort
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs
-from hvt_ground.state import StateMaker
-from hvt_ground.status import status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
 from programs.outsider import joined
 from programs.processes import Link, eventually

@@ -13,13 +13,13 @@ from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, Overlay
+from hvt_ground.report.state import StateMaker
+from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.state import StateMaker
-from hvt_ground.status import completed, status_text, summary, table
 from programs.processes import eventually
 from programs.rrd import Recording
 from rigs.flight import Flight, Port, pipeline_of

@@ -15,10 +15,10 @@ from hvt_common.protocol.messages import Info, PoseEncoder
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Pose
 from hvt_ground.perception.worker import LockstepWorker, RealtimeWorker
+from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
-from hvt_ground.status import completed, summary, table
 from rigs.flight import Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from rigs.handled import WatchedInbox, check, end
 
@@ -429,7 +429,7 @@ def test_poses_that_come_before_their_session_is_open_are_taken(flight):
         rig.settle()
         session = rig.receiver.session
         assert session.ledger.messages(Account.META) == 3
-        assert session.geolocation.has_pose
+        assert session.poses.has_pose
         assert rig.receiver.unusable == 0
 
 

@@ -19,8 +19,8 @@ from rasterio.transform import from_origin
 import hvt_ground.cli
 from hvt_common.geodesy import metres_per_degree
 from hvt_common.values import Orientation, Pose, View
+from hvt_geo.camera import places_of_boxes
 from hvt_ground.events import Overlay, PoseUpdate
-from hvt_ground.geolocation.camera import places_of_boxes
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs.rrd import Recording

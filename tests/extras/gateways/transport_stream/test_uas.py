@@ -15,13 +15,14 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose, View
 from hvt_gateways.transport_stream.uas import Platform, sensor_angles, uas_local_set
 from hvt_gateways.transport_stream.vmti import MOST_BYTES
+from hvt_geo.locator import SurfaceLocator
 from hvt_ground.events import Overlay, Places
 from media.klv_reader import KlvPacket, packets_of
 
 NOW_NS = 1_790_000_000 * SECOND_NS + 123_456_789
 SIZE = (1280, 720)
 VIEW = View.fitted((1920, 1080), SIZE, fit="letterbox")
-PLATFORM = Platform("uav-1", "00000000000000ff", VIEW)
+PLATFORM = Platform("uav-1", "00000000000000ff", VIEW, SurfaceLocator())
 POSE = Pose(
     NOW_NS,
     -33.5,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hvt_common.values import Orientation, Pose
-from hvt_ground.geolocation.trail import PoseTrail
+from hvt_ground.poses import PoseTrail
 
 SECOND_NS = 1_000_000_000
 

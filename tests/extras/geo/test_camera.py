@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hvt_common.values import Orientation, Pose, View
-from hvt_ground.geolocation.camera import ground_points, places_of_boxes
+from hvt_geo.camera import ground_points, places_of_boxes
 
 SIZE = (1000, 500)
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")

@@ -251,7 +251,7 @@ def _left_out(status: Status | None) -> int:
 
 
 def _pose(session: GroundSession, now_ns: int) -> PoseState | None:
-    newest = session.geolocation.newest
+    newest = session.poses.newest
     if newest is None:
         return None
     age_ns = session.newest_capture_ns - newest.capture_ns

@@ -1,15 +1,18 @@
-"""The poses of one session, and the pose of a moment between or shortly after them."""
+"""The poses of one session, the pose of a moment between or shortly after them, and what an extra places by it."""
 
 from __future__ import annotations
 
 import math
+import threading
 from bisect import bisect_right
-from dataclasses import replace
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
 
 from hvt_common.geodesy import between, metres_per_degree, turned_deg
+from hvt_common.protocol.messages import PoseDecoder, PoseReport
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Orientation, Pose
+from hvt_common.values import Boxes, Orientation, Pose, View
+from hvt_ground.events import Overlay, Places
 
 STALE_S: Final = 10.0
 """A pose this old is none."""
@@ -107,3 +110,101 @@ def _turn_deg(first: Orientation | None, second: Orientation | None) -> float:
         turned_deg(second.roll_deg - first.roll_deg),
     )
     return max(abs(one) for one in changes)
+
+
+Place = tuple[float, float]
+"""Latitude and longitude, degrees, WGS 84."""
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """The footprint of the base picture, black edges included. Corners at or above the horizon are None."""
+
+    centre: Place
+    below_m: float
+    """How far the ground at the centre lies below the camera."""
+    slant_m: float
+    """From the camera to the ground at the centre."""
+    corners: tuple[Place, Place, Place, Place] | None
+    """Upper left, upper right, lower right, lower left."""
+
+
+class Locator(Protocol):
+    """Where the pictures of one flight lie on the ground."""
+
+    def places(self, pose: Pose, boxes_base_px: Boxes, view: View) -> Places | None:
+        """Places of the objects in (N, 4) boxes; None where the pose does not say enough."""
+        ...
+
+    def footprint(self, pose: Pose, view: View) -> Footprint | None:
+        """The footprint of a picture; None where the pose does not say enough, or the centre is in the sky."""
+        ...
+
+
+class Nowhere:
+    """Places nothing, where no extra does."""
+
+    def places(self, pose: Pose, boxes_base_px: Boxes, view: View) -> None:
+        """See `Locator.places`."""
+
+    def footprint(self, pose: Pose, view: View) -> None:
+        """See `Locator.footprint`."""
+
+
+NOWHERE: Final = Nowhere()
+
+
+class SessionPoses:
+    """Takes poses in one thread, and overlays in another: these by the poses that `use` was told of."""
+
+    def __init__(self, view: View, *, locator: Locator = NOWHERE) -> None:
+        self._view = view
+        self._locator = locator
+        self._decoder = PoseDecoder()
+        self._trail = PoseTrail()
+        self._used = PoseTrail()
+        self._stale = False
+        self.has_pose = False
+        """Whether one is used: without, there are no places to ask for."""
+        self._lock = threading.Lock()
+
+    def report(self, report: PoseReport) -> Pose | None:
+        """Take a report; its pose, or None where it builds on one that did not come or is not newer.
+
+        Raises `WireError` where its bits make no sense.
+        """
+        pose = self._decoder.decode(report)
+        return None if pose is None or not self._trail.add(pose) else pose
+
+    def use(self, pose: Pose) -> None:
+        """Locate by this pose from now on."""
+        with self._lock:
+            self._used.add(pose)
+        self.has_pose = True
+
+    @property
+    def newest(self) -> Pose | None:
+        """The last pose that came."""
+        return self._trail.newest
+
+    def stale_s(self, capture_ns: int) -> float | None:
+        """The age of the newest pose where it is too old to use; None where it is not, or none ever came."""
+        age_s = self._trail.age_s(capture_ns)
+        return age_s if age_s is not None and age_s > STALE_S else None
+
+    def turned_stale(self, capture_ns: int) -> bool | None:
+        """True once when the pose has become stale, False once when there is one again, None otherwise."""
+        stale = self.stale_s(capture_ns) is not None
+        if stale is self._stale:
+            return None
+        self._stale = stale
+        return stale
+
+    def located(self, overlay: Overlay) -> Overlay:
+        """The overlay with the places of its tracks; as it is where no pose tells."""
+        with self._lock:
+            pose = self._used.at(overlay.capture_ns)
+        if pose is None:
+            return overlay
+        places = self._locator.places(pose, overlay.boxes_base_px, self._view)
+        return overlay if places is None else replace(overlay, places=places)

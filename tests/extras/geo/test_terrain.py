@@ -6,6 +6,7 @@ import logging
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,14 +20,16 @@ from hvt_common.geodesy import metres_per_degree, moved
 from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Orientation, Pose, View
+from hvt_geo.camera import ground_points, places_of_boxes
+from hvt_geo.elevation import ElevationModel
+from hvt_geo.extra import GeoExtra
+from hvt_geo.terrain import Terrain
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
-from hvt_ground.config import GroundConfig, check
-from hvt_ground.geolocation.camera import ground_points, places_of_boxes
-from hvt_ground.geolocation.elevation import ElevationModel
-from hvt_ground.geolocation.terrain import Terrain
+from hvt_ground.config import check
+from hvt_ground.extras import config_class
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.sinks import Outputs
-from hvt_ground.wiring import Models, SessionFactory, make_surfaces
+from hvt_ground.wiring import Models, SessionFactory
 from rigs.messages import INFO
 
 pytestmark = [
@@ -305,7 +308,8 @@ def test_a_flight_inside_the_model_is_no_news(tmp_path, caplog):
 
 
 def opened_factory(path: Path, folder: Path) -> tuple[SessionFactory, Outputs]:
-    config = check(GroundConfig(record=folder, terrain=path, detector="motion", classifier="none"))
+    make: Any = config_class()
+    config = check(make(record=folder, terrain=path, detector="motion", classifier="none"))
     outputs = Outputs(Failures(time.time_ns))
     return SessionFactory(config, Models(config), clock=time.time_ns, outputs=outputs, view=None), outputs
 
@@ -327,7 +331,7 @@ def test_a_model_that_goes_in_flight_ends_no_flight(tmp_path, caplog):
     finally:
         outputs.close()
     caplog.clear()
-    terrain = make_surfaces(model(tmp_path, lambda north, east: 500.0))("uav-1")
+    terrain = GeoExtra().locators(model(tmp_path, lambda north, east: 500.0))("uav-1").surface
     path.unlink()
     assert not terrain.usable(POSE)
     (notice,) = caplog.records
@@ -336,10 +340,10 @@ def test_a_model_that_goes_in_flight_ends_no_flight(tmp_path, caplog):
 
 def test_each_flight_has_a_ground_below_its_own_first_pose(tmp_path):
     """The second drone's heights would count from where the first one took off."""
-    surface_of = make_surfaces(model(tmp_path, lambda north, east: 500 + 0.5 * north))
+    locator_of = GeoExtra().locators(model(tmp_path, lambda north, east: 500 + 0.5 * north))
     above = replace(POSE, altitude_m=None, height_m=100.0)
     for flight, north in (("uav-1", 0.0), ("uav-2", 400.0)):
         pose = replace(above, latitude_deg=47.0 + north / NORTH_M)
-        surface = surface_of(flight)
+        surface = locator_of(flight).surface
         assert surface.usable(pose)
         assert surface.below_m(pose, np.zeros((1, 2)))[0] == pytest.approx(100.0, abs=0.1)

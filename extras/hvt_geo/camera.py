@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from hvt_common.geodesy import metres_per_degree, turned_deg
 from hvt_common.values import Boxes, Pose, View
+from hvt_geo.surface import FLAT_GROUND, Points, Rays, Surface
 from hvt_ground.events import Places
-from hvt_ground.geolocation.surface import FLAT_GROUND, Points, Rays, Surface
 
 _CHI2_95: Final = 5.991
 """Chi-square of two degrees of freedom: the ellipse that holds 95 % (Abramowitz and Stegun, 26.4.9)."""

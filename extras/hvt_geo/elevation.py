@@ -23,7 +23,7 @@ from rasterio.windows import Window
 
 from hvt_common.errors import UserError
 from hvt_common.geodesy import metres_per_degree, turned_deg
-from hvt_ground.geolocation.surface import Points
+from hvt_geo.surface import Points
 
 TILE_M: Final = 15_000.0
 """Half the side of the part in memory."""

@@ -16,14 +16,14 @@ from hvt_common.protocol.messages import FailedPart, Info, Status
 from hvt_common.protocol.still_words import STILL_WORDS
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_ground.metrics import metrics_text
+from hvt_ground.report.metrics import metrics_text
+from hvt_ground.report.state import SessionState, StateMaker
+from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.state import SessionState, StateMaker
-from hvt_ground.status import completed, status_text, summary, table
 from hvt_ground.web.feed import state_message
 from programs.processes import eventually
 from programs.rrd import Recording

@@ -9,7 +9,7 @@ import pytest
 
 from hvt_common.geodesy import metres_per_degree, moved
 from hvt_common.values import Orientation, Pose, View
-from hvt_ground.geolocation.camera import places_of_boxes
+from hvt_geo.camera import places_of_boxes
 from hvt_scene import Scene
 from hvt_scene.appearance import Appearance
 

@@ -1,4 +1,4 @@
-"""The footprint of a picture on the ground: its middle and its corners, and how far away they are."""
+"""The ground of one flight: places of boxes, and the footprint of a picture."""
 
 from __future__ import annotations
 
@@ -8,34 +8,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvt_common.geodesy import moved
-from hvt_common.values import Pose, View
-from hvt_ground.geolocation.camera import ground_points
-from hvt_ground.geolocation.surface import FLAT_GROUND, Surface
-
-Place = tuple[float, float]
-"""Latitude and longitude, degrees, WGS 84."""
+from hvt_common.values import Boxes, Pose, View
+from hvt_geo.camera import ground_points, places_of_boxes
+from hvt_geo.surface import FLAT_GROUND, Surface
+from hvt_ground.events import Places
+from hvt_ground.poses import Footprint
 
 
 @dataclass(frozen=True, slots=True)
-class Footprint:
-    """The footprint of the base picture, black edges included. Corners at or above the horizon are None."""
+class SurfaceLocator:
+    """A `Locator` on this surface."""
 
-    centre: Place
-    below_m: float
-    """How far the ground at the centre lies below the camera."""
-    slant_m: float
-    """From the camera to the ground at the centre."""
-    corners: tuple[Place, Place, Place, Place] | None
-    """Upper left, upper right, lower right, lower left."""
+    surface: Surface = FLAT_GROUND
 
+    def places(self, pose: Pose, boxes_base_px: Boxes, view: View) -> Places | None:
+        """See `places_of_boxes`."""
+        return places_of_boxes(pose, boxes_base_px, view=view, surface=self.surface)
 
-def fields_of_view(pose: Pose, view: View) -> tuple[float, float] | None:
-    """The fields of view of the base picture, degrees: across and up; None if the pose lacks that of the source."""
-    if pose.hfov_deg is None:
-        return None
-    half = math.tan(math.radians(pose.hfov_deg) / 2) / (view.source_size[0] / 2)
-    across, up = (math.degrees(2 * math.atan(side / view.scale / 2 * half)) for side in view.base_size)
-    return across, up
+    def footprint(self, pose: Pose, view: View) -> Footprint | None:
+        """See `footprint`."""
+        return footprint(pose, view, surface=self.surface)
 
 
 def footprint(pose: Pose, view: View, *, surface: Surface = FLAT_GROUND) -> Footprint | None:

@@ -11,7 +11,7 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.still_words import STILL_WORDS
 from hvt_common.runtime.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
 from hvt_common.units import SECOND_NS
-from hvt_ground.state import GroundState, SessionState
+from hvt_ground.report.state import GroundState, SessionState
 
 _LINKS = ("waiting", "up", "thin", "lost", "ended")
 _OTHER = "other"
