@@ -13,10 +13,10 @@ from hvt_common.runtime.failures import Failures
 from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception import models as ground_models
+from hvt_ground.report.state import StateMaker
+from hvt_ground.report.status import status_text, summary
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.sinks import Outputs
-from hvt_ground.state import StateMaker
-from hvt_ground.status import status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
 from programs.processes import eventually
 from programs.rrd import Recording
