@@ -10,7 +10,9 @@ from functools import partial
 from typing import Any
 
 from hvt_common.errors import FlightError, UserError, needs_extra
+from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.few_found import FewFoundHint
+from hvt_common.inference.retried import RetriedDetector
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.failures import Awaited
@@ -29,8 +31,6 @@ from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating import LoopClock
-from hvt_edge.perception.analyzer import FailingDetector
-from hvt_edge.perception.guarded_detector import GuardedDetector
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.source.live import SOURCE_PART, closing_on
@@ -122,10 +122,10 @@ class Edge:
             )
             detector: FailingDetector = opened
             if not self._lockstep:  # whose result would be of something else
-                detector = GuardedDetector(
-                    opened,
-                    open_again=lambda: world.open_detector(config),
-                    failures=self._failures,
+                ready = [opened]
+                detector = RetriedDetector(
+                    lambda: ready.pop() if ready else world.open_detector(config),
+                    self._failures,
                     clock=world.clock,
                     hint=FewFoundHint(config.detector, confidence=track_confidence(config)),
                 )

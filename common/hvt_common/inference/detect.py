@@ -66,6 +66,17 @@ class Detector(Protocol):
         """
 
 
+class FailingDetector(Protocol):
+    """A detector, or one that may not work at the moment."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """The names that ``class_ids`` index."""
+
+    def detect(self, image_bgr: Image) -> Detections | None:
+        """As `Detector.detect`; None while it does not work."""
+
+
 def open_detector(
     spec: str,
     *,
@@ -137,7 +148,7 @@ def detect_every(given: int | None, *, fps: float) -> int:
     return given or min(5, max(1, round(fps / 3)))
 
 
-def warm_up(detector: Detector, size: tuple[int, int]) -> None:
+def warm_up(detector: FailingDetector, size: tuple[int, int]) -> None:
     """Run a network once at the (width, height) it will get: a runtime may compile for it, which takes 0.2 s.
 
     The motion detector, which remembers pictures, is left alone.

@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from hvt_common.inference.detect import FailingDetector
 from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
@@ -55,17 +56,6 @@ class AnalyzedFrame:
 
 class _Decoder(Protocol):
     def decode_yuv(self, data: bytes) -> YuvPicture | None: ...
-
-
-class FailingDetector(Protocol):
-    """A detector, or one that may not work at the moment."""
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """The names that ``class_ids`` index."""
-
-    def detect(self, image_bgr: Image) -> Detections | None:
-        """As `Detector.detect`; None while it does not work."""
 
 
 class Analyzer:

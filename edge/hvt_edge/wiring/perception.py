@@ -8,8 +8,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Literal, cast
 
-from hvt_common.inference.detect import Detector, detect_every, open_detector, warm_up
+from hvt_common.inference.detect import Detector, FailingDetector, detect_every, open_detector, warm_up
 from hvt_common.inference.motion import MOTION
+from hvt_common.inference.retried import RetriedDetector
 from hvt_common.inference.scores import (
     declared_class_names,
     default_confidence,
@@ -19,10 +20,9 @@ from hvt_common.inference.scores import (
 from hvt_common.inference.tiles import detect_whole, tiled
 from hvt_common.runtime.process import NETWORK_NICENESS
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
-from hvt_common.values import View
+from hvt_common.values import Detections, Image, View
 from hvt_edge.config import EdgeConfig
-from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings, FailingDetector
-from hvt_edge.perception.guarded_detector import GuardedDetector, OpenedOnUse
+from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.shadow import UNMEASURED, Shadow, ShadowGround, ShadowSettings
 from hvt_edge.stills.policy.registry import method
 
@@ -55,7 +55,7 @@ def open_for_flight(
     needed = config.tracks_used or not method(config.method).video_only or config.labels is not None
     class_names = None if needed else declared_class_names(config.detector)
     if class_names is not None:
-        return OpenedOnUse(open_detector, class_names)
+        return _OpenedOnUse(open_detector, class_names)
     detector = open_detector()
     warm_up(detector)
     return detector
@@ -100,7 +100,7 @@ def make_shadow(
         return None
     whole = (
         detector.detect_whole
-        if isinstance(detector, GuardedDetector)
+        if isinstance(detector, RetriedDetector)
         else partial(detect_whole, cast("Detector", detector))
     )
     return ShadowGround(
@@ -114,3 +114,16 @@ def make_shadow(
 def track_confidence(config: EdgeConfig) -> float:
     """From where a detection starts a track: as given, else as the detector's file says."""
     return default_confidence(config.detector) if config.confidence is None else config.confidence
+
+
+class _OpenedOnUse:
+    # A detector that is opened when it is first used, for who may never use it; its class names are known.
+
+    def __init__(self, open_detector: Callable[[], Detector], class_names: tuple[str, ...]) -> None:
+        self._open = open_detector
+        self._opened: Detector | None = None
+        self.class_names = class_names
+
+    def detect(self, image_bgr: Image) -> Detections:
+        self._opened = self._opened or self._open()
+        return self._opened.detect(image_bgr)

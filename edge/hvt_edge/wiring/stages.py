@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 
+from hvt_common.inference.detect import FailingDetector
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import fitted_class_names
@@ -23,7 +24,6 @@ from hvt_edge.link.still_readers import StillReaders
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import LoopClock, Operating, base_rate_bps
-from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.pose.contract import PoseSource
 from hvt_edge.pose.stage import PoseStage
 from hvt_edge.source.contract import Source

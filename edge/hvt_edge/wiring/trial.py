@@ -7,12 +7,12 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from hvt_common.inference.detect import FailingDetector
 from hvt_common.runtime.log import START_LOGGER
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame, View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.loop.cpu import processors
-from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.perception.shadow import UNMEASURED, Shadow
 from hvt_edge.source.contract import Source
 from hvt_edge.stills.policy.registry import method

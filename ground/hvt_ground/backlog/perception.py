@@ -11,10 +11,10 @@ from contextlib import contextmanager
 import numpy as np
 
 from hvt_common.inference.classify import Classifier
-from hvt_common.inference.detect import Detector
+from hvt_common.inference.detect import FailingDetector
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker
-from hvt_common.values import Image
+from hvt_common.values import Detections, Image
 from hvt_ground.events import Event, Overlay
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
@@ -36,7 +36,7 @@ class StretchTracker:
     """Detects and tracks along one stretch of video."""
 
     def __init__(
-        self, detector: Detector, tracker: ByteTracker, *, first_id: int, detect_every: int, emit: Emit
+        self, detector: FailingDetector, tracker: ByteTracker, *, first_id: int, detect_every: int, emit: Emit
     ) -> None:
         self._detector = detector
         self._tracker = tracker
@@ -50,7 +50,7 @@ class StretchTracker:
         """Take the next frame; frames rise."""
         if self._detected is None or frame_index - self._detected >= self._detect_every:
             self._detected = frame_index
-            found = self._detector.detect(image_bgr)
+            found = self._detector.detect(image_bgr) or Detections.none()
             tracks = self._tracker.update(found, frame_index=frame_index, image_bgr=image_bgr)
         else:
             tracks = self._tracker.predict(frame_index=frame_index, image_bgr=image_bgr)
@@ -85,7 +85,7 @@ class BacklogPerception:
         *,
         take_models: Callable[[], ModelSet],
         tracker_of: Callable[[], ByteTracker],
-        reader_of: Callable[[Detector, Classifier | None], StillReader],
+        reader_of: Callable[[FailingDetector, Classifier | None], StillReader],
         detect_every: int,
     ) -> None:
         self._info = info

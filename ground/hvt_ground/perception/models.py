@@ -8,15 +8,15 @@ from concurrent.futures import Future
 from functools import partial
 
 from hvt_common.inference.classify import Classifier, open_classifier
-from hvt_common.inference.detect import Detector, open_detector, warm_up
+from hvt_common.inference.detect import FailingDetector, open_detector, warm_up
 from hvt_common.inference.few_found import FewFoundHint
+from hvt_common.inference.retried import RetriedClassifier, RetriedDetector
 from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.process import NETWORK_NICENESS
 from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
-from hvt_ground.perception.retried import RetriedClassifier, RetriedDetector
 from hvt_ground.perception.stills.vocabulary import check_common
 from hvt_ground.perception.turns import Turns
 
@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 _USUAL_SIZE = (1280, 720)
 """The usual size of base streams; an edge's own is known with its first picture."""
 
-ModelSet = tuple[Detector, Classifier | None]
+ModelSet = tuple[FailingDetector, Classifier | None]
 
 
 class Models:
@@ -72,7 +72,7 @@ class Models:
         else:
             self._opened.set_result(opened)
 
-    def _open_detector(self) -> Detector:
+    def _open_detector(self) -> FailingDetector:
         config = self._config
         open_one = partial(
             open_detector,
@@ -86,7 +86,7 @@ class Models:
             niceness=NETWORK_NICENESS,
         )
         hint = FewFoundHint(config.detector, confidence=track_confidence(config))
-        return RetriedDetector(open_one, "detector", self.failures, hint=hint)
+        return RetriedDetector(open_one, self.failures, hint=hint)
 
     def _check(self, opened: ModelSet) -> None:
         # Refuse a classifier that has nothing to say of the detector's tracks; say which scores mean little.

@@ -10,13 +10,13 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.inference.detect import Detector
+from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.few_found import ViewTrust
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Boxes, Image, Tracks, View
+from hvt_common.values import Boxes, Detections, Image, Tracks, View
 from hvt_common.video.hevc import YuvPicture
 from hvt_ground.events import Event, Overlay
 from hvt_ground.perception.fusion.camera_path import CameraPath
@@ -68,7 +68,7 @@ class DecodedFrame:
 class PipelineParts:
     """The parts of one session's perception; but for the detector none of it may be shared with another."""
 
-    detector: Detector
+    detector: FailingDetector
     tracker: ByteTracker
     reader: StillReader
     refiner: Refiner
@@ -272,7 +272,7 @@ class Pipeline:
             self._detected_frame = index
             self.detections_run += 1
             try:
-                found = parts.detector.detect(image)
+                found = parts.detector.detect(image) or Detections.none()
             finally:
                 parts.turns.release()
             parts.trust.take(found)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Literal, cast
 
 from hvt_common.inference.classify import Classifier
-from hvt_common.inference.detect import Detector, detect_every
+from hvt_common.inference.detect import FailingDetector, detect_every
 from hvt_common.inference.few_found import ViewTrust
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -77,7 +77,7 @@ def _tracker(config: GroundConfig, info: Info) -> ByteTracker:
 
 
 def _reader(
-    config: GroundConfig, detector: Detector, classifier: Classifier | None, *, info: Info
+    config: GroundConfig, detector: FailingDetector, classifier: Classifier | None, *, info: Info
 ) -> StillReader:
     if classifier is not None:
         return CropReader(classifier, view=info.view)

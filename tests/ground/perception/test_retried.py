@@ -12,15 +12,11 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from hvt_common.inference.detect import open_detector
 from hvt_common.protocol.messages import RoiHeader
-from hvt_common.runtime.failures import Failures, RetryPause
-from hvt_common.units import SECOND_NS
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.models import Models
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
-from hvt_ground.perception.retried import RetriedDetector
 from hvt_ground.wiring import make_pipeline
 from media.onnx_models import colour_classifier, colour_detector
 from rigs.flight import Flight
@@ -117,26 +113,3 @@ def test_a_still_is_shown_though_nobody_can_name_it(tmp_path: Path, classifier: 
         "classifier" if classifier == "file" else "detector"
     ]
     pipeline.end()
-
-
-def test_a_model_that_never_works_is_opened_ever_more_seldom(tmp_path: Path) -> None:
-    """A broken model would take the processor from the picture, and fill the log."""
-    path = fragile(colour_detector(tmp_path / "d.onnx", "yolox"), bright=200)
-    opened: list[float] = []
-
-    def open_one():
-        opened.append(time.monotonic())
-        return open_detector(str(path), provider="cpu")
-
-    failures = Failures(time.time_ns)
-    pause = RetryPause(first_ns=SECOND_NS // 20, longest_ns=SECOND_NS)
-    detector = RetriedDetector(open_one, "detector", failures, pause=pause)
-    until = time.monotonic() + 0.7
-    while time.monotonic() < until:
-        assert len(detector.detect(picture(0, value=255).picture)) == 0
-        time.sleep(0.002)
-    assert 3 <= len(opened) <= 6, "after 0, 0.05, 0.15, 0.35 s"
-    path.unlink()
-    time.sleep(pause.pause_ns / SECOND_NS)
-    assert len(detector.detect(picture(0, value=100).picture)) == 0
-    assert "d.onnx" in failures.parts[0].reason, "it cannot be opened either"

@@ -6,10 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from hvt_common.inference.retried import RetriedDetector
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.pipeline import DecodedFrame
-from hvt_ground.perception.retried import RetriedDetector
 from hvt_ground.wiring import Models
 from rigs.flight import Flight, pipeline_of
 

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.classify import Classifier
-from hvt_common.inference.detect import Detector, OnnxDetector
+from hvt_common.inference.detect import FailingDetector, OnnxDetector
+from hvt_common.inference.retried import RetriedDetector
 from hvt_common.values import Boxes, Detections, Image, Posterior, View, iou
-from hvt_ground.perception.retried import RetriedDetector
 from hvt_ground.perception.stills.composite import composite
 from hvt_ground.perception.stills.decode import Box, DecodedStill
 
@@ -122,7 +122,7 @@ class Redetection:
     detector's confidence on, an object that nobody has named from ``new_confidence`` on.
     """
 
-    def __init__(self, detector: Detector, *, view: View, new_confidence: float = 0.5) -> None:
+    def __init__(self, detector: FailingDetector, *, view: View, new_confidence: float = 0.5) -> None:
         self._detector = detector
         self._view = view
         self._new_confidence = new_confidence
@@ -149,6 +149,7 @@ class Redetection:
         # On the composite; base pixels.
         zoom = self._zoom((base_bgr.shape[1], base_bgr.shape[0]))
         found = self._detector.detect(composite(base_bgr, stills, view=self._view, zoom=zoom))
+        found = found or Detections.none()
         boxes = (found.boxes_xyxy_px / zoom).astype(np.float32)
         return Detections(boxes, found.confidences, found.class_ids)
 

@@ -1,29 +1,31 @@
-"""Models whose run may raise: the ground goes on without them, and they are opened again with growing pauses."""
+"""Models whose run may raise: a flight goes on without them, and they are opened again with growing pauses."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
 from hvt_common.inference.few_found import FewFoundHint
+from hvt_common.inference.tiles import detect_whole
 from hvt_common.runtime.failures import Failures, Retried, RetryPause
 from hvt_common.values import Detections, Image, Posterior
 
 
 class RetriedDetector(Retried[Detector]):
-    """Finds nothing while its model fails; ``hint`` may say that it finds little."""
+    """A `FailingDetector`; ``hint`` may say that it finds little."""
 
     def __init__(
         self,
         open_part: Callable[[], Detector],
-        name: str,
         failures: Failures,
         *,
+        clock: Callable[[], int] = time.monotonic_ns,
         hint: FewFoundHint | None = None,
         pause: RetryPause | None = None,
     ) -> None:
-        super().__init__(open_part, name, failures, pause=pause)
+        super().__init__(open_part, "detector", failures, clock=clock, pause=pause)
         self._hint = hint
 
     @property
@@ -31,14 +33,16 @@ class RetriedDetector(Retried[Detector]):
         """The model's."""
         return self.part.class_names
 
-    def detect(self, image_bgr: Image) -> Detections:
-        """Like the model's."""
+    def detect(self, image_bgr: Image) -> Detections | None:
+        """Like the model's; None while it fails."""
         found = self.run(lambda model: model.detect(image_bgr))
-        if found is None:
-            return Detections.none()
-        if self._hint is not None:
+        if found is not None and self._hint is not None:
             self._hint.take(found, image_bgr, lambda other: self.run(lambda model: model.detect(other)))
         return found
+
+    def detect_whole(self, image_bgr: Image) -> Detections | None:
+        """Like `hvt_common.inference.tiles.detect_whole`; None while it fails."""
+        return self.run(lambda model: detect_whole(model, image_bgr))
 
 
 class RetriedClassifier(Retried[Classifier]):

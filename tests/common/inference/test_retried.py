@@ -7,9 +7,9 @@ import logging
 import numpy as np
 
 from hvt_common.inference.detect import open_detector
-from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.inference.retried import RetriedDetector
+from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_edge.perception.guarded_detector import GuardedDetector
 from media.onnx_models import failing_in_the_light
 
 DARK, BRIGHT = np.full((192, 320, 3), 20, np.uint8), np.full((192, 320, 3), 250, np.uint8)
@@ -21,19 +21,16 @@ def test_a_model_whose_run_raises_is_opened_again_with_growing_pauses(tmp_path, 
     opened, now_ns = [], [0]
     failures = Failures(lambda: now_ns[0])
 
-    def open_again():
+    def open_one():
         opened.append(now_ns[0] // SECOND_NS)
         return open_detector(str(path))
 
-    detector = GuardedDetector(
-        open_detector(str(path)), open_again=open_again, failures=failures, clock=lambda: now_ns[0],
-        pause=RetryPause(),
-    )  # fmt: skip
+    detector = RetriedDetector(open_one, failures, clock=lambda: now_ns[0])
     assert detector.detect(DARK) is not None
     for second in range(1, 21):
         now_ns[0] = second * SECOND_NS
         assert detector.detect(BRIGHT) is None
-    assert opened == [2, 4, 8, 16]
+    assert opened == [0, 2, 4, 8, 16]
     (failed,) = failures.parts
     assert failed.part == "detector"
     assert failed.count == 5
@@ -43,3 +40,8 @@ def test_a_model_whose_run_raises_is_opened_again_with_growing_pauses(tmp_path, 
     assert failures.parts[0].working
     said = [record for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(said) <= 2, "said once"
+    assert detector.detect(BRIGHT) is None
+    path.unlink()
+    now_ns[0] = 80 * SECOND_NS
+    assert detector.detect(DARK) is None
+    assert "model.onnx" in failures.parts[0].reason, "it cannot be opened either"
