@@ -8,7 +8,7 @@ from typing import get_args
 
 from hvt_common.protocol.frame_account import FRAME_GROUPS, FrameGroup
 from hvt_common.protocol.still_words import STILL_WORDS, counts_text
-from hvt_ground.perception.stills.resolved import Outcome
+from hvt_ground.perception.stills.match import Outcome
 
 ROOT = Path(__file__).parents[3]
 EMITTED = (

@@ -18,12 +18,15 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.tracking.association import assign
-from hvt_common.values import Boxes, Tracks, iou
+from hvt_common.values import Boxes, Posterior, Tracks, iou
+from hvt_ground.events import Refinement
+from hvt_ground.perception.stills.decode import Box
 
 KNOWN_BONUS = 0.10
 OTHERS_PENALTY = 0.25
@@ -36,15 +39,52 @@ _REMEMBERED_FRAMES = 256
 Floats = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class StillToMatch:
-    """A still for which a track is wanted."""
+Outcome = Literal["matched", "superseded", "no track", "ambiguous", "frame lost", "late", "overflow", "ended"]
+"""What became of a still:
 
-    key: Hashable
-    edge_track_id: int
-    """Negative where the still belongs to no track of the edge."""
-    box_base_px: tuple[float, float, float, float]
-    class_name: str
+matched
+    it spoke on the class of ``track_id``.
+superseded
+    it belongs to ``track_id``, but a still of a later frame has already replaced the class.
+no track
+    no track of the ground overlaps its box enough at its frame.
+ambiguous
+    two tracks of the ground fit its box about equally well.
+frame lost
+    the ground never decoded its frame.
+late
+    its frame is older than the history, or was not reached within the hold time.
+overflow
+    more stills wait than are held; the oldest goes.
+ended
+    it still waited when the stream or its session ended.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class StillSeen:
+    """One object of a still that was decoded and read; it may wait for its track."""
+
+    event: Refinement
+    """As it is known so far: unmatched it has no track, the class of the edge's detector and that of the still alone.
+    Until it is given out it bears the frame and the time of its own picture."""
+    posterior: Posterior
+    """Its class posterior, over `Vocabulary.names`."""
+    side_px: float
+    """The shorter side of the object, source pixels."""
+    news: float = 1.0
+    """How much the still shows that the base did not, 0…1."""
+    part: int = 0
+    """Number of the object in the still: each is matched by itself, under the still's sequence number."""
+    found_base_px: Box | None = None
+    """The reader's box of the object."""
+    outcome: Outcome | None = None
+    """None while it waits."""
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Sequence and part."""
+        return self.event.still_sequence, self.part
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +116,12 @@ class Matcher:
 
     def match(
         self,
-        wanted: Sequence[StillToMatch],
+        wanted: Sequence[StillSeen],
         tracks: Tracks,
         *,
         later: Iterable[Tracks],
         class_names: Sequence[str],
-    ) -> dict[Hashable, TrackMatch]:
+    ) -> dict[tuple[int, int], TrackMatch]:
         """A `TrackMatch` for each key of ``wanted``, all of which are stills of the frame of ``tracks``.
 
         ``later`` are the tracks of the following frames, in order, as far as a late confirmation counts.
@@ -117,12 +157,12 @@ class Matcher:
 
     def _assign(
         self,
-        groups: Sequence[Sequence[StillToMatch]],
+        groups: Sequence[Sequence[StillSeen]],
         tracks: Tracks,
         rows: npt.NDArray[np.intp],
         frame_index: int,
         class_names: Sequence[str],
-    ) -> dict[Hashable, TrackMatch]:
+    ) -> dict[tuple[int, int], TrackMatch]:
         # One to one among the tracks in ``rows``, by the key of each group's first; finds are remembered.
         heads = [group[0] for group in groups]
         found = {head.key: TrackMatch() for head in heads}
@@ -138,19 +178,19 @@ class Matcher:
                 found[heads[r].key] = TrackMatch(ambiguous=True)
                 continue
             found[heads[r].key] = TrackMatch(tracks, int(rows[c]))
-            self._remember(heads[r].edge_track_id, int(tracks.ids[rows[c]]), frame_index)
+            self._remember(heads[r].event.edge_track_id, int(tracks.ids[rows[c]]), frame_index)
         return found
 
     def _preference(
         self,
-        heads: Sequence[StillToMatch],
+        heads: Sequence[StillSeen],
         tracks: Tracks,
         rows: npt.NDArray[np.intp],
         frame_index: int,
         class_names: Sequence[str],
     ) -> Floats:
         # (heads, rows) how much each pair is preferred; 0 where the evidence does not reach the threshold.
-        wanted_px = np.array([head.box_base_px for head in heads], np.float32)
+        wanted_px = np.array([head.event.box_base_px for head in heads], np.float32)
         evidence = iou(wanted_px, tracks.boxes_xyxy_px[rows])
         same_class = np.zeros(evidence.shape, np.bool_)
         claims = self._claims.get(frame_index, {})
@@ -158,11 +198,11 @@ class Matcher:
             ground_id, name = int(tracks.ids[row]), class_names[tracks.class_ids[row]]
             claimed_by = claims.get(ground_id)
             for line, head in enumerate(heads):
-                if claimed_by not in (None, head.edge_track_id):
+                if claimed_by not in (None, head.event.edge_track_id):
                     evidence[line, column] = -np.inf
                 elif evidence[line, column] > 0:
-                    evidence[line, column] += self._known(head.edge_track_id, ground_id, frame_index)
-                same_class[line, column] = head.class_name == name
+                    evidence[line, column] += self._known(head.event.edge_track_id, ground_id, frame_index)
+                same_class[line, column] = head.event.class_before == name
         evidence[evidence < self._iou] = 0.0
         return evidence + CLASS_BONUS * (same_class & (evidence > 0))
 
@@ -189,11 +229,13 @@ class Matcher:
                 known.popitem(last=False)
 
 
-def _by_edge_track(wanted: Sequence[StillToMatch]) -> list[list[StillToMatch]]:
-    groups: dict[tuple[str, Hashable], list[StillToMatch]] = {}
+def _by_edge_track(wanted: Sequence[StillSeen]) -> list[list[StillSeen]]:
+    groups: dict[tuple[str, Hashable], list[StillSeen]] = {}
     for want in wanted:
-        of_track = want.edge_track_id >= 0
-        groups.setdefault(("track", want.edge_track_id) if of_track else ("still", want.key), []).append(want)
+        of_track = want.event.edge_track_id >= 0
+        groups.setdefault(
+            ("track", want.event.edge_track_id) if of_track else ("still", want.key), []
+        ).append(want)
     return list(groups.values())
 
 

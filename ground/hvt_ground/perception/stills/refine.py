@@ -13,34 +13,18 @@ the only clock here.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from hvt_common.values import Tracks
 from hvt_ground.perception.history import History
-from hvt_ground.perception.stills.match import Matcher, StillToMatch, TrackMatch
+from hvt_ground.perception.stills.match import Matcher, Outcome, StillSeen, TrackMatch
 from hvt_ground.perception.stills.posterior import ClassEstimate, TrackPosterior
-from hvt_ground.perception.stills.resolved import (
-    Outcome,
-    ResolvedStill,
-    ShownClasses,
-    StillContext,
-    StillSeen,
-)
 from hvt_ground.perception.stills.vocabulary import Vocabulary
-
-__all__ = [
-    "Mode",
-    "Outcome",
-    "Refiner",
-    "ResolvedStill",
-    "ShownClasses",
-    "StillContext",
-    "StillSeen",
-]
 
 Mode = Literal["replace", "fuse"]
 
@@ -54,10 +38,19 @@ def _unknown(_edge_track_id: int) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Held:
-    still: StillSeen
-    last_frame: int
-    """It waits no longer once the stream is past this frame."""
+class ShownClasses:
+    """Classes of N tracks, parallel to the given `Tracks`; fields of `events.Overlay`."""
+
+    base_classes: tuple[str, ...]
+    classes: tuple[str, ...]
+    confidences: npt.NDArray[np.float32]
+    """(N,) of ``classes``, 0…1."""
+    refined: npt.NDArray[np.bool_]
+    """(N,) True once a still has refined it."""
+    doubted: npt.NDArray[np.bool_]
+    """(N,) True where stills say that it is nothing of mine."""
+    sure: npt.NDArray[np.bool_]
+    """(N,) True where stills agree on the class with a calibrated probability above .9."""
 
 
 class Refiner:
@@ -93,13 +86,14 @@ class Refiner:
         self._confirm_frames = round(confirm_s * fps)
         self._forget_frames = round(forget_s * fps)
         self._matcher = Matcher(least_iou=iou, owned_frames=self._forget_frames)
-        self._held: dict[tuple[int, int], _Held] = {}  # by still sequence and part, oldest offer first
+        self._held: dict[tuple[int, int], tuple[StillSeen, int]] = {}
+        """By still sequence and part, oldest offer first; each waits no longer once the stream is past the frame."""
         self._seen: OrderedDict[tuple[int, int], None] = OrderedDict()
         self._track_posteriors: OrderedDict[int, TrackPosterior] = (
             OrderedDict()
         )  # by ground track id, longest unseen first
 
-    def offer(self, still: StillSeen, *, now_frame: int) -> list[ResolvedStill]:
+    def offer(self, still: StillSeen, *, now_frame: int) -> list[StillSeen]:
         """Take a still; returns what had to make room for it (almost always nothing).
 
         ``now_frame`` is the newest frame that was decoded. A part of a still that was here before is ignored.
@@ -109,33 +103,33 @@ class Refiner:
         self._seen[still.key] = None
         if len(self._seen) > _REMEMBERED_STILLS:
             self._seen.popitem(last=False)
-        self._held[still.key] = _Held(still, now_frame + self._hold_frames)
+        self._held[still.key] = still, now_frame + self._hold_frames
         if len(self._held) <= MAX_HELD:
             return []
         oldest = next(iter(self._held))
-        return [self._unmatched(self._held.pop(oldest).still, "overflow")]
+        return [self._unmatched(self._held.pop(oldest)[0], "overflow")]
 
     def settle(
         self, history: History, *, now_frame: int, known_as: Callable[[int], int | None] = _unknown
-    ) -> list[ResolvedStill]:
+    ) -> list[StillSeen]:
         """Match what can be matched and give up what never will be, oldest frame first.
 
         Call it after each frame was tracked, with the newest frame that was decoded. ``known_as`` gives the ground's
         track for one of the edge, where the edge has reported it.
         """
-        by_frame: dict[int, list[_Held]] = {}
-        for held in self._held.values():
-            by_frame.setdefault(held.still.frame_index, []).append(held)
-        resolved: list[ResolvedStill] = []
+        by_frame: dict[int, list[StillSeen]] = {}
+        for still, _ in self._held.values():
+            by_frame.setdefault(still.event.shown_index, []).append(still)
+        resolved: list[StillSeen] = []
         for frame_index in sorted(by_frame):
             resolved += self._resolve_frame(by_frame[frame_index], history, now_frame, known_as)
         for done in resolved:
-            del self._held[done.still.key]
+            del self._held[done.key]
         return resolved
 
-    def end(self) -> list[ResolvedStill]:
+    def end(self) -> list[StillSeen]:
         """Give out all that still waits, as unmatched: the stream or its session is over."""
-        ended = [self._unmatched(held.still, "ended") for held in self._held.values()]
+        ended = [self._unmatched(still, "ended") for still, _ in self._held.values()]
         self._held.clear()
         return ended
 
@@ -178,58 +172,55 @@ class Refiner:
     # One frame's stills.
 
     def _resolve_frame(
-        self, held: list[_Held], history: History, now_frame: int, known_as: Callable[[int], int | None]
-    ) -> list[ResolvedStill]:
-        frame_index = held[0].still.frame_index
+        self, held: list[StillSeen], history: History, now_frame: int, known_as: Callable[[int], int | None]
+    ) -> list[StillSeen]:
+        frame_index = held[0].event.shown_index
         tracks = history.tracks(frame_index)
         if tracks is None:
             return self._resolve_untracked(held, history, now_frame, known_as)
         found = self._match(held, tracks, history)
         newest = history.newest_tracked
-        resolved: list[ResolvedStill] = []
-        for pending in sorted(held, key=lambda pending: pending.still.key):
-            candidate = found[pending.still.key]
+        resolved: list[StillSeen] = []
+        for still in sorted(held, key=lambda still: still.key):
+            candidate = found[still.key]
             if candidate.tracks is not None:
-                resolved.append(self._apply(pending.still, candidate.tracks, candidate.row))
-            elif now_frame > pending.last_frame or (
+                resolved.append(self._apply(still, candidate.tracks, candidate.row))
+            elif now_frame > self._held[still.key][1] or (
                 newest is not None and newest >= frame_index + self._confirm_frames
             ):
                 outcome: Outcome = "ambiguous" if candidate.ambiguous else "no track"
-                resolved.append(self._unmatched(pending.still, outcome))
+                resolved.append(self._unmatched(still, outcome))
         return resolved
 
     def _resolve_untracked(
         self,
-        held: Iterable[_Held],
+        held: Iterable[StillSeen],
         history: History,
         now_frame: int,
         known_as: Callable[[int], int | None],
-    ) -> list[ResolvedStill]:
+    ) -> list[StillSeen]:
         # Tracks come in the order of frames: once a later frame is there, an absent one never will be.
-        resolved: list[ResolvedStill] = []
-        for pending in held:
-            oldest, newest, frame_index = (
-                history.oldest_tracked,
-                history.newest_tracked,
-                pending.still.frame_index,
-            )
+        resolved: list[StillSeen] = []
+        oldest, newest = history.oldest_tracked, history.newest_tracked
+        for still in held:
+            frame_index = still.event.shown_index
             outcome: Outcome | None = None
             if oldest is not None and frame_index < oldest:
                 outcome = "late"
             elif newest is not None and frame_index < newest:
                 outcome = "frame lost"
-            elif now_frame > pending.last_frame:
+            elif now_frame > self._held[still.key][1]:
                 outcome = "late"
             if outcome is not None:
-                named = self._by_name(pending.still, history, known_as) if pending.still.stored else None
-                resolved.append(named or self._unmatched(pending.still, outcome))
+                named = self._by_name(still, history, known_as) if still.event.stored else None
+                resolved.append(named or self._unmatched(still, outcome))
         return resolved
 
     def _by_name(
         self, still: StillSeen, history: History, known_as: Callable[[int], int | None]
-    ) -> ResolvedStill | None:
+    ) -> StillSeen | None:
         # Apply a still of long ago to the track that its edge track is known as now; None where it is not known.
-        edge_id = still.edge_track_id
+        edge_id = still.event.edge_track_id
         if edge_id < 0 or history.newest_tracked is None:
             return None
         track_id, tracks = known_as(edge_id), history.tracks(history.newest_tracked)
@@ -239,24 +230,17 @@ class Refiner:
             return None
         return self._apply(still, tracks, int(np.flatnonzero(tracks.ids == track_id)[0]))
 
-    def _match(self, held: list[_Held], tracks: Tracks, history: History) -> dict[Hashable, TrackMatch]:
-        wanted = [
-            StillToMatch(
-                key=pending.still.key,
-                edge_track_id=pending.still.edge_track_id,
-                box_base_px=pending.still.box_base_px,
-                class_name=pending.still.class_name,
-            )
-            for pending in held
-        ]
+    def _match(
+        self, held: list[StillSeen], tracks: Tracks, history: History
+    ) -> dict[tuple[int, int], TrackMatch]:
         newest = history.newest_tracked or 0
         last = min(tracks.frame_index + self._confirm_frames, newest)
         later = (history.tracks(frame_index) for frame_index in range(tracks.frame_index + 1, last + 1))
         return self._matcher.match(
-            wanted, tracks, later=(t for t in later if t is not None), class_names=self._vocabulary.names
+            held, tracks, later=(t for t in later if t is not None), class_names=self._vocabulary.names
         )
 
-    def _apply(self, still: StillSeen, tracks: Tracks, row: int) -> ResolvedStill:
+    def _apply(self, still: StillSeen, tracks: Tracks, row: int) -> StillSeen:
         track_id = int(tracks.ids[row])
         class_posterior = self._track_posteriors.get(track_id)
         if class_posterior is None:
@@ -269,17 +253,16 @@ class Refiner:
             before = self._read(class_posterior, tracks, row).class_id
         newest = class_posterior.update(
             still.posterior,
-            order=(still.frame_index, still.sequence),
+            order=(still.event.shown_index, still.event.still_sequence),
             side_px=still.side_px,
             news=still.news,
         )
-        self._touch(track_id, class_posterior, still.frame_index)
+        self._touch(track_id, class_posterior, still.event.shown_index)
         after = self._read(class_posterior, tracks, row)
         self.class_changes += after.class_id != before
         names = self._vocabulary.names
-        return ResolvedStill(
-            still=still,
-            outcome="matched" if newest or self._mode == "fuse" else "superseded",
+        event = replace(
+            still.event,
             track_id=track_id,
             class_before=names[before],
             class_after=names[after.class_id],
@@ -287,18 +270,12 @@ class Refiner:
             doubted=after.class_id == self._vocabulary.nothing,
             sure=self._is_sure(after),
         )
+        outcome: Outcome = "matched" if newest or self._mode == "fuse" else "superseded"
+        return replace(still, event=event, outcome=outcome)
 
-    def _unmatched(self, still: StillSeen, outcome: Outcome) -> ResolvedStill:
-        said = still.posterior
-        return ResolvedStill(
-            still=still,
-            outcome=outcome,
-            track_id=None,
-            class_before=still.class_name,
-            class_after=said.class_name,
-            confidence=said.confidence,
-            doubted=self._vocabulary.says_nothing(said.class_name),
-        )
+    def _unmatched(self, still: StillSeen, outcome: Outcome) -> StillSeen:
+        doubted = self._vocabulary.says_nothing(still.posterior.class_name)
+        return replace(still, event=replace(still.event, doubted=doubted), outcome=outcome)
 
     # The posterior of each track.
 

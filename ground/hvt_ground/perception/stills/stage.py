@@ -17,7 +17,8 @@ from hvt_ground.perception.fusion.fuse import Fusion
 from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.classify import Box, DecodedStill, ObjectReading, StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still, needs_base
-from hvt_ground.perception.stills.refine import Refiner, ResolvedStill, StillContext, StillSeen
+from hvt_ground.perception.stills.match import StillSeen
+from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary, Vote
 
 SAME_DB, OTHER_DB = 38.0, 26.0
@@ -185,30 +186,17 @@ class StillStage:
         news = self._news(decoded)
         shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
         for part, ((track_id, _), box, reading) in enumerate(shown):
-            context = StillContext(still, decoded, track_id, box, reading.box_base_px, crop)
             side_px = min(box[2] - box[0], box[3] - box[1]) / self._view.scale
             vote = self._vote(reading, called=header.class_name, side_px=side_px)
             self._answer(header, track_id, vote.posterior)
+            event = self._refinement(still, decoded, track_id, box, crop)
             if vote.posterior is None:
                 self.outcomes["unread"] += 1
-                name = header.class_name
-                unread = self._refinement(context, now, None, name, name, header.confidence)
-                self._emit(replace(unread, unread=True, note=vote.note))
+                self._give_out(replace(event, unread=True, note=vote.note), now)
                 continue
-            seen = StillSeen(
-                sequence=header.sequence,
-                frame_index=header.frame_index,
-                capture_ns=header.capture_ns,
-                edge_track_id=track_id,
-                box_base_px=box,
-                class_name=header.class_name,
-                posterior=vote.posterior,
-                context=context,
-                side_px=side_px,
-                news=news,
-                part=part,
-                stored=bool(header.flags & Flags.STORED),
-            )
+            said = vote.posterior
+            event = replace(event, class_after=said.class_name, confidence=said.confidence)
+            seen = StillSeen(event, said, side_px, news, part, reading.box_base_px)
             for resolved in self._refiner.offer(seen, now_frame=now.frame_index):
                 self._resolved(resolved, now)
 
@@ -229,49 +217,44 @@ class StillStage:
         nearness_db = psnr_y_db(seen, decoded.image_bgr)
         return float(np.clip((SAME_DB - nearness_db) / (SAME_DB - OTHER_DB), 0.0, 1.0))
 
-    def _resolved(self, resolved: ResolvedStill, now: Progress) -> None:
-        self.outcomes[resolved.outcome] += 1
-        context, track_id = resolved.still.context, resolved.track_id
-        if track_id is not None:
-            self._name_track(resolved.still, track_id)
-            if context.found_base_px is not None and not resolved.still.stored:
-                frame_index = resolved.still.frame_index
-                self._fusion.take_box(track_id, context.found_base_px, frame_index=frame_index)
-        before, after = resolved.class_before, resolved.class_after
-        refinement = self._refinement(context, now, track_id, before, after, resolved.confidence)
-        self._emit(replace(refinement, doubted=resolved.doubted, sure=resolved.sure))
+    def _resolved(self, still: StillSeen, now: Progress) -> None:
+        event, found = still.event, still.found_base_px
+        self.outcomes[str(still.outcome)] += 1
+        if event.track_id is not None:
+            self._name_track(event, event.track_id)
+            if found is not None and not event.stored:
+                self._fusion.take_box(event.track_id, found, frame_index=event.shown_index)
+        self._give_out(event, now)
 
-    def _refinement(
-        self,
-        context: StillContext,
-        now: Progress,
-        track_id: int | None,
-        before: str,
-        after: str,
-        confidence: float,
-    ) -> Refinement:
-        header = context.received.header
-        stored = bool(header.flags & Flags.STORED)
+    def _give_out(self, event: Refinement, now: Progress) -> None:
         # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already. What
         # was stored while the link was down belongs to that time.
+        if not event.stored:
+            event = replace(event, frame_index=now.frame_index, capture_ns=now.capture_ns)
+        self._emit(event)
+
+    def _refinement(
+        self, still: ReceivedStill, decoded: DecodedStill, track_id: int, box: Box, crop: Image | None
+    ) -> Refinement:
+        header = still.header
         return Refinement(
-            frame_index=header.frame_index if stored else now.frame_index,
-            capture_ns=header.capture_ns if stored else now.capture_ns,
+            frame_index=header.frame_index,
+            capture_ns=header.capture_ns,
             still_sequence=header.sequence,
-            track_id=track_id,
-            edge_track_id=context.track_id,
-            box_base_px=context.box_base_px,
-            still=context.received.data,
+            track_id=None,
+            edge_track_id=track_id,
+            box_base_px=box,
+            still=still.data,
             media_type=still_codec(header.codec).media_type,  # not what Zenoh said: that is nobody's word
-            base_crop_bgr=context.base_crop_bgr,
-            class_before=before,
-            class_after=after,
-            confidence=confidence,
+            base_crop_bgr=crop,
+            class_before=header.class_name,
+            class_after=header.class_name,
+            confidence=header.confidence,
             reason=header.reason,
             quality_pct=header.quality_pct,
-            still_bgr=context.decoded.image_bgr,
+            still_bgr=decoded.image_bgr,
             crop_base_px=self._to_base(header.crop_source_px),
-            stored=stored,
+            stored=bool(header.flags & Flags.STORED),
             shown_index=header.frame_index,
             header=header,
         )
@@ -294,9 +277,9 @@ class StillStage:
             )
         )
 
-    def _name_track(self, still: StillSeen, ground_track_id: int) -> None:
+    def _name_track(self, event: Refinement, ground_track_id: int) -> None:
         for place, result in enumerate(self._results):
-            if (result.still_sequence, result.track_id) == (still.sequence, still.edge_track_id):
+            if (result.still_sequence, result.track_id) == (event.still_sequence, event.edge_track_id):
                 self._results[place] = replace(result, ground_track_id=ground_track_id)
 
     def _to_base(self, box_source_px: Sequence[float]) -> Box:

@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 
 from hvt_common.values import Posterior, Tracks, iou
 from hvt_ground.perception.history import History
-from hvt_ground.perception.stills.match import Matcher, StillToMatch
-from hvt_ground.perception.stills.refine import MAX_HELD, Refiner, StillSeen
+from hvt_ground.perception.stills.match import Matcher
+from hvt_ground.perception.stills.refine import MAX_HELD, Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 from rigs.footprint import footprint_bytes
+from rigs.stills import seen
 
 DETECTOR = ("car", "van", "person")
 CLASSIFIER = ("Person", "car", "van")
@@ -59,17 +60,8 @@ def still(
     sequence, frame_index, box=A, *, edge=70, posterior=VAN, class_name="car", words=WORDS, side_px=20.0
 ):
     """A still of an edge track."""
-    return StillSeen(
-        sequence=sequence,
-        frame_index=frame_index,
-        capture_ns=frame_index * 66_666_667,
-        edge_track_id=edge,
-        box_base_px=box,
-        class_name=class_name,
-        posterior=words.vote(posterior, called=class_name, side_px=20.0).posterior,
-        context=f"still {sequence}",
-        side_px=side_px,
-    )
+    posterior = words.vote(posterior, called=class_name, side_px=20.0).posterior
+    return seen(sequence, frame_index, posterior, box, edge=edge, class_name=class_name, side_px=side_px)
 
 
 class Ground:
@@ -103,7 +95,7 @@ class Ground:
 
 def brief(resolved):
     """(sequence, outcome, track) of each."""
-    return [(done.still.sequence, done.outcome, done.track_id) for done in resolved]
+    return [(done.event.still_sequence, done.outcome, done.event.track_id) for done in resolved]
 
 
 @pytest.fixture
@@ -116,9 +108,9 @@ def test_a_still_replaces_the_class_of_its_track(ground):
     """The whole point: the operator would go on reading what the thin base stream suggests."""
     ground.track(5, {1: A, 2: B})
     (done,) = ground.offer(still(0, 5))
-    assert (done.track_id, done.class_before, done.class_after) == (1, "car", "van")
-    assert done.confidence == pytest.approx(0.7)
-    assert done.still.context == "still 0"
+    assert (done.event.track_id, done.event.class_before, done.event.class_after) == (1, "car", "van")
+    assert done.event.confidence == pytest.approx(0.7)
+    assert done.event.still == b"still 0"
     shown = ground.refiner.shown(tracks(6, {1: A, 2: B}, classes={2: 1}, confidences={2: 0.25}))
     assert shown.base_classes == ("car", "van")
     assert shown.classes == ("van", "van")
@@ -156,8 +148,8 @@ def test_a_close_neighbour_that_has_its_own_edge_track_is_left_alone(ground):
     assert brief(ground.offer(still(3, 30, A, edge=70))) == [(3, "matched", 2)], "a clear overlap corrects"
 
 
-FIRST = StillToMatch(key=0, edge_track_id=70, box_base_px=A, class_name="car")
-OTHER = StillToMatch(key=1, edge_track_id=71, box_base_px=A_NEAR, class_name="car")
+FIRST = still(0, 0)
+OTHER = still(1, 0, A_NEAR, edge=71)
 
 
 def rows(matcher, frame_index, boxes, *wanted):
@@ -251,8 +243,8 @@ def test_what_still_waits_at_the_end_is_given_out(ground):
     ground.offer(still(0, 3), still(1, 4))
     ended = ground.refiner.end()
     assert brief(ended) == [(0, "ended", None), (1, "ended", None)]
-    assert (ended[0].class_before, ended[0].class_after) == ("car", "van")
-    assert ended[0].confidence == pytest.approx(0.7)
+    assert (ended[0].event.class_before, ended[0].event.class_after) == ("car", "van")
+    assert ended[0].event.confidence == pytest.approx(0.7)
     assert ground.refiner.end() == []
 
 
@@ -309,9 +301,9 @@ def test_the_newest_frame_wins_in_whatever_order_stills_come(ground):
     assert brief(ground.offer(still(4, 8, posterior=PERSON))) == [(4, "matched", 1)]
     (older,) = ground.offer(still(3, 6, posterior=VAN))
     assert brief([older]) == [(3, "superseded", 1)]
-    assert (older.class_before, older.class_after) == ("person", "person")
+    assert (older.event.class_before, older.event.class_after) == ("person", "person")
     (newer,) = ground.offer(still(5, 8, posterior=CAR))
-    assert (newer.class_before, newer.class_after) == ("person", "car")
+    assert (newer.event.class_before, newer.event.class_after) == ("person", "car")
     assert (ground.refiner.tracks_refined, ground.refiner.class_changes) == (1, 2)
 
 
@@ -363,12 +355,12 @@ def test_fusing_multiplies_what_the_stills_say():
     ground = Ground("fuse", words=moves)
     ground.run(5, 10, {1: A})
     (first,) = ground.offer(still(0, 9, posterior=says(0.1, 0.6, 0.3), words=moves))
-    assert (first.class_before, first.class_after) == ("moving", "car")
-    assert first.confidence == pytest.approx(0.6, abs=1e-3)
+    assert (first.event.class_before, first.event.class_after) == ("moving", "car")
+    assert first.event.confidence == pytest.approx(0.6, abs=1e-3)
     ground.track(10, {1: A})
     (second,) = ground.offer(still(1, 10, posterior=says(0.1, 0.2, 0.7), words=moves))
-    assert (second.class_before, second.class_after) == ("car", "van")
-    assert second.confidence == pytest.approx(0.21 / 0.34, abs=1e-3)
+    assert (second.event.class_before, second.event.class_after) == ("car", "van")
+    assert second.event.confidence == pytest.approx(0.21 / 0.34, abs=1e-3)
     assert ground.refiner.shown(tracks(11, {1: A})).classes == ("van",)
 
 
@@ -412,8 +404,8 @@ def test_fusing_survives_certainty_and_long_runs():
     broken.probabilities[0] = np.nan
     ground.track(101, {1: A})
     (done,) = ground.offer(still(200, 101, posterior=broken))
-    assert done.class_after == "van"
-    assert math.isfinite(done.confidence)
+    assert done.event.class_after == "van"
+    assert math.isfinite(done.event.confidence)
 
 
 def test_a_posterior_over_other_classes_is_a_bug():
@@ -466,9 +458,11 @@ def test_objects_that_stand_apart_are_never_confused(script):
         resolved += ground.offer(still(frame_index, max(0, frame_index - late), spots[edge], edge=edge))
         sent += 1
     resolved += ground.refiner.end()
-    assert sorted(done.still.sequence for done in resolved) == list(range(sent)), "each still comes out once"
+    assert sorted(done.event.still_sequence for done in resolved) == list(range(sent)), (
+        "each still comes out once"
+    )
     for done in resolved:
-        assert done.track_id in (None, done.still.edge_track_id)
-        if done.track_id is not None:
-            at_its_frame = ground.history.tracks(done.still.frame_index)
+        assert done.event.track_id in (None, done.event.edge_track_id)
+        if done.event.track_id is not None:
+            at_its_frame = ground.history.tracks(done.event.shown_index)
             assert at_its_frame is not None, "a lost frame refines nothing"

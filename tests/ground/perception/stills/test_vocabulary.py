@@ -17,6 +17,7 @@ from hvt_common.values import Posterior, Tracks
 from hvt_edge.perception.crop import PADDING
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import LEAST_SIDE_PX, Vocabulary, check_common
+from rigs.stills import seen
 
 AERIAL = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
 VEHICLES = {"car", "van", "truck", "bus", "motor"}
@@ -110,7 +111,6 @@ def test_a_class_that_the_classifier_cannot_say_is_left_alone():
 def flown(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, mode="fuse"):
     """What is shown of a track after these stills."""
     from hvt_ground.perception.history import History
-    from hvt_ground.perception.stills.refine import StillSeen
 
     tracks = Tracks(
         frame_index=0,
@@ -126,18 +126,8 @@ def flown(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, m
     history.add_tracks(tracks)
     refiner = Refiner(mode, fps=15, vocabulary=words, calibrated=calibrated)
     for sequence, posterior in enumerate(posteriors):
-        seen = StillSeen(
-            sequence=sequence,
-            frame_index=0,
-            capture_ns=0,
-            edge_track_id=1,
-            box_base_px=(10, 10, 50, 40),
-            class_name="car",
-            posterior=posterior,
-            context=None,  # type: ignore[arg-type]
-            side_px=side_px,
-        )
-        refiner.offer(seen, now_frame=0)
+        still = seen(sequence, 0, posterior, (10, 10, 50, 40), edge=1, side_px=side_px)
+        refiner.offer(still, now_frame=0)
         refiner.settle(history, now_frame=0)
     return refiner.shown(tracks)
 
