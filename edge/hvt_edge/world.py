@@ -16,8 +16,7 @@ from hvt_common.values import Fit
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink, ZenohLink
-from hvt_edge.pose.opening import PoseSource, open_pose
-from hvt_edge.pose.table import PoseTable
+from hvt_edge.loop.pose import PoseSource, PoseTable, open_pose
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.opening import Source, open_source, shown
 from hvt_edge.wiring import base_size, make_detector, make_link_settings, warm_up_for

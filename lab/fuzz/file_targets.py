@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_common.transport.inbox import Received
-from hvt_edge.pose.files import read_poses
+from hvt_geo.pose.files import read_poses
 from hvt_ground.sinks.message_log import MessageLog, read_log
 from lab.fuzz.contract import Target, scratch
 from rigs import messages

@@ -23,9 +23,8 @@ from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.link.still_readers import StillReaders
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.loop.pose import PoseSource, PoseStage
 from hvt_edge.operating import LoopClock, Operating, base_rate_bps
-from hvt_edge.pose.contract import PoseSource
-from hvt_edge.pose.stage import PoseStage
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
 from hvt_edge.status import InfoReporter

@@ -21,7 +21,7 @@ from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.runtime.health_server import Answer, HealthServer
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.transport.session import LinkSettings, open_session
-from hvt_edge.pose.opening import open_pose
+from hvt_edge.loop.pose import open_pose
 from hvt_edge.source.live import LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_ground.sinks.rerun.live_view import LiveView, listening

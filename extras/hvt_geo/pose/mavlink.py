@@ -17,9 +17,9 @@ from typing import Any
 
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
-from hvt_edge.pose.angles import compass_deg, euler_deg
-from hvt_edge.pose.mavlink_frames import FrameParser
-from hvt_edge.pose.mavlink_transport import Address, Connection
+from hvt_geo.pose.angles import compass_deg, euler_deg
+from hvt_geo.pose.mavlink_frames import FrameParser
+from hvt_geo.pose.mavlink_transport import Address, Connection
 
 _log = logging.getLogger(__name__)
 

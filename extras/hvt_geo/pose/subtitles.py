@@ -41,7 +41,7 @@ _MOST_SATELLITES = 60
 
 
 def subtitle_rows(text: str, note: Callable[[str], None]) -> Iterator[Mapping[str, float]]:
-    """Rows of values as `hvt_edge.pose.files.COLUMNS` names them; ``note`` gets the guesses and their reasons."""
+    """Rows of values as `hvt_geo.pose.files.COLUMNS` names them; ``note`` gets the guesses and their reasons."""
     times = list(_TIMES.finditer(text))  # whatever lines are empty: tools leave them out, or double them
     ends = (*(time.start() for time in times[1:]), len(text))
     blocks = [(time, text[time.end() : end]) for time, end in zip(times, ends, strict=False)]

@@ -13,9 +13,9 @@ import pytest
 pytest.importorskip("pymavlink")
 
 
-from hvt_edge.pose.mavlink_frames import MAX_FRAME_BYTES, FrameParser
-from hvt_edge.pose.mavlink_transport import Address, Connection
-from hvt_edge.pose.opening import open_pose
+from hvt_edge.loop.pose import open_pose
+from hvt_geo.pose.mavlink_frames import MAX_FRAME_BYTES, FrameParser
+from hvt_geo.pose.mavlink_transport import Address, Connection
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("pymavlink")
 
-from hvt_edge.pose.opening import open_pose
+from hvt_edge.loop.pose import open_pose
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
-from hvt_edge.pose.files import read_poses
-from hvt_edge.pose.opening import open_pose
+from hvt_edge.loop.pose import open_pose
+from hvt_geo.pose.files import read_poses
 
 SECOND_NS = 1_000_000_000
 MINI = """1

@@ -5,8 +5,7 @@ from __future__ import annotations
 from hvt_common.protocol.messages import PoseDecoder, PoseReport
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Pose
-from hvt_edge.pose.stage import PoseStage
-from hvt_edge.pose.table import PoseTable
+from hvt_edge.loop.pose import PoseStage, PoseTable
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_790_000_000_000_000_000

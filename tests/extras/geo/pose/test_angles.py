@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_edge.pose.angles import compass_deg, euler_deg
+from hvt_geo.pose.angles import compass_deg, euler_deg
 
 
 def quaternion(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float, float]:

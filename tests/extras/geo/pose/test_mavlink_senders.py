@@ -10,9 +10,9 @@ pytest.importorskip("pymavlink")
 
 from pymavlink.dialects.v20 import ardupilotmega
 
-from hvt_edge.pose.angles import euler_deg
-from hvt_edge.pose.mavlink_frames import FrameParser
-from hvt_edge.pose.opening import open_pose
+from hvt_edge.loop.pose import open_pose
+from hvt_geo.pose.angles import euler_deg
+from hvt_geo.pose.mavlink_frames import FrameParser
 
 
 class Device:

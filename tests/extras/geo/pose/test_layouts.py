@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_edge.pose.files import read_poses
+from hvt_geo.pose.files import read_poses
 
 SECOND_NS = 1_000_000_000
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from hvt_common.errors import UserError
 from hvt_common.values import Orientation, Pose
-from hvt_edge.pose.angles import compass_deg
+from hvt_geo.pose.angles import compass_deg
 
 _ACCEPTED = (
     "give fixed:LAT,LON,HEIGHT,AZIMUTH,TILT: degrees, metres above the ground, degrees clockwise from north, degrees "

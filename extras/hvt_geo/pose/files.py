@@ -27,9 +27,9 @@ from hvt_common.geodesy import turned_deg
 from hvt_common.inference.labels import decoded
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
-from hvt_edge.pose.angles import compass_deg
-from hvt_edge.pose.subtitles import subtitle_rows
-from hvt_edge.pose.table import MOST_GAP_S, PoseTable
+from hvt_edge.loop.pose import MOST_GAP_S, PoseTable
+from hvt_geo.pose.angles import compass_deg
+from hvt_geo.pose.subtitles import subtitle_rows
 
 _log = logging.getLogger(__name__)
 
