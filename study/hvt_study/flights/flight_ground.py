@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Protocol, TypeVar
 
 from hvt_common.inference.classify import Classifier
-from hvt_common.inference.detect import Detector
+from hvt_common.inference.detect import FailingDetector
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys, parse_key
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.protocol.messages import (
@@ -72,11 +72,11 @@ class InlineExecutor(ThreadPoolExecutor):
 class SharedModels(Models):
     """Models that are open already; flights of one process take turns with them."""
 
-    def __init__(self, detector: Detector, classifier: Classifier | None = None) -> None:
+    def __init__(self, detector: FailingDetector, classifier: Classifier | None = None) -> None:
         self._shared = detector, classifier
         self.turns = Turns()
 
-    def take(self) -> tuple[Detector, Classifier | None]:
+    def take(self) -> tuple[FailingDetector, Classifier | None]:
         """The same for every session."""
         return self._shared
 

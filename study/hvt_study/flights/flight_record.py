@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 
 from hvt_common.inference.classify import Classifier
-from hvt_common.inference.detect import Detector
+from hvt_common.inference.detect import FailingDetector
 from hvt_common.protocol.messages import RoiHeader, StillResult
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Boxes, Detections, Image, Posterior, Tracks, View, iou
@@ -60,7 +60,7 @@ class Watch:
 class _WatchedDetector:
     """The ground's detector on the base stream; re-detection of stills has its own way to it."""
 
-    def __init__(self, detector: Detector) -> None:
+    def __init__(self, detector: FailingDetector) -> None:
         self._detector = detector
         self.found: Detections | None = None
 
@@ -68,7 +68,7 @@ class _WatchedDetector:
     def class_names(self) -> tuple[str, ...]:
         return self._detector.class_names
 
-    def detect(self, image_bgr: Image) -> Detections:
+    def detect(self, image_bgr: Image) -> Detections | None:
         self.found = self._detector.detect(image_bgr)
         return self.found
 
