@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
-from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import (
     MAX_MISSING_STILLS,
@@ -29,6 +28,7 @@ from hvt_common.runtime.statistics import LatencyStats
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, MessageTiming, Traffic
+from hvt_ground.link.capture_clock import CaptureClock
 
 _MS = 1_000_000
 REPORT_LINE_BYTES = 180
@@ -200,7 +200,7 @@ class SessionAccount:
         info: Info,
         *,
         clock: Callable[[], int],
-        clock_offset: ClockOffset,
+        clock_offset: CaptureClock,
         emit: Callable[[Event], None],
     ) -> None:
         self.ledger = Ledger(window_ns=info.window_ns)

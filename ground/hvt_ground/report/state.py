@@ -69,10 +69,11 @@ class SessionState:
     base_bps: float | None
     roi_bps: float | None
     delay_p50_ms: float | None
-    """Capture to overlay over the session; None in lockstep, before the first, and while no picture comes."""
+    """Capture to overlay over the session; None in lockstep, before the first, while no picture comes, and where the
+    camera's clock cannot be right."""
     delay_p95_ms: float | None
     picture_age_s: float | None
-    """Since the newest picture was captured; None in lockstep."""
+    """Since the newest picture was captured, or came where the camera's clock cannot be right; None in lockstep."""
     pose: PoseState | None
     """None where none ever came."""
     frames_received: int
@@ -256,7 +257,7 @@ def _pose(session: GroundSession, now_ns: int) -> PoseState | None:
         return None
     age_ns = session.newest_capture_ns - newest.capture_ns
     if not session.lockstep:  # the camera may be gone, and flies on
-        age_ns = now_ns - session.to_local_ns(newest.capture_ns)
+        age_ns = now_ns - session.posed_ns(newest.capture_ns)
     age_s = max(0.0, age_ns / SECOND_NS)
     return PoseState(newest.latitude_deg, newest.longitude_deg, newest.height_m, age_s)
 
@@ -264,7 +265,7 @@ def _pose(session: GroundSession, now_ns: int) -> PoseState | None:
 def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState, now_ns: int) -> SessionState:
     info, pipeline, counters, status = session.info, session.perceived, session.counters, session.last_status
     now: Traffic | None = None if link == "lost" else session.traffic(now_ns)
-    delayed = now is not None and not session.lockstep
+    delayed = now is not None and session.knows_delay
     captured_ns = None if session.lockstep else session.newest_captured_ns
     counts, health = None if status is None else status.health, session.health(now_ns)
     totals = session.backlog.totals
@@ -320,7 +321,7 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
             FailedPart(
                 one.part,
                 one.reason,
-                session.to_local_ns(session.edge_failing.get(one.part, one.failed_ns)),
+                min(now_ns, session.to_local_ns(session.edge_failing.get(one.part, one.failed_ns))),
             )
             for one in status.failed
             if not one.working

@@ -35,6 +35,7 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
+from hvt_ground.link.capture_clock import CaptureClock
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.sequence_window import StillSequenceWindow
@@ -87,7 +88,8 @@ class GroundSession:
         """As they are now, some seconds late."""
         self.lockstep = info.pace == "lockstep"
         self._clock_offset = ClockOffset() if reports is None else reports.clock_offset
-        self._account = SessionAccount(info, clock=clock, clock_offset=self._clock_offset, emit=self._emit)
+        self._capture_clock, self._pose_clock = (CaptureClock(self._clock_offset) for _ in range(2))
+        self._account = SessionAccount(info, clock=clock, clock_offset=self._capture_clock, emit=self._emit)
         self.ledger = self._account.ledger
         self.receive_latency = self._account.receive_latency
         self.overlay_latency = self._account.overlay_latency
@@ -121,9 +123,8 @@ class GroundSession:
         """When the newest report of tracks came, the newest status, and the newest access unit."""
         self._first_capture_ns: int | None = None
         self._last_capture_ns = 0
-        self._results: list[StillResult] = []
-        self._results_lock = threading.Lock()
-        self._still_window = StillSequenceWindow()
+        self._results: tuple[StillResult, ...] = ()
+        self._still_window, self._results_lock = StillSequenceWindow(), threading.Lock()
         if worker_of is None:
             worker_of = (
                 partial(LockstepWorker, name=info.edge)
@@ -149,12 +150,12 @@ class GroundSession:
         """Take one access unit; False where the decoder could make nothing of it."""
         header, item = packet.arrival.header, packet.item
         decode = packet.arrival.verdict == "decode"
+        self._note_capture(header.capture_ns, item.received_ns)
         if packet.on_time:  # of one that waited behind a hole the time says nothing
             delay_ms = None
-            if not self.lockstep:
-                delay_ms = max(
-                    0.0, (item.received_ns - self._clock_offset.to_local_ns(header.capture_ns)) / _MILLION
-                )
+            if self.knows_delay:
+                captured_ns = self._capture_clock.to_local_ns(header.capture_ns)
+                delay_ms = max(0.0, (item.received_ns - captured_ns) / _MILLION)
             self._statistics.base(
                 header, size_bytes=item.size_bytes, arrived_ns=item.received_ns, delay_ms=delay_ms
             )
@@ -182,7 +183,7 @@ class GroundSession:
         self.backlog.live(header.frame_index, item.payload, keyframe=header.keyframe, after_gap=starts_run)
         # In lockstep capture and sending are media time and say nothing of delay: count from here.
         reference_ns = (
-            item.received_ns if self.lockstep else self._clock_offset.to_local_ns(header.capture_ns)
+            item.received_ns if self.lockstep else self._capture_clock.to_local_ns(header.capture_ns)
         )
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
         self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, picture))
@@ -224,6 +225,7 @@ class GroundSession:
         pose = self.poses.report(report)
         self._account.time(Channel.POSE, item, report, handled=pose is not None)
         if pose is not None:
+            self._pose_clock.note(pose.capture_ns, received_ns=item.received_ns)
             self.worker.pose(partial(self.poses.use, pose), pose.capture_ns)
             self._emit(PoseUpdate(max(0, self._last_index), pose.capture_ns, pose, self.info.view))
             self._note_stale(pose.capture_ns)
@@ -334,7 +336,18 @@ class GroundSession:
     @property
     def newest_captured_ns(self) -> int | None:
         """The capture time of the newest picture, this ground's clock; None before the first."""
-        return None if self._first_capture_ns is None else self.to_local_ns(self._last_capture_ns)
+        if self._first_capture_ns is None:
+            return None
+        return self._capture_clock.to_local_ns(self._last_capture_ns)
+
+    @property
+    def knows_delay(self) -> bool:
+        """Whether the times of pictures say how long they were on their way."""
+        return self._capture_clock.is_sound and not self.lockstep
+
+    def posed_ns(self, capture_ns: int) -> int:
+        """The time of a pose, this ground's clock."""
+        return self._pose_clock.to_local_ns(capture_ns)
 
     def traffic(self, now_ns: int) -> Traffic | None:
         """The link's load; None before the first access unit, and where none has come lately."""
@@ -438,11 +451,24 @@ class GroundSession:
         """Return and forget up to ``most`` results that the edge has not been sent yet."""
         with self._results_lock:
             taken, self._results = self._results[:most], self._results[most:]
-            return tuple(taken)
+            return taken
 
     def _collect_results(self) -> None:
         with self._results_lock:
-            self._results = (self._results + self.pipeline.take_results())[-_MOST_RESULTS:]
+            self._results = (*self._results, *self.pipeline.take_results())[-_MOST_RESULTS:]
+
+    def _note_capture(self, capture_ns: int, received_ns: int) -> None:
+        if self.lockstep:
+            return
+        was_sound = self._capture_clock.is_sound
+        self._capture_clock.note(capture_ns, received_ns=received_ns)
+        if was_sound and not self._capture_clock.is_sound:
+            off_s = abs(received_ns - self._clock_offset.to_local_ns(capture_ns)) // SECOND_NS
+            self.note(
+                "warning",
+                f"the camera's clock is {off_s} s off: ages count from the arrival of pictures, and delays are not "
+                "known",
+            )
 
     def _note_stale(self, capture_ns: int) -> None:
         stale = self.poses.turned_stale(capture_ns)

@@ -40,7 +40,7 @@ class SessionFeed:
         self._hub = hub
         self._clock = clock
         self._pictures = Pictures(info)
-        self._offset_ns = 0
+        self._offset_ns: int | None = None
         self._late_ns = 0
         session = {
             "edge": info.edge,
@@ -95,8 +95,9 @@ class SessionFeed:
             self._hub.post(partial(give, frame_index=sample.frame_index, captured_ms=captured_ms))
 
     def _captured_ms(self, capture_ns: int) -> float:
-        # Capture time by the ground's clock. In lockstep capture is media time: there the picture is from now.
-        if self._info.pace == "lockstep":
+        # Capture time by the ground's clock. In lockstep capture is media time: there, and before the first is
+        # counted, the picture is from now.
+        if self._info.pace == "lockstep" or self._offset_ns is None:
             return self._clock() / _MILLION
         return (capture_ns - self._offset_ns) / _MILLION
 
@@ -238,7 +239,7 @@ def _short(one: EdgeState) -> str:
     session = one.session
     if session is None:
         return ""
-    said = [_failure(part) for part in session.edge_failed if part.part == "source"]
+    said = [_failure(part, "the camera") for part in session.edge_failed if part.part == "source"]
     if session.total_bps is not None:
         thin = "link too thin, " if one.link == "thin" else ""
         said.append(f"{thin}{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")
@@ -262,7 +263,7 @@ def _edge_failures(one: EdgeState) -> list[str]:
     )
 
 
-def _failure(part: FailedPart) -> str:
+def _failure(part: FailedPart, name: str = "") -> str:
     # Without the reason: it may name files of this machine.
     at = time.strftime("%H:%M:%S", time.gmtime(part.since_ns // 1_000_000_000))
-    return f"{part.part} does not work since {at} UTC"
+    return f"{name or part.part} has not worked since {at} UTC"

@@ -27,6 +27,7 @@ from hvt_geo.terrain import Terrain
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.config import check
 from hvt_ground.extras import config_class
+from hvt_ground.link.capture_clock import CaptureClock
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.sinks import Outputs
 from hvt_ground.wiring import Models, SessionFactory
@@ -323,7 +324,7 @@ def test_a_model_that_goes_in_flight_ends_no_flight(tmp_path, caplog):
         reports = ReceiverReports(
             lambda _report: None,
             clock=time.time_ns,
-            clock_offset=ClockOffset(),
+            clock_offset=CaptureClock(ClockOffset()),
             backlog=EdgeBacklog("uav-1", recordings=None),
         )
         session = factory.open_session(replace(INFO, edge="uav-1"), reports)

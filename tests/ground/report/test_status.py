@@ -24,7 +24,8 @@ from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.web.feed import state_message
+from hvt_ground.web.feed import SessionFeed, state_message
+from hvt_ground.web.viewers import EdgePage
 from programs.processes import eventually
 from programs.rrd import Recording
 from rigs.flight import Flight, Port, pipeline_of
@@ -57,6 +58,23 @@ class Ground:
     def line(self) -> str:
         """The status line."""
         return status_text(self.maker.make([("uav-1", self.sessions)]))
+
+
+class Shown:
+    """A hub that keeps the capture time of the newest event."""
+
+    captured_ms = 0.0
+
+    def post(self, call: Callable[[], None]) -> None:
+        """Do it at once."""
+        call()
+
+    def begin(self, *_: object) -> None:
+        """A session begins."""
+
+    def notice(self, _: EdgePage, message: str) -> None:
+        """An event."""
+        self.captured_ms = json.loads(message)["captured"]
 
 
 @pytest.fixture
@@ -119,6 +137,31 @@ def test_a_link_that_carries_nothing_is_lost_in_the_line(ground):
     assert "LINK LOST" not in ground.line()
     ground.sessions.close()
     ground.outputs.close()
+
+
+def test_a_camera_whose_clock_is_wrong_is_as_old_as_its_arrival(tmp_path):
+    """``NO PICTURE for 5704667 s`` stood beside a picture of this moment."""
+    flight, now_ns = Flight(6), [time.time_ns()]
+    ground = Ground(tmp_path, flight, clock=lambda: now_ns[0])
+    for index in range(5):
+        now_ns[0] += SECOND_NS // 15
+        ground.sessions.handle(replace(flight.base(index), received_ns=now_ns[0]))
+    now_ns[0] += 4 * SECOND_NS
+    (edge,) = ground.maker.make([("uav-1", ground.sessions)]).edges
+    assert edge.session.picture_age_s == pytest.approx(4.0, abs=0.2)
+    assert edge.session.delay_p50_ms is None
+    shown = Shown()
+    ground.sessions.session.sinks.append(
+        SessionFeed(flight.info(), EdgePage("uav-1"), shown, clock=ground.clock)
+    )
+    ground.sessions.handle(replace(flight.base(5), received_ns=now_ns[0]))
+    ground.sessions.session.note("info", "a line")
+    came_ms = (now_ns[0] - 4 * SECOND_NS + SECOND_NS // 15) / 1e6  # it waited behind the hole
+    assert shown.captured_ms == pytest.approx(came_ms, abs=5)
+    ground.sessions.close()
+    ground.outputs.close()
+    said = [text for _, _, text in Recording(ground.path).events()]
+    assert sum("the camera's clock is" in one and "s off" in one for one in said) == 1
 
 
 def test_what_could_not_be_written_is_named_of_the_edge_it_concerns(ground):
