@@ -13,7 +13,7 @@ STILL_WORDS: Mapping[str, str] = MappingProxyType(
         "new": "of new tracks",
         "uncertain": "of uncertain class",
         "small": "of small objects",
-        "utility": "most useful by the paper's rule",
+        "utility": "of most use within the budget",
         "asked": "on demand",
         "again": "sent again",
         "stored": "stored for later",

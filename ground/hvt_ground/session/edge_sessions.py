@@ -160,7 +160,7 @@ class EdgeSessions:
         if self._pause.due(now_ns) and self._receiver.take_keyframe_request(pending=pending):
             self.port.request_keyframe()
             if session is not None:
-                session.note("warning", "keyframe requested")
+                session.note("warning", "the ground has asked for a keyframe")
         if session is None:
             return
         if session.take_resumed():
@@ -266,8 +266,8 @@ class EdgeSessions:
         if session_id != session.info.session_id:
             return
         if arrival.lost_before:
-            lost = f"{arrival.lost_before} picture{'s' * (arrival.lost_before != 1)} lost"
-            session.note("warning", f"{lost}; waiting for a keyframe")
+            lost = "1 picture was" if arrival.lost_before == 1 else f"{arrival.lost_before} pictures were"
+            session.note("warning", f"{lost} lost: the ground waits for a keyframe")
         if not session.base(packet):
             self._receiver.wait_for_keyframe()
 

@@ -263,7 +263,10 @@ class GroundSession:
     def learn(self, info: Info) -> None:
         """Take the session's present `Info`: budget and method may have changed."""
         if (info.budget_bps, info.method) != (self.budget_bps, self.method):
-            self.note("info", f"budget {bitrate_text(info.budget_bps)}, {info.method} from now on")
+            self.note(
+                "info",
+                f"from now on the budget is {bitrate_text(info.budget_bps)}, and the method {info.method}",
+            )
         self.budget_bps, self.method = info.budget_bps, info.method
         self._account.budget_bps = info.budget_bps
 
@@ -305,7 +308,7 @@ class GroundSession:
         if self.failure:
             self.note("error", f"the session failed: {self.failure}", last=True)
         if self.not_sent:
-            self.note("info", f"stills that the edge did not send: {counts_text(self.not_sent)}", last=True)
+            self.note("info", f"the edge did not send these stills: {counts_text(self.not_sent)}", last=True)
         ended = self.last_status is not None and self.last_status.state == "ended"
         self.note("info", "the flight has ended" if ended else "this session has ended", last=True)
 

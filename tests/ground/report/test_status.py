@@ -121,7 +121,7 @@ def test_who_gets_no_stills_reads_why(ground):
     assert content["stills"]["reasons"]["not_sent"] == {"base_good": 49, "cooldown": 3, "too_large": 1}
     said = "49 the video already shows well, 3 sent a moment ago, 1 too large for the budget"
     assert said in dict(table(content))["stills"]
-    assert f"stills that the edge did not send: {said}" in [
+    assert f"the edge did not send these stills: {said}" in [
         text for _, _, text in Recording(ground.path).events()
     ]
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import os
 import re
 import shutil
 import subprocess
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import hvt_ground
 import hvt_ground.web
 from hvt_common.protocol.still_words import STILL_WORDS
 
@@ -37,7 +41,12 @@ def said(calls: list[tuple[str, list]]) -> list:
 def ran(script: str) -> Any:
     """What a module of JavaScript prints as JSON."""
     done = subprocess.run(
-        [NODE, "--input-type=module", "-e", script], capture_output=True, text=True, check=False, timeout=60
+        [NODE, "--input-type=module", "-e", script],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env=os.environ | {"TZ": "UTC"},
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -61,6 +70,7 @@ def test_what_is_not_live_never_says_live():
         ({"shown": False}, "waiting for a picture"),
         ({"shown": False, "lastMs": None}, "waiting for a picture"),
         ({"shown": False, "lastMs": 94_000}, "NO PICTURE 94 s"),
+        ({"ageMs": 27_000, "sinceMs": 400}, "NO NEW PICTURE 27 s"),
         ({"sinceMs": 4_000}, "NO NEW PICTURE 4 s"),
         ({"sinceMs": 1_400, "periodMs": 1_000}, "live, 0.3 s"),
     ]
@@ -77,33 +87,68 @@ def test_what_is_not_live_never_says_live():
         assert one["words"].startswith("live") == one["live"]
 
 
+SENTENCES: dict[str, list[tuple[list, Any]]] = json.loads(
+    Path(__file__).with_name("sentences.json").read_text(encoding="utf-8")
+)
+"""By name in words.js: what it is given, and what an operator then reads. A new one is written here, and read."""
+
+
 @pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
-def test_what_is_unknown_is_not_said_to_be_nothing():
-    """The list would say 0 tracks beside sixty cars whose boxes are half a second late."""
-    found = said(
-        [
-            ("boxesWords", [None, 500]),
-            ("boxesWords", [1400, 500]),
-            ("boxesWords", [100, 500]),
-            ("tracksTitle", [None, ""]),
-            ("tracksTitle", [69, "boxes 1.4 s behind"]),
-            ("tracksTitle", [0, ""]),
-            ("recordingWords", [None]),
-            ("recordingWords", [False]),
-            ("connectionWords", [False, "the proxy takes the port off the header Host"]),
-        ]
+def test_every_sentence_of_the_page_is_read():
+    """A word of the code, a hole or a number that nobody knows would stand before who flies."""
+    found = ran(
+        f"""
+      import * as words from {json.dumps((STATIC / "words.js").as_uri())};
+      const given = {json.dumps({name: [one for one, _ in cases] for name, cases in SENTENCES.items()})};
+      const say = (one, cases) => (typeof one === "function" ? cases.map((args) => one(...args)) : [one]);
+      const said = Object.entries(words).map(([name, one]) => [name, say(one, given[name] ?? [])]);
+      console.log(JSON.stringify(Object.fromEntries(said)));
+    """
     )
-    assert found == [
-        "no boxes yet",
-        "boxes 1.4 s behind",
-        "",
-        "Tracks: not known yet",
-        "Tracks: 69 (boxes 1.4 s behind)",
-        "Tracks: 0",
-        "",
-        "NOT RECORDED",
-        "the ground refuses this page: the proxy takes the port off the header Host",
-    ]
+    assert found == {name: [said for _, said in cases] for name, cases in SENTENCES.items()}
+    for said in texts(found):
+        assert not re.search(r"undefined|null|NaN|\[object|\$\{|_|  ", said), said
+
+
+def texts(found: Any) -> list[str]:
+    """All texts within."""
+    if isinstance(found, dict):
+        return [text for one in found.values() for text in texts(one)]
+    return [text for one in found for text in texts(one)] if isinstance(found, list) else [str(found)]
+
+
+_NO_TEXT = {
+    "`${letter}px system-ui, sans-serif`",
+    "`${11 * ratio}px system-ui, sans-serif`",
+    '"(prefers-color-scheme: light)"',
+    '"button, input, select"',
+    '`${track.doubted ? "doubted" : ""} ${track.read ? "read" : ""}`',
+    '`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`',
+    '`video/mp4; codecs="${codec}"`',
+    '`video/mp4; codecs="${start.codec}"`',
+    "`#${new URLSearchParams({ edge, ...(wanted ? { rung: wanted } : {}) })}`",
+    "`calc(min(72vh, max(15rem, 100vh - 24.5rem)) * ${width / height})`",
+    "`${page}#${new URLSearchParams({ edge })}`",
+    "`${width} / ${height}`",
+    '" · "',
+    '" "',
+}
+"""Fonts, selectors, addresses and the like."""
+_SHOWN = re.compile(
+    r'(?:\.(?:textContent|title|alt|innerHTML) = |"aria-label", |confirm\(|tell\()(?:`|"[^"])'
+)
+
+
+def test_no_text_of_the_page_is_written_elsewhere():
+    """It would be read by nobody before an operator does."""
+    parts = re.compile(r'"(?:[^"\\\n]|\\.)*"|`(?:[^`\\]|\\.)*`|//[^\n]*|/\*.*?\*/', re.DOTALL)
+    for path in sorted(STATIC.glob("*.js")):
+        if path.name == "words.js":
+            continue
+        literals = [one for one in parts.findall(path.read_text()) if one[0] in '"`']
+        said = [one for one in literals if re.search(r"\s|[^\x00-\x7f]", one) and one not in _NO_TEXT]
+        assert not said, f"{path.name}: {said} belongs into words.js"
+        assert not _SHOWN.search(path.read_text()), path.name
 
 
 ELEMENTS = """
@@ -173,5 +218,113 @@ def test_the_page_shows_no_word_of_the_code():
     for path in [*sorted(STATIC.glob("*.js")), STATIC / "index.html"]:
         found = code & set(re.findall(r"\w+", path.read_text()))
         assert not found, f"{path.name} says {found}"
-    shown = (STATIC / "stills.js").read_text()
-    assert "still.reason}" not in shown, "the reason is said in words"
+
+
+EVENTS = {
+    "the ground has asked for a keyframe",
+    "… lost: the ground waits for a keyframe",
+    "from now on the budget is …, and the method …",
+    "… from the outage at … UTC arrived",
+    "… of this session arrived after it had ended",
+    "the session failed: …",
+    "the edge did not send these stills: …",
+    "the flight has ended",
+    "this session has ended",
+    "the camera's clock is … s off: ages count from the arrival of pictures, and delays are not known",
+    "the pose is stale: nothing is placed on the ground until there is a new one",
+    "there is a pose again",
+    "… lines were left out here: the edge gave rise to too many",
+    "still … is asked for again: …",
+    "still … cannot be decoded: …",
+}
+"""Every text of an event that the ground makes; it passes on what an edge says of its settings in flight."""
+REFUSALS = {
+    "unknown host, or a reverse proxy without --web-proxy",
+    "give the link that hvt-ground showed at its start",
+    "the proxy of … has to pass that host on and say in … who is viewer or operator",
+    (
+        "the proxy takes the port off the header Host, so that this looks like another site: have it pass Host as "
+        "the browser sent it (nginx: proxy_set_header Host $http_host)"
+    ),
+    "this comes from another site",
+    "only an operator may do this",
+    "too many viewers",
+    "too many viewers: one from another address took this place",
+    "it does not take what is sent",
+    "there is no such picture any more",
+    "there is no such edge",
+    "there is nothing here",
+    "too much was sent",
+    "this is no JSON",
+    "this is no JSON object",
+    "give kbps, from 1 on, or method, such as M5",
+    "box is no [x1, y1, x2, y2] in pixels of the picture",
+    "frame is no whole number",
+    "… requests are under way: wait for one of them",
+    "the link is not open yet",
+}
+"""Every answer of the page's server that is no picture."""
+
+
+def test_every_event_and_every_refusal_is_read():
+    """What the ground says on the page comes from many places: each text stands here, and was read."""
+    ground = Path(hvt_ground.__file__).parent
+    found = {text for path in ground.rglob("*.py") for text in noted(path)}
+    assert found == EVENTS
+    web = [ground / "web" / f"{name}.py" for name in ("access", "site", "requests", "viewers", "server")]
+    said = {text for path in web for text in sentences(path)}
+    assert said >= REFUSALS
+    answers = {
+        text
+        for path in web
+        for text in given(path, {"PlainTextResponse", "BadRequestError", "BusyError", "give_up"})
+    }
+    assert answers <= REFUSALS
+
+
+def noted(path: Path) -> Iterator[str]:
+    """The texts of events that a module makes."""
+    for call in calls(path):
+        name = called(call)
+        if name == "note" and len(call.args) == 2:  # level, text
+            yield from spoken(call.args[1])
+        elif name in ("Notice", "_notice"):
+            yield from spoken(call.args[-1])
+    for node in ast.walk(ast.parse(path.read_text())):  # what was put into a name before
+        if isinstance(node, ast.Assign) and path.stem in ("session_log", "recordings"):
+            yield from (
+                text for text in spoken(node.value) if "left out here" in text or "of this session" in text
+            )
+
+
+def given(path: Path, names: set[str]) -> Iterator[str]:
+    """The texts that a module gives to calls of these names."""
+    for call in calls(path):
+        if called(call) in names and call.args:
+            yield from spoken(call.args[0])
+
+
+def sentences(path: Path) -> Iterator[str]:
+    """All texts of a module."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.expr):
+            yield from spoken(node)
+
+
+def calls(path: Path) -> Iterator[ast.Call]:
+    return (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+
+
+def called(call: ast.Call) -> str:
+    return getattr(call.func, "attr", getattr(call.func, "id", ""))
+
+
+def spoken(node: ast.expr) -> Iterator[str]:
+    """The texts of a constant, an f-string, or one of two; what is filled in is an ellipsis."""
+    match node:
+        case ast.Constant(value=str(text)):
+            yield text
+        case ast.JoinedStr(values=values):
+            yield "".join(str(one.value) if isinstance(one, ast.Constant) else "…" for one in values)
+        case ast.IfExp(body=body, orelse=other):
+            yield from (*spoken(body), *spoken(other))

@@ -1,5 +1,7 @@
 // Boxes and names on the picture, in step with it; a click or a drag is a box too.
 
+import { boxWords } from "./words.js";
+
 /** @typedef {{id: number, box: number[], name: string, sureness: number, read?: 1, doubted?: 1, sure?: 1}} Track */
 /** @typedef {{frame: number, captured: number, tracks: Track[], colours: Record<string, string>}} Overlay */
 
@@ -190,7 +192,7 @@ export class Boxes {
    * @param {number[][]} taken @param {number[][]} centres of the others @param {boolean} crowd
    */
   drawName(context, track, scale, letter, taken, centres, crowd) {
-    const words = `${track.name} ${track.sure ? "✓" : Math.round(track.sureness * 100)}`;
+    const words = boxWords(track.name, track.sureness, Boolean(track.sure));
     const height = letter * 1.35;
     const width = context.measureText(words).width + letter * 0.5;
     const [x, y, end, low] = track.box.map((value) => value * scale);

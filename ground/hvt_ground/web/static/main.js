@@ -4,9 +4,9 @@ import { Boxes, OLD_MS } from "./boxes.js";
 import { Connection, unpacked } from "./connection.js";
 import { Player } from "./player.js";
 import { Plot } from "./plot.js";
-import { Stills, clock } from "./stills.js";
-import { Wall, kbps, make } from "./wall.js";
-import { LINK_WORDS, RUNG_WORDS, boxesWords, connectionWords, recordingWords, seconds, standing, tracksTitle } from "./words.js";
+import { Stills } from "./stills.js";
+import { Wall, make } from "./wall.js";
+import * as words from "./words.js";
 
 /** @typedef {import("./connection.js").Message} Message */
 
@@ -72,7 +72,7 @@ function onState(state, why) {
   refused = Boolean(why);
   if (connected) connectedAt = performance.now();
   showAge();
-  by("connection").textContent = connectionWords(connected, why);
+  by("connection").textContent = words.connectionWords(connected, why);
   if (state !== "connected") return;
   connection.send({ type: "wall", shown: true });
   if (chosen) watch();
@@ -127,7 +127,7 @@ function onMessage(message, payload) {
     case "fragment":
       player.fragment(/** @type {any} */ (message), payload);
       if (mine && message.key && keyframeAt) {
-        confirm(`a keyframe came ${seconds(performance.now() - keyframeAt)} after it was asked for`);
+        confirm(words.keyframeCame(performance.now() - keyframeAt));
         keyframeAt = 0;
       }
       break;
@@ -144,7 +144,7 @@ function chooseFirst() {
   const named = new URLSearchParams(location.hash.slice(1)).get("edge");
   const [first] = [...sessions.keys()].sort();
   if (named && !sessions.has(named)) {
-    by("absent").textContent = `${named}, which the address names, is not here: it is shown when it comes; or choose another`;
+    by("absent").textContent = words.absentWords(named);
     by("absent").hidden = false;
   } else if (sessions.size) choose(named || first);
 }
@@ -189,18 +189,19 @@ function watch() {
   stills.reset();
   by("events").replaceChildren();
   connection.send({ type: "watch", edge: chosen, rung: rungs[0] });
-  by("rung").textContent = RUNG_WORDS[rungs[0]];
+  by("rung").textContent = words.RUNG_WORDS[rungs[0]];
 }
 
 function describe() {
   const session = sessions.get(chosen);
   if (!session) return;
-  const [width, height] = session.baseSize;
+  const { method, baseSize, fps, budget } = session;
+  const [width, height] = baseSize;
   by("name").textContent = chosen;
-  by("facts").textContent = `${session.method} · ${width}×${height} at ${Math.round(session.fps * 10) / 10} a second · ${kbps(session.budget)}`;
+  by("facts").textContent = words.sessionWords(method, baseSize, fps, budget);
   by("stage").style.aspectRatio = `${width} / ${height}`;
-  by("stage").style.maxWidth = `calc(min(72vh, max(15rem, 100vh - 21.5rem)) * ${width / height})`;
-  boxes.size = session.baseSize;
+  by("stage").style.maxWidth = `calc(min(72vh, max(15rem, 100vh - 24.5rem)) * ${width / height})`;
+  boxes.size = baseSize;
   showSettings();
 }
 
@@ -230,7 +231,7 @@ function showAge() {
   const ms = connection.now() - shown.captured;
   const state = states.get(chosen);
   const jpeg = rungs[0] === "jpeg";
-  const { state: name, words, live } = standing({
+  const { state: name, words: said, live } = words.standing({
     connected: connected && (now - stateAt < STATE_OLD_MS || now - connectedAt < STATE_OLD_MS),
     refused,
     goneMs: now - Math.max(stateAt, 0),
@@ -249,24 +250,24 @@ function showAge() {
   const stage = by("stage");
   stage.dataset.state = name;
   stage.classList.toggle("old", !live && shown.frame >= 0 && name !== "paused");
-  by("standing").textContent = words;
+  by("standing").textContent = said;
   const gone = name === "gone";
-  by("behind").textContent = shown.frame < 0 || gone ? "" : boxesWords(boxes.behind(), OLD_MS);
+  by("behind").textContent = shown.frame < 0 || gone ? "" : words.boxesWords(boxes.behind(), OLD_MS);
   by("on-link").textContent = state && !gone && name !== "lost" ? state.short : "";
-  by("recording").textContent = gone ? "" : recordingWords(state?.recording ?? null);
+  by("recording").textContent = gone ? "" : words.recordingWords(state?.recording ?? null, !["lost", "stale", "ended"].includes(name));
   by("recording").classList.toggle("bad", state?.recording === false);
   by("gap").hidden = shown.frame >= 0;
-  by("gap").textContent = state?.link === "ended" ? "the flight has ended" : name === "stale" ? "no picture comes" : "waiting for a picture";
-  by("age").textContent = shown.frame < 0 || player.live ? "" : `of ${clock(shown.captured)}, ${seconds(ms)} ago`;
+  by("gap").textContent = words.emptyWords(name);
+  by("age").textContent = shown.frame < 0 || player.live ? "" : words.pictureWords(shown.captured, ms);
   by("now").disabled = player.live;
-  by("pause").textContent = by("video").paused && !player.live ? "Play" : "Pause";
+  by("pause").textContent = words.pauseWords(!by("video").paused || player.live);
 }
 setInterval(showAge, 200);
 setInterval(() => {
   const told = connected && performance.now() - stateAt < STATE_OLD_MS;
   wall.tick(connection.now(), told);
   if (performance.now() - tracksAt > 1000) listTracks();
-  if (!told && by("link-text").textContent) by("link-text").textContent = "not known: the ground says nothing now";
+  if (!told && by("link-text").textContent) by("link-text").textContent = words.UNKNOWN_LINK;
 }, 500);
 
 function listTracks() {
@@ -275,14 +276,14 @@ function listTracks() {
   if (list.contains(document.activeElement)) return; // not under somebody's fingers
   const newest = boxes.newest();
   const tracks = newest?.tracks ?? [];
-  by("objects-title").textContent = tracksTitle(newest ? tracks.length : null, newest ? boxesWords(boxes.behind(), OLD_MS) : "");
+  by("objects-title").textContent = words.tracksTitle(newest ? tracks.length : null, newest ? words.boxesWords(boxes.behind(), OLD_MS) : "");
   listClasses(tracks);
   if (!by("objects").open) return;
   list.replaceChildren();
   for (const track of tracks.slice(0, 40)) {
     const button = make("button", `${track.doubted ? "doubted" : ""} ${track.read ? "read" : ""}`, make("li", "", list));
-    button.textContent = `${track.name} ${track.id}, ${Math.round(track.sureness * 100)} %`;
-    button.setAttribute("aria-label", `${track.name}, track ${track.id}${track.doubted ? ", doubted" : ""}: closer look`);
+    button.textContent = words.trackWords(track);
+    button.setAttribute("aria-label", words.trackLabel(track));
     button.disabled = role !== "operator";
     button.addEventListener("click", () => pick(track.box, track));
   }
@@ -320,18 +321,18 @@ function pressed(button) {
 
 /**
  * What came of a command.
- * @param {string} words
+ * @param {string} said
  */
-function confirm(words) {
-  by("settings-text").textContent = words;
+function confirm(said) {
+  by("settings-text").textContent = said;
 }
 
-/** @param {number[]} box @param {{name: string, id: number} | null} track */
+/** @param {number[]} box @param {words.TrackFacts | null} track */
 async function pick(box, track) {
   if (role !== "operator" || !chosen) return;
   const edge = chosen;
   boxes.mark(box);
-  tell(`asking ${edge} for ${track ? `${track.name} ${track.id}` : "this place"}`, null);
+  tell(words.askingStill(edge, track), null);
   const reply = await post(`/edges/${encodeURIComponent(edge)}/still`, { box, frame: shown.frame < 0 ? null : shown.frame });
   boxes.mark(null);
   if (edge !== chosen) return;
@@ -340,18 +341,17 @@ async function pick(box, track) {
     return;
   }
   const [about, data] = unpacked(await reply.arrayBuffer());
-  tell(`${track ? `${track.name} ${track.id}` : "this place"}, ${about.place[2]}×${about.place[3]} pixels of the camera`, data);
+  tell(words.answeredStill(track, about.place), data);
 }
 
-/** @param {string} words @param {Uint8Array | null} picture */
-function tell(words, picture) {
+/** @param {string} said @param {Uint8Array | null} picture */
+function tell(said, picture) {
   const image = by("answer-picture");
   if (image.src) URL.revokeObjectURL(image.src);
   image.hidden = !picture;
   image.removeAttribute("src");
   if (picture) image.src = URL.createObjectURL(new Blob([picture], { type: "image/jpeg" }));
-  image.alt = words;
-  by("answer-text").textContent = words;
+  image.alt = by("answer-text").textContent = said;
   by("answer").hidden = false;
 }
 
@@ -363,9 +363,9 @@ async function post(address, content) {
       headers: { "Content-Type": "application/json" },
       body: JSON.stringify(content),
     });
-    return reply.ok ? reply : (await reply.text()) || `the ground refused (${reply.status})`;
+    return reply.ok ? reply : (await reply.text()) || words.refusedWords(reply.status);
   } catch {
-    return "no connection to the ground";
+    return words.NO_CONNECTION;
   }
 }
 
@@ -374,25 +374,25 @@ async function keyframe() {
   const edge = chosen;
   const at = performance.now();
   keyframeAt = rungs[0] === "jpeg" ? 0 : at;
-  confirm("asked for a keyframe");
+  confirm(words.ASKING_KEYFRAME);
   const reply = await post(`/edges/${encodeURIComponent(edge)}/keyframe`, {});
   if (edge !== chosen) return;
   if (typeof reply === "string") {
     keyframeAt = 0;
     confirm(reply);
-  } else if (rungs[0] === "jpeg") confirm("the edge has taken the request for a keyframe");
+  } else if (rungs[0] === "jpeg") confirm(words.KEYFRAME_TAKEN);
   setTimeout(() => {
     if (keyframeAt !== at) return;
     keyframeAt = 0;
-    confirm(`no keyframe has come within ${seconds(KEYFRAME_MS)}`);
+    confirm(words.noKeyframe(KEYFRAME_MS));
   }, KEYFRAME_MS);
 }
 
-/** @param {object} content @param {{budget?: number, method?: string}} now of the session, once it is set @param {string} words */
-async function set(content, now, words) {
+/** @param {object} content @param {{budget?: number, method?: string}} now of the session, once it is set */
+async function set(content, now) {
   if (role !== "operator" || !chosen) return;
   const edge = chosen;
-  confirm(`asking ${edge} for ${words}`);
+  confirm(words.askingSetting(edge, now));
   const reply = await post(`/edges/${encodeURIComponent(edge)}/settings`, content);
   if (typeof reply !== "string") {
     Object.assign(sessions.get(edge) ?? {}, now);
@@ -400,7 +400,7 @@ async function set(content, now, words) {
     asked.set(edge, now);
   }
   if (edge !== chosen) return;
-  confirm(typeof reply === "string" ? reply : `${edge} has agreed to ${words}; it is not in force yet`);
+  confirm(typeof reply === "string" ? reply : words.agreedSetting(edge, now));
   describe();
 }
 
@@ -414,7 +414,7 @@ function confirmSet(edge, state) {
   if (!now || (now.budget ?? state.budget) !== state.budget || (now.method ?? state.method) !== state.method) return;
   asked.delete(edge);
   setAt.delete(edge);
-  if (edge === chosen) confirm(now.budget ? `${kbps(now.budget)} is in force` : `stills by ${now.method} is in force`);
+  if (edge === chosen) confirm(words.settingInForce(now));
 }
 
 /** What the edge flies with now; not under somebody's fingers. */
@@ -429,13 +429,13 @@ for (const name of METHODS) make("option", "", by("method")).textContent = name;
 by("budget-form").addEventListener("submit", (/** @type {Event} */ event) => {
   event.preventDefault();
   const kbps = Number(by("budget").value);
-  set({ kbps }, { budget: 1000 * kbps }, `${kbps} kbps`);
+  set({ kbps }, { budget: 1000 * kbps });
 });
 // A wheel or a key that moves a list commands nothing: only Set does.
 by("method-form").addEventListener("submit", (/** @type {Event} */ event) => {
   event.preventDefault();
   const method = by("method").value;
-  set({ method }, { method }, `stills by ${method}`);
+  set({ method }, { method });
 });
 by("show-boxes").addEventListener("click", () => boxes.toggle(pressed(by("show-boxes"))));
 
@@ -465,7 +465,7 @@ function onGroundState(message) {
  * @param {Message} state
  */
 function showState(state) {
-  by("link-text").textContent = [`${LINK_WORDS[state.link]} since ${clock(state.since)}`, ...state.words].join(" · ");
+  by("link-text").textContent = words.linkWords(state.link, state.since, state.words);
   by("failed").textContent = state.failed.join(" · ");
   by("why-list").replaceChildren();
   for (const one of state.why) make("li", "", by("why-list")).textContent = one;
@@ -476,13 +476,13 @@ function addEvent(message) {
   const item = document.createElement("li");
   item.className = message.level;
   const time = make("button", "", item);
-  time.textContent = clock(message.at * 1000);
-  time.setAttribute("aria-label", `the picture of ${clock(message.at * 1000)}`);
+  time.textContent = words.clock(message.at * 1000);
+  time.setAttribute("aria-label", words.eventPictureWords(message.at * 1000));
   time.addEventListener("click", () => {
     if (player.show(message.captured)) showAge();
     else {
       time.disabled = true;
-      time.title = "no longer at hand: see the recording";
+      time.title = words.PICTURE_GONE;
     }
   });
   make("span", "", item).textContent = message.text;

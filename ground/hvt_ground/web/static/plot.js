@@ -1,5 +1,7 @@
 // The link over the last four minutes: all bits, those of the base stream, and the budget.
 
+import { minutesAgo, plotWords } from "./words.js";
+
 const SECONDS = 240;
 const GAP_MS = 3000; // a row comes each second: where none came, nothing is known
 
@@ -67,7 +69,7 @@ export class Plot {
     for (let minute = 1; minute < 4; minute++) {
       const at = x(newest - minute * 60000);
       context.fillRect(at, 0, 1, canvas.height - foot);
-      context.fillText(`−${minute} min`, at + 3 * ratio, canvas.height - 4 * ratio);
+      context.fillText(minutesAgo(minute), at + 3 * ratio, canvas.height - 4 * ratio);
     }
     const line = (/** @type {"total" | "base" | "budget"} */ what, /** @type {string} */ ink, /** @type {number[]} */ dash) => {
       context.beginPath();
@@ -87,10 +89,11 @@ export class Plot {
     line("base", colour("--faint"), []);
     line("total", colour("--accent"), []);
     let left = 6 * ratio;
-    for (const [words, ink] of [["all", "--accent"], ["base stream", "--faint"], ["budget", "--thin"]]) {
+    const words = plotWords(rows[rows.length - 1].budget);
+    for (const [said, ink] of [[words.total, "--accent"], [words.base, "--faint"], [words.budget, "--thin"]]) {
       context.fillStyle = colour(ink);
-      context.fillText(words, left, 12 * ratio);
-      left += context.measureText(words).width + 12 * ratio;
+      context.fillText(said, left, 12 * ratio);
+      left += context.measureText(said).width + 12 * ratio;
     }
   }
 }

@@ -1,6 +1,7 @@
 // The strip of stills, each beside what the base stream showed there; a click opens the pair large.
 
 import { make } from "./wall.js";
+import { BASE_ALT, stillAlt, stillReason, stillTitle, stillWords } from "./words.js";
 
 const MOST = 60;
 
@@ -60,11 +61,11 @@ export class Stills {
       const picture = make("img", "", pair);
       picture.src = address(still, which);
       picture.loading = "lazy";
-      picture.alt = which === "still" ? `still: ${sentence(still)}` : "what the base stream showed";
+      picture.alt = which === "still" ? stillAlt(still) : BASE_ALT;
     }
     const words = make("span", "words", button);
-    words.textContent = sentence(still);
-    make("small", "", words).textContent = `${clock(still.captured)} · ${still.why}${still.stored ? " · came afterwards" : ""}`;
+    words.textContent = stillWords(still);
+    make("small", "", words).textContent = stillReason(still);
     button.addEventListener("click", () => this.open(still));
     this.list.prepend(item);
     while (this.list.children.length > MOST) this.list.lastElementChild?.remove();
@@ -77,7 +78,7 @@ export class Stills {
       picture.parentElement.hidden = !still.shows.includes(which);
       if (still.shows.includes(which)) picture.src = address(still, which);
     }
-    this.part("#large-text").textContent = `${sentence(still)} · ${clock(still.captured)} · ${still.why}`;
+    this.part("#large-text").textContent = stillTitle(still);
     this.large.showModal();
   }
 
@@ -89,16 +90,3 @@ export class Stills {
 
 /** @param {Still} still @param {string} which */
 const address = (still, which) => `/stills/${encodeURIComponent(still.edge)}/${still.id}/${which}`;
-
-/** @param {Still} still */
-function sentence(still) {
-  if (still.track === null && still.reason === "asked") return "a closer look"; // of a place, whatever is there
-  const track = still.track === null ? "" : `track ${still.track}: `;
-  if (still.unread) return `${track}${still.after}, not read${still.note ? ` (${still.note})` : ""}`;
-  if (still.doubted) return `${track}doubted, was ${still.before}`;
-  const sure = `${Math.round(still.sureness * 100)} %`;
-  return still.before === still.after || !still.before ? `${track}${still.after}, ${sure}` : `${track}${still.before} → ${still.after}, ${sure}`;
-}
-
-/** @param {number} ms */
-export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour12: false });

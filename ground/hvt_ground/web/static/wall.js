@@ -1,5 +1,7 @@
 // The wall: each edge with a small picture, its link, its budget and what happened last.
 
+import * as words from "./words.js";
+
 const OLD_MS = 10000; // a thumbnail comes once a second, or with each frame
 
 /** @typedef {{link: string, since: number, total: number | null, budget: number | null}} EdgeState */
@@ -30,10 +32,12 @@ export class Wall {
     const age = make("span", "card-age", button);
     const top = make("span", "top", about);
     const light = make("span", "light", top);
-    make("b", "", top).textContent = edge;
-    const state = make("span", "state", top);
-    const bar = make("meter", "bar", about);
-    bar.setAttribute("aria-label", "Share of the budget in use");
+    const name = make("b", "", top);
+    make("bdi", "", name).textContent = name.title = edge;
+    const middle = make("span", "top", about);
+    const state = make("span", "state", middle);
+    const bar = make("meter", "bar", middle);
+    bar.setAttribute("aria-label", words.BUDGET_SHARE);
     const last = make("span", "last", about);
     button.addEventListener("click", () => this.onChoose(edge));
     const card = { button, picture, light, state, bar, last, age, captured: 0, link: "" };
@@ -67,7 +71,8 @@ export class Wall {
 
   /** @param {string} edge @param {string} text */
   event(edge, text) {
-    this.card(edge).last.textContent = text;
+    const { last } = this.card(edge);
+    last.textContent = last.title = text;
   }
 
   /** @param {string} edge @param {EdgeState} state @param {number} now */
@@ -77,12 +82,12 @@ export class Wall {
     const age = now - card.captured;
     const silent = card.captured > 0 && age > OLD_MS && (state.link === "up" || state.link === "thin");
     card.light.dataset.state = silent ? "silent" : state.link;
-    card.state.textContent = silent ? `no picture ${lasting(age)}` : `${state.link} ${lasting(now - state.since)}`;
+    card.state.textContent = words.cardWords(state.link, now - state.since, silent ? age : null);
     const { total, budget } = state;
     const known = total !== null && budget !== null;
     card.bar.hidden = !known;
     card.bar.value = known ? Math.min(1, total / budget) : 0;
-    card.bar.title = known ? `${kbps(total)} of ${kbps(budget)}` : "";
+    card.bar.title = known ? words.shareWords(total, budget) : "";
   }
 
   /**
@@ -94,10 +99,10 @@ export class Wall {
       const age = now - card.captured;
       const old = !connected || card.link === "lost" || card.link === "ended" || age > OLD_MS;
       card.button.classList.toggle("old", old);
-      card.age.textContent = card.captured && old ? `${lasting(age)} old` : "";
+      card.age.textContent = card.captured && old ? words.oldWords(age) : "";
       if (connected) continue;
       card.light.dataset.state = "unknown";
-      card.state.textContent = "not known";
+      card.state.textContent = words.UNKNOWN_CARD;
       card.bar.hidden = true;
     }
   }
@@ -119,7 +124,7 @@ export class Wall {
       const tile = make(page ? "a" : "span", "elsewhere", this.root);
       if (page) tile.href = `${page}#${new URLSearchParams({ edge })}`;
       make("b", "", tile).textContent = edge;
-      make("span", "", tile).textContent = `at ${member}`;
+      make("span", "", tile).textContent = words.elsewhereWords(member);
     }
     if (this.root.children.length > 1) this.nobody.hidden = true;
   }
@@ -139,13 +144,3 @@ export function make(kind, name, into) {
   into.append(made);
   return made;
 }
-
-/** @param {number} ms */
-function lasting(ms) {
-  const seconds = Math.max(0, Math.round(ms / 1000));
-  if (seconds < 100) return `${seconds} s`;
-  return seconds < 6000 ? `${Math.round(seconds / 60)} min` : `${Math.round(seconds / 3600)} h`;
-}
-
-/** @param {number} bps */
-export const kbps = (bps) => (bps >= 1e6 ? `${(bps / 1e6).toFixed(2)} Mbps` : `${Math.round(bps / 1e3)} kbps`);

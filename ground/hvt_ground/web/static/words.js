@@ -1,4 +1,4 @@
-// What the page says of the picture, in one place: pure functions of what is known. What is not known is not said.
+// All that the page says, in one place: pure functions of what is known. What is not known is not said.
 
 /**
  * @typedef {{connected: boolean, refused: boolean, goneMs: number, link: string, silentMs: number | null, chosen: boolean,
@@ -8,6 +8,9 @@
  * whether a picture is shown, follows the newest, plays on; its age, when it was shown, what usually lies between two; the age of the newest
  * one of this edge, wherever it is shown.
  */
+/** @typedef {{track: number | null, before: string, after: string, sureness: number, reason: string, why: string,
+ *    stored: boolean, unread: boolean, doubted: boolean, note: string}} StillFacts */
+/** @typedef {{name: string, id: number, sureness: number, doubted?: 1}} TrackFacts */
 
 /** @type {Record<string, string>} */
 export const LINK_WORDS = {
@@ -26,17 +29,37 @@ export const RUNG_WORDS = {
 const LEAST_GAP_MS = 1000;
 const MOST_GAP_MS = 12000;
 
+// Numbers
+
 /** @param {number} ms */
 export const seconds = (ms) => (Math.abs(ms) < 9950 ? `${(ms / 1000).toFixed(1)} s` : `${Math.round(ms / 1000)} s`);
 
 /** @param {number} ms */
 const whole = (ms) => `${Math.max(0, Math.round(ms / 1000))} s`;
 
+/** @param {number} ms */
+function lasting(ms) {
+  const seconds = Math.max(0, Math.round(ms / 1000));
+  if (seconds < 100) return `${seconds} s`;
+  return seconds < 6000 ? `${Math.round(seconds / 60)} min` : `${Math.round(seconds / 3600)} h`;
+}
+
+/** @param {number} bps */
+export const kbps = (bps) => (bps >= 1e6 ? `${(bps / 1e6).toFixed(2)} Mbps` : `${Math.round(bps / 1e3)} kbps`);
+
+/** @param {number} ms */
+export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour12: false });
+
+/** @param {number} share */
+const percent = (share) => `${Math.round(share * 100)} %`;
+
 /**
  * By clocks that agree within the time of a message; of a picture of the future it is not known.
  * @param {number} ms
  */
 const age = (ms) => (ms < -LEAST_GAP_MS ? "age not known" : seconds(Math.max(0, ms)));
+
+// On the picture
 
 /**
  * The state of the picture: its name for the style, the words that stand on it, whether it is the picture of now.
@@ -53,9 +76,17 @@ export function standing(facts) {
     return { state: "paused", words: `${facts.plays ? "REPLAY" : "PAUSED"} ${seconds(ageMs)}`, live: false };
   }
   const patience = Math.min(MOST_GAP_MS, Math.max(LEAST_GAP_MS, 2.5 * facts.periodMs));
-  if (sinceMs > patience) return { state: "stale", words: `NO NEW PICTURE ${whole(sinceMs)}`, live: false };
+  // Who comes later is shown a picture that may be old already.
+  if (sinceMs > patience || ageMs > MOST_GAP_MS) return { state: "stale", words: `NO NEW PICTURE ${whole(Math.max(sinceMs, ageMs))}`, live: false };
   return { state: "live", words: facts.lockstep ? "lockstep: no age" : `live, ${age(ageMs)}`, live: true };
 }
+
+/**
+ * In the middle of an empty picture, by the state.
+ * @param {string} state
+ */
+export const emptyWords = (state) =>
+  state === "ended" ? "the flight has ended" : state === "stale" ? "no picture comes" : "waiting for a picture";
 
 /**
  * How old the list of boxes is that belongs to this picture; null where none has come.
@@ -66,17 +97,146 @@ export function boxesWords(behindMs, oldMs) {
   return behindMs > oldMs ? `boxes ${seconds(behindMs)} behind` : "";
 }
 
-/** @param {number | null} count of tracks; null where it is not known @param {string} behind */
-export function tracksTitle(count, behind) {
-  if (count === null) return "Tracks: not known yet";
-  return behind ? `Tracks: ${count} (${behind})` : `Tracks: ${count}`;
-}
+/**
+ * Of a picture that is not the newest.
+ * @param {number} captured @param {number} ageMs
+ */
+export const pictureWords = (captured, ageMs) => `of ${clock(captured)}, ${seconds(ageMs)} ago`;
 
-/** @param {boolean | null} recording null: not known */
-export const recordingWords = (recording) => (recording === null ? "" : recording ? "recording" : "NOT RECORDED");
+/** @param {boolean} plays */
+export const pauseWords = (plays) => (plays ? "Pause" : "Play");
+
+/**
+ * @param {boolean | null} recording null: not known
+ * @param {boolean} comes whether there is anything to record
+ */
+export const recordingWords = (recording, comes) => (recording === false ? "NOT RECORDED" : recording && comes ? "recording" : "");
+
+/** @param {string} name @param {number} sureness @param {boolean} sure */
+export const boxWords = (name, sureness, sure) => `${name} ${sure ? "✓" : Math.round(sureness * 100)}`;
+
+// Around it
 
 /** @param {boolean} connected @param {string} why the ground's own words, where it refuses */
 export function connectionWords(connected, why) {
   if (connected) return "connected";
   return why ? `the ground refuses this page: ${why}` : "no connection to the ground: trying again";
 }
+
+/** @param {string} edge */
+export const absentWords = (edge) => `${edge}, which the address names, is not here: it is shown when it comes; or choose another`;
+
+/** @param {string} method @param {number[]} size @param {number} fps @param {number} budget */
+export const sessionWords = (method, [width, height], fps, budget) =>
+  `${method} · ${width}×${height} at ${Math.round(fps * 10) / 10} a second · ${kbps(budget)}`;
+
+/** @param {string} link @param {number} since @param {string[]} more the ground's own sentences */
+export const linkWords = (link, since, more) => [`${LINK_WORDS[link]} since ${clock(since)}`, ...more].join(" · ");
+
+export const UNKNOWN_LINK = "not known: the ground says nothing now";
+
+/**
+ * On the plot, by line.
+ * @param {number} budget
+ */
+export const plotWords = (budget) => ({ total: "all", base: "base stream", budget: `budget ${kbps(budget)}` });
+
+/** @param {number} minutes */
+export const minutesAgo = (minutes) => `−${minutes} min`;
+
+/**
+ * Of an event.
+ * @param {number} captured
+ */
+export const eventPictureWords = (captured) => `the picture of ${clock(captured)}`;
+
+export const PICTURE_GONE = "no longer at hand: see the recording";
+
+// The wall
+
+/** @param {string} link @param {number} ms since when @param {number | null} silentMs of an edge that should send pictures and does not */
+export const cardWords = (link, ms, silentMs) => (silentMs === null ? `${link} ${lasting(ms)}` : `no picture ${lasting(silentMs)}`);
+
+export const UNKNOWN_CARD = "not known";
+export const BUDGET_SHARE = "Share of the budget in use";
+
+/** @param {number} total @param {number} budget */
+export const shareWords = (total, budget) => `${kbps(total)} of ${kbps(budget)}`;
+
+/** @param {number} ms */
+export const oldWords = (ms) => `${lasting(ms)} old`;
+
+/** @param {string} member another ground */
+export const elsewhereWords = (member) => `at ${member}`;
+
+// Tracks and stills
+
+/** @param {number | null} count of tracks; null where it is not known @param {string} behind */
+export function tracksTitle(count, behind) {
+  if (count === null) return "Tracks: not known yet";
+  return behind ? `Tracks: ${count} (${behind})` : `Tracks: ${count}`;
+}
+
+/** @param {TrackFacts} track */
+export const trackWords = (track) => `${track.name} ${track.id}, ${percent(track.sureness)}`;
+
+/** @param {TrackFacts} track */
+export const trackLabel = (track) => `${track.name}, track ${track.id}${track.doubted ? ", doubted" : ""}: closer look`;
+
+/** @param {StillFacts} still */
+export function stillWords(still) {
+  if (still.track === null && still.reason === "asked") return "a closer look"; // of a place, whatever is there
+  const track = still.track === null ? "" : `track ${still.track}: `;
+  if (still.unread) return `${track}${still.after}, not read${still.note ? ` (${still.note})` : ""}`;
+  if (still.doubted) return `${track}doubted, was ${still.before}`;
+  const sure = percent(still.sureness);
+  return still.before === still.after || !still.before ? `${track}${still.after}, ${sure}` : `${track}${still.before} → ${still.after}, ${sure}`;
+}
+
+/** @param {StillFacts & {captured: number}} still */
+export const stillReason = (still) => `${clock(still.captured)} · ${still.why}${still.stored ? " · came afterwards" : ""}`;
+
+/** @param {StillFacts & {captured: number}} still */
+export const stillTitle = (still) => `${stillWords(still)} · ${stillReason(still)}`;
+
+/** @param {StillFacts} still */
+export const stillAlt = (still) => `still: ${stillWords(still)}`;
+
+export const BASE_ALT = "what the base stream showed";
+
+// Commands, and what came of them
+
+/** @param {TrackFacts | null} track */
+const place = (track) => (track ? `${track.name} ${track.id}` : "this place");
+
+/** @param {string} edge @param {TrackFacts | null} track */
+export const askingStill = (edge, track) => `asking ${edge} for ${place(track)}`;
+
+/** @param {TrackFacts | null} track @param {number[]} box x, y, width and height in the camera's picture */
+export const answeredStill = (track, [, , width, height]) => `${place(track)}, ${width}×${height} pixels of the camera`;
+
+/** @param {number} status */
+export const refusedWords = (status) => `the ground refused (${status})`;
+
+export const NO_CONNECTION = "no connection to the ground";
+
+export const ASKING_KEYFRAME = "asked for a keyframe";
+export const KEYFRAME_TAKEN = "the edge has taken the request for a keyframe";
+
+/** @param {number} ms */
+export const keyframeCame = (ms) => `a keyframe came ${seconds(ms)} after it was asked for`;
+
+/** @param {number} ms */
+export const noKeyframe = (ms) => `no keyframe has come within ${seconds(ms)}`;
+
+/** @param {{budget?: number, method?: string}} what */
+const setting = ({ budget, method }) => (budget ? kbps(budget) : `stills by ${method}`);
+
+/** @param {string} edge @param {{budget?: number, method?: string}} what */
+export const askingSetting = (edge, what) => `asking ${edge} for ${setting(what)}`;
+
+/** @param {string} edge @param {{budget?: number, method?: string}} what */
+export const agreedSetting = (edge, what) => `${edge} has agreed to ${setting(what)}; it is not in force yet`;
+
+/** @param {{budget?: number, method?: string}} what */
+export const settingInForce = (what) => `${setting(what)} ${what.budget ? "is" : "are"} in force`;
