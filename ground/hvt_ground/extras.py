@@ -56,6 +56,8 @@ class Opening:
     open: Callable[[], SinkWriter[Event]]
     waits: bool = True
     """Whether an edge in lockstep waits for it; one that sends to others does not hold it up."""
+    longest_pause_s: float = 60.0
+    """At most so long after a failure it is made again."""
 
 
 OpenSinks = Callable[[Flight], Iterable[Opening]]

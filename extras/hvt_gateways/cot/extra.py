@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 from hvt_common.config import PATH, Group, SettingType
 from hvt_common.errors import UserError, needs_extra
+from hvt_common.units import SECOND_NS
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 
@@ -96,9 +97,15 @@ class CotExtra(Extra):
         self.check_outputs(config, reads=())
         from hvt_gateways.cot.connection import CotConnection  # noqa: PLC0415 - as above
         from hvt_gateways.cot.reporter import SessionReporter  # noqa: PLC0415 - as above
+        from hvt_gateways.cot.schedule import STALE_NS  # noqa: PLC0415 - as above
         from hvt_gateways.cot.type_table import read_types  # noqa: PLC0415 - as above
 
-        targets = [outputs.open(f"CoT {url}", partial(CotConnection, url)) for url in config.cot]
+        # A server that cuts one connection shall not see everything go stale before the next.
+        pause_s = STALE_NS / SECOND_NS / 3
+        targets = [
+            outputs.open(f"CoT {url}", partial(CotConnection, url), longest_pause_s=pause_s)
+            for url in config.cot
+        ]
         reporter = partial(SessionReporter, targets=targets, types=read_types(config.cot_types))
 
         def sinks(flight: Flight) -> Iterable[Opening]:

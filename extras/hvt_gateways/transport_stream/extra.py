@@ -73,6 +73,6 @@ class TransportStreamExtra(Extra):
             else:
                 address = where.of_edge(info.edge)
                 opens = partial(live_stream, address, platform=platform, fps=info.fps, addresses=addresses)
-            yield Opening(f"MPEG-TS of {info.edge}", opens)
+            yield Opening(f"MPEG-TS of {info.edge}", opens, longest_pause_s=5.0)
 
         return sinks

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
+from hvt_common.units import SECOND_NS
 from hvt_ground.sinks.contract import SinkWriter, is_stored, size_bytes
 
 _log = logging.getLogger(__name__)
@@ -29,9 +30,10 @@ _AT_ONCE.set()
 class QueuedSink(Generic[T]):
     """Writes in a thread of its own what `log` takes, into a sink that ``open_sink`` makes there.
 
-    A sink that raises is closed and made anew after growing pauses; until then what comes is counted as lost. Where
-    the queue is full `log` waits up to ``wait_s`` for room, then what comes is counted as dropped. ``failures``
-    learns of it under the name ``part``. ``for_backlog``: what was stored at the edge is to be written there.
+    A sink that raises is closed and made anew after pauses that grow up to ``longest_pause_s``; until then what comes
+    is counted as lost. Where the queue is full `log` waits up to ``wait_s`` for room, then what comes is counted as
+    dropped. ``failures`` learns of it under the name ``part``. ``for_backlog``: what was stored at the edge is to be
+    written there.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class QueuedSink(Generic[T]):
         failures: Failures,
         wait_s: float = 0.0,
         for_backlog: bool = False,
+        longest_pause_s: float = 60.0,
     ) -> None:
         self.part = part
         self.for_backlog = for_backlog
@@ -59,7 +62,8 @@ class QueuedSink(Generic[T]):
         self._ending = False
         self._hurry = threading.Event()
         self._failures = failures
-        self._pause = RetryPause()
+        longest_ns = round(longest_pause_s * SECOND_NS)
+        self._pause = RetryPause(min(SECOND_NS, longest_ns), longest_ns)
         self.files: list[Path] = []
         """The sinks in the order of opening."""
         self._open = self._failing = self._resumed = False
@@ -275,9 +279,17 @@ class Outputs:
         *,
         wait_s: float = 0.0,
         for_backlog: bool = False,
+        longest_pause_s: float = 60.0,
     ) -> QueuedSink[T]:
         """A sink behind a queue (`QueuedSink`)."""
-        sink = QueuedSink(part, open_sink, failures=self._failures, wait_s=wait_s, for_backlog=for_backlog)
+        sink = QueuedSink(
+            part,
+            open_sink,
+            failures=self._failures,
+            wait_s=wait_s,
+            for_backlog=for_backlog,
+            longest_pause_s=longest_pause_s,
+        )
         with self._lock:
             self._sinks = [one for one in self._sinks if not one.ended]
             self._sinks.append(sink)

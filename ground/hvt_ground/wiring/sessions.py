@@ -43,6 +43,8 @@ S = TypeVar("S", bound=SinkWriter[Any])
 OpenSink = Callable[[Info], Callable[[], SinkWriter[Event]]]
 """Opens a sink for a session."""
 
+_LIVE_PAUSE_S = 5.0
+"""At most so long somebody who looks waits for what failed."""
 _LOCKSTEP_WAIT_S = 10.0
 
 
@@ -111,9 +113,10 @@ class SessionFactory:
             sinks.append(self._outputs.open(part, opens, wait_s=wait_s, for_backlog=not self.records))
         if self._view is not None:
             open_live = partial(_live_recorder, settings, self._view)
-            sinks.append(self._outputs.open(f"live view of {edge}", open_live))
+            sinks.append(self._outputs.open(f"live view of {edge}", open_live, longest_pause_s=_LIVE_PAUSE_S))
         if self._page is not None:
-            sinks.append(self._outputs.open(f"web page of {edge}", self._page.feed(info)))
+            part, opens = f"web page of {edge}", self._page.feed(info)
+            sinks.append(self._outputs.open(part, opens, longest_pause_s=_LIVE_PAUSE_S))
         files: dict[str, QueuedSink[Event]] = {}
         for target, what, suffix, make in (
             (config.tracks, "tracks table", ".csv", TrackTable),
@@ -131,7 +134,9 @@ class SessionFactory:
             still_address=self._still_address(info, files.get("stills")),
         )
         for one in chain.from_iterable(opens(flight) for opens in self._extras):
-            sinks.append(self._outputs.open(one.part, one.open, wait_s=wait_s if one.waits else 0.0))
+            pause_s = one.longest_pause_s
+            held_s = wait_s if one.waits else 0.0
+            sinks.append(self._outputs.open(one.part, one.open, wait_s=held_s, longest_pause_s=pause_s))
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
         return GroundSession(

@@ -83,6 +83,21 @@ def test_a_sink_that_has_ended_keeps_nothing_of_what_made_it(tmp_path):
     assert maker() is None
 
 
+def test_what_sends_to_others_is_made_again_after_the_longest_pause(caplog):
+    """A server that cuts each connection at once would see everything go stale between two tries."""
+    tries: list[float] = []
+
+    def cut() -> LineFile:
+        tries.append(time.monotonic())
+        raise OSError("it has closed the connection")
+
+    failures = Failures(time.time_ns)
+    sink: QueuedSink[str] = Outputs(failures).open("CoT", cut, longest_pause_s=0.01)
+    eventually(lambda: len(tries) > 4, within_s=5, what="it is tried again")
+    assert sink.join(time.monotonic() + 5)
+    assert sum("tried again" in one.message for one in caplog.records) == 1
+
+
 def test_in_lockstep_a_full_queue_is_waited_for(tmp_path):
     """Two runs of one input would leave two different tables, by the speed of the disk."""
     pipe = tmp_path / "table.csv"

@@ -21,6 +21,8 @@ from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
 from hvt_gateways.cot.connection import CotConnection, check_connection
 from hvt_gateways.cot.event import CotMessage
+from hvt_gateways.cot.extra import CotExtra, CotOptions
+from hvt_gateways.cot.schedule import STALE_NS
 from hvt_ground.sinks import QueuedSink
 from programs.fleet_keys import EXPIRED, Fleet
 from programs.processes import eventually, free_ports
@@ -444,3 +446,19 @@ def test_a_group_without_a_route_names_the_remedy(monkeypatch):
         CotConnection("udp://239.2.3.1:6969")
     with pytest.raises(UserError, match="Network is unreachable"):
         CotConnection("udp://10.0.0.1:6969")
+
+
+def test_nothing_goes_stale_between_two_tries():
+    """A server that cuts one connection would show no camera for most of a minute."""
+    pauses_s: list[float] = []
+
+    class Opened:
+        """Outputs that tell how long a target is left alone."""
+
+        def open(self, _part: str, _open_sink: object, *, longest_pause_s: float) -> None:
+            """Note it."""
+            pauses_s.append(longest_pause_s)
+
+    config = CotOptions(cot=("tcp://127.0.0.1:1",))
+    CotExtra().start(config, Opened())  # type: ignore[arg-type]
+    assert 3 * pauses_s[0] <= STALE_NS / 1e9
