@@ -100,7 +100,7 @@ def source_place(box_base_px: tuple[float, float, float, float], info: Info) -> 
 def _box(given: object) -> tuple[float, float, float, float]:
     match given:
         case [int() | float() as x1, int() | float() as y1, int() | float() as x2, int() | float() as y2] if (
-            all(math.isfinite(one) and abs(one) < 1e5 for one in (x1, y1, x2, y2)) and x1 < x2 and y1 < y2
+            all(abs(one) < 1e5 for one in (x1, y1, x2, y2)) and x1 < x2 and y1 < y2
         ):
             return float(x1), float(y1), float(x2), float(y2)
     raise BadRequestError("box is no [x1, y1, x2, y2] in pixels of the picture")

@@ -28,6 +28,7 @@ from hvt_ground.web.viewers import Hub, Viewer, packed, text
 MOST_MESSAGE_BYTES = 4096
 MOST_VIEWERS = 64
 _MOST_MESSAGES_A_S = 30
+_WATCH_PAUSE_S = 0.2
 _COOKIE_S = 30 * 86400
 _KINDS = {"js": "text/javascript", "css": "text/css", "html": "text/html", "svg": "image/svg+xml"}
 _FILES = {
@@ -142,7 +143,9 @@ class Site:
             try:
                 message = json.loads(await socket.receive_text())
                 self._obey(viewer, message)
-            except (WebSocketDisconnect, RuntimeError, KeyError, TypeError, ValueError, RecursionError):
+                if message["type"] == "watch":  # each sends all that is known, and may begin a stream anew
+                    await asyncio.sleep(_WATCH_PAUSE_S)
+            except (WebSocketDisconnect, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError):
                 return
             now_s = time.monotonic()
             if len(times) == times.maxlen and now_s - times[0] < 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import math
 import os
 import socket
 import ssl
@@ -21,6 +22,7 @@ from hvt_common.errors import UserError
 from hvt_common.transport.zenoh_config import key_pair
 from hvt_ground.events import Notice, Refinement
 from hvt_ground.web import WebPage, server, site
+from hvt_ground.web.requests import BadRequestError, EdgeRequests
 from programs.fleet_keys import Fleet
 from programs.processes import eventually, free_ports
 from rigs.flight import Flight
@@ -318,6 +320,29 @@ def test_nonsense_closes_that_connection_alone(local, message):
         with pytest.raises(ConnectionClosed):
             ended(viewer)
     assert greets(local)
+
+
+def test_who_asks_for_another_edge_all_the_time_gets_a_few(local):
+    """Each time a stream is coded anew from its keyframe: one viewer would take the processor from all others."""
+    with joined(local) as viewer:
+        began_s = time.monotonic()
+        for number in range(20):
+            viewer.send(json.dumps({"type": "watch", "edge": f"uav-{number}", "rung": "h264"}))
+        answers = 0
+        while (left_s := began_s + 0.9 - time.monotonic()) > 0:
+            with suppress(TimeoutError):
+                answers += json.loads(viewer.recv(timeout=left_s))["type"] == "loads"
+        assert answers <= 5
+    assert greets(local)
+
+
+@pytest.mark.parametrize(
+    "box", [[0, 0, 1, 10**400], [0, 0, math.nan, 5], [0, 0, -1, 5], ["0", 0, 1, 1], [0, 0, 1]]
+)
+def test_a_box_that_is_none_is_one_sentence(box):
+    """It would be an error of the server, in no words at all."""
+    with pytest.raises(BadRequestError, match="box is no"):
+        EdgeRequests(lambda: pytest.fail("nobody is asked")).request_still("uav-1", {"box": box})
 
 
 def test_frames_of_a_megabyte_are_refused(local):
