@@ -267,7 +267,12 @@ setInterval(() => {
   const told = connected && performance.now() - stateAt < STATE_OLD_MS;
   wall.tick(connection.now(), told);
   if (performance.now() - tracksAt > 1000) listTracks();
-  if (!told && by("link-text").textContent) by("link-text").textContent = words.UNKNOWN_LINK;
+  by("commands").disabled = !told;
+  if (told) return;
+  plot.tick(connection.now());
+  if (by("link-text").textContent) by("link-text").textContent = words.UNKNOWN_LINK;
+  by("failed").textContent = "";
+  by("why-list").replaceChildren();
 }, 500);
 
 function listTracks() {

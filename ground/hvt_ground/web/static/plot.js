@@ -60,15 +60,16 @@ export class Plot {
     const style = getComputedStyle(document.documentElement);
     const colour = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
     const newest = Math.max(this.now, rows[rows.length - 1].at);
-    const top = 1.15 * Math.max(1, ...rows.map((row) => Math.max(row.total, row.budget)));
+    const top = 1.05 * Math.max(1, ...rows.map((row) => Math.max(row.total, row.budget)));
+    const head = 18 * ratio;
     const foot = 16 * ratio;
     const x = (/** @type {number} */ at) => canvas.width * (1 - (newest - at) / (SECONDS * 1000));
-    const y = (/** @type {number} */ bps) => (canvas.height - foot) * (1 - bps / top);
+    const y = (/** @type {number} */ bps) => head + (canvas.height - foot - head) * (1 - bps / top);
     context.font = `${11 * ratio}px system-ui, sans-serif`;
     context.fillStyle = colour("--faint");
     for (let minute = 1; minute < 4; minute++) {
       const at = x(newest - minute * 60000);
-      context.fillRect(at, 0, 1, canvas.height - foot);
+      context.fillRect(at, head, 1, canvas.height - foot - head);
       context.fillText(minutesAgo(minute), at + 3 * ratio, canvas.height - 4 * ratio);
     }
     const line = (/** @type {"total" | "base" | "budget"} */ what, /** @type {string} */ ink, /** @type {number[]} */ dash) => {
