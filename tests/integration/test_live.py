@@ -24,7 +24,7 @@ LONG = 3000
 """Pictures: minutes, on a slow machine too."""
 
 CHEAP = (
-    *("--size", "640x360", "--fps", "10", "--preset", "ultrafast", "--budget", "300kbps"),
+    *("--size", "320x192", "--fps", "10", "--preset", "ultrafast", "--budget", "300kbps"),
     *("--detector", "motion"),
 )
 ANALYSES = ("--detector", "motion", "--classifier", "none")
@@ -183,12 +183,12 @@ def fleet(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
     folder = tmp_path_factory.mktemp("fleet")
     with Link(folder) as link:
         ground = link.ground(*ANALYSES, "--record", "recordings", "--once", "--edges", "uav-*")
-        steady = link.edge(*arguments(scene, "uav-2", "--max-frames", "150"), name="uav-2")
+        steady = link.edge(*arguments(scene, "uav-2", "--max-frames", "100"), name="uav-2")
         other = link.edge(*arguments(scene, "rover-1", "--max-frames", "20", "--wait", "1s"), name="rover-1")
         killed = link.edge(*arguments(scene, "uav-1", "--record-base", "killed.mkv"), name="uav-1-killed")
         eventually(lambda: "uav-1: " in served(ground), within_s=30, what="the ground serves uav-1")
         eventually(
-            lambda: served(ground).count("uav-1: ") >= 4, within_s=60, what="some seconds of uav-1 are shown"
+            lambda: served(ground).count("uav-1: ") >= 3, within_s=60, what="some seconds of uav-1 are shown"
         )
         killed.kill()
         again = link.edge(*arguments(scene, "uav-1", "--max-frames", "40"), name="uav-1-again")

@@ -24,8 +24,8 @@ def test_the_pose_is_part_of_the_budget_and_of_both_accounts(drawn):
 
 def test_tracks_are_placed_where_the_scene_has_them(drawn):
     """The map would be nonsense, and everything else green."""
-    rows = [row for row in drawn.tracks() if int(row["frame"]) > 2 * FPS]
-    each = {*sorted({row["frame"] for row in rows}, key=int)[::5]}
+    rows = [row for row in drawn.tracks() if int(row["frame"]) > FPS]
+    each = {*sorted({row["frame"] for row in rows}, key=int)[::3]}
     found = [
         (off, off <= float(row["error_m"]))
         for row in rows
@@ -39,7 +39,7 @@ def test_tracks_are_placed_where_the_scene_has_them(drawn):
 def test_the_recording_shows_camera_and_tracks_on_a_map(drawn):
     """Who opens it would have numbers in a table and no picture."""
     recording = Recording(drawn.folder / "flight.rrd")
-    assert len(recording.rows("/map/camera", "GeoPoints:positions")) >= 4
+    assert len(recording.rows("/map/camera", "GeoPoints:positions")) >= 2
     assert recording.rows("/map/tracks", "GeoPoints:positions")
 
 

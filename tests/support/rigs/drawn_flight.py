@@ -21,7 +21,7 @@ from hvt_common.values import View, iou
 from hvt_scene import Scene
 from programs.processes import Link, free_ports
 
-FPS, FRAMES, SEED = 15, 75, 3
+FPS, FRAMES, SEED = 15, 45, 3
 SIZE = (640, 360)
 VIEW = View.fitted((1920, 1080), SIZE, fit="letterbox")
 
@@ -34,7 +34,7 @@ def scene() -> Scene:
 
 @dataclass(frozen=True)
 class DrawnFlight:
-    """What five seconds left: a folder with flight.rrd, .csv, .hvtlog and stills, both summaries.
+    """What three seconds left: a folder with flight.rrd, .csv, .hvtlog and stills, both summaries.
 
     And with the gateways flight.ts and CoT events.
     """
@@ -78,7 +78,7 @@ def receiving(port: int) -> Iterator[list[ET.Element]]:
 
 
 def fly(link: Link, *ground: str, edge: tuple[str, ...] = ()) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """Five seconds of the scene, or what ``edge`` says; both summaries, and what the ground said."""
+    """Three seconds of the scene, or what ``edge`` says; both summaries, and what the ground said."""
     running = link.ground(
         "--once", "--provider", "cpu", "--record", "flight.rrd", "--tracks", "flight.csv", *ground
     )

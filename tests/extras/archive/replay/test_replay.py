@@ -119,7 +119,7 @@ def test_a_recording_holds_video_and_stills(drawn, tmp_path, capsys):
         capsys, folder / "flight.rrd", "--tracks", tmp_path / "again.csv", "--record", tmp_path, *SETTINGS
     )
     assert f"stills    │ {len(second)}," in outcome
-    assert len({row[0] for row in lines(tmp_path / "again.csv")}) > 60
+    assert len({row[0] for row in lines(tmp_path / "again.csv")}) > 30
     assert any(row[7] == "1" for row in lines(tmp_path / "again.csv")), "a still spoke"
 
 
@@ -177,7 +177,7 @@ def test_the_halves_of_a_log_are_played_in_their_order(drawn, tmp_path):
     times = [
         item.received_ns for item in messages_in([log.path, log.before])() if not item.key.endswith("/info")
     ]
-    assert len(times) > 60
+    assert len(times) > 30
     assert times == sorted(times)
 
 
