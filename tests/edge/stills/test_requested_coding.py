@@ -173,18 +173,18 @@ BOXES = [(400, 200, 64, 48), (300, 100, 230, 70), (100, 60, 480, 320)]
 
 @pytest.mark.parametrize(("profile", "budget_bps"), FLIGHTS)
 def test_in_flight_it_is_full_prompt_and_better_than_the_video_with_every_method(
-    tmp_path, profile, budget_bps
+    scene, profile, budget_bps
 ):
     """With the defaults on a thin link it would come after seconds, small and blurred, or be refused."""
-    write_scene(tmp_path, frames=90)
     looks = [
         RequestedLook(30 + 20 * number, dict(zip("xywh", box, strict=True)))
         for number, box in enumerate(BOXES)
     ]
     flight = LookFlight(
         {
-            "source": str(tmp_path),
+            "source": str(scene),
             "source_fps": 15.0,
+            "max_frames": 90,
             "budget": budget_bps,
             "size": (480, 270),
             "preset": "ultrafast",

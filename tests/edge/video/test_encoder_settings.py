@@ -17,7 +17,7 @@ from hvt_edge.video.encoder_settings import (
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, hard_pictures, real_pictures
 
-SIZE, FPS = (1280, 720), 15
+SIZE, FPS = (640, 360), 15
 KEYFRAMES = (20, 46, 95, 125)
 """A second or more apart."""
 
@@ -48,7 +48,7 @@ def fullest_second(bits: list[int]) -> int:
     return max(sum(bits[start : start + FPS]) for start in range(len(bits) - FPS + 1))
 
 
-@pytest.mark.parametrize(("base_bps", "count"), [(300_000, 100), (1_138_000, 60)])
+@pytest.mark.parametrize(("base_bps", "count"), [(100_000, 100), (400_000, 60)])
 def test_the_base_stays_within_its_share(base_bps, count):
     """Stills would pay for what the base overspends, or the picture would come late."""
     bits = line_bits(hard_pictures(count, size=SIZE), asked(base_bps, round(base_bps / 0.8125)))
@@ -60,16 +60,16 @@ def test_the_base_stays_within_its_share(base_bps, count):
 def test_the_base_stays_within_its_share_on_a_real_clip(data):
     """As above, on what the product is for."""
     pictures = real_pictures(data / "clips" / "drone_carpark.mp4", 75, size=SIZE)
-    bits = line_bits(pictures, asked(650_000, 800_000))
-    assert 0.92 * 650_000 <= sum(bits) / (len(bits) / FPS) <= 1.02 * 650_000
-    assert fullest_second(bits) <= 1.15 * 650_000
+    bits = line_bits(pictures, asked(200_000, 246_000))
+    assert 0.92 * 200_000 <= sum(bits) / (len(bits) / FPS) <= 1.02 * 200_000
+    assert fullest_second(bits) <= 1.15 * 200_000
 
 
 def test_video_alone_stays_within_the_total():
     """In M0 there are no stills that could yield: each burst would make the picture late."""
-    bits = line_bits(hard_pictures(60, size=SIZE), asked(800_000, 800_000))
-    assert fullest_second(bits) <= 1.08 * 800_000
-    assert sum(bits) / 4 >= 0.85 * 800_000
+    bits = line_bits(hard_pictures(60, size=SIZE), asked(250_000, 250_000))
+    assert fullest_second(bits) <= 1.08 * 250_000
+    assert sum(bits) / 4 >= 0.85 * 250_000
 
 
 def test_headers_and_status_are_taken_off_the_target():
@@ -107,13 +107,13 @@ def test_fewer_frames_leave_more_for_each_and_keep_the_share(decimation):
     """With ``--fps auto`` the base would overspend, or waste what headers no longer take."""
     fps = FPS / decimation
     settings = encoder_settings(
-        size=SIZE, fps=fps, preset="veryfast", total_bps=400_000, base_bps=320_000, edge_id="edge-1"
+        size=SIZE, fps=fps, preset="veryfast", total_bps=150_000, base_bps=120_000, edge_id="edge-1"
     )
-    assert settings.bitrate_bps > asked(320_000, 400_000).bitrate_bps + 3_000
+    assert settings.bitrate_bps > asked(120_000, 150_000).bitrate_bps + 3_000
     assert settings.vbv_s * fps >= 0.999, "x265 takes no VBV that holds less than a frame"
     pictures = hard_pictures(210, size=SIZE)[::decimation]
     encoder = BaseEncoder(settings)
     payload = sum(len(encoder.encode(frame).data) for frame in framed(pictures, fps=fps))
     header = len(pictures) * 110
-    assert 0.85 * 320_000 <= 8 * (payload + header) / (len(pictures) / fps) <= 1.03 * 320_000
+    assert 0.85 * 120_000 <= 8 * (payload + header) / (len(pictures) / fps) <= 1.03 * 120_000
     assert least_base_bps(SIZE, fps, edge_id="edge-1") < 0.6 * least_base_bps(SIZE, FPS, edge_id="edge-1")
