@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from hvt_common.values import Image, Orientation, Pose, View
 from hvt_scene.appearance import Appearance
 from hvt_scene.drawing.cast import Cast
 from hvt_scene.drawing.foliage import Grove
-from hvt_scene.drawing.ground import paint_ground
+from hvt_scene.drawing.ground import Ground, paint_ground
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_scene.truth import CodeInView, Truth, write_truth
 from hvt_scene.view.camera import Camera, Matrix
@@ -79,9 +80,18 @@ class Scene:
             )
         self._camera = _flight(layout, appearance, size=size, rng=flight, duration_s=self.duration_s)
         self._grove = Grove(layout, appearance, rng=grounds)
-        finest = max(min(appearance.width_m) / size[0], 0.05)
-        self._ground = paint_ground(
-            layout, appearance, rng=grounds, canopies=self._grove.canopies, m_per_px=finest
+        self._layout, self._grounds = layout, grounds
+
+    @cached_property
+    def _ground(self) -> Ground:
+        """Painted for the first picture: it takes longer than all else, and truth needs none of it."""
+        finest = max(min(self._appearance.width_m) / self.size[0], 0.05)
+        return paint_ground(
+            self._layout,
+            self._appearance,
+            rng=self._grounds,
+            canopies=self._grove.canopies,
+            m_per_px=finest,
         )
 
     def image(self, t_s: float, *, without: Collection[int] = ()) -> Image:
