@@ -318,7 +318,7 @@ def _measured(size: tuple[int, int], kbps: int) -> float:
         )
     )
     shadow = ShadowGround(detector.detect, settings=SETTINGS)
-    with DemoSource(size=size, fps=FPS, fit="letterbox", seed=0, max_frames=20) as source:
+    with DemoSource(size=size, fps=FPS, fit="letterbox", seed=0, max_frames=12) as source:
         analyzer = Analyzer(
             detector,
             ByteTracker(TrackerSettings.starting_at(0.4, camera_motion="off"), fps=FPS),

@@ -172,9 +172,7 @@ BOXES = [(400, 200, 64, 48), (300, 100, 230, 70), (100, 60, 480, 320)]
 
 
 @pytest.mark.parametrize(("profile", "budget_bps"), FLIGHTS)
-def test_in_flight_it_is_full_prompt_and_better_than_the_video_with_every_method(
-    scene, profile, budget_bps
-):
+def test_in_flight_it_is_full_prompt_and_better_than_the_video_with_every_method(scene, profile, budget_bps):
     """With the defaults on a thin link it would come after seconds, small and blurred, or be refused."""
     looks = [
         RequestedLook(30 + 20 * number, dict(zip("xywh", box, strict=True)))

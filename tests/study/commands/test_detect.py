@@ -4,27 +4,41 @@ from __future__ import annotations
 
 import csv
 import json
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from hvt_common.values import Image
 from hvt_scene import Scene
+from hvt_scene.truth import Truth
 from hvt_study.cli import main
 from hvt_study.metrics.operating_point import calibration_error
 
 CLASSES = "car,van,truck,bus,motor,pedestrian,other"
 
 
+@cache
+def scene() -> Scene:
+    """To paint it takes seconds."""
+    return Scene(5, size=(1280, 720))
+
+
+@cache
+def moment(t_s: float) -> tuple[Image, Truth]:
+    """A picture and what is in it."""
+    return scene().image(t_s), scene().truth(t_s)
+
+
 def draw(folder: Path, *, moments: int = 2) -> Path:
     """A YOLO folder of drawn pictures, 1280x720, with the truth of what is at least half visible."""
-    scene = Scene(5, size=(1280, 720))
     (folder / "images").mkdir(parents=True)
     (folder / "labels").mkdir()
     for number in range(moments):
-        truth = scene.truth(1.0 + number)
-        cv2.imwrite(str(folder / f"images/{number}.png"), scene.image(1.0 + number))
+        picture, truth = moment(1.0 + number)
+        cv2.imwrite(str(folder / f"images/{number}.png"), picture)
         boxes = truth.boxes_source_px.clip(0, (1280, 720, 1280, 720)) / (1280, 720, 1280, 720)
         rows = [
             f"{kind} {(x1 + x2) / 2:.6f} {(y1 + y2) / 2:.6f} {x2 - x1:.6f} {y2 - y1:.6f}\n"
@@ -142,13 +156,12 @@ def test_wrong_boxes_of_coco_are_named(
 
 def write_sequence(folder: Path, *, frames: int, targets: int) -> Path:
     """Write a MOTChallenge sequence of the drawn scene that labels the ``targets`` largest cars, and nothing else."""
-    scene = Scene(5, size=(1280, 720))
     (folder / "img1").mkdir(parents=True)
     (folder / "gt").mkdir()
     chosen, rows = None, []
     for number in range(1, frames + 1):
-        truth = scene.truth(1.0 + number / 15)
-        cv2.imwrite(str(folder / f"img1/{number:06d}.png"), scene.image(1.0 + number / 15))
+        picture, truth = moment(1.0 + number / 15)
+        cv2.imwrite(str(folder / f"img1/{number:06d}.png"), picture)
         if chosen is None:
             inside = (truth.visible > 0.95) & (truth.class_ids == 0)
             middle = np.abs(
