@@ -25,7 +25,7 @@ pytestmark = pytest.mark.integration
 LIGHT = LinkState(rate_bps=1_500_000, delay_s=0.02)
 DARK = LinkState(rate_bps=1_500_000, delay_s=0.02, dark=True)
 EDGE = (
-    "--source-fps", "10", "--fps", "10", "--size", "640x360", "--budget", "800kbps", "--detector", "motion",
+    "--source-fps", "10", "--fps", "10", "--size", "320x192", "--budget", "800kbps", "--detector", "motion",
     "--preset", "ultrafast", "--detect-every", "5", "--cooldown", "0", "--wait", "60s", "--method", "M5",
 )  # fmt: skip
 

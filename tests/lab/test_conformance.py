@@ -82,7 +82,7 @@ def test_a_wrong_vector_is_noticed(reader, tmp_path, name, before, after):
 
 def test_the_vectors_notice_a_broken_reader(reader):
     """Somebody's reader that is wrong at a bound would pass them; `python -m lab.conformance.mutants` tries all."""
-    assert survivors(Path(reader[-1]), MUTANTS[::10]) == []
+    assert survivors(Path(reader[-1]), MUTANTS[::25]) == []
     assert sum(bool(one.harmless) for one in MUTANTS) <= 3
 
 

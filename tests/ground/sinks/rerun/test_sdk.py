@@ -59,7 +59,7 @@ def fly(number):
             path=path, edge_id=f"uav-{number}", session=str(session), base_size=(640, 360), fps=15, budget_bps=800_000
         )
         with Recorder(settings) as recorder:
-            for index in range(100):
+            for index in range(25):
                 boxes = np.full((20, 4), index, np.float32) + (0, 0, 9, 9)
                 names, ones = ("car",) * 20, np.ones(20, np.float32)
                 recorder.log(
