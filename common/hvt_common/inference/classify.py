@@ -65,17 +65,16 @@ _ULTRALYTICS = Preparation(mean=(0.0,) * 3, scale=(1 / 255,) * 3)
 
 
 def open_classifier(
-    spec: str, *, labels: Path | None = None, threads: int = 1, provider: str = "cpu", niceness: int = 0
+    spec: str, *, labels: Path | None = None, threads: int = 1, provider: str = "cpu"
 ) -> Classifier:
     """Open an ONNX classifier by the name of a model (see `resolve_model`) or the path of a file.
 
     ``labels`` are class names, one a line; else those of the metadata, ImageNet's, or "class 0" and so on. 1000
     names fit a model of 1001 classes (a background comes first), and the reverse. The first synonym is shown.
-    ``niceness``: see `ModelSettings`.
     Raises `UserError` where there is no such model, it is not a classifier, or metadata or labels do not fit.
     """
     path = resolve_model(spec, role="classifier")
-    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider, niceness=niceness))
+    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
     return OnnxClassifier(model, labels=labels)
 
 

@@ -87,7 +87,6 @@ def open_detector(
     head: str | None = None,
     threads: int = 1,
     provider: str = "cpu",
-    niceness: int = 0,
 ) -> Detector:
     """Open a detector: ``motion``, the name of a model (see `resolve_model`), a file, a plug-in's name, or ``A+B``.
 
@@ -95,7 +94,7 @@ def open_detector(
     ``head`` is one of `heads.choose.HEAD_NAMES`; else the file tells, or what it answers. ``confidence`` is the least
     of a detection, ``nms_iou`` the largest overlap of two of one class, both 0…1. ``size`` is (width, height) of the
     network's input where the model leaves it free; else each image gets the multiples of the network's stride that
-    hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). ``niceness``: see `ModelSettings`. A
+    hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). A
     plug-in gets none of these; ``confidence`` is applied to its answer. For ``A+B`` (see `ensemble`) it is on the
     scale of A, and ``labels``, ``head`` and ``size`` are refused.
     Raises `UserError` where there is no such model, it is no detector, its labels do not fit, or a setting is out of
@@ -110,7 +109,7 @@ def open_detector(
         for word, given in (("labels file", labels), ("head", head), ("detector size", size)):
             if given is not None:
                 raise UserError(f"{word} {given} has no say: detector {spec!r} is several, each with its own")
-        settings = {"nms_iou": nms_iou, "threads": threads, "provider": provider, "niceness": niceness}
+        settings = {"nms_iou": nms_iou, "threads": threads, "provider": provider}
         return _open_ensemble(parts, confidence=confidence, settings=settings)
     plug_in = None if spec == MOTION else plug_in_of(spec, taken=model_names)
     if head is not None and (spec == MOTION or plug_in is not None):
@@ -122,7 +121,7 @@ def open_detector(
             raise UserError(f"labels file {labels} has no say: detector {spec!r} brings its own class names")
         return PlugInDetector(plug_in, spec, confidence=confidence)
     path = resolve_model(spec, role="detector", words=(MOTION, *plug_in_names()))
-    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider, niceness=niceness))
+    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
     return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size, head=head)
 
 

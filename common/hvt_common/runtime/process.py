@@ -1,6 +1,6 @@
 """The set-up of a process: the signals that stop it, its threads' priority, its memory allocator.
 
-Priorities, as Linux's niceness: 0 for what the operator sees move, 10 for perception, 11 for the networks in it.
+Priorities, as Linux's niceness: 0 for what the operator sees move, 11 for perception with its networks.
 
 And what it tells systemd.
 """
@@ -25,8 +25,7 @@ from typing import NoReturn, Self, TypeVar
 T = TypeVar("T")
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_NICENESS = 10
-NETWORK_NICENESS = 11
+_NICENESS = 11
 """x265 sets its own workers to 10 (threadpool.cpp); far below them a network stands still beside other programs."""
 _SWITCH_S = 0.0005
 _ZENOH_CALLBACK = "(pyo3-closure)"
@@ -100,14 +99,14 @@ def _join_threads() -> None:
             thread.join(max(0.0, until_s - time.monotonic()))
 
 
-def lower_priority(niceness: int = _NICENESS) -> None:
+def lower_priority() -> None:
     """Let other threads go before the calling one, and before those that it starts; on Linux only.
 
     Encoding and decoding are what the operator sees move; detection and stills may come a little later.
     """
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
 
 
 class NewThreads:

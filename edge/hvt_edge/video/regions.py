@@ -52,6 +52,7 @@ class RegionTagger:
         The result is valid until the next call: its side data belongs to the filter graph of this call.
         """
         graph = Graph()
+        graph.threads = 1  # else a pool of as many as there are cores, made for each picture
         last = graph.add_buffer(
             width=picture.width,
             height=picture.height,

@@ -18,7 +18,6 @@ from hvt_common.inference.scores import (
     uncalibrated,
 )
 from hvt_common.inference.tiles import detect_whole, tiled
-from hvt_common.runtime.process import NETWORK_NICENESS
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.values import Detections, Image, View
 from hvt_edge.config import EdgeConfig
@@ -40,7 +39,6 @@ def make_detector(config: EdgeConfig) -> Detector:
         threads=config.threads,
         # By its speed auto may choose one this time and another the next, and their answers differ a little.
         provider="cpu" if config.pace == "lockstep" and config.provider == "auto" else config.provider,
-        niceness=0 if config.pace == "lockstep" else NETWORK_NICENESS,
     )
     return tiled(detector, config.tiles) if config.candidates == "source" else detector
 

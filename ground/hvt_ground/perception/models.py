@@ -14,7 +14,7 @@ from hvt_common.inference.retried import RetriedClassifier, RetriedDetector
 from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
-from hvt_common.runtime.process import NETWORK_NICENESS
+from hvt_common.runtime.process import lower_priority
 from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
 from hvt_ground.perception.stills.vocabulary import check_common
@@ -64,6 +64,8 @@ class Models:
         return (self._open_detector(), opened[1]) if self._config.detector == MOTION else opened
 
     def _load(self) -> None:
+        if self._config.threads > 1:  # workers have the priority of whoever opens the network
+            lower_priority()
         try:
             opened = self._open()
             self._check(opened)
@@ -83,7 +85,6 @@ class Models:
             head=config.head,
             threads=config.threads,
             provider=config.provider,
-            niceness=NETWORK_NICENESS,
         )
         hint = FewFoundHint(config.detector, confidence=track_confidence(config))
         return RetriedDetector(open_one, self.failures, hint=hint)
@@ -112,7 +113,6 @@ class Models:
             labels=config.labels,
             threads=config.threads,
             provider=config.provider,
-            niceness=NETWORK_NICENESS,
         )
         return detector, RetriedClassifier(open_one, "classifier", self.failures)
 

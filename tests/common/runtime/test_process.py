@@ -148,8 +148,8 @@ def test_a_library_that_lowers_its_own_workers_gets_them_back():
         own = niceness(threading.get_native_id())
         assert worker.native_id is not None
         assert other.native_id is not None
-        assert niceness(worker.native_id) == (own if may_raise_priority() else max(own, 10))
-        assert niceness(other.native_id) == max(own, 10), "it was there before"
+        assert niceness(worker.native_id) == (own if may_raise_priority() else max(own, 11))
+        assert niceness(other.native_id) == max(own, 11), "it was there before"
     finally:
         end.set()
         worker.join()

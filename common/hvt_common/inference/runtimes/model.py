@@ -12,13 +12,12 @@ import logging
 import math
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -28,12 +27,9 @@ from hvt_common.inference.runtimes.ir_file import ir_metadata, is_ir
 from hvt_common.inference.runtimes.onnx_file import check_onnx_file, onnx_version, opset_versions
 from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
 from hvt_common.inference.runtimes.providers import ONNXRUNTIME_PROVIDERS, ProviderChoice, choose_provider
-from hvt_common.runtime.process import lower_priority
 
 if TYPE_CHECKING:
     import onnxruntime as ort
-
-_T = TypeVar("_T")
 
 _log = logging.getLogger(__name__)
 
@@ -100,11 +96,9 @@ class ModelSettings:
     """Settings of a model's run."""
 
     threads: int = 1
-    """CPU threads inside one operator, 1 or more."""
+    """CPU threads inside one operator, 1 or more: the caller's, and workers of the priority of whoever opens it."""
     provider: str = "cpu"
     """One of `hvt_common.inference.runtimes.providers.PROVIDERS`."""
-    niceness: int = 0
-    """Linux's niceness of the thread that runs it and of its workers; 0: the calling thread runs it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,39 +159,6 @@ class OnnxModel:
             shape = "x".join(map(str, feed.shape))
             raise UserError(f"model {self.path} does not run on a {shape} input: it takes {port}")
         return self._runner.run(feed, *more)
-
-
-class _Background:
-    # A thread of this niceness (0: the caller's), taken after the first run, so that a start waits for no other
-    # program; with ``workers`` before it, since they inherit it. Who waits for the answer may hold up video.
-
-    def __init__(self, niceness: int, *, workers: bool) -> None:
-        self._niceness = niceness
-        self._lowered = workers or not niceness
-        self._thread = None
-        if niceness:
-            first = partial(lower_priority, niceness) if workers else None
-            self._thread = ThreadPoolExecutor(1, thread_name_prefix="hvt-network", initializer=first)
-
-    def do(self, call: Callable[[], _T]) -> _T:
-        return call() if self._thread is None else self._thread.submit(call).result()
-
-    def lower(self) -> None:
-        """After a run."""
-        if not self._lowered:
-            self._lowered = True
-            self.do(lambda: lower_priority(self._niceness))
-
-
-@dataclass(frozen=True, slots=True)
-class _InBackground:
-    background: _Background
-    runner: _Runner
-
-    def run(self, feed: npt.NDArray[Any], *more: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
-        outputs = self.background.do(lambda: self.runner.run(feed, *more))
-        self.background.lower()
-        return outputs
 
 
 class _OnnxRuntimeRunner:
@@ -262,15 +223,15 @@ def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
             f"model {path} is OpenVINO's, which is not installed here: pip install 'hvt[openvino]'"
         )
     bf16 = found.bf16 and settings.provider != "cpu"
-    background = _Background(settings.niceness, workers=settings.threads > 1)
-    openvino = background.do(lambda: OpenVinoRunner(path, threads=settings.threads, bf16=bf16))
+    openvino = OpenVinoRunner(path, threads=settings.threads, bf16=bf16)
     inputs, outputs = (tuple(Port(*port) for port in ports) for ports in openvino.ports)
-    runner = _InBackground(background, openvino)
     why = f"OpenVINO {found.version} in {'bf16' if bf16 else 'float32'}: the file is OpenVINO's"
     choice = ProviderChoice("openvino", why, explicit=True)
     _check_ports(path, inputs, outputs)
     _log.info("%s runs on openvino: %s", path.name, why)
-    return OnnxModel(path, inputs=inputs, outputs=outputs, metadata=metadata, runner=runner, provider=choice)
+    return OnnxModel(
+        path, inputs=inputs, outputs=outputs, metadata=metadata, runner=openvino, provider=choice
+    )
 
 
 def _quicker(openvino: OnnxModel, path: Path, settings: ModelSettings) -> OnnxModel:
@@ -301,21 +262,19 @@ def _seconds(model: OnnxModel, feed: npt.NDArray[Any]) -> Iterator[float]:
 
 
 def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxModel:
-    background = _Background(settings.niceness, workers=settings.threads > 1)
     if choice.provider == "openvino":
         described = _session(path, settings, ("CPUExecutionProvider",), optimised=False)
         found = find_openvino()
         bf16 = found is not None and found.bf16
-        openvino = background.do(lambda: OpenVinoRunner(path, threads=settings.threads, bf16=bf16))
-        return _described(path, described, _InBackground(background, openvino), choice)
+        openvino = OpenVinoRunner(path, threads=settings.threads, bf16=bf16)
+        return _described(path, described, openvino, choice)
     names = ONNXRUNTIME_PROVIDERS[choice.provider]
-    session = background.do(lambda: _session(path, settings, names))
+    session = _session(path, settings, names)
     if session.get_providers()[0] != names[0]:
         raise UserError(
             f"--provider {choice.provider} did not start (its driver or libraries are missing): choose cpu"
         )
-    runner = _InBackground(background, _OnnxRuntimeRunner(path, session))
-    return _described(path, session, runner, choice)
+    return _described(path, session, _OnnxRuntimeRunner(path, session), choice)
 
 
 def _described(

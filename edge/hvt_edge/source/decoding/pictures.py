@@ -135,6 +135,7 @@ class Pictures:
 
     def _make_graph(self, frame: av.VideoFrame) -> None:
         graph = Graph()
+        graph.threads = 1
         source = graph.add_buffer(
             width=frame.width, height=frame.height, format=frame.format, time_base=self._stream.time_base
         )

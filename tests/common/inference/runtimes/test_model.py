@@ -18,6 +18,7 @@ from onnx import TensorProto, helper
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.runtimes.onnx_file import MAX_MODEL_BYTES
+from hvt_common.runtime.process import with_lower_priority
 from media.onnx_models import colour_detector, constant_model
 
 
@@ -42,14 +43,15 @@ def test_a_network_runs_below_everything_else(tmp_path: Path, threads: int) -> N
     """Video would wait for it, or for whoever waits for it with the interpreter's lock in hand."""
     others = {one.name for one in Path("/proc/self/task").iterdir()}
     own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-    model = open_model(
-        colour_detector(tmp_path / "m.onnx", "yolox", size=None),
-        settings=ModelSettings(threads=threads, niceness=19),
-    )
-    model.run(np.zeros((1, 3, 64, 64), np.float32))
+    path = colour_detector(tmp_path / "m.onnx", "yolox", size=None)
+    model = with_lower_priority(lambda: open_model(path, settings=ModelSettings(threads=threads)))
+    with_lower_priority(lambda: model.run(np.zeros((1, 3, 64, 64), np.float32)))
     started = {one.name for one in Path("/proc/self/task").iterdir()} - others
-    assert len(started) >= threads
-    assert {os.getpriority(os.PRIO_PROCESS, int(one)) for one in started} == {19}
+    levels = set()
+    for one in started:
+        with contextlib.suppress(OSError):  # ours of a moment ago
+            levels.add(os.getpriority(os.PRIO_PROCESS, int(one)))
+    assert levels == {11} or (threads == 1 and not levels), "perception has a thread already"
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == own
 
 
