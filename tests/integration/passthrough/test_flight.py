@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+import hvt_edge.cli
 from hvt_common.video.annex_b import nal_kind, nal_units, parameter_sets
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.control import EdgeClient, RefusedError
@@ -15,12 +16,14 @@ from programs.rrd import Recording
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
 
+def camera(clip: object) -> tuple[str, ...]:
+    """Settings of an edge that passes the clip through."""
+    return ("--source", str(clip), "--encoder", "passthrough", "--detector", "motion", "--wait", "60s")
+
+
 def with_camera(link: Link, clip: object, *settings: str) -> Running:
-    """An edge that passes the clip through, started."""
-    return link.edge(
-        *("--source", str(clip), "--encoder", "passthrough", "--detector", "motion", "--wait", "60s"),
-        *settings,
-    )
+    """Such an edge, started."""
+    return link.edge(*camera(clip), *settings)
 
 
 def ground_of(link: Link) -> Running:
@@ -97,12 +100,11 @@ def test_a_closer_look_and_a_keyframe_are_refused_with_their_reasons(link):
         ("demo", (), "'demo' is the drawn demo"),
     ],
 )
-def test_what_cannot_be_passed_through_is_one_sentence(link, source, settings, says):
+def test_what_cannot_be_passed_through_is_one_sentence(tmp_path, capsys, source, settings, says):
     """A traceback, or a flight whose picture is garbage or left out, in place of what to change."""
     if isinstance(source, dict):
-        source = write_clip(link.folder / "camera.mp4", hard_pictures(45, size=SIZE), **source)
-    edge = with_camera(link, source, *settings)
-    assert edge.wait(within_s=60) == 2
-    (line,) = edge.said.splitlines()
+        source = write_clip(tmp_path / "camera.mp4", hard_pictures(45, size=SIZE), **source)
+    assert hvt_edge.cli.main(["--connect", "tcp/127.0.0.1:9", *camera(source), *settings]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("hvt-edge: ")
     assert says in line
