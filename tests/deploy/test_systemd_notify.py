@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,17 +15,28 @@ from programs.processes import START_S, Link
 pytestmark = pytest.mark.integration
 
 
-@pytest.fixture(params=["path", "abstract"])
-def systemd(
-    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[socket.socket]:
-    """What systemd listens on, of either kind."""
-    name = str(tmp_path / "notify") if request.param == "path" else f"@hvt-{tmp_path}"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
-        listening.bind(name.replace("@", "\0", 1))
-        listening.settimeout(START_S)
+@contextmanager
+def listening(name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """What systemd listens on."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
+        bound.bind(name.replace("@", "\0", 1))
+        bound.settimeout(START_S)
         monkeypatch.setenv("NOTIFY_SOCKET", name)
-        yield listening
+        yield bound
+
+
+@pytest.fixture
+def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """A socket that is a file."""
+    with listening(str(tmp_path / "notify"), monkeypatch) as bound:
+        yield bound
+
+
+def test_a_socket_may_have_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where systemd uses an abstract one, a start would never end."""
+    with listening(f"@hvt-{tmp_path}", monkeypatch) as bound:
+        notify_systemd("READY=1")
+        assert bound.recv(64) == b"READY=1"
 
 
 def test_a_ground_is_ready_and_goes_on_telling_that_it_lives(systemd: socket.socket, tmp_path: Path) -> None:
