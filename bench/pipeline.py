@@ -26,8 +26,8 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.config import GroundConfig
-from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import Arrival
+from hvt_ground.link.receiver import BasePacket
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings

@@ -11,8 +11,8 @@ from typing import NamedTuple
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
+from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
-from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings

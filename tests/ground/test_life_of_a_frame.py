@@ -10,8 +10,8 @@ import pytest
 
 from hvt_common.protocol.messages import Info
 from hvt_ground.events import Event, Overlay, VideoSample
+from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
-from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from rigs.flight import Flight, Port, pipeline_of
 

@@ -1,6 +1,6 @@
 """Messages of the link, put in order and counted; pure but for `group`.
 
-`packets` are messages once parsed; `reassemble` makes them decodable, `statistics` says what is missing,
-`sequence_window` remembers numbers, `other_sessions` keeps strangers apart. `group` shares edges among grounds,
+`receiver` takes all of one edge, `reassemble` makes its video decodable, `statistics` says what is missing,
+`sequence_window` remembers numbers. `group` shares edges among grounds,
 and `capture_clock` has capture times by this ground's clock.
 """

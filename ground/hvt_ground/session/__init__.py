@@ -1,5 +1,5 @@
 """From the link of one edge to its sessions.
 
-`subscribe` sorts what comes by edge, each of which is an `edge_port`; `edge_sessions` begins and ends each `session`.
-`receiver_report` is what the edge is told.
+`subscribe` sorts what comes by edge; an `edge_port` is one of them, with the way to query it and to report to it.
+`edge_sessions` begins and ends each `session`.
 """

@@ -29,12 +29,9 @@ from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.backlog.recordings import BacklogRecordings
-from hvt_ground.link.other_sessions import PreSessionBuffer
-from hvt_ground.link.packets import BasePacket, Packet
 from hvt_ground.link.reassemble import StreamCounters
-from hvt_ground.session.edge_port import EdgePort, InfoAnswer
-from hvt_ground.session.receiver import Receiver
-from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.link.receiver import BasePacket, Packet, Receiver
+from hvt_ground.session.edge_port import EdgePort, InfoAnswer, ReceiverReports
 from hvt_ground.session.session import GroundSession
 
 _BASE_CODECS = (BASE_CODEC, "hevc")
@@ -99,7 +96,6 @@ class EdgeSessions:
             port.report, clock=self._clock, clock_offset=self._clock_offset, backlog=self.backlog
         )
         self._receiver = Receiver(port.edge, clock=self._clock, versions=versions)
-        self._pre_session = PreSessionBuffer()
         self._counted = StreamCounters()
         """When the session before ended."""
         self._ended_ns: int | None = None
@@ -224,11 +220,11 @@ class EdgeSessions:
                 if session is not None and header.is_of(session.info.session_id):
                     session.pose(header, item)
                 else:  # it may overtake the first keyframe of its session
-                    self._pre_session.hold(packet)
+                    self._receiver.hold(packet)
             elif session is not None and header.session_id == session.info.session_id:
                 self._take(session, header, item)
             elif isinstance(header, Status) or (isinstance(header, RoiHeader) and session is None):
-                self._pre_session.hold(packet)
+                self._receiver.hold(packet)
             elif isinstance(header, TrackStep) and session is None:
                 pass  # who joins between two keyframes gets some; the next ones say all of it again
             else:
@@ -313,7 +309,7 @@ class EdgeSessions:
         log_fields(session=f"{info.session_id:016x}")
         self.session = self._open_session(info, self._reports)
         self.failures.works(self._part)
-        for packet in self._pre_session.take():
+        for packet in self._receiver.take_held():
             self._route(packet)
 
     def _end_session(self) -> None:

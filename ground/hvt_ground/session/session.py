@@ -36,14 +36,14 @@ from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
 from hvt_ground.link.capture_clock import CaptureClock
-from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import StreamCounters
+from hvt_ground.link.receiver import BasePacket
 from hvt_ground.link.sequence_window import StillSequenceWindow
 from hvt_ground.link.statistics import ReceptionStatistics, SessionAccount
 from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.poses import NOWHERE, Locator, SessionPoses
-from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.session_log import Level, SessionLog
 from hvt_ground.sinks import QueuedSink, Sink
 

@@ -22,7 +22,7 @@ from hvt_ground.extras import Flight, all_extras, locators
 from hvt_ground.perception.models import Models
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
-from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
 from hvt_ground.sinks.line_file import has_nothing

@@ -27,8 +27,8 @@ from hvt_common.values import Tracks
 from hvt_edge.perception.shadow import Detected
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Overlay, Refinement
-from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import Arrival as AccessUnitArrival
+from hvt_ground.link.receiver import BasePacket
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.turns import Turns
 from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
@@ -206,7 +206,7 @@ class GroundSide:
         return self._worker
 
     def _receive(self, arrival: Arrival[Received]) -> None:
-        """As `hvt_ground.session.receiver` hands on what is whole and in order."""
+        """As `hvt_ground.link.receiver` hands on what is whole and in order."""
         item = arrival.message
         row = (parse_key(item.key) or ("", None))[1]
         if row is Channel.BASE:
@@ -236,7 +236,7 @@ class GroundSide:
             self.detected.append((back_ns, Detected(_RECEIVER, self._session.last_frame_index, objects)))
 
     def _weight(self, results: tuple[StillResult, ...]) -> int:
-        """Line bytes of a report with these, as `hvt_ground.session.receiver_report` would send it."""
+        """Line bytes of a report with these, as `hvt_ground.session.edge_port` would send it."""
         frames, stills = self._session.frames_received, self._session.stills_received
         payload = Feedback(
             session_id=self._info.session_id,

@@ -28,7 +28,7 @@ from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.config import check
 from hvt_ground.extras import config_class
 from hvt_ground.link.capture_clock import CaptureClock
-from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.sinks import Outputs
 from hvt_ground.wiring import Models, SessionFactory
 from rigs.messages import INFO

@@ -32,8 +32,8 @@ from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job, RealtimeWorker
 from hvt_ground.report.status import completed, summary, table
+from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
-from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings

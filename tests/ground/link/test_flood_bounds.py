@@ -10,8 +10,8 @@ import pytest
 
 from hvt_common.protocol.messages import BaseHeader, RoiHeader, Status, TrackStep
 from hvt_ground.events import MessageTiming, Notice
-from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import Arrival
+from hvt_ground.link.receiver import BasePacket
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import RealtimeWorker
 from hvt_ground.session.session import GroundSession

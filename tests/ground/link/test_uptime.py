@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvt_ground.link.statistics import Uptime
+from hvt_ground.link.receiver import Uptime
 
 MS = 1_000_000
 

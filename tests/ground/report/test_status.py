@@ -19,8 +19,8 @@ from hvt_common.units import SECOND_NS
 from hvt_ground.report.metrics import metrics_text
 from hvt_ground.report.state import SessionState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
+from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
-from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings

@@ -15,8 +15,8 @@ from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, Overlay
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
+from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
-from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings

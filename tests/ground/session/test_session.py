@@ -16,8 +16,8 @@ from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Pose
 from hvt_ground.perception.worker import LockstepWorker, RealtimeWorker
 from hvt_ground.report.status import completed, summary, table
+from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
-from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from rigs.flight import Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from rigs.handled import WatchedInbox, check, end

@@ -58,7 +58,7 @@ sys.path[:0] = sys.argv[1:]
 from dataclasses import replace
 from rigs.flight import Flight, pipeline_of
 from hvt_common.protocol.messages import BaseHeader
-from hvt_ground.link.packets import BasePacket
+from hvt_ground.link.receiver import BasePacket
 from hvt_ground.link.reassemble import Arrival
 from hvt_ground.session.session import GroundSession
 (bomb,) = pickle.load(sys.stdin.buffer)

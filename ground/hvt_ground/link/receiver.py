@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (
@@ -20,10 +21,8 @@ from hvt_common.protocol.messages import (
     WireError,
 )
 from hvt_common.transport.inbox import Received
-from hvt_ground.link.other_sessions import DuplicatePublishers
-from hvt_ground.link.packets import BasePacket, Packet
+from hvt_common.units import SECOND_NS
 from hvt_ground.link.reassemble import Arrival, Reassembler, StreamCounters
-from hvt_ground.link.statistics import Uptime
 
 _log = logging.getLogger(__name__)
 
@@ -39,6 +38,58 @@ _KINDS: Mapping[Channel, type[_Message]] = {
 _ATTACHED = (Channel.BASE, Channel.ROI, Channel.BACKLOG)
 _SILENT_NS = 2_000_000_000
 """A keyframe is requested only of an edge that sent something so long ago at most."""
+_MOST_HELD = 16
+"""Stills, and poses, that are held for a session that is not open yet."""
+_AGAIN_NS = 60 * SECOND_NS
+"""Between two warnings: sessions' ids cost a forger nothing, and a log is not to fill."""
+
+
+@dataclass(frozen=True, slots=True)
+class BasePacket:
+    """An access unit that the reassembly has judged, with its own bytes even if it waited behind a hole."""
+
+    arrival: Arrival
+    item: Received
+    on_time: bool
+    """It did not wait: the time of ``item`` is its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """Any other message."""
+
+    header: RoiHeader | TrackStep | PoseReport | BacklogHeader | Status
+    item: Received
+
+
+class Uptime:
+    """Counts a gap between two messages only as far as both their arrival and their handling show it.
+
+    While the thread was away the sender was not silent, so by arrival the gap is small. And a sender that waited for
+    this side's answer in the meantime was not silent either: by handling that gap is small. Both clocks are one.
+    """
+
+    def __init__(self) -> None:
+        self._lived_ns = 0
+        self._arrived_ns: int | None = None
+        self._handled_ns = 0
+
+    def handle(self, *, arrived_ns: int, now_ns: int) -> int:
+        """Return the time of the message that is taken up now; never less than before."""
+        arrived_ns = min(arrived_ns, now_ns)
+        if self._arrived_ns is None:
+            self._lived_ns = now_ns
+        else:
+            self._lived_ns += max(0, min(arrived_ns - self._arrived_ns, now_ns - self._handled_ns))
+            arrived_ns = max(arrived_ns, self._arrived_ns)
+        self._arrived_ns, self._handled_ns = arrived_ns, now_ns
+        return self._lived_ns
+
+    def at(self, now_ns: int, *, pending: bool) -> int:
+        """Return the time now; with messages ``pending`` it is still that of the last one taken up."""
+        if self._arrived_ns is None:
+            return now_ns
+        return self._lived_ns + (0 if pending else max(0, now_ns - self._handled_ns))
 
 
 class Receiver:
@@ -52,7 +103,12 @@ class Receiver:
         self._versions = versions
         self._clock = clock
         self._reassembler: Reassembler = Reassembler()
-        self._duplicates = DuplicatePublishers(edge)
+        self._other: int | None = None
+        """The session of a second edge of this id that was noted last."""
+        self._other_said_ns: int | None = None
+        self._status: list[Packet] = []
+        self._stills: deque[Packet] = deque(maxlen=_MOST_HELD)
+        self._poses: deque[Packet] = deque(maxlen=_MOST_HELD)
         self._uptime = Uptime()
         self._captures = CaptureTimes()
         self._last_message_ns = time.monotonic_ns()
@@ -114,11 +170,33 @@ class Receiver:
         """The session that came last is nobody's: go on with the next keyframe of any other."""
         self._reassembler.disown()
 
+    def hold(self, packet: Packet) -> None:
+        """Hold a still, a pose, or the first report of a session: it may overtake the keyframe that begins it."""
+        if isinstance(packet.header, RoiHeader):
+            self._stills.append(packet)
+        elif isinstance(packet.header, PoseReport):
+            self._poses.append(packet)
+        elif isinstance(packet.header, Status) and packet.header.sequence == 0:
+            self._status = [packet]
+
+    def take_held(self) -> list[Packet]:
+        """Hand them out, once: the report, then poses and stills, each in the order in which they came."""
+        packets = [*self._status, *self._poses, *self._stills]
+        for held in (self._status, self._poses, self._stills):
+            held.clear()
+        return packets
+
     def duplicate_notice(self, session_id: int, *, shown: int) -> str | None:
         """The notice of a second edge of this id; None if it was given lately."""
-        text = self._duplicates.note(session_id, shown=shown, now_ns=time.monotonic_ns())
-        if text is not None:
-            _log.warning("%s", text)
+        self._other, now_ns = session_id, time.monotonic_ns()
+        if self._other_said_ns is not None and now_ns - self._other_said_ns < _AGAIN_NS:
+            return None
+        self._other_said_ns = now_ns
+        text = (
+            f"two edges call themselves {self._edge}: the session {shown:016x} is shown, {session_id:016x} is not; "
+            "stop one of them, or start it with an --edge-id of its own"
+        )
+        _log.warning("%s", text)
         return text
 
     def skip(self, row: str, error: WireError) -> None:
@@ -134,7 +212,7 @@ class Receiver:
 
     def skip_stranger(self, row: str, session_id: int) -> None:
         """Count a message of a session that is not open."""
-        if self._duplicates.knows(session_id):
+        if session_id == self._other:  # of which enough has been said
             self._damaged += 1
         else:
             self.skip(row, WireError(f"it belongs to the session {session_id:016x}, which is not shown"))
