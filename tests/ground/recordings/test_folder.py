@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 
@@ -67,6 +68,14 @@ def fly(folder: Path, events: list[Event], retention: Retention = ALL) -> Failur
     return failures
 
 
+@pytest.fixture(scope="module")
+def flown(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the two files and their index, to be copied."""
+    folder = tmp_path_factory.mktemp("flown")
+    fly(folder, events)
+    return folder
+
+
 def look(
     folder: Path, retention: Retention = ALL, *, later_s: float = 0.0, set_by_s: float = 0.0, times: int = 1
 ) -> list[RecordingRow]:
@@ -102,9 +111,9 @@ def test_it_says_what_is_in_each_file(tmp_path, events):
     assert failures.parts == ()
 
 
-def test_files_tell_the_same_when_the_index_is_lost(tmp_path, events):
+def test_files_tell_the_same_when_the_index_is_lost(tmp_path, flown):
     """After a damaged card everything would have to be searched by hand."""
-    fly(tmp_path, events)
+    copytree(flown, tmp_path, dirs_exist_ok=True)
     before = read_index(tmp_path)
     (tmp_path / INDEX).unlink()
     (tmp_path / "mine.rrd").write_bytes((tmp_path / NAMES[0]).read_bytes())
@@ -114,9 +123,9 @@ def test_files_tell_the_same_when_the_index_is_lost(tmp_path, events):
 
 
 @pytest.mark.parametrize("damage", ["text", "zeros", "half", "empty"])
-def test_a_damaged_index_is_set_aside_and_made_anew(tmp_path, events, caplog, damage):
+def test_a_damaged_index_is_set_aside_and_made_anew(tmp_path, flown, caplog, damage):
     """No flight could be recorded with an index, until somebody removes a file that he does not know."""
-    fly(tmp_path, events)
+    copytree(flown, tmp_path, dirs_exist_ok=True)
     index = tmp_path / INDEX
     data = index.read_bytes()
     index.write_bytes(
@@ -202,9 +211,9 @@ def test_an_index_that_is_removed_in_flight_is_made_anew(tmp_path, events):
     assert [one.file for one in look(tmp_path)] == NAMES
 
 
-def test_by_age_and_by_bytes(tmp_path, events, caplog):
+def test_by_age_and_by_bytes(tmp_path, flown, caplog):
     """The disk is full after a month."""
-    fly(tmp_path, events)
+    copytree(flown, tmp_path, dirs_exist_ok=True)
     day = Retention((Limit(seconds=86_400),))
     assert len(look(tmp_path, day, later_s=80_000)) == 2
     first, second = read_index(tmp_path)
@@ -218,9 +227,9 @@ def test_by_age_and_by_bytes(tmp_path, events, caplog):
     assert list(tmp_path.glob("*.rrd")) == []
 
 
-def test_by_age_one_goes_at_a_time(tmp_path, events):
+def test_by_age_one_goes_at_a_time(tmp_path, flown):
     """Whatever went wrong with a clock, there would be nothing left to look at when it is noticed."""
-    fly(tmp_path, events)
+    copytree(flown, tmp_path, dirs_exist_ok=True)
     day = Retention((Limit(seconds=86_400),))
     assert [one.file for one in look(tmp_path, day, later_s=90_000)] == NAMES[1:]
 
@@ -230,9 +239,9 @@ YEAR_S = 365 * 86_400.0
 
 
 @pytest.mark.parametrize("set_by_s", [100 * 86_400.0, 2 * YEAR_S, 56 * YEAR_S, -2 * YEAR_S])
-def test_a_clock_that_is_set_removes_nothing(tmp_path, events, set_by_s):
+def test_a_clock_that_is_set_removes_nothing(tmp_path, flown, set_by_s):
     """NTP comes after the flight, or the clock is years ahead: the flight of a minute ago would be gone."""
-    fly(tmp_path, events)
+    copytree(flown, tmp_path, dirs_exist_ok=True)
     for step_s in (set_by_s, 0.0, set_by_s):  # in flight, and at the next starts
         rows = look(tmp_path, CLOCKS, set_by_s=step_s, later_s=60, times=3)
         assert [(one.file, one.video) for one in rows] == [(name, True) for name in NAMES]
@@ -241,9 +250,9 @@ def test_a_clock_that_is_set_removes_nothing(tmp_path, events, set_by_s):
 
 
 @pytest.mark.parametrize("ahead_s", [2 * YEAR_S, -56 * YEAR_S])
-def test_a_clock_that_is_wrong_after_a_boot_removes_nothing(tmp_path, events, ahead_s):
+def test_a_clock_that_is_wrong_after_a_boot_removes_nothing(tmp_path, flown, ahead_s):
     """The clock of a machine without a battery says anything: nobody knows how long it was off."""
-    fly(tmp_path, events)
+    copytree(flown, tmp_path, dirs_exist_ok=True)
     clock = {
         "now_ns": lambda: time.time_ns() + round(ahead_s * 1e9),
         "since_boot": lambda: ("the next", since_boot_ns()),
@@ -254,9 +263,9 @@ def test_a_clock_that_is_wrong_after_a_boot_removes_nothing(tmp_path, events, ah
     assert [(one.file, one.video) for one in read_index(tmp_path)] == [(name, True) for name in NAMES]
 
 
-def test_files_that_no_look_has_seen_before_are_not_old(tmp_path, events):
+def test_files_that_no_look_has_seen_before_are_not_old(tmp_path, flown):
     """A copied folder, or a lost index: their times are those of the copy, or of a clock that nobody knows."""
-    fly(tmp_path, events)
+    copytree(flown, tmp_path, dirs_exist_ok=True)
     (tmp_path / INDEX).unlink()
     for one in NAMES:
         os.utime(tmp_path / one, (0, 0))
@@ -284,9 +293,9 @@ def test_by_bytes_the_newest_stays_whatever_the_clock_says(tmp_path, events):
     assert [one.file for one in read_index(tmp_path)] == files[1:]
 
 
-def test_what_somebody_removed_does_not_count(tmp_path, events):
+def test_what_somebody_removed_does_not_count(tmp_path, flown):
     """Another would be removed to make room that is there."""
-    fly(tmp_path, events)
+    copytree(flown, tmp_path, dirs_exist_ok=True)
     rows = read_index(tmp_path)
     both = Retention((Limit(size_bytes=sum(one.size_bytes for one in rows)),))
     third = f"{STEM}-0003.rrd"
@@ -297,11 +306,11 @@ def test_what_somebody_removed_does_not_count(tmp_path, events):
     assert sorted(one.name for one in tmp_path.glob("*.rrd")) == [NAMES[0], third]
 
 
-def test_only_files_of_ours_in_the_folder_are_removed(tmp_path, events):
+def test_only_files_of_ours_in_the_folder_are_removed(tmp_path, flown):
     """What somebody put there, or a link to elsewhere, would be gone."""
     folder = tmp_path / "flights"
     folder.mkdir()
-    fly(folder, events)
+    copytree(flown, folder, dirs_exist_ok=True)
     kept = [folder / "mine.rrd", folder / "notes.txt", tmp_path / "other.rrd", folder / "hvt-a.rrd"]
     for one in kept:
         one.write_bytes((folder / NAMES[0]).read_bytes())
@@ -354,9 +363,9 @@ def test_video_is_removed_and_the_rest_stays(tmp_path, events):
     assert [one.video for one in look(tmp_path)] == [False, False]
 
 
-def test_a_file_that_breaks_off_is_smaller_without_its_video(tmp_path, events):
+def test_a_file_that_breaks_off_is_smaller_without_its_video(tmp_path, flown):
     """Its footer, a row for each chunk, takes more than the pictures of a file that was cut short by a power cut."""
-    fly(tmp_path, events)
+    copytree(flown, tmp_path, dirs_exist_ok=True)
     path = tmp_path / NAMES[0]
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2 - 37])
@@ -435,11 +444,11 @@ def test_a_killed_ground_leaves_an_index_that_goes_on(tmp_path, events, at):
         assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
 
 
-def test_a_ground_killed_while_it_removes_video_leaves_no_half_file(tmp_path, events):
+def test_a_ground_killed_while_it_removes_video_leaves_no_half_file(tmp_path, flown):
     """Half a copy would stand in the place of the flight, or lie there for ever."""
     folder = tmp_path / "flights"
     folder.mkdir()
-    fly(folder, events)
+    copytree(flown, folder, dirs_exist_ok=True)
     half = folder / f"{NAMES[0]}.part"
     half.write_bytes((folder / NAMES[0]).read_bytes()[:5000])  # as a kill in the middle leaves it
     empty = folder / f"{STEM}-0003.rrd"
