@@ -81,12 +81,25 @@ class Overlay:
     stored: bool = False
     """Whether the `VideoSample` was stored."""
     doubted: npt.NDArray[np.bool_] | None = None
-    """(N,) True where stills say that it is nothing of mine, or the view is unlike what the detector knows; None is
-    nowhere."""
+    """(N,) True where stills say that it is nothing of mine, or it is a guess (`hvt_ground.perception.guesses`), as
+    all are in a view that the detector does not know; None is nowhere."""
     sure: npt.NDArray[np.bool_] | None = None
     """(N,) True where stills agree on the class with a calibrated probability above .9; None is nowhere."""
     places: Places | None = None
     """Their places on the ground; None without a pose."""
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """N names for people: that of the class, or ``something`` where it is doubted."""
+        if self.doubted is None:
+            return self.classes
+        pairs = zip(self.classes, self.doubted.tolist(), strict=True)
+        return tuple("something" if doubt else name for name, doubt in pairs)
+
+    @property
+    def firm(self) -> npt.NDArray[np.bool_]:
+        """(N,) True where a still has refined the class, and nothing doubts it: drawn thick."""
+        return self.refined if self.doubted is None else self.refined & ~self.doubted
 
 
 @dataclass(frozen=True, slots=True)

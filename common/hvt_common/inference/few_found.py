@@ -108,37 +108,43 @@ class FewFoundHint:
 class ViewTrust:
     """Of one video. It is measured for ``aerial-nano`` alone; every other detector's views are trusted.
 
-    ``unlike`` holds while the view is unlike what the detector knows; that is said once.
+    ``unlike`` holds while the view is unlike what the detector knows; that is said once, with ``hence``, what follows
+    from it. ``mean`` is the mean confidence of the boxes that count, None before there were enough. From any thread.
     """
 
-    def __init__(self, detector: str) -> None:
+    def __init__(self, detector: str, *, hence: str) -> None:
         self._measured = detector == EMBEDDED_DETECTOR
         self._counts_from = default_confidence(detector) if self._measured else 0.0
         self._recent: deque[tuple[float, int]] = deque(maxlen=_RUNS)
+        self._lock = threading.Lock()
+        self._hence = hence
         self._said = False
         self.unlike = False
+        self.mean: float | None = None
 
     def take(self, found: Detections) -> None:
         """Count what was found on the next picture."""
         if not self._measured:
             return
         counted = found.confidences[found.confidences >= self._counts_from]
-        self._recent.append((float(np.sum(counted, dtype=np.float64)), len(counted)))
-        boxes = sum(count for _, count in self._recent)
-        if len(self._recent) < _RUNS or boxes < _LEAST_BOXES:
-            return  # too few tell nothing new
-        mean = sum(total for total, _ in self._recent) / boxes
-        self.unlike = mean < (_LIKE_FROM if self.unlike else _UNLIKE_BELOW)
-        if self.unlike and not self._said:
+        with self._lock:
+            self._recent.append((float(np.sum(counted, dtype=np.float64)), len(counted)))
+            boxes = sum(count for _, count in self._recent)
+            if len(self._recent) < _RUNS or boxes < _LEAST_BOXES:
+                return  # too few tell nothing new
+            self.mean = sum(total for total, _ in self._recent) / boxes
+            self.unlike = self.mean < (_LIKE_FROM if self.unlike else _UNLIKE_BELOW)
+            if not self.unlike or self._said:
+                return
             self._said = True
-            _log.warning(
-                "this view is unlike what %s knows: its last %d boxes have a mean confidence of %.2f, and are drawn "
-                "thin and unnamed; for other views try hvt-models fetch yolox-s and --detector yolox-s, or teach it "
-                "yours: hvt-study train",
-                EMBEDDED_DETECTOR,
-                boxes,
-                mean,
-            )
+        _log.warning(
+            "this view is unlike what %s knows: its last %d boxes have a mean confidence of %.2f, and %s; for other "
+            "views try hvt-models fetch yolox-s and --detector yolox-s, or teach it yours: hvt-study train",
+            EMBEDDED_DETECTOR,
+            boxes,
+            self.mean,
+            self._hence,
+        )
 
 
 def _middle_enlarged(image: Image) -> Image:

@@ -10,6 +10,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from hvt_common.inference.detect import FailingDetector
+from hvt_common.inference.few_found import ViewTrust
 from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
@@ -61,7 +62,7 @@ class _Decoder(Protocol):
 class Analyzer:
     """Decodes the edge's own access units, detects on every n-th frame and tracks on each.
 
-    While the detector gives None the tracks are carried on.
+    While the detector gives None the tracks are carried on. ``trust`` is told what it finds.
     """
 
     def __init__(
@@ -72,11 +73,13 @@ class Analyzer:
         view: View,
         settings: AnalyzerSettings = AnalyzerSettings(),
         decoder: _Decoder | None = None,
+        trust: ViewTrust | None = None,
     ) -> None:
         self._detector = detector
         self._tracker = tracker
         self._view = view
         self._settings = settings
+        self._trust = trust
         self._decoder = decoder or BaseDecoder()
         self._detected_index: int | None = None
         self.detected_ns: int | None = None
@@ -93,6 +96,11 @@ class Analyzer:
     def detect_every(self) -> int:
         """Source frames from one detection to the next, where there is time for it and each of them is coded."""
         return self._settings.detect_every
+
+    @property
+    def view_unlike(self) -> bool:
+        """The view is unlike what the detector knows."""
+        return self._trust is not None and self._trust.unlike
 
     @property
     def tracks(self) -> int:
@@ -156,6 +164,8 @@ class Analyzer:
         if detections is None:
             tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
             return AnalyzedFrame(frame, picture, tracks, detected=False, _bgr=bgr)
+        if self._trust is not None:
+            self._trust.take(detections)
         self._detected_index, self.detected_ns = frame.index, frame.capture_ns
         tracks = self._tracker.update(detections, frame_index=frame.index, image_bgr=pixels)
         return AnalyzedFrame(frame, picture, tracks, detected=True, _bgr=bgr)

@@ -2,10 +2,10 @@
 
 Both cost bits that the video could have.
 
-**Tracks** pay if the ground's detector misses objects on the base, or finds false ones: their gain in F1 is the
-shadow ground's measurement, less the gain of video by the same bits. **Stills** pay if they change the ground's
-list: it reports the outcome of each. If hardly any changed anything they pause, and a few are sent now and then as
-a test. If the source is much finer than the base, they never pause, because they show details.
+**Tracks** pay if the detector knows the view, and the ground's misses objects on the base, or finds false ones: their
+gain in F1 is the shadow ground's measurement, less the gain of video by the same bits. **Stills** pay if they change
+the ground's list: it reports the outcome of each. If hardly any changed anything they pause, and a few are sent now
+and then as a test. If the source is much finer than the base, they never pause, because they show details.
 
 False reports of a ground can stop stills and tracks or bring them back, and with them move some of the bits of the
 video, within auto's bounds. They cannot change the budget.
@@ -100,13 +100,17 @@ class LeverControl:
         self._changed: deque[bool] = deque(maxlen=settings.most_answers)
         self._paused_until_ns: int | None = None
         self._pauses = 1
-        self._too_slow = False
+        self._too_slow = self._unlike = False
         operating.pull(Levers(tracks=False))
         self._loads: deque[tuple[int, int]] = deque(maxlen=settings.load_samples)
 
     def take_shadow(self, measured: Measured) -> None:
         """Take a measurement of the shadow ground."""
         self._measured = measured
+
+    def take_view(self, *, unlike: bool) -> None:
+        """``unlike``: the detector does not know the view, so that a gain in what it finds is a gain in guesses."""
+        self._unlike = unlike
 
     def take_answer(self, *, changed: bool) -> None:
         """A ground has inspected a still; ``changed``: it now names the object otherwise than the edge does."""
@@ -152,6 +156,8 @@ class LeverControl:
         return levers
 
     def _tracks(self, sent: bool) -> bool:  # noqa: FBT001 - the state before
+        if self._unlike:
+            return False
         return self._settings.tracks_pay(self._measured, total_bps=self._operating.now.total_bps, sent=sent)
 
     def _stills(self, now_ns: int) -> bool:
@@ -181,6 +187,8 @@ class LeverControl:
             if round(count):
                 hidden += f", {what.format(f'{count:.0f}')}"
         why = hidden if measured.comparisons else "not measured yet"
+        if self._unlike:
+            why = "this view is unlike what the detector knows"
         of_tracks = f"{'tracks' if tracks else 'no tracks'}: {why}"
         renamed = f"{sum(self._changed)} of {len(self._changed)} renamed something"
         renamed = renamed if self._changed else "none was answered yet"

@@ -9,6 +9,7 @@ from functools import partial
 from typing import Literal, cast
 
 from hvt_common.inference.detect import Detector, FailingDetector, detect_every, open_detector, warm_up
+from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.motion import MOTION
 from hvt_common.inference.retried import RetriedDetector
 from hvt_common.inference.scores import (
@@ -69,7 +70,9 @@ def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
         warm_up(detector, view.base_size)
 
 
-def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) -> Analyzer:
+def make_analyzer(
+    config: EdgeConfig, *, detector: FailingDetector, view: View, trust: ViewTrust | None = None
+) -> Analyzer:
     """Decoder, detector and tracker of the edge's own stream."""
     settings = TrackerSettings.starting_at(
         track_confidence(config), camera_motion=cast('Literal["off", "flow"]', config.camera_motion)
@@ -82,6 +85,7 @@ def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) 
             detect_every=detect_every(config.detect_every, fps=config.nominal_fps),
             candidates=cast('Literal["decoded", "source"]', config.candidates),
         ),
+        trust=trust,
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from hvt_common.inference.detect import FailingDetector
+from hvt_common.inference.few_found import ViewTrust
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import fitted_class_names
@@ -254,8 +255,10 @@ def build_stages(
         observe=reconfiguration.observe,
         on_demand=on_demand,
     )
+    levers = make_levers(config, operating, view)
+    trust = None if levers is None else ViewTrust(config.detector, hence="auto gives its tracks no credit")
     stills = StillStage(
-        make_analyzer(config, detector=detector, view=view),
+        make_analyzer(config, detector=detector, view=view, trust=trust),
         chooser,
         outbox=outbox,
         sender=still_sender,
@@ -264,7 +267,7 @@ def build_stages(
         tracks_used=config.tracks_used,
         reporter=TrackReporter(transmitter, session_id=session_id) if config.send_tracks else None,
         shadow=make_shadow(config, detector, before=beginning.shadow),
-        levers=make_levers(config, operating, view),
+        levers=levers,
     )
     commands = Commands(
         config,

@@ -95,14 +95,14 @@ def _draw(recorded: Recorded, output: OutputContainer) -> None:
 
 
 def _with_boxes(picture: Image, overlay: Overlay) -> Image:
-    """A copy with a frame, id and class for each track; thick where a still has spoken."""
+    """A copy with a frame, id and class for each track; thick where a still has spoken, unnamed where in doubt."""
     drawn = picture.copy()
+    firm, words = overlay.firm, overlay.words
     for row, track_id in enumerate(overlay.track_ids.tolist()):
         x1, y1, x2, y2 = (round(value) for value in overlay.boxes_base_px[row].tolist())
-        name = overlay.classes[row]
-        colour = class_colour(name)[::-1]
-        cv2.rectangle(drawn, (x1, y1), (x2, y2), colour, 2 if overlay.refined[row] else 1)
-        text = f"{track_id} {name}"
+        colour = class_colour(overlay.classes[row])[::-1]
+        cv2.rectangle(drawn, (x1, y1), (x2, y2), colour, 2 if firm[row] else 1)
+        text = f"{track_id} {words[row]}"
         x, y = x1, y1 - 4 if y1 > 14 else y2 + 12
         for at, ink in (((x + 1, y + 1), (0, 0, 0)), ((x, y), colour)):
             cv2.putText(drawn, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, ink, 1, cv2.LINE_AA)

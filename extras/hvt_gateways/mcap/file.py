@@ -142,6 +142,7 @@ def _location(pose: Pose) -> LocationFix:
 def _annotations(overlay: Overlay) -> ImageAnnotations:
     """A frame around each track, with its id and class, and the rest as metadata of the frame."""
     origins = overlay.origins or ("base",) * len(overlay.track_ids)
+    firm, words = overlay.firm, overlay.words
     result = ImageAnnotations()
     for row, track_id in enumerate(overlay.track_ids.tolist()):
         x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
@@ -154,6 +155,7 @@ def _annotations(overlay: Overlay) -> ImageAnnotations:
             "confidence": f"{overlay.confidences[row]:.2f}",
             "refined": int(refined),
             "origin": origins[row],
+            "doubted": int(words[row] != name),
         }
         corners = _points(((x1, y1), (x2, y1), (x2, y2), (x1, y2)))
         result.points.append(
@@ -161,13 +163,13 @@ def _annotations(overlay: Overlay) -> ImageAnnotations:
                 type=PointsAnnotation.LINE_LOOP,
                 points=corners,
                 outline_color=colour,
-                thickness=_THICK_PX if refined else _THIN_PX,
+                thickness=_THICK_PX if firm[row] else _THIN_PX,
                 metadata=[KeyValuePair(key=key, value=str(value)) for key, value in facts.items()],
             )
         )
         result.texts.append(
             TextAnnotation(
-                position=corners[0], text=f"{track_id} {name}", font_size=_FONT_PX, text_color=colour
+                position=corners[0], text=f"{track_id} {words[row]}", font_size=_FONT_PX, text_color=colour
             )
         )
     return result

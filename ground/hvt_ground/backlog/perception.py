@@ -12,12 +12,14 @@ import numpy as np
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import FailingDetector
+from hvt_common.inference.few_found import ViewTrust
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import Detections, Image
 from hvt_ground.events import Event, Overlay
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import History
 from hvt_ground.perception.models import ModelSet
 from hvt_ground.perception.stills.classify import StillReader
@@ -33,16 +35,26 @@ Emit = Callable[[Event], None]
 
 
 class StretchTracker:
-    """Detects and tracks along one stretch of video."""
+    """Detects and tracks along one stretch of video. What is doubted live is doubted here."""
 
     def __init__(
-        self, detector: FailingDetector, tracker: ByteTracker, *, first_id: int, detect_every: int, emit: Emit
+        self,
+        detector: FailingDetector,
+        tracker: ByteTracker,
+        *,
+        first_id: int,
+        detect_every: int,
+        emit: Emit,
+        trust: ViewTrust,
+        guesses: Guesses | None,
     ) -> None:
         self._detector = detector
         self._tracker = tracker
         self._first_id = first_id
         self._detect_every = detect_every
         self._emit = emit
+        self._trust = trust
+        self._guesses = guesses
         self._detected: int | None = None
         self.next_id = first_id
 
@@ -51,12 +63,17 @@ class StretchTracker:
         if self._detected is None or frame_index - self._detected >= self._detect_every:
             self._detected = frame_index
             found = self._detector.detect(image_bgr) or Detections.none()
+            self._trust.take(found)
             tracks = self._tracker.update(found, frame_index=frame_index, image_bgr=image_bgr)
         else:
             tracks = self._tracker.predict(frame_index=frame_index, image_bgr=image_bgr)
         ids = tracks.ids + (self._first_id - 1)
         self.next_id = max(self.next_id, int(ids.max(initial=0)) + 1)
         names = tuple(self._detector.class_names[class_id] for class_id in tracks.class_ids)
+        doubted = np.full(len(tracks), self._trust.unlike)
+        if self._guesses is not None:
+            self._guesses.update(tracks, names, self._tracker.camera_step)
+            doubted |= self._guesses.among(tracks.ids)
         self._emit(
             Overlay(
                 frame_index=frame_index,
@@ -68,6 +85,7 @@ class StretchTracker:
                 confidences=tracks.confidences,
                 refined=np.zeros(len(tracks), np.bool_),
                 stored=True,
+                doubted=doubted,
             )
         )
 
@@ -76,7 +94,8 @@ class BacklogPerception:
     """Of one session. For one thread at a time.
 
     ``take_models`` gives detector and classifier, ``tracker_of`` makes a tracker for one stretch,
-    ``reader_of`` makes what names stills of detector and classifier.
+    ``reader_of`` makes what names stills of detector and classifier; ``trust`` is of the session's view,
+    ``guesses_of`` of one stretch.
     """
 
     def __init__(
@@ -87,12 +106,16 @@ class BacklogPerception:
         tracker_of: Callable[[], ByteTracker],
         reader_of: Callable[[FailingDetector, Classifier | None], StillReader],
         detect_every: int,
+        trust: ViewTrust,
+        guesses_of: Callable[[], Guesses | None] = lambda: None,
     ) -> None:
         self._info = info
         self._take_models = take_models
         self._tracker_of = tracker_of
         self._reader_of = reader_of
         self._detect_every = detect_every
+        self._trust = trust
+        self._guesses_of = guesses_of
         self._next_id = FIRST_TRACK_ID
 
     @contextmanager
@@ -104,6 +127,8 @@ class BacklogPerception:
             first_id=self._next_id,
             detect_every=self._detect_every,
             emit=emit,
+            trust=self._trust,
+            guesses=self._guesses_of(),
         )
         try:
             yield tracker

@@ -21,6 +21,7 @@ from hvt_common.video.hevc import YuvPicture
 from hvt_ground.events import Event, Overlay
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import FusedTracks, Fusion
+from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import History, as_bgr
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
@@ -81,6 +82,8 @@ class PipelineParts:
     """Of the sessions that share the detector."""
     trust: ViewTrust
     """Of the detector, in this session's video."""
+    guesses: Guesses | None = None
+    """None where the detector's scores are no probabilities."""
     patient: bool = False
     """Wait for a turn, however long: what is due is always detected, as lockstep needs it."""
 
@@ -89,6 +92,8 @@ class NothingPerceived:
     """The counts of a `Pipeline` that is not made yet."""
 
     tracks = refined = class_changes = stills_pending = detections_run = doubted = 0
+    view_trust: float | None = None
+    view_unlike = False
 
     def __init__(self) -> None:
         self.outcomes: Counter[str] = Counter()
@@ -149,8 +154,19 @@ class Pipeline:
         """Objects that the detector showed when it last looked; -1 before the first time."""
         self.doubted = 0
         """Of the tracks that are shown, those that stills doubt."""
+        self.trust = parts.trust
         self.steps_used = 0
         """Reports of the edge's tracks that were taken in."""
+
+    @property
+    def view_trust(self) -> float | None:
+        """Mean confidence of what the detector shows; None where that tells nothing."""
+        return self.trust.mean
+
+    @property
+    def view_unlike(self) -> bool:
+        """It is so low that the detector does not know the view."""
+        return self.trust.unlike
 
     @property
     def tracks(self) -> int:
@@ -248,6 +264,7 @@ class Pipeline:
             raise ValueError(f"frame {frame_index} lies before the newest frame, {self._now.picture_index}")
         fused = self._parts.fusion.listed(self._own_at(frame_index))
         shown = self._parts.refiner.preview(fused.tracks)
+        shown = self._doubting(fused, shown)
         return _overlay(fused, shown, self._capture_ns(frame_index), base_size=self._base_size)
 
     def take_results(self) -> list[StillResult]:
@@ -275,7 +292,7 @@ class Pipeline:
                 found = parts.detector.detect(image) or Detections.none()
             finally:
                 parts.turns.release()
-            parts.trust.take(found)
+            self.trust.take(found)
             own = parts.tracker.update(found, frame_index=index, image_bgr=image)
             self.objects_detected = int((own.seen_frames == index).sum())
         else:
@@ -311,13 +328,24 @@ class Pipeline:
         self._track_ids.add(fused.tracks.ids.tolist())
         self._stills.update(self._now)
         if own.frame_index > self._listed_frame:
+            step = self._parts.path.between(max(0, self._listed_frame), own.frame_index)
             self._listed_frame = own.frame_index
             shown = self._parts.refiner.shown(fused.tracks)
+            if self._parts.guesses is not None:
+                self._parts.guesses.update(fused.tracks, shown.base_classes, step, scores=fused.means)
             self.doubted = int(shown.doubted.sum())
-            if self._parts.trust.unlike:  # of our detector: what the edge's alone sees is its own affair
-                ours = np.array([origin == "base" for origin in fused.origins], np.bool_)
-                shown = replace(shown, doubted=shown.doubted | ours & ~shown.refined)
+            shown = self._doubting(fused, shown)
             self._emit(_overlay(fused, shown, capture_ns, base_size=self._base_size))
+
+    def _doubting(self, fused: FusedTracks, shown: ShownClasses) -> ShownClasses:
+        # In a view that our detector does not know all its tracks are guesses, and no class is certain. What the
+        # edge's alone sees is its own affair.
+        guesses, sure = self._parts.guesses, shown.sure
+        doubted = np.zeros(len(sure), np.bool_) if guesses is None else guesses.among(fused.tracks.ids)
+        if self.trust.unlike:
+            doubted |= np.array([origin == "base" for origin in fused.origins], np.bool_)
+            sure = np.zeros_like(sure)
+        return replace(shown, doubted=shown.doubted | doubted & ~shown.refined, sure=sure)
 
     def _carry_merges(self) -> None:
         for survivor_id, merged_id in self._parts.fusion.take_merged():

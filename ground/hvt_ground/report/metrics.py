@@ -44,6 +44,11 @@ _GAUGES: Table[SessionState] = {
     "hvt_tracks": ("Distinct tracks of the session.", lambda one: one.tracks),
     "hvt_tracks_refined": ("Of these, refined by a still.", lambda one: one.tracks_refined),
     "hvt_tracks_doubted": ("Shown, and doubted by stills.", lambda one: one.tracks_doubted),
+    "hvt_view_trust_ratio": ("Mean confidence of the ground's detector.", lambda one: one.view_trust),
+    "hvt_view_unlike": (
+        "1: the view is unlike what the ground's detector knows.",
+        lambda one: int(one.view_unlike),
+    ),
     "hvt_stills_pending": ("To be read.", lambda one: one.stills_pending),
     "hvt_budget_used_ratio": ("Of the edge's budget.", lambda one: one.budget_share),
     "hvt_backlog_objects_working": ("Stored objects in hand.", lambda one: one.backlog_working),

@@ -96,6 +96,11 @@ class SessionState:
     tracks_refined: int
     tracks_doubted: int | None
     """Shown now, and nothing of what is looked for as stills have it; None while no picture comes."""
+    view_trust: float | None
+    """Mean confidence of what the ground's detector shows, 0…1; None for another than the embedded one, before there
+    was enough, and while no picture comes."""
+    view_unlike: bool
+    """It is so low that the view is unlike what the detector knows: boxes are thin and unnamed."""
     class_changes: int
     detections: int
     backlog_stills: int
@@ -303,6 +308,8 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
         tracks=pipeline.tracks,
         tracks_refined=pipeline.refined,
         tracks_doubted=None if now is None else pipeline.doubted,
+        view_trust=None if now is None else pipeline.view_trust,
+        view_unlike=now is not None and pipeline.view_unlike,
         class_changes=pipeline.class_changes,
         detections=pipeline.detections_run,
         backlog_stills=totals.stills,

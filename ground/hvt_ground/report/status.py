@@ -41,6 +41,7 @@ def _edge_text(one: EdgeState) -> str:
             f"{one.edge}: {session.duration_s:.1f} s  {rate}{' (thin link)' if one.link == 'thin' else ''}  "
             f"stills {session.stills_received}{why}  "
             f"tracks {session.tracks}, {session.tracks_refined} refined{age}"
+            f"{'  UNKNOWN VIEW' if session.view_unlike else ''}"
         )
     return "  ".join([said, *map(failed_text, one.failed)])
 
@@ -97,6 +98,8 @@ def summary(session: GroundSession) -> dict[str, Any]:
         "tracks": pipeline.tracks,
         "tracks_refined": pipeline.refined,
         "class_changes": pipeline.class_changes,
+        "view_trust": None if pipeline.view_trust is None else round(pipeline.view_trust, 3),
+        "view_unlike": pipeline.view_unlike,
         "detections_run": pipeline.detections_run,
         "gaps": counters.gaps,
         "lost": counters.lost,
@@ -184,6 +187,8 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("keyframes", f"{content['keyframe_requests']} requested"),
     ]
+    if content["view_unlike"]:
+        rows.append(("view", f"unlike what the detector knows (trust {content['view_trust']:.2f})"))
     backlog = content["backlog"]
     if backlog["stills"] or backlog["frames"]:
         rows.append(

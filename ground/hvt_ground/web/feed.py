@@ -222,6 +222,8 @@ def _words(session: SessionState, *, calibrated: bool) -> list[str]:
     words.append(_some(session.stills_received, "still"))
     trust = "" if calibrated else "; the probability of a class is not calibrated"
     words.append(f"{_some(session.tracks, 'track')}, {session.tracks_refined} refined by stills{trust}")
+    if session.view_unlike:
+        words.append("this view is unlike what the detector knows: its boxes are thin and unnamed")
     if session.gaps:
         words.append(f"{_some(session.gaps, 'gap')}, {_some(session.lost, 'message')} lost")
     if session.backlog_stills or session.backlog_video_s:

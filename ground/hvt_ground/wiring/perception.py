@@ -8,6 +8,7 @@ from typing import Literal, cast
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import FailingDetector, detect_every
 from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.scores import is_calibrated
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_ground.backlog.perception import BacklogPerception
@@ -15,6 +16,7 @@ from hvt_ground.config import DETECTOR, GroundConfig
 from hvt_ground.events import Event
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.models import Models, stills_calibrated, track_confidence
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader
@@ -23,9 +25,14 @@ from hvt_ground.perception.stills.vocabulary import Vocabulary
 
 
 def make_pipeline(
-    config: GroundConfig, models: Models, *, info: Info, emit: Callable[[Event], None]
+    config: GroundConfig,
+    models: Models,
+    *,
+    info: Info,
+    emit: Callable[[Event], None],
+    trust: ViewTrust | None = None,
 ) -> Pipeline:
-    """The pipeline of one session."""
+    """The pipeline of one session; ``trust`` is of its view, and of what is stored of it too."""
     detector, classifier = models.take()
     reader = _reader(config, detector, classifier, info=info)
     names, edge_classes = unified_names(detector.class_names, info.class_names)
@@ -45,7 +52,8 @@ def make_pipeline(
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path, base_per_source=info.view.scale),
         path=path,
         turns=models.turns,
-        trust=ViewTrust(config.detector),
+        trust=trust or make_trust(config),
+        guesses=_guesses(config, info),
         # In lockstep the same input gives the same detections, however long they take.
         patient=info.pace == "lockstep",
     )
@@ -59,7 +67,14 @@ def make_pipeline(
     )
 
 
-def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info) -> BacklogPerception:
+def make_trust(config: GroundConfig) -> ViewTrust:
+    """How far the view of one session can be trusted."""
+    return ViewTrust(config.detector, hence="are drawn thin and unnamed")
+
+
+def make_backlog_perception(
+    config: GroundConfig, models: Models, *, info: Info, trust: ViewTrust
+) -> BacklogPerception:
     """Make the analyzer of the stored video and stills of a session."""
     return BacklogPerception(
         info,
@@ -67,7 +82,13 @@ def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info)
         tracker_of=lambda: _tracker(config, info),
         reader_of=lambda detector, classifier: _reader(config, detector, classifier, info=info),
         detect_every=detect_every(config.detect_every, fps=info.fps),
+        trust=trust,
+        guesses_of=lambda: _guesses(config, info),
     )
+
+
+def _guesses(config: GroundConfig, info: Info) -> Guesses | None:
+    return Guesses(fps=info.fps) if is_calibrated(config.detector, role="detector") else None
 
 
 def _tracker(config: GroundConfig, info: Info) -> ByteTracker:

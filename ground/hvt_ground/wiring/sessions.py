@@ -33,7 +33,7 @@ from hvt_ground.sinks.still_files import StillFiles, picture_of
 from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.sinks.tracks_table import TrackTable
 from hvt_ground.wiring.files import backlog_path, free_path, output_path
-from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline
+from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline, make_trust
 
 if TYPE_CHECKING:  # who serves no page needs no web server
     from hvt_ground.web import WebPage
@@ -139,13 +139,14 @@ class SessionFactory:
             sinks.append(self._outputs.open(one.part, one.open, wait_s=held_s, longest_pause_s=pause_s))
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
+        trust = make_trust(config)
         return GroundSession(
             info,
             sinks=sinks,
-            pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit),
+            pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit, trust=trust),
             clock=self._clock,
             reports=reports,
-            backlog_perception=make_backlog_perception(config, models, info=info),
+            backlog_perception=make_backlog_perception(config, models, info=info, trust=trust),
             locator=locator,
             later=models.loading,
         )
@@ -157,7 +158,9 @@ class SessionFactory:
         names = partial(backlog_path, self._config.record, edge=info.edge, stamp=stamp)
         part = f"backlog recording of {info.edge}"
         sink = self._outputs.open(part, partial(self._opened, self._files(settings, backlog=True), names))
-        perception = make_backlog_perception(self._config, self._models, info=info)
+        perception = make_backlog_perception(
+            self._config, self._models, info=info, trust=make_trust(self._config)
+        )
         return BacklogRecording(info, sink=sink, perception=perception)
 
     def _new_file(

@@ -104,7 +104,7 @@ STREET = many(0.9, 0.8, 0.45, 0.2)
 
 def test_a_view_that_it_does_not_know_is_said_once_and_left_again(caplog):
     """Boxes that are right half the time would look like those that are right nine times in ten."""
-    trust = ViewTrust("aerial-nano")
+    trust = ViewTrust("aerial-nano", hence="are drawn thin and unnamed")
     for _ in range(44):
         trust.take(WATER)
     assert not trust.unlike
@@ -126,7 +126,7 @@ def test_a_view_that_it_does_not_know_is_said_once_and_left_again(caplog):
 @pytest.mark.parametrize("view", [STREET, many(), many(0.41)])
 def test_a_view_that_it_knows_or_that_is_nearly_empty_is_trusted(view):
     """A field with one far car now and then would be called unknown."""
-    trust = ViewTrust("aerial-nano")
+    trust = ViewTrust("aerial-nano", hence="are drawn thin and unnamed")
     for index in range(200):
         trust.take(view if index % 2 or view is STREET else many())
         assert not trust.unlike
@@ -134,7 +134,7 @@ def test_a_view_that_it_knows_or_that_is_nearly_empty_is_trusted(view):
 
 def test_scores_that_are_no_probabilities_say_nothing():
     """A network whose scores are low by habit would never have a name."""
-    trust = ViewTrust("boat.onnx")
+    trust = ViewTrust("boat.onnx", hence="")
     for _ in range(200):
         trust.take(WATER)
     assert not trust.unlike

@@ -51,6 +51,19 @@ class Rig:
         return self.operating.now.levers
 
 
+def test_in_a_view_that_the_detector_does_not_know_its_tracks_have_no_credit():
+    """A tenth of the budget went into guesses, because the ground guessed otherwise."""
+    rig = Rig()
+    assert rig.tracks(0.3)
+    rig.control.take_view(unlike=True)
+    assert not rig.tracks(0.3)
+    assert rig.operating.now.levers.says.startswith(
+        "no tracks: this view is unlike what the detector knows; "
+    )
+    rig.control.take_view(unlike=False)
+    assert rig.tracks(0.3)
+
+
 def test_tracks_follow_their_gain_and_do_not_flicker():
     """At the border of being worth their bits they would come and go with the noise of the measurement."""
     rig = Rig()

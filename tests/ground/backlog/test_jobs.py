@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from hvt_common.inference.few_found import ViewTrust
 from hvt_common.protocol.messages import BacklogUnit, RoiHeader, parse_backlog_units
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -40,6 +41,7 @@ def test_work_that_was_never_begun_lets_its_recording_go():
         tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader_of=lambda _detector, _classifier: SameAnswer(),
         detect_every=3,
+        trust=ViewTrust("motion", hence=""),
     )
     former = SessionBacklog(info, log=log, perception=perception, read=lambda _still: None)
     destination = Destination(lambda: users.append(former) or former, users.remove)

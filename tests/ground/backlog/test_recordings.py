@@ -6,6 +6,7 @@ import os
 import threading
 import time
 
+from hvt_common.inference.few_found import ViewTrust
 from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_ground.backlog.perception import BacklogPerception
@@ -33,6 +34,7 @@ def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):
             tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
             reader_of=lambda _detector, _classifier: SameAnswer(),
             detect_every=3,
+            trust=ViewTrust("motion", hence=""),
         )
         sink = QueuedSink("recording", lambda: LineFile(pipe, ("a",)), failures=failures)
         sinks.append(sink)

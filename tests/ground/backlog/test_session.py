@@ -14,6 +14,7 @@ import av
 import numpy as np
 import pytest
 
+from hvt_common.inference.few_found import ViewTrust
 from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import (
     AcknowledgedRange,
@@ -26,6 +27,7 @@ from hvt_common.protocol.messages import (
 from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.transport.inbox import Received
+from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import FIRST_TRACK_ID, BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
 from hvt_ground.perception.pipeline import DecodedFrame
@@ -78,7 +80,7 @@ def settings(info: Info, path: Path, **changes) -> RecorderSettings:
     )
 
 
-def look_of(info: Info, models=None) -> BacklogPerception:
+def look_of(info: Info, models=None, trust: ViewTrust | None = None) -> BacklogPerception:
     """What looks at kept things."""
     return BacklogPerception(
         info,
@@ -86,6 +88,7 @@ def look_of(info: Info, models=None) -> BacklogPerception:
         tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader_of=lambda _detector, _classifier: SameAnswer(),
         detect_every=3,
+        trust=trust or ViewTrust("motion", hence=""),
     )
 
 
@@ -292,6 +295,17 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
     assert after.boxes(61) == {}, "nothing is known of the frames after"
     assert after.boxes(64) == {}
     assert len(after.boxes(74)) == 1
+
+
+def test_stored_video_of_an_unknown_view_is_doubted_as_it_is_live(flight):
+    """Boxes that were dashed and unnamed before an outage were certain in the middle of it."""
+    trust, found = ViewTrust("motion", hence=""), []
+    perception, decoder = look_of(flight.info(), trust=trust), BaseDecoder()
+    with perception.track(found.append) as tracker:
+        for unit in flight.units[:6]:
+            trust.unlike = unit.frame_index >= 3
+            tracker.analyze(unit.frame_index, unit.capture_ns, decoder.decode(unit.data))
+    assert [one.doubted.tolist() for one in found[1:]] == [[False]] * 2 + [[True]] * 3
 
 
 @pytest.mark.parametrize("compact_bytes", [6_000, 1 << 30])

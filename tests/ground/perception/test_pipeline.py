@@ -90,7 +90,7 @@ def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures
 
 def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flight, pictures):
     """A box that is a guess would be drawn and named like one that is right nine times in ten."""
-    trust = ViewTrust("motion")  # which measures nothing by itself
+    trust = ViewTrust("motion", hence="")  # which measures nothing by itself
     rig = Rig(trust=trust)
     for picture in pictures[:20]:
         trust.unlike = picture.frame_index >= 10

@@ -41,6 +41,7 @@ class Ground:
         self.clock = clock
         self.maker = StateMaker(clock, failures=self.failures)
         self.outputs = Outputs(self.failures)
+        self.opened: list[GroundSession] = []
         self.ended: list[GroundSession] = []
         self.sessions = EdgeSessions(self.port, open_session=self.open_one, on_ended=self.ended.append)
 
@@ -53,7 +54,10 @@ class Ground:
             self.outputs.open("second recording of uav-1", lambda: Recorder(gone)),
             self.outputs.open("recording of uav-10", lambda: Recorder(gone)),
         ]
-        return GroundSession(info, sinks=sinks, pipeline_of=pipeline_of, clock=self.clock, reports=reports)
+        self.opened.append(
+            GroundSession(info, sinks=sinks, pipeline_of=pipeline_of, clock=self.clock, reports=reports)
+        )
+        return self.opened[-1]
 
     def line(self) -> str:
         """The status line."""
@@ -124,6 +128,26 @@ def test_who_gets_no_stills_reads_why(ground):
     assert f"the edge did not send these stills: {said}" in [
         text for _, _, text in Recording(ground.path).events()
     ]
+
+
+def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground):
+    """Who came later, or reads tables alone, took guesses for objects."""
+    assert "UNKNOWN VIEW" not in ground.line()
+    trust = ground.opened[0].pipeline.trust
+    trust.mean, trust.unlike = 0.53, True
+    assert "refined  UNKNOWN VIEW" in ground.line()
+    state = ground.maker.make([("uav-1", ground.sessions)])
+    assert (state.edges[0].session.view_trust, state.edges[0].session.view_unlike) == (0.53, True)
+    shown = json.loads(state_message(state, recorded=True))["edges"]["uav-1"]
+    assert any(one.startswith("this view is unlike") for one in shown["words"])
+    text = metrics_text(state).decode()
+    assert 'hvt_view_trust_ratio{edge="uav-1"} 0.53' in text
+    assert 'hvt_view_unlike{edge="uav-1"} 1.0' in text
+    ground.sessions.close()
+    ground.outputs.close()
+    content = summary(ground.ended[0])
+    assert (content["view_trust"], content["view_unlike"]) == (0.53, True)
+    assert dict(table(content))["view"] == "unlike what the detector knows (trust 0.53)"
 
 
 def test_a_link_that_carries_nothing_is_lost_in_the_line(ground):

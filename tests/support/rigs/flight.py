@@ -136,7 +136,7 @@ def pipeline_of(
         fusion=Fusion(fps=15, edge_classes=places, path=path),
         path=path,
         turns=Turns(),
-        trust=trust or ViewTrust(MOTION),
+        trust=trust or ViewTrust(MOTION, hence=""),
     )
     view = View.fitted(SIZE, SIZE, fit="letterbox")
     return Pipeline(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)

@@ -45,6 +45,8 @@ class FusedTracks:
     tracks: Tracks
     """Ids are those of the entities; class ids index the unified names."""
     origins: tuple[Origin, ...]
+    means: npt.NDArray[np.float32]
+    """(N,) of the confidences of both sides; that of the tracks is the surer one's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,7 @@ def list_entities(
     """
     lines = _lines(entities, own, rules, doubting=doubting)
     boxes = _boxes(lines, own, path, rules)
-    classes, confidences = _classes(lines, own, rules)
+    classes, confidences, means = _classes(lines, own, rules)
     listed = _once_each(lines, boxes, classes, confidences)
     lines = [line for line, is_listed in zip(lines, listed, strict=True) if is_listed]
     born = [line.entity.born for line in lines]
@@ -83,7 +85,7 @@ def list_entities(
         seen_frames=np.array([_seen_frame(line, own) for line in lines], np.int64),
         started=np.array([_started(line, own) for line in lines], np.bool_),
     )
-    return FusedTracks(tracks, tuple(line.origin for line in lines))
+    return FusedTracks(tracks, tuple(line.origin for line in lines), means[listed])
 
 
 def reported_boxes(entities: Sequence[Entity], frame_index: int, *, path: CameraPath, reach: int) -> _Floats:
@@ -163,21 +165,24 @@ def _correction(entity: Entity, frame_index: int, rules: FusionRules) -> _Floats
 
 def _classes(
     lines: Sequence[_Line], own: Tracks, rules: FusionRules
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    # (N,) class ids and their confidences: the side that is surer says.
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    # (N,) class ids and their confidences: the side that is surer says; and the means of both sides.
     classes, confidences = np.zeros(len(lines), np.int32), np.zeros(len(lines), np.float32)
+    means = np.zeros(len(lines), np.float32)
     for place, line in enumerate(lines):
         entity = line.entity
         if line.row is not None:
             classes[place], confidences[place] = own.class_ids[line.row], own.confidences[line.row]
+            means[place] = own.confidences[line.row]
         if line.observed is None:
             continue
+        means[place] = (means[place] + line.observed.confidence) / (1 + (line.row is not None))
         theirs = rules.edge_class_weight * entity.edge_vote.confidence
         if line.row is None or theirs > entity.own_vote.confidence:
             classes[place] = entity.edge_vote.class_id
         if line.row is None or line.observed.confidence > confidences[place]:
             confidences[place] = line.observed.confidence
-    return classes, confidences
+    return classes, confidences, means
 
 
 def _once_each(

@@ -178,10 +178,13 @@ export function tracksTitle(count, behind) {
 }
 
 /** @param {TrackFacts} track */
-export const trackWords = (track) => `${track.name} ${track.id}, ${percent(track.sureness)}`;
+const trackName = (track) => (track.doubted ? "something" : track.name);
 
 /** @param {TrackFacts} track */
-export const trackLabel = (track) => `${track.name}, track ${track.id}${track.doubted ? ", doubted" : ""}: closer look`;
+export const trackWords = (track) => `${trackName(track)} ${track.id}, ${percent(track.sureness)}`;
+
+/** @param {TrackFacts} track */
+export const trackLabel = (track) => `${trackName(track)}, track ${track.id}${track.doubted ? ", doubted" : ""}: closer look`;
 
 /** @param {StillFacts} still */
 export function stillWords(still) {

@@ -198,6 +198,30 @@ def test_mcap_has_video_boxes_stills_and_events(recording, events, tmp_path):
     assert all(text.text.split()[0] == one["id"] for text, one in zip(boxes.texts, facts, strict=True))
 
 
+def test_what_is_doubted_has_no_name_in_any_picture(events, tmp_path):
+    """A guess of an unknown view bore its class in Foxglove and in the video, and none on the page."""
+    settings = RecorderSettings(tmp_path / "unknown.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
+    overlays = [
+        replace(one, doubted=np.ones(len(one.track_ids), np.bool_))
+        for one in events
+        if isinstance(one, Overlay)
+    ]
+    with Recorder(settings) as recorder:
+        for event in [*(one for one in events[:8] if isinstance(one, VideoSample)), *overlays[:8]]:
+            recorder.log(event)
+    with export(settings.path, tmp_path / "unknown.mcap").open("rb") as file:
+        drawn = [
+            ImageAnnotations.FromString(message.data)
+            for _, channel, message in make_reader(file).iter_messages()
+            if channel.topic == "/uav-1/tracks"
+        ]
+    words = {text.text.split()[1] for one in drawn for text in one.texts}
+    assert words == {"something"}
+    facts = [{fact.key: fact.value for fact in box.metadata} for one in drawn for box in one.points]
+    assert {fact["doubted"] for fact in facts} == {"1"}
+    assert {fact["class"] for fact in facts} <= {"car", "van", "truck", "bus"}
+
+
 def test_a_ground_that_was_started_again_leaves_no_ghosts(events, tmp_path):
     """Boxes of the first recording would stand in the second, beside their own."""
     halves = (0, 30), (30, 60)

@@ -1,0 +1,98 @@
+"""Tracks that are more likely nothing: weak, never moved, and like nothing around them.
+
+A post is a pedestrian, a planter a bus: what a detector takes wrongly for an object mostly stands still. Where scores
+are true, a box of .4 is right four times in ten; that it moves over the ground, or that surer ones of its kind and
+size stand around it, as in a row of parked cars, is the better evidence. Without either it is a guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.camera_motion import Affine
+from hvt_common.inference.class_names import group_of
+from hvt_common.values import Tracks
+
+_LIKELY, _LIKELY_ODD = 0.5, 0.65
+"""From this mean confidence on a track is more likely right than not; one much larger than those around it."""
+_REACH, _NOISE_PX = 0.5, 4.0
+"""It has moved when its middle is so many of its longer sides, and so many pixels, from where it stood."""
+_FORGOTTEN_S = 10.0
+"""Where it stood follows it so slowly: the estimate of the camera's motion drifts."""
+_NEIGHBOURS, _LARGER = 3, 2.0
+"""So many surer ones of its group speak for it, unless it is so many times larger or smaller than they mostly are."""
+
+_Floats = npt.NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class _Evidence:
+    at: _Floats
+    moved: bool = False
+    seen_frame: int = -1
+    total: float = 0.0
+    count: int = 0
+
+
+class Guesses:
+    """Of one video, whose detector's scores are probabilities. Frames rise; for one thread."""
+
+    def __init__(self, *, fps: float) -> None:
+        self._fps = fps
+        self._seen: dict[int, _Evidence] = {}
+        self._frame = 0
+        self._ids: frozenset[int] = frozenset()
+
+    def update(
+        self,
+        tracks: Tracks,
+        names: Sequence[str],
+        step: Affine | None,
+        *,
+        scores: npt.NDArray[np.float32] | None = None,
+    ) -> None:
+        """Take the next list, with the class of each, and the camera's motion since the one before, base pixels.
+
+        ``scores`` count in place of the tracks' confidences, which are not true where the surer of two was taken.
+        """
+        scores = tracks.confidences if scores is None else scores
+        share = min(1.0, (tracks.frame_index - self._frame) / self._fps / _FORGOTTEN_S)
+        self._frame = tracks.frame_index
+        boxes = tracks.boxes_xyxy_px.astype(np.float64)
+        centres, sides = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]).max(1, initial=0)
+        before, self._seen = self._seen, {}
+        for row, track_id in enumerate(tracks.ids.tolist()):
+            one = before.get(track_id)
+            if one is None:
+                one = _Evidence(centres[row])
+            elif step is not None:
+                one.at = step[:, :2] @ one.at + step[:, 2]
+            off = centres[row] - one.at
+            one.moved |= bool(np.hypot(*off) > _REACH * sides[row] + _NOISE_PX)
+            one.at = one.at + off * share
+            if tracks.seen_frames[row] > one.seen_frame:
+                one.seen_frame = int(tracks.seen_frames[row])
+                one.total, one.count = one.total + float(scores[row]), one.count + 1
+            self._seen[track_id] = one
+        self._ids = self._guessed(tracks.ids.tolist(), names, sides)
+
+    def among(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """(N,) True for those that were guesses in the newest list."""
+        return np.array([one in self._ids for one in ids.tolist()], np.bool_)
+
+    def _guessed(self, ids: Sequence[int], names: Sequence[str], sides: _Floats) -> frozenset[int]:
+        groups = np.array([group_of(name) or name for name in names], object)
+        means = np.array([self._seen[one].total / max(1, self._seen[one].count) for one in ids])
+        found = set()
+        for row in np.flatnonzero(means < _LIKELY_ODD).tolist():
+            like = sides[(means >= _LIKELY) & (groups == groups[row])]
+            larger = sides[row] / np.median(like) if len(like) >= _NEIGHBOURS else np.nan
+            usual = 1 / _LARGER < larger < _LARGER
+            weak = means[row] < (_LIKELY_ODD if larger >= _LARGER else _LIKELY)
+            if weak and not (usual or self._seen[ids[row]].moved):
+                found.add(ids[row])
+        return frozenset(found)

@@ -1,0 +1,79 @@
+"""What stands there and is hardly believed has no name."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hvt_common.values import Tracks
+from hvt_ground.perception.guesses import Guesses
+
+Thing = tuple[str, float, tuple[float, float], float]
+"""Class, confidence, middle, side."""
+STEP = np.array([[1.0, 0.0, 3.0], [0.0, 1.0, -2.0]])
+
+
+def tracks(frame: int, things: list[Thing]) -> Tracks:
+    """All of them seen at this frame."""
+    count = len(things)
+    frames = np.full(count, frame, np.int64)
+    boxes = [(x - side / 2, y - side / 4, x + side / 2, y + side / 4) for _, _, (x, y), side in things]
+    return Tracks(
+        frame_index=frame,
+        ids=np.arange(1, count + 1),
+        boxes_xyxy_px=np.array(boxes, np.float32).reshape(-1, 4),
+        confidences=np.array([one[1] for one in things], np.float32),
+        class_ids=np.zeros(count, np.int32),
+        born_frames=np.zeros(count, np.int64),
+        seen_frames=frames,
+        started=np.zeros(count, np.bool_),
+    )
+
+
+def guessed(things: list[Thing], *, frames: int = 50, moves_px: float = 0.0) -> list[bool]:
+    """Which are guesses in the end, under a camera that pans; the last of them moves so far a frame."""
+    guesses = Guesses(fps=10)
+    for frame in range(frames):
+        shift = STEP[:, 2] * frame
+        shown = [
+            (
+                name,
+                score,
+                (x + shift[0] + (moves_px * frame if row == len(things) - 1 else 0), y + shift[1]),
+                side,
+            )
+            for row, (name, score, (x, y), side) in enumerate(things)
+        ]
+        listed = tracks(frame, shown)
+        guesses.update(listed, [one[0] for one in shown], STEP)
+    return guesses.among(np.arange(1, len(things) + 2)).tolist()
+
+
+ROW: list[Thing] = [("car", 0.8, (100.0 * one, 200.0), 90.0) for one in range(5)]
+
+
+def test_a_post_is_no_pedestrian_and_a_walker_is_one():
+    """A stranger saw two pedestrians who never took a step, as firm as the cars beside them."""
+    post: Thing = ("pedestrian", 0.44, (900.0, 400.0), 12.0)
+    assert guessed([*ROW, post]) == [False] * 5 + [True, False]
+    assert guessed([*ROW, post], moves_px=1.0) == [False] * 7
+    assert guessed([("pedestrian", 0.55, (900.0, 400.0), 12.0)]) == [False] * 2, (
+        "a surer one may stand and wait"
+    )
+    assert guessed([*[post] * 5]) == [True] * 5 + [False], "five posts do not vouch for each other"
+
+
+def test_a_planter_among_cars_is_no_bus_and_a_parked_car_is_kept():
+    """A planter between the rows was a bus; to leave out what stands would leave out the rows."""
+    planter: Thing = ("bus", 0.43, (500.0, 60.0), 216.0)
+    faint: Thing = ("van", 0.35, (500.0, 500.0), 80.0)
+    assert guessed([*ROW, faint, planter]) == [False] * 6 + [True, False]
+    assert guessed([*ROW[:2], faint]) == [False, False, True, False], "two say little of what is usual"
+
+
+def test_a_camera_that_is_followed_a_little_wrongly_moves_nothing():
+    """In a minute of hovering every post would have walked away from where it stood."""
+    guesses = Guesses(fps=10)
+    for frame in range(600):
+        listed = tracks(frame, [("pedestrian", 0.4, (500.0 + 0.05 * frame, 400.0), 30.0)])
+        guesses.update(listed, ["pedestrian"], None)
+    assert guesses.among(np.array([1])).tolist() == [True]
