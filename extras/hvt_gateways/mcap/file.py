@@ -34,7 +34,7 @@ from hvt_ground.sinks.line_file import check_there
 from hvt_ground.sinks.palette import Rgb, class_colour
 from hvt_ground.sinks.rerun.stills.pairs import event_text, still_picture
 
-_CHUNK_BYTES = 256 * 1024
+_CHUNK_BYTES = 32 * 1024
 """The most that a kill loses: a chunk is written once it is full."""
 _LATEST_NS = (1 << 63) - 1
 _THIN_PX, _THICK_PX = 1.0, 3.0
@@ -121,6 +121,7 @@ class McapFile:
                 publish_time=capture_ns,
                 sequence=max(0, at.frame_index) & 0xFFFFFFFF,
             )
+            self._file.flush()  # nothing to do but after a chunk
         except OSError as error:
             raise UserError(
                 f"MCAP file {self.path} cannot be written any further: {error.strerror}"
