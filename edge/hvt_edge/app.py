@@ -18,7 +18,7 @@ from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.failures import Awaited
 from hvt_common.runtime.health_server import HealthServer, state_answers
 from hvt_common.runtime.log import START_LOGGER
-from hvt_common.runtime.process import notify_systemd, with_lower_priority
+from hvt_common.runtime.process import give_back_holes, notify_systemd, with_lower_priority
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
@@ -213,6 +213,7 @@ class Edge:
                 now_ns = self._loop_clock()
                 if now_ns >= next_status_ns:
                     next_status_ns = now_ns + SECOND_NS
+                    give_back_holes()
                     stages.stills.note_load(self._counts.captured, self._counts.unanalyzed, now_ns=now_ns)
                     status.send("running")
                     self._reached |= link.has_subscriber(Channel.BASE)

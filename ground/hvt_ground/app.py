@@ -16,7 +16,7 @@ from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.runtime.health_server import HealthServer, state_answers
-from hvt_common.runtime.process import notify_systemd
+from hvt_common.runtime.process import give_back_holes, notify_systemd
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
@@ -238,6 +238,7 @@ class Ground:
             self._raise_error()
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
+                give_back_holes()
                 self._state = maker.make([(edge, one.sessions) for edge, one in sorted(self._edges.items())])
                 if page is not None:
                     page.show(self._state)

@@ -70,6 +70,30 @@ def test_who_has_asked_for_another_allocation_keeps_it():
     assert resident_mb(asked=True, MALLOC_ARENA_MAX="16") > resident_mb(asked=True) + 100
 
 
+HOLES = """
+import numpy as np, psutil
+from hvt_common.runtime.process import give_back_holes, limit_malloc_arenas
+limit_malloc_arenas()
+frames, kept = [], []
+for _ in range(40):
+    frames.append(np.ones(3 << 19, np.uint8))
+    kept.append(np.ones(1 << 12, np.uint8))  # what a still, a track or a message leaves
+frames.clear()
+held = psutil.Process().memory_info().rss
+give_back_holes()
+print(held - psutil.Process().memory_info().rss >> 20)
+"""
+
+
+@only_with_glibc
+def test_what_lies_between_pictures_is_given_back():
+    """The peaks of different threads would add up, 20 MB of an edge's."""
+    done = subprocess.run(
+        [sys.executable, "-c", HOLES], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert int(done.stdout) >= 40, "of 60"
+
+
 DETECTING = """
 import threading, time
 import numpy as np
