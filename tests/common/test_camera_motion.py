@@ -60,10 +60,7 @@ def flight(*, steps: int, pan_px: float, zoom: float, turn: float, seed: int) ->
 
 
 @pytest.mark.realdata
-@pytest.mark.parametrize(
-    ("scale", "median_px", "worst_px"),
-    [(1.0, 0.1, 0.2), (0.5, 0.2, 0.5)],
-)
+@pytest.mark.parametrize(("scale", "median_px", "worst_px"), [(1.0, 0.1, 0.2), (0.5, 0.2, 0.5)])
 def test_known_motion_is_measured(
     ground: np.ndarray, scale: float, median_px: float, worst_px: float
 ) -> None:

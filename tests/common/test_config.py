@@ -160,14 +160,7 @@ def test_help_says_unit_and_default_of_every_flag(capsys):
     assert end.value.code == 0
     out = " ".join(capsys.readouterr().out.split())
     for shown in (
-        "[800kbps]",
-        "[1.5s]",
-        "[0.5]",
-        "[64x48]",
-        "[5]",
-        "[crop]",
-        "100% of it",
-        "--no-loud",
+        *("[800kbps]", "[1.5s]", "[0.5]", "[64x48]", "[5]", "[crop]", "100% of it", "--no-loud"),
         "--fit-mode crop|letterbox",
     ):
         assert shown in out

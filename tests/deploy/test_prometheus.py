@@ -50,16 +50,8 @@ def test_every_metric_that_is_asked_for_is_told_in_flight(tmp_path, long_scene):
     with Link(tmp_path) as link:
         link.ground("--detector", "motion", "--classifier", "none", "--metrics", at_ground)
         flight = (
-            "--source",
-            str(long_scene),
-            "--size",
-            "640x360",
-            "--fps",
-            "5",
-            "--method",
-            "M5",
-            "--detector",
-            "motion",
+            *("--source", str(long_scene), "--size", "640x360", "--fps", "5", "--method", "M5"),
+            *("--detector", "motion"),
         )
         store = ("--store", "20MB", "--store-folder", str(tmp_path / "store"))
         link.edge(*flight, *store, "--metrics", at_edge)

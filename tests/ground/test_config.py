@@ -27,12 +27,7 @@ def read(*argv: str) -> GroundConfig:
 def test_without_flags_it_listens_and_needs_no_model():
     """``hvt-ground`` alone would not start."""
     config = read()
-    assert (config.detector, config.edges, config.refine, config.once) == (
-        "aerial-nano",
-        "*",
-        "fuse",
-        False,
-    )
+    assert (config.detector, config.edges, config.refine, config.once) == ("aerial-nano", "*", "fuse", False)
     assert (config.listen, config.connect, config.record) == ((), (), None)
 
 

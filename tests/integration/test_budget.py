@@ -36,11 +36,7 @@ def run(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
         (port,) = free_ports(1)
         summary = tmp_path / "edge.json"
         arguments = [
-            "--source",
-            str(data / "clips/drone_carpark.mp4"),
-            "--max-frames",
-            str(FRAMES),
-            "--quiet",
+            *("--source", str(data / "clips/drone_carpark.mp4"), "--max-frames", str(FRAMES), "--quiet")
         ]
         arguments += ["--connect", f"tcp/127.0.0.1:{port}", "--wait", "0s", "--pace", "lockstep"]
         arguments += ["--detector", str(data / "models/yolov5su_visdrone_640.onnx"), "--detect-every", "10"]
@@ -66,8 +62,7 @@ def held(summary: dict[str, Any], *, budget_bps: int, base_bps: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "method",
-    [pytest.param(name, marks=() if name in EACH_TIME else pytest.mark.nightly) for name in METHODS],
+    "method", [pytest.param(name, marks=() if name in EACH_TIME else pytest.mark.nightly) for name in METHODS]
 )
 def test_every_method_holds_the_budget(run, method):
     """A method that overdraws would stall the video on the link it was chosen for."""

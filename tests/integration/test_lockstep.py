@@ -48,16 +48,8 @@ def flown(folder: Path, *, edge_settings: tuple[str, ...], ground_settings: tupl
         # By its speed auto may choose one provider this time and another the next, and their answers differ a little.
         ground = link.ground("--once", "--record", "flight.rrd", "--provider", "cpu", *ground_settings)
         edge = link.edge(
-            *(
-                "--max-frames",
-                str(FRAMES),
-                "--pace",
-                "lockstep",
-                "--size",
-                "640x360",
-                "--preset",
-                "ultrafast",
-            ),
+            *("--max-frames", str(FRAMES), "--pace", "lockstep", "--size", "640x360"),
+            *("--preset", "ultrafast"),
             *("--record-base", "base.mkv", "--wait", "60s", *edge_settings),
         )
         summaries = edge.finish(), ground.finish(within_s=30)
@@ -70,14 +62,8 @@ def play(data: Path, folder: Path, *ground_settings: str) -> Play:
     """Four seconds of drone_carpark with M3, whose decisions hang on the classifier's confidence."""
     settings = (
         *("--source", str(data / "clips/drone_carpark.mp4"), "--budget", "400kbps", "--method", "M3"),
-        *(
-            "--detector",
-            str(data / "models/yolov5su_visdrone_640.onnx"),
-            "--cooldown",
-            "1s",
-            "--min-gain",
-            "1",
-        ),
+        *("--detector", str(data / "models/yolov5su_visdrone_640.onnx"), "--cooldown", "1s"),
+        *("--min-gain", "1"),
     )
     return flown(folder, edge_settings=settings, ground_settings=ground_settings)
 

@@ -30,18 +30,8 @@ ROUTER = Path(__file__).resolve().parents[2] / "deploy" / "router.py"
 SOON_S = 60.0
 """Generous: the machine may be busy with other tests."""
 PLAYS = (
-    *(
-        "--source",
-        "scene",
-        "--size",
-        "320x180",
-        "--fps",
-        "10",
-        "--preset",
-        "ultrafast",
-        "--budget",
-        "300kbps",
-    ),
+    *("--source", "scene", "--size", "320x180", "--fps", "10", "--preset", "ultrafast"),
+    *("--budget", "300kbps"),
     *("--detector", "motion", "--edge-id", "uav-1", "--wait", "60s", "--method", "M5"),
 )
 SEES = ("--detector", "motion", "--classifier", "none")

@@ -101,18 +101,8 @@ def test_a_broken_detector_is_one_sentence(link, scene, acme):
 def with_encoder(link: Link, source: str, name: str, *settings: str) -> Running:
     """An edge of six seconds at 300 kbps, started."""
     return link.edge(
-        *(
-            "--source",
-            source,
-            "--fps",
-            "10",
-            "--max-frames",
-            str(FRAMES),
-            "--pace",
-            "lockstep",
-            "--wait",
-            "60s",
-        ),
+        *("--source", source, "--fps", "10", "--max-frames", str(FRAMES), "--pace", "lockstep"),
+        *("--wait", "60s"),
         *("--size", "640x360", "--budget", "300kbps", "--preset", "ultrafast", "--detector", "motion"),
         *("--encoder", name, *settings),
     )

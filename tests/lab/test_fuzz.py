@@ -77,11 +77,7 @@ def test_parts_come_back():
 
 @pytest.mark.parametrize(
     ("seeds", "why"),
-    [
-        (list, "it has no seeds"),
-        (lambda: 1 / 0, "division by zero"),
-        (lambda: [b"t"], "here to be found"),
-    ],
+    [(list, "it has no seeds"), (lambda: 1 / 0, "division by zero"), (lambda: [b"t"], "here to be found")],
 )
 def test_a_target_that_cannot_start_is_an_error_at_once(seeds, why):
     """The weightiest target was not tried for weeks, and nothing said so."""

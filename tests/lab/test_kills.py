@@ -10,17 +10,7 @@ import pytest
 from hvt_edge.backlog.disk import FILE_NAME, Store
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
-from lab.link.kills import (
-    BARS,
-    Trial,
-    Verdict,
-    in_matroska,
-    in_recording,
-    missing_s,
-    plan,
-    rows_of,
-    run_all,
-)
+from lab.link.kills import BARS, Trial, Verdict, in_matroska, in_recording, missing_s, plan, rows_of, run_all
 from lab.link.measures.store_left import StoreLeft, store_left
 from lab.link.measures.timing import Arrival
 from media.clips import framed, smooth_pictures

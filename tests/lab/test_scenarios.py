@@ -21,16 +21,8 @@ from media.pictures import write_scene
 pytestmark = [pytest.mark.integration, pytest.mark.realtime, pytest.mark.timeout(900)]
 
 EDGE = (
-    "--source-fps",
-    "10",
-    "--fps",
-    "10",
-    "--size",
-    "320x180",
-    "--preset",
-    "ultrafast",
-    "--detector",
-    "motion",
+    *("--source-fps", "10", "--fps", "10", "--size", "320x180", "--preset", "ultrafast"),
+    *("--detector", "motion"),
 )
 GROUND = ("--detector", "motion", "--classifier", "none")
 AT_ONCE = min(5, os.cpu_count() or 1)
@@ -102,10 +94,7 @@ def test_there_is_a_picture_at_the_end(outcomes, name):
     assert measures(outcome)["decodable frames, %"] > 0
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["steady-1M", "steady-300k", "satellite-600ms"],
-)
+@pytest.mark.parametrize("name", ["steady-1M", "steady-300k", "satellite-600ms"])
 def test_a_steady_link_loses_nothing(outcomes, name):
     """The two accounts would differ, and with them what the budget means."""
     found = measures(outcomes[name])
@@ -114,10 +103,7 @@ def test_a_steady_link_loses_nothing(outcomes, name):
     assert found["decodable frames, %"] == 100
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["outage-8s", "outage-60s", "flapping", "drone-fade"],
-)
+@pytest.mark.parametrize("name", ["outage-8s", "outage-60s", "flapping", "drone-fade"])
 def test_darkness_is_dark(outcomes, name):
     """The lab would be testing nothing."""
     assert measures(outcomes[name])["received in darkness, bytes"] == 0

@@ -21,18 +21,8 @@ def edge(refused, pictures, free_port):
 
     def edge(*settings: str, source: str = pictures, code: int = 2) -> str:
         link = (
-            "--connect",
-            f"tcp/127.0.0.1:{free_port}",
-            "--wait",
-            "0s",
-            "--size",
-            "96x64",
-            "--max-frames",
-            "2",
-            "--detector",
-            "motion",
-            "--preset",
-            "ultrafast",
+            *("--connect", f"tcp/127.0.0.1:{free_port}", "--wait", "0s", "--size", "96x64"),
+            *("--max-frames", "2", "--detector", "motion", "--preset", "ultrafast"),
         )
         return refused("hvt-edge", "--source", source, *link, *settings, code=code)
 

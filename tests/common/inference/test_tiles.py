@@ -9,14 +9,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector, warm_up
 from hvt_common.inference.nms import suppress
-from hvt_common.inference.tiles import (
-    MOST_RUNS,
-    TiledDetector,
-    auto_grid,
-    parse_tiles,
-    tile_boxes,
-    tiled,
-)
+from hvt_common.inference.tiles import MOST_RUNS, TiledDetector, auto_grid, parse_tiles, tile_boxes, tiled
 from hvt_common.values import Detections, iou
 
 MODEL = "yolov5su_visdrone_640.onnx"

@@ -190,11 +190,7 @@ def test_messages_of_one_moment_leave_the_window_together():
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    one=budgets(windows=(0.5, 1.0)),
-    skew=st.integers(0, 300_000_000),
-)
+@given(seed=st.integers(0, 2**32 - 1), one=budgets(windows=(0.5, 1.0)), skew=st.integers(0, 300_000_000))
 def test_two_threads_with_times_a_little_apart_hold_it_too(seed, one, skew):
     """The still thread decides at a time that has passed, while a base message already waits for a later one."""
     rng = np.random.default_rng(seed)

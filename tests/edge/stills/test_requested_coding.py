@@ -62,11 +62,7 @@ def shown(still: Still) -> Image:
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    base_pct=st.integers(1, 99),
-    wanted_pct=st.integers(5, 95),
-    most_bytes=st.integers(200, 60_000),
-)
+@given(base_pct=st.integers(1, 99), wanted_pct=st.integers(5, 95), most_bytes=st.integers(200, 60_000))
 def test_what_comes_is_closer_to_the_source_than_the_video_and_fits(base_pct, wanted_pct, most_bytes):
     """An operator who looks closer would see less than before, or wait for what never fits."""
     base = as_base(base_pct)

@@ -59,13 +59,7 @@ def test_what_is_chosen_can_be_coded(payload_bps, source, most_fps, fps):
 
 def test_the_ladder_keeps_the_source_s_shape():
     """A circle would become an egg, or black bars would be coded."""
-    assert sizes_of((1920, 1080)) == [
-        (1280, 720),
-        (960, 540),
-        (640, 360),
-        (480, 270),
-        (320, 180),
-    ]
+    assert sizes_of((1920, 1080)) == [(1280, 720), (960, 540), (640, 360), (480, 270), (320, 180)]
     assert sizes_of((1280, 720))[0] == (1280, 720)
     assert sizes_of((1100, 720))[0] == (1100, 720)
     assert sizes_of((3840, 2160))[0] == (1280, 720)

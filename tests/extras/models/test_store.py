@@ -132,11 +132,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def known(folder: Path, *urls: str, name: str = "made", content: bytes = CONTENT) -> Store:
     """A store that knows one more model, from these addresses."""
     folder.mkdir(parents=True, exist_ok=True)
-    table = {
-        "size_bytes": len(content),
-        "sha256": hashlib.sha256(content).hexdigest(),
-        "urls": list(urls),
-    }
+    table = {"size_bytes": len(content), "sha256": hashlib.sha256(content).hexdigest(), "urls": list(urls)}
     (folder / "added.toml").write_text(tomli_w.dumps({name: table}))
     return Store(folder)
 
@@ -301,11 +297,7 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(
     assert (
         main(
             [
-                "add",
-                __file__,
-                "--name",
-                "x",
-                "--sha256",
+                *("add", __file__, "--name", "x", "--sha256"),
                 hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
             ]
         )
@@ -425,11 +417,7 @@ def test_an_openvino_model_is_fetched_and_checked_in_both_files(origin: Origin, 
     assert not store.is_there("made")
     assert store.held_bytes("made") == len(CONTENT) + 1000
     assert store.fetch("made", progress=held.append) == folder / "made.xml"
-    assert origin.asked == [
-        ("/model.xml", None),
-        ("/model.bin", None),
-        ("/model.bin", "bytes=1000-"),
-    ]
+    assert origin.asked == [("/model.xml", None), ("/model.bin", None), ("/model.bin", "bytes=1000-")]
     assert held[-1] == 2 * len(CONTENT)
     (folder / "made.bin").write_bytes(CONTENT[::-1])
     with pytest.raises(UserError, match=r"made\.bin has SHA-256 .* and is not used"):

@@ -385,11 +385,7 @@ def test_stills_of_an_outage_name_the_tracks_of_its_video(flight, tmp_path, own)
     assert f"late still #3 → track {FIRST_TRACK_ID}: car → bus .90" in texts[1][1]
     before, after = (recording.boxes(frame)[FIRST_TRACK_ID] for frame in (43, 50))
     assert (before.class_after, before.refined) == ("car", False)
-    assert (after.class_after, after.refined, after.label) == (
-        "bus",
-        True,
-        f"{FIRST_TRACK_ID} bus",
-    )
+    assert (after.class_after, after.refined, after.label) == ("bus", True, f"{FIRST_TRACK_ID} bus")
 
 
 def test_a_still_at_a_frame_that_is_known_speaks_on_its_track(flight, tmp_path):

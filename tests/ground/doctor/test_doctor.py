@@ -21,12 +21,7 @@ def test_it_names_the_edges_that_are_there(tmp_path, capsys, long_scene):
         cheap = ("--source", str(long_scene), "--size", "640x360", "--fps", "5", "--detector", "motion")
         link.edge(*cheap, "--edge-id", "uav-7", listens=True).until("ground")
         words = (
-            "--connect",
-            link.edge_endpoint,
-            "--record",
-            str(tmp_path / "flights"),
-            "--classifier",
-            "none",
+            *("--connect", link.edge_endpoint, "--record", str(tmp_path / "flights"), "--classifier", "none"),
         )
         code, found = examined(
             capsys, *words, "--detector", "motion", "--web", f"127.0.0.1:{free_ports(1)[0]}"

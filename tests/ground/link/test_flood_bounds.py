@@ -43,10 +43,7 @@ class Rig:
         self.events = Events()
         self.now_ns = 1_790_000_000 * SECOND_NS
         self.session = GroundSession(
-            flight.info(),
-            sinks=[self.events],
-            pipeline_of=pipeline_of,
-            clock=lambda: self.now_ns,
+            flight.info(), sinks=[self.events], pipeline_of=pipeline_of, clock=lambda: self.now_ns
         )
         for index in range(3):
             item = flight.base(index)

@@ -127,10 +127,7 @@ def test_a_ground_says_which_stills_it_reads(link):
     ground, outsider = link
     keys, questions = EdgeKeys("uav-1"), []
     queryable = serve(
-        outsider,
-        Channel.INFO,
-        keys=keys,
-        answer=lambda question: questions.append(question) or INFO.pack(),
+        outsider, Channel.INFO, keys=keys, answer=lambda question: questions.append(question) or INFO.pack()
     )
     with outsider.liveliness().declare_token(keys.key(Channel.ALIVE)):
         eventually(lambda: served(ground) == {"uav-1"}, within_s=20, what="it is served")

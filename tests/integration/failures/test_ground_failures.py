@@ -16,16 +16,8 @@ pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(
 
 SOON_S = 60.0
 FLIGHT = (
-    "--source-fps",
-    "10",
-    "--fps",
-    "10",
-    "--size",
-    "320x192",
-    "--preset",
-    "ultrafast",
-    "--budget",
-    "400kbps",
+    *("--source-fps", "10", "--fps", "10", "--size", "320x192", "--preset", "ultrafast"),
+    *("--budget", "400kbps"),
 )
 
 

@@ -17,18 +17,8 @@ from programs.rrd import Recording
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
 
 EDGE = (
-    *(
-        "--source",
-        "scene",
-        "--size",
-        "320x180",
-        "--fps",
-        "10",
-        "--preset",
-        "ultrafast",
-        "--budget",
-        "300kbps",
-    ),
+    *("--source", "scene", "--size", "320x180", "--fps", "10", "--preset", "ultrafast"),
+    *("--budget", "300kbps"),
     *("--detector", "motion", "--edge-id", "uav-1", "--wait", "60s", "--method", "M5"),
     *("--keyframe-interval", "2s"),
 )

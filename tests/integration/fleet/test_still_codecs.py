@@ -14,16 +14,8 @@ pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(
 EDGE = (
     *("--edge-id", "uav-1", "--size", "640x360", "--fps", "5", "--preset", "ultrafast"),
     *("--budget", "400kbps", "--video-share", "0.6", "--method", "permissive", "--gate", "0", "--wait", "0s"),
-    *(
-        "--still-codec",
-        "residual",
-        "--fallback-codec",
-        "h264-intra",
-        "--pace",
-        "realtime",
-        "--source-fps",
-        "5",
-    ),
+    *("--still-codec", "residual", "--fallback-codec", "h264-intra", "--pace", "realtime"),
+    *("--source-fps", "5"),
 )
 
 

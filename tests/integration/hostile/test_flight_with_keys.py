@@ -48,17 +48,8 @@ def flight(fleet: Fleet, scene: Path, tmp_path_factory: pytest.TempPathFactory) 
         ground.until("listening on")
         edge = start(
             *("hvt_edge.cli", "uav-1", "--connect", endpoint, "--edge-id", "uav-1", "--wait", "60s"),
-            *(
-                "--source",
-                str(scene),
-                "--source-fps",
-                "5",
-                "--fps",
-                "5",
-                "--size",
-                "640x360",
-                "--send-tracks",
-            ),
+            *("--source", str(scene), "--source-fps", "5", "--fps", "5", "--size", "640x360"),
+            "--send-tracks",
             *("--preset", "ultrafast", "--budget", "500kbps", "--video-share", "0.6", "--cooldown", "0s"),
             *("--method", "M5"),
         )

@@ -30,18 +30,8 @@ _SECONDS = 2.5
 _GROWTH_MB, _GROWTH_SHARE = 60.0, 0.1
 """So much may either process grow over all floods, and by so much of what they said: most of it would be a leak."""
 _EDGE = (
-    *(
-        "--source-fps",
-        "10",
-        "--fps",
-        "10",
-        "--size",
-        "640x360",
-        "--preset",
-        "ultrafast",
-        "--budget",
-        "300kbps",
-    ),
+    *("--source-fps", "10", "--fps", "10", "--size", "640x360", "--preset", "ultrafast"),
+    *("--budget", "300kbps"),
     *("--edge-id", "uav-1", "--method", "M1", "--send-tracks", "--no-adapt", "--keyframe-interval", "60s"),
 )
 
@@ -96,15 +86,7 @@ class Flight:
         say = self.link.edge_endpoint if to_edge else self.link.ground_endpoint
         hear = self.link.ground_endpoint if kind == "reports" else self.link.edge_endpoint
         command = [
-            sys.executable,
-            str(_FLOODER),
-            kind,
-            "--hear",
-            hear,
-            "--say",
-            say,
-            "--seconds",
-            str(_SECONDS),
+            *(sys.executable, str(_FLOODER), kind, "--hear", hear, "--say", say, "--seconds", str(_SECONDS))
         ]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as flooder:
             try:

@@ -12,13 +12,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from hvt_common.protocol.messages import (
-    MAX_PAYLOAD_BYTES,
-    BaseHeader,
-    ControlAnswer,
-    ControlRequest,
-    Flags,
-)
+from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, BaseHeader, ControlAnswer, ControlRequest, Flags
 from programs.outsider import Message, Tap, answer, joined
 from programs.processes import Link, eventually
 from programs.rrd import Recording

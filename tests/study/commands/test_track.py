@@ -53,11 +53,7 @@ def test_upstream_is_reproduced_from_file_to_file(
     )
     out = tmp_path / "tracks.txt"
     options = [
-        "--fps=30",
-        "--track-thresh=0.5",
-        "--track-buffer=30",
-        "--match-thresh=0.8",
-        "--min-box-area=10",
+        *("--fps=30", "--track-thresh=0.5", "--track-buffer=30", "--match-thresh=0.8", "--min-box-area=10")
     ]
     assert main(["track", str(source), "--out", str(out), *options]) == 0
     assert capsys.readouterr().out == f"{out}: 314 frames, 45 tracks, 5961 boxes\n"

@@ -291,12 +291,7 @@ def test_a_picture_that_is_not_there_is_called_so(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("shown", "labels"),
-    [
-        ("A.JPG", "A.TXT"),
-        ("Images/a.jpg", "Labels/a.txt"),
-        ("a.jpg", "a.jpg.txt"),
-        ("a.JPEG", "A.XML"),
-    ],
+    [("A.JPG", "A.TXT"), ("Images/a.jpg", "Labels/a.txt"), ("a.jpg", "a.jpg.txt"), ("a.JPEG", "A.XML")],
 )
 def test_names_of_other_case_are_found(tmp_path: Path, shown: str, labels: str) -> None:
     """A set from Windows was taken for pictures that nobody labelled."""

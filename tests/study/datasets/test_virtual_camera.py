@@ -85,10 +85,7 @@ def test_shared_once_for_all(picture, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "content", "said"),
-    [
-        ("no.png", None, "does not exist"),
-        ("text.png", b"not a picture", "not one of at least"),
-    ],
+    [("no.png", None, "does not exist"), ("text.png", b"not a picture", "not one of at least")],
 )
 def test_a_bad_picture_is_one_sentence(tmp_path, name, content, said):
     """The file is named, and what is accepted."""

@@ -69,15 +69,8 @@ def test_video_alone_shows_the_square_at_every_frame(clip):
 
 
 AUTO = (
-    "--method",
-    "M6",
-    "--candidates",
-    "source",
-    "--send-tracks",
-    "--profile",
-    "auto",
-    "--video-share",
-    "auto",
+    *("--method", "M6", "--candidates", "source", "--send-tracks", "--profile", "auto"),
+    *("--video-share", "auto"),
 )
 
 

@@ -77,14 +77,8 @@ def flown(clip, *flags, classifier=None):
     width, height = SIZE
     base = ["--source", "drawn", "--pace", "lockstep", "--size", f"{width}x{height}", "--detector", "motion"]
     base += [
-        "--budget",
-        "400kbps",
-        "--video-share",
-        "0.15",
-        "--preset",
-        "ultrafast",
-        "--still-codec",
-        "residual",
+        *("--budget", "400kbps", "--video-share", "0.15", "--preset", "ultrafast"),
+        *("--still-codec", "residual"),
     ]
     edge, _ = load(EdgeConfig, [*base, *flags], program="hvt-edge", description="")
     ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))

@@ -157,10 +157,7 @@ def test_means_are_of_the_runs_that_count():
     table = named_table(setting)
     assert [(cells[1].text, cells[3].text) for cells in table.rows] == [("M0", "3 of 5"), ("M5", "4 of 5")]
     assert "Means of fewer sequences (n) are not to be compared" in table.caption
-    assert [cell.text for cell in column(table, "named F1")] == [
-        "0.900",
-        "0.450",
-    ]  # (.5 + .6 + .7 + 0) / 4
+    assert [cell.text for cell in column(table, "named F1")] == ["0.900", "0.450"]  # (.5 + .6 + .7 + 0) / 4
     assert "5 sequences; labels: annotations" in table.caption
     # Neither of the followers is an arm of its own: R0 was flown at the totals of M5 only.
     spent = spent_table(setting)

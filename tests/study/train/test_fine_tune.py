@@ -134,15 +134,7 @@ def test_the_command_writes_a_file_that_a_detector_takes(tmp_path, start, water,
     cv2.imwrite(str(water / "images" / "unlabelled.png"), np.zeros((20, 20, 3), np.uint8))
     out = tmp_path / "boat.onnx"
     words = [
-        "train",
-        "--data",
-        f"yolo:{water}",
-        "--start",
-        str(start),
-        "--out",
-        str(out),
-        "--size",
-        "320x192",
+        *("train", "--data", f"yolo:{water}", "--start", str(start), "--out", str(out), "--size", "320x192")
     ]
     assert main([*words, "--steps", "2"]) == 0
     said = capsys.readouterr()

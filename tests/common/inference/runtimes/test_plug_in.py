@@ -133,14 +133,8 @@ def test_it_is_listed_and_scored(installed, tmp_path, capsys):
     (tmp_path / "set/labels/0.txt").write_text("0 0.1 0.16666667 0.1 0.16666667\n")
     (tmp_path / "set/classes.txt").write_text("person\nvehicle\n")
     run = [
-        "detect",
-        str(tmp_path / "set"),
-        "--detector",
-        "acme-blobs",
-        "--size",
-        "200x120",
-        "--provider",
-        "cpu",
+        *("detect", str(tmp_path / "set"), "--detector", "acme-blobs", "--size", "200x120"),
+        *("--provider", "cpu"),
     ]
     assert study([*run, "--out", str(tmp_path / "out")]) == 0
     score = json.loads((tmp_path / "out/score.json").read_text())

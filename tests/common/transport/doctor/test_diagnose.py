@@ -189,10 +189,7 @@ def test_a_guest_with_one_link_is_no_half(
     """A viewer that calls with one link would be reported as a loss, and the user search for what is not missing."""
     own, other = f"tcp/127.0.0.1:{free_port}", f"tcp/127.0.0.1:{free_ports(1)[0]}"
     settings = LinkSettings("edge", listen=(own,), connect=(other,), name="uav-1", links=2)
-    with (
-        open_session(LinkSettings("ground", listen=(other,), links=2)),
-        open_session(settings) as session,
-    ):
+    with open_session(LinkSettings("ground", listen=(other,), links=2)), open_session(settings) as session:
         _until(lambda: len(session.info.links()) == 2)
         with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch, joined(own):
             _until(lambda: len(session.info.links()) == 3)

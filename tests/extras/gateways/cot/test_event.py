@@ -75,14 +75,7 @@ def test_field_of_view_motion_and_link_are_where_atak_reads_them():
     shown = detail.find("sensor").attrib
     assert {
         name: float(shown[name]) for name in ("azimuth", "elevation", "roll", "fov", "vfov", "range")
-    } == {
-        "azimuth": 350,
-        "elevation": -30,
-        "roll": 2,
-        "fov": 45,
-        "vfov": 26,
-        "range": 812,
-    }
+    } == {"azimuth": 350, "elevation": -30, "roll": 2, "fov": 45, "vfov": 26, "range": 812}
     assert detail.find("track").attrib == {"course": "271.0", "speed": "12.3"}
     (link,) = detail.findall("link")  # of two, ATAK would take the platform's uid from the one without
     assert link.attrib == {

@@ -210,11 +210,7 @@ def test_remarks_say_what_is_known_and_where_the_still_is():
     rig.says(still(None, 4))
     rig.says(still(1, 2, stored=True))
     first, second = rig.says(
-        overlay(
-            classes=("truck", "car"),
-            refined=np.array([True, False]),
-            sure=np.array([True, False]),
-        )
+        overlay(classes=("truck", "car"), refined=np.array([True, False]), sure=np.array([True, False]))
     )
     assert first.find("detail/remarks").text == (
         "truck 0.87; refined by stills, which agree; car in the video; still http://ground:8080/stills/3"

@@ -387,11 +387,7 @@ def test_two_boxes_of_one_vehicle_count_once(ground):
     ground.fusion.take_own(ours)
     ground.step(0, {70: A, 71: C})
     fused = ground.fusion.listed(ours)
-    assert brief(fused) == {
-        1: ("edge+base", whole(A)),
-        3: ("base", whole(B)),
-        4: ("edge", whole(C)),
-    }
+    assert brief(fused) == {1: ("edge+base", whole(A)), 3: ("base", whole(B)), 4: ("edge", whole(C))}
 
 
 def test_the_class_is_that_of_the_surer_side():

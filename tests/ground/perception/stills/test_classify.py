@@ -167,9 +167,7 @@ def test_a_network_larger_than_the_base_gets_the_stills_detail(data, monkeypatch
     view = View.fitted(size, (640, 384), fit="letterbox")
     truth = detector.detect(source)
     base = composite(
-        np.zeros((384, 640, 3), np.uint8),
-        [DecodedStill(source, (0, 0, *size), (0, 0, 1, 1), 0)],
-        view=view,
+        np.zeros((384, 640, 3), np.uint8), [DecodedStill(source, (0, 0, *size), (0, 0, 1, 1), 0)], view=view
     )
     base = cv2.resize(cv2.resize(base, (160, 96), interpolation=cv2.INTER_AREA), (640, 384))
     stills = []
