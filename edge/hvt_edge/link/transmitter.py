@@ -378,6 +378,11 @@ class Transmitter:
         with self._lock:
             return self._holds(unit, line_bytes)
 
+    def has_room_for(self, line_bytes: int) -> bool:
+        """Tell whether an empty window of the budget has room for a message of so many line bytes."""
+        with self._lock:
+            return self.budget.holds(line_bytes)
+
     def _holds(self, unit: AccessUnit, line_bytes: int) -> bool:
         return len(unit.data) <= MAX_PAYLOAD_BYTES and self.budget.holds(line_bytes)
 

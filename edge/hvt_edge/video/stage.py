@@ -76,11 +76,15 @@ class BaseStage:
         fits = self.transmitter.keyframe_fits(keyframe_bytes, now_ns=now_ns)
         if not self.keyframes.requested:  # one of the schedule: a requested still goes before it
             fits = fits and not self.transmitter.yielding(now_ns)
-        keyframe_due = self.keyframes.now(now_ns, fits=fits) or self._begins_anew
-        line_bytes = keyframe_bytes if keyframe_due else self.transmitter.frame_bytes
-        backlog = self.backlog
-        due, admitted = self._frame_skip.codes(frame.index), self.admits(now_ns, line_bytes, self._coding_ns)
+        backlog, frame_bytes = self.backlog, self.transmitter.frame_bytes
         link = State.LIVE if backlog is None else backlog.state
+        keyframe_due = self.keyframes.now(now_ns, fits=fits) or self._begins_anew
+        if (
+            link is State.LIVE and self.reconfigure is not None
+        ):  # only at another rate is there one that can go
+            keyframe_due = keyframe_due or not self.transmitter.has_room_for(frame_bytes)
+        line_bytes = keyframe_bytes if keyframe_due else frame_bytes
+        due, admitted = self._frame_skip.codes(frame.index), self.admits(now_ns, line_bytes, self._coding_ns)
         coded = due and admitted and not keyframe_due and link is State.LIVE
         decision = decide(
             FrameInputs(
@@ -114,7 +118,7 @@ class BaseStage:
             regions = [] if self.regions is None else self.regions.regions(tracks)
             unit = self.encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
             if decision.to_link:
-                unit = self._within_a_window(unit, frame)
+                unit = self._within_a_window(unit, frame, now_ns=now_ns, may_open=not decision.to_store)
         except Exception as error:
             if self.open_again is None:
                 raise
@@ -125,7 +129,7 @@ class BaseStage:
             self.failures.works(_PART)
         self._begins_anew = False
         self._frame_skip.coded(frame.index, keyframe=unit.keyframe, mean_qp=self.encoder.mean_qp)
-        if decision.meets_plan:
+        if decision.meets_plan or (unit.keyframe and not decision.to_store):
             self.keyframes.done(now_ns)
         if decision.resumes and self.backlog is not None:
             self.backlog.resume()
@@ -168,8 +172,12 @@ class BaseStage:
         """Whether more frames are worth a keyframe of their own after this one; about once a second."""
         return self._frame_skip.wants_keyframe(index)
 
-    def _within_a_window(self, unit: AccessUnit, frame: Frame) -> AccessUnit:
-        # The unit, or a keyframe of the same picture with so little detail that a window has room for it.
+    def _within_a_window(self, unit: AccessUnit, frame: Frame, *, now_ns: int, may_open: bool) -> AccessUnit:
+        # The unit, or a keyframe of the same picture for which a window has room: at the rate of now, since at that
+        # of before x265 fills its VBV with any picture, and then with less and less detail.
+        if may_open and not unit.keyframe and not self.transmitter.holds(unit):
+            self._at_keyframe(frame.index, now_ns=now_ns)
+            unit = self.encoder.encode(frame, keyframe=True, regions=[])
         for factor in _COARSER:
             if self.transmitter.holds(unit):
                 break

@@ -14,6 +14,7 @@ from rigs.live_flight import LiveFlight, SteppedLink
 
 SIZES = ((1920, 1080), (1280, 720), (640, 360), (320, 180), (96, 64))
 BACK_S = 3.0
+M0, M6 = {"method": "M0"}, {"method": "M6", "video_share": 0.85}
 
 
 def needed_bps(config: EdgeConfig, window_s: float) -> int:
@@ -40,8 +41,9 @@ def largest(budget: int, fps: float, **settings) -> dict:
 
 
 def flown(flight: LiveFlight, seconds: float) -> LiveFlight:
-    """The flight, with its budget kept in each window."""
+    """The flight, with its budget kept in each window, and no picture coded that had no room."""
     flight.fly(seconds)
+    assert not flight.failures.parts
     assert flight.ledger.worst_window_bps.total <= flight.operating.now.highest_budget_bps
     return flight
 
@@ -54,7 +56,7 @@ def flown(flight: LiveFlight, seconds: float) -> LiveFlight:
 def test_live_video_is_back_after_a_silence(tmp_path, budget, fps, silent_s, store):
     """After a hiccup of some seconds no frame would ever be sent again, however good the link is."""
     link = SteppedLink(((0, 1.3 * budget), (12, 0), (12 + silent_s, 1.3 * budget)), loses=store)
-    given = largest(budget, fps, video_share=0.85, method="M6")
+    given = largest(budget, fps, **M6)
     flight = flown(LiveFlight(link, store=tmp_path / "store" if store else None, **given), 40 + silent_s)
     assert flight.back_after(12 + silent_s) <= BACK_S
     assert flight.longest_hole(15 + silent_s, 40 + silent_s) <= BACK_S
@@ -63,12 +65,26 @@ def test_live_video_is_back_after_a_silence(tmp_path, budget, fps, silent_s, sto
 
 
 @pytest.mark.parametrize(
+    ("budget", "fps", "video"), [(300_000, 2, M0), (500_000, 2, M6), (1_800_000, 15, M0)]
+)
+@pytest.mark.parametrize("loses", [False, True])
+def test_where_video_has_the_window_to_itself_it_is_back_without_a_frame_coded_in_vain(
+    budget, fps, video, loses
+):
+    """Four pictures would be coded one after the other at the former rate, and none of them has room."""
+    link = SteppedLink(((0, 1.3 * budget), (12, 0), (13.7, 1.3 * budget)), loses=loses)
+    given = largest(budget, fps, **video) | {"window": 1}
+    flight = flown(LiveFlight(link, track_bytes=0, pose_bytes=0, coding_s=0.05, **given), 24)
+    assert flight.back_after(13.7) <= BACK_S
+
+
+@pytest.mark.parametrize(
     ("budget", "fps", "falls_to"),
     [(800_000, 3, 200_000), (2_000_000, 15, 150_000), (2_000_000, 7.5, 150_000), (8_000_000, 30, 300_000)],
 )
 def test_live_video_is_back_after_a_fall_of_the_link(budget, fps, falls_to):
     """Behind a hill nothing more would be sent, although the link carries a coarser picture well."""
-    given = largest(budget, fps, video_share=0.85, method="M6")
+    given = largest(budget, fps, **M6)
     flight = flown(LiveFlight(SteppedLink(((0, 1.3 * budget), (12, falls_to))), **given), 60)
     known = flight.drained(14)  # what was on its way, and what went before anybody could know
     assert flight.longest_hole(known, 60) <= BACK_S
@@ -79,7 +95,7 @@ def test_live_video_is_back_after_a_fall_of_the_link(budget, fps, falls_to):
 @pytest.mark.parametrize(("budget", "fps"), [(300_000, 2), (800_000, 15)])
 def test_a_long_window_keeps_live_video_away_no_longer(budget, fps, window):
     """What the link carried before it fell would fill the window for all its seconds at the lower rate."""
-    given = largest(budget, fps, video_share=0.85, method="M6") | {"window": window}
+    given = largest(budget, fps, **M6) | {"window": window}
     silent = SteppedLink(((0, 1.3 * budget), (12, 0), (16, 1.3 * budget)), loses=True)
     assert flown(LiveFlight(silent, **given), 30).back_after(16) <= BACK_S
     fallen = flown(LiveFlight(SteppedLink(((0, 1.3 * budget), (12, 0.3 * budget))), **given), 30)
@@ -92,7 +108,7 @@ def test_what_is_stored_does_not_stand_before_live_video(tmp_path, budget, fps):
     flights = []
     for store in (None, tmp_path / "store"):
         link = SteppedLink(((0, 1.3 * budget), (12, 0), (20, 200_000)))
-        given = largest(budget, fps, video_share=0.85, method="M6")
+        given = largest(budget, fps, **M6)
         flights.append(flown(LiveFlight(link, store=store, **given), 60))
     live, stored = (flight.back_after(20) for flight in flights)
     assert stored <= live + BACK_S
