@@ -28,7 +28,7 @@ Other commands, each with --help:
   hvt-ground edges                       which edges are there
   hvt-ground keys                        make keys, and say who may do what"""
 _COMMANDS = {
-    "doctor": "hvt_ground.doctor.command",
+    "doctor": "hvt_ground.doctor",
     "recordings": "hvt_ground.recordings.command",
     "status": "hvt_ground.control.watch",
 }

@@ -28,8 +28,8 @@ from mcap_protobuf.writer import Writer
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
+from hvt_gateways.decodable import DecodableRun
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, VideoSample
-from hvt_ground.sinks.decodable import DecodableRun
 from hvt_ground.sinks.line_file import check_there
 from hvt_ground.sinks.palette import Rgb, class_colour
 from hvt_ground.sinks.rerun.stills.pairs import event_text, still_picture

@@ -19,6 +19,7 @@ from av.stream import Stream
 
 from hvt_common.errors import UserError
 from hvt_common.values import View
+from hvt_gateways.decodable import DecodableRun
 from hvt_gateways.transport_stream.destination import (
     Address,
     Addresses,
@@ -32,7 +33,6 @@ from hvt_gateways.transport_stream.timeline import TIME_BASE, Timeline
 from hvt_gateways.transport_stream.uas import Platform, uas_local_set
 from hvt_ground.events import Event, Overlay, PoseUpdate, VideoSample
 from hvt_ground.poses import PoseTrail
-from hvt_ground.sinks.decodable import DecodableRun
 
 if TYPE_CHECKING:
     from hvt_ground.recordings.recorded import Recorded

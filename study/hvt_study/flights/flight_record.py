@@ -19,7 +19,8 @@ from hvt_common.transport.inbox import Received
 from hvt_common.values import Boxes, Detections, Image, Posterior, Tracks, View, iou
 from hvt_ground.events import Overlay, Refinement
 from hvt_ground.perception.pipeline import Pipeline
-from hvt_ground.perception.stills.classify import DecodedStill, object_crops
+from hvt_ground.perception.stills.classify import object_crops
+from hvt_ground.perception.stills.decode import DecodedStill
 from hvt_ground.perception.stills.refine import Refiner, ShownClasses
 from hvt_study.metrics.frames import NO_ID, FrameView
 from hvt_study.metrics.observed import ObservedFrame

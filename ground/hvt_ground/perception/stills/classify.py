@@ -16,18 +16,6 @@ from hvt_common.values import Boxes, Detections, Image, Posterior, View, iou
 from hvt_ground.perception.stills.composite import composite
 from hvt_ground.perception.stills.decode import Box, DecodedStill
 
-__all__ = [
-    "Box",
-    "CropReader",
-    "DecodedStill",
-    "FrameReadings",
-    "NoReader",
-    "ObjectReading",
-    "Redetection",
-    "StillReader",
-    "object_crops",
-]
-
 _SAME_OBJECT_IOU = 0.4
 """A detection on the composite that overlaps an object's box less is of something else."""
 _NEW_OBJECT_IOU = 0.2

@@ -15,8 +15,8 @@ from hvt_common.video.still_codecs import BaseMissingError, StillError, psnr_y_d
 from hvt_ground.events import Event, Notice, Refinement
 from hvt_ground.perception.fusion.fuse import Fusion
 from hvt_ground.perception.history import History
-from hvt_ground.perception.stills.classify import Box, DecodedStill, ObjectReading, StillReader
-from hvt_ground.perception.stills.decode import ReceivedStill, decode_still, needs_base
+from hvt_ground.perception.stills.classify import ObjectReading, StillReader
+from hvt_ground.perception.stills.decode import Box, DecodedStill, ReceivedStill, decode_still, needs_base
 from hvt_ground.perception.stills.match import StillSeen
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary, Vote

@@ -16,13 +16,13 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.values import Detections, Image, View, iou
 from hvt_ground.perception.stills.classify import (
     CropReader,
-    DecodedStill,
     NoReader,
     ObjectReading,
     Redetection,
     object_crops,
 )
 from hvt_ground.perception.stills.composite import composite
+from hvt_ground.perception.stills.decode import DecodedStill
 from media.onnx_models import colour_classifier
 
 SOURCE, BASE = (1280, 720), (320, 180)

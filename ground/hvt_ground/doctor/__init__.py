@@ -1,1 +1,0 @@
-"""``hvt-ground doctor``: whether a ground with these settings could start, and why not. See `command`."""
