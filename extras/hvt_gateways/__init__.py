@@ -1,4 +1,4 @@
 """Gateways to other systems: Cursor on Target (`cot`), MPEG-TS with KLV (`transport_stream`) and MCAP (`mcap`).
 
-`decodable` is of two of them. Each is an extra of the ground (`hvt_ground.extras`): nothing of the ground imports one.
+Each is an extra of the ground (`hvt_ground.extras`), which imports none of it; two of them share `decodable`.
 """
