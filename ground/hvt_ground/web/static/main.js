@@ -73,6 +73,7 @@ function onState(state, why) {
   if (connected) connectedAt = performance.now();
   showAge();
   by("connection").textContent = words.connectionWords(connected, why);
+  by("connection").classList.toggle("bad", !connected);
   if (state !== "connected") return;
   connection.send({ type: "wall", shown: true });
   if (chosen) watch();
