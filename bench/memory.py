@@ -1,5 +1,5 @@
-"""Memory and threads at the defaults, whatever is installed: an edge on the demo with a ground, and one of video
-alone; then a ground of one edge and of eight.
+"""Memory and threads, whatever is installed: an edge on the demo with a ground, one of video alone and one at its
+defaults; then a ground of one edge and of eight.
 
 The eight are played from this process: access units of 640x360 at 5 fps, coded once, over eight Zenoh sessions.
 """
@@ -24,13 +24,16 @@ _PLAYED_S = 25.0
 
 def rows() -> list[dict[str, object]]:
     edge_mb, ground_mb = _demo()
-    clip_mb, clip_threads = _clip()
+    clip_mb, clip_threads = _clip("--method", "M0")
+    auto_mb, auto_threads = _clip()
     (one_mb, one_threads), (all_mb, all_threads) = _played(1), _played(_EDGES)
     return [
         measured("edge at its defaults on the 1080p demo, peak MB", edge_mb),
         measured("ground of that edge, peak MB", ground_mb),
         measured("M0 on a 720p clip, peak MB of the edge", clip_mb),
         measured("M0 on a 720p clip, threads of the edge", clip_threads),
+        measured("defaults on a 720p clip, peak MB of the edge", auto_mb),
+        measured("defaults on a 720p clip, threads of the edge", auto_threads),
         measured("each further edge at the ground, MB", (all_mb - one_mb) / (_EDGES - 1)),
         measured("each further edge at the ground, threads", (all_threads - one_threads) / (_EDGES - 1)),
         measured("ground of one edge of 640x360, peak MB", one_mb),
@@ -54,10 +57,10 @@ def _demo() -> tuple[float, float]:
     return peaks.mb[0], peaks.mb[1]
 
 
-def _clip() -> tuple[float, int]:
-    """Peak MB and most threads of an edge with video alone, to which nobody listens."""
-    settings = ("--source", clip(), "--method", "M0", "--wait", "0s", "--connect", free_endpoint(), "--quiet")
-    with running("hvt_edge.cli", *settings) as edge:
+def _clip(*settings: str) -> tuple[float, int]:
+    """Peak MB and most threads of an edge to which nobody listens."""
+    nobody = ("--wait", "0s", "--connect", free_endpoint(), "--quiet")
+    with running("hvt_edge.cli", "--source", clip(), *nobody, *settings) as edge:
         peaks = Peaks([edge])
         peaks.until_ended(edge, patience_s=180)
     return peaks.mb[0], peaks.threads[0]
