@@ -156,12 +156,12 @@ def test_the_video_lends_what_is_requested_within_every_window_and_goes_on(
 
 
 FLIGHTS = [
-    ({"method": "M0", "fps": "auto"}, 100_000),
+    pytest.param({"method": "M0", "fps": "auto"}, 100_000, marks=pytest.mark.nightly),
     ({"profile": "auto"}, 100_000),
     ({"method": "M0"}, 300_000),
     ({"profile": "paper"}, 300_000),
-    ({"profile": "thin"}, 300_000),
-    ({"profile": "auto", "video_share": 1.0}, 300_000),
+    pytest.param({"profile": "thin"}, 300_000, marks=pytest.mark.nightly),
+    pytest.param({"profile": "auto", "video_share": 1.0}, 300_000, marks=pytest.mark.nightly),
     ({"profile": "tracks"}, 2_000_000),
 ]
 BOXES = [(400, 200, 64, 48), (300, 100, 230, 70), (100, 60, 480, 320)]
