@@ -378,7 +378,7 @@ class Transmitter:
         with self._lock:
             return self._holds(unit, line_bytes)
 
-    def has_room_for(self, line_bytes: int) -> bool:
+    def window_holds(self, line_bytes: int) -> bool:
         """Tell whether an empty window of the budget has room for a message of so many line bytes."""
         with self._lock:
             return self.budget.holds(line_bytes)

@@ -82,7 +82,7 @@ class BaseStage:
         if (
             link is State.LIVE and self.reconfigure is not None
         ):  # only at another rate is there one that can go
-            keyframe_due = keyframe_due or not self.transmitter.has_room_for(frame_bytes)
+            keyframe_due = keyframe_due or not self.transmitter.window_holds(frame_bytes)
         line_bytes = keyframe_bytes if keyframe_due else frame_bytes
         due, admitted = self._frame_skip.codes(frame.index), self.admits(now_ns, line_bytes, self._coding_ns)
         coded = due and admitted and not keyframe_due and link is State.LIVE
