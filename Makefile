@@ -30,10 +30,10 @@ endif
 demo: setup      ## three edges and one ground on the drawn scene: a table, demo.png, demo.rrd
 	@$(BIN)/python deploy/demo.py
 
-# One process more than there are processors, because tests of processes wait for them half of their time; none depends on
-# how busy the machine is. Nothing has a second chance. All tests of a file run in one process, so what a module flies is flown
+# A flight is three processes, and its networks give way to everything else: more at once than there are processors would
+# leave them none. Nothing has a second chance. All tests of a file run in one process, so what a module flies is flown
 # once; xdist 3.8 does not see its own groups with pytest 9.2.
-JOBS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
+JOBS ?= $(shell getconf _NPROCESSORS_ONLN)
 AT_ONCE = $(if $(CORE),--ignore=tests/extras) --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS= CORE=1
