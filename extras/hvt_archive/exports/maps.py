@@ -122,7 +122,7 @@ def write_kml(recorded: Recorded, path: Path) -> None:
         _with(style, "PolyStyle", color=f"30{blue:02x}{green:02x}{red:02x}")
         facts = _with(place, "ExtendedData")
         for name, value in (
-            ("confidence", f"{track.confidence:.2f}"),
+            ("confidence", f"{track.confidence:.3f}"),
             ("refined", str(int(track.refined))),
             ("error_m", f"{spot.ellipse[0]:.1f}"),
         ):

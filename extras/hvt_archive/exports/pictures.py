@@ -15,9 +15,9 @@ from hvt_ground.events import Overlay
 from hvt_ground.recordings.recorded import Recorded
 from hvt_ground.sinks.tracks_table import utc_text
 
-STILL_COLUMNS = ("file", "base_file", "frame", "capture_utc", "caption")
-"""``base_file`` shows what the base stream had there, empty where the recording does not say; ``frame`` is the one,
-from 1, at which the still was known; ``caption`` what it did, as under the pair on the screen."""
+STILL_COLUMNS = ("file", "base_file", "frame_index", "capture_utc", "caption")
+"""``base_file`` shows what the base stream had there, empty where the recording does not say; ``frame_index`` is
+the one, from 0, at which the still was known; ``caption`` what it did, as under the pair on the screen."""
 _JPEG_QUALITY_PCT = 95
 
 
@@ -31,11 +31,11 @@ def write_coco(recorded: Recorded, folder: Path) -> None:
     numbers: dict[str, int] = {}
     (folder / "images").mkdir()
     for sample, picture, overlay in pictures(recorded):
-        name = f"images/{sample.frame_index + 1:06d}.jpg"
+        name = f"images/{sample.frame_index:06d}.jpg"
         _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY_PCT])
         (folder / name).write_bytes(data.tobytes())
         image = {
-            "id": sample.frame_index + 1,
+            "id": sample.frame_index,
             "file_name": name,
             "width": picture.shape[1],
             "height": picture.shape[0],
@@ -69,7 +69,7 @@ def _annotations(
                 "area": (x2 - x1) * (y2 - y1),
                 "iscrowd": 0,
                 "track_id": track_id,
-                "score": round(float(overlay.confidences[row]), 2),
+                "score": round(float(overlay.confidences[row]), 3),
             }
         )
     return found
@@ -90,4 +90,4 @@ def write_stills(recorded: Recorded, folder: Path) -> None:
             for name, data in zip(names, (still.jpeg, still.base_jpeg), strict=True):
                 if name:
                     (folder / name).write_bytes(data)
-            writer.writerow((*names, still.frame_index + 1, utc_text(still.capture_ns), still.caption))
+            writer.writerow((*names, still.frame_index, utc_text(still.capture_ns), still.caption))

@@ -15,7 +15,7 @@ from hvt_ground.sinks.tracks_table import COLUMNS, track_rows
 
 _BATCH_ROWS = 100_000
 _TYPES = {
-    "frame": pa.int64(),
+    "frame_index": pa.int64(),
     "capture_utc": pa.string(),
     "id": pa.int64(),
     **dict.fromkeys(("x", "y", "w", "h", "confidence"), pa.float32()),
@@ -59,12 +59,13 @@ def write_mot(recorded: Recorded, path: Path) -> None:
 
     Tracks that stills doubt are left out: the format has no word for them.
     """
-    place = {name: COLUMNS.index(name) for name in COLUMNS}
+    doubted = COLUMNS.index("doubted")
     with path.open("w", encoding="utf-8") as file:
-        for row in _rows(recorded):
-            if not row[place["doubted"]]:
-                values = (row[place[name]] for name in ("frame", "id", "x", "y", "w", "h", "confidence"))
-                file.write(",".join(map(str, values)) + ",-1,-1,-1\n")
+        for overlay in recorded.overlays():
+            for row in track_rows(overlay):
+                if not row[doubted]:
+                    _, _, *values = row[: COLUMNS.index("confidence") + 1]
+                    file.write(",".join(map(str, (overlay.frame_index + 1, *values))) + ",-1,-1,-1\n")
 
 
 def _rows(recorded: Recorded) -> Iterator[tuple[object, ...]]:

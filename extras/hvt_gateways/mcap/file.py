@@ -153,7 +153,7 @@ def _annotations(overlay: Overlay) -> ImageAnnotations:
             "id": track_id,
             "class": name,
             "base_class": overlay.base_classes[row],
-            "confidence": f"{overlay.confidences[row]:.2f}",
+            "confidence": f"{overlay.confidences[row]:.3f}",
             "refined": int(refined),
             "origin": origins[row],
             "doubted": int(words[row] != name),

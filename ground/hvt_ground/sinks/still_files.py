@@ -17,11 +17,11 @@ from hvt_ground.events import Event, Refinement
 from hvt_ground.sinks.line_file import LineFile
 
 COLUMNS = (
-    *("file", "frame", "known_frame", "still", "track", "edge_track", "x", "y", "w", "h"),
+    *("file", "frame_index", "known_frame_index", "still", "track", "edge_track", "x", "y", "w", "h"),
     *("class_before", "class_after", "confidence", "reason"),
 )
-"""``frame`` is what the still shows and ``known_frame`` when it was known here, both from 1; ``x y w h`` is where the
-whole picture lies in the base picture of ``frame``, base pixels."""
+"""``frame_index`` is what the still shows and ``known_frame_index`` when it was known here, both from 0; ``x y w h``
+is where the whole picture lies in the base picture of ``frame_index``, base pixels."""
 
 
 class StillFiles:
@@ -69,8 +69,8 @@ def _row(item: Refinement, name: str) -> tuple[object, ...]:
     x1, y1, x2, y2 = item.crop_base_px
     return (
         name,
-        item.shown_index + 1,
-        item.frame_index + 1,
+        item.shown_index,
+        item.frame_index,
         item.still_sequence,
         "" if item.track_id is None else item.track_id,
         item.edge_track_id,

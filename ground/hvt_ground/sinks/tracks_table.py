@@ -16,11 +16,11 @@ from hvt_ground.events import Event, Overlay, Places
 from hvt_ground.sinks.line_file import LineFile
 
 COLUMNS = (
-    *("frame", "capture_utc", "id", "x", "y", "w", "h", "confidence"),
+    *("frame_index", "capture_utc", "id", "x", "y", "w", "h", "confidence"),
     *("base_class", "class", "refined", "origin", "late", "doubted"),
     *("latitude", "longitude", "error_m"),
 )
-"""``frame`` counts from 1 and ``x y w h`` are base pixels, as in MOTChallenge; ``capture_utc`` is the time at the
+"""``frame_index`` counts from 0, as on the wire, and ``x y w h`` are base pixels; ``capture_utc`` is the time at the
 camera by the edge's clock; ``base_class`` is what the detectors say without stills, ``class`` the same after
 refinement, ``refined`` 1 once a still has refined it; ``origin``: ``base``, ``edge``, ``edge+base`` or ``still``;
 ``late``: 1 where it is of stored video that came after an outage, behind later frames; ``doubted``: 1 where stills
@@ -58,7 +58,7 @@ def track_rows(overlay: Overlay) -> Iterator[tuple[object, ...]]:
     for row, track_id in enumerate(overlay.track_ids.tolist()):
         x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
         yield (
-            overlay.frame_index + 1,
+            overlay.frame_index,
             utc_text(overlay.capture_ns),
             track_id,
             *(f"{value:.1f}" for value in (x1, y1, x2 - x1, y2 - y1)),

@@ -83,5 +83,7 @@ def _stills(path: Path) -> list[FlownStill]:
             image = cv2.imread(str(path.with_name(row["file"])), cv2.IMREAD_COLOR)
             if image is not None:
                 place = (x, y, x + w, y + h)
-                stills[row["file"]] = FlownStill(int(row["frame"]), place, np.asarray(image, np.uint8))
+                stills[row["file"]] = FlownStill(
+                    int(row["frame_index"]) + 1, place, np.asarray(image, np.uint8)
+                )
     return list(stills.values())

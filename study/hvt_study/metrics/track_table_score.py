@@ -63,7 +63,10 @@ class Score:
 
 
 def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
-    """Read a tracks table of the ground by frame (from 1); ``column`` is ``class`` or ``base_class``.
+    """Read a tracks table of the ground by frame, from 1 as in MOTChallenge.
+
+    ``column`` is ``class`` or ``base_class``. Tables of earlier versions have ``frame``, from 1, in place
+    of ``frame_index``.
 
     Where the edge codes each n-th frame, those between show the list of the one before.
     """
@@ -72,7 +75,8 @@ def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
         with io.StringIO(decoded(path.read_bytes()), newline="") as file:
             for line in csv.DictReader(file):
                 x, y, w, h = (float(line[name]) for name in ("x", "y", "w", "h"))
-                rows[int(line["frame"])].append(([x, y, x + w, y + h], line[column]))
+                frame = int(line["frame_index"]) + 1 if "frame_index" in line else int(line["frame"])
+                rows[frame].append(([x, y, x + w, y + h], line[column]))
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise UserError(
             f"{path} is not a table of tracks as hvt-ground --tracks writes it ({error})"

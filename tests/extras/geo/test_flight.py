@@ -24,12 +24,12 @@ def test_the_pose_is_part_of_the_budget_and_of_both_accounts(drawn):
 
 def test_tracks_are_placed_where_the_scene_has_them(drawn):
     """The map would be nonsense, and everything else green."""
-    rows = [row for row in drawn.tracks() if int(row["frame"]) > FPS]
-    each = {*sorted({row["frame"] for row in rows}, key=int)[::3]}
+    rows = [row for row in drawn.tracks() if int(row["frame_index"]) >= FPS]
+    each = {*sorted({row["frame_index"] for row in rows}, key=int)[::3]}
     found = [
         (off, off <= float(row["error_m"]))
         for row in rows
-        if row["frame"] in each and row["latitude"] and (off := off_m(row)) is not None
+        if row["frame_index"] in each and row["latitude"] and (off := off_m(row)) is not None
     ]
     assert len(found) > 150
     assert np.percentile([off for off, _ in found], 95) < 3.0
@@ -59,6 +59,6 @@ def test_a_pose_that_ends_is_said_to_be_stale_and_places_nothing_more(tmp_path):
     events = [text for _, _, text in Recording(tmp_path / "flight.rrd").events()]
     assert any("the pose is stale" in text for text in events)
     with (tmp_path / "flight.csv").open(encoding="utf-8") as file:
-        placed = {int(row["frame"]) for row in csv.DictReader(file) if row["latitude"]}
+        placed = {int(row["frame_index"]) + 1 for row in csv.DictReader(file) if row["latitude"]}
     assert min(placed) >= 1
     assert max(placed) <= 12 * FPS

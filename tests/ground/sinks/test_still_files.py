@@ -45,7 +45,7 @@ def test_a_still_is_written_as_it_arrived_with_the_place_it_shows(tmp_path):
     rows = list(csv.DictReader((tmp_path / "uav.csv").read_text(encoding="utf-8").splitlines()))
     assert [(row["track"], row["class_after"]) for row in rows] == [("7", "van"), ("", "bus")]
     assert {row["file"] for row in rows} == {"uav-000004.png"}
-    assert (rows[0]["frame"], rows[0]["known_frame"]) == ("10", "12")
+    assert (rows[0]["frame_index"], rows[0]["known_frame_index"]) == ("9", "11")
     assert [float(rows[0][name]) for name in "xywh"] == [8, 9, 20, 12]
     assert np.array_equal(cv2.imread(str(tmp_path / "uav-000004.png")), PIXELS)
     assert len(list(tmp_path.iterdir())) == 2

@@ -33,10 +33,15 @@ def test_each_line_says_who_knows_of_the_track(tmp_path, origins, expected):
     table.close()
     every = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
     assert {row["capture_utc"] for row in every} == {"2023-11-14T22:13:20.123Z"}
-    assert [(row["frame"], row["late"]) for row in every] == [("5", "0"), ("5", "0"), ("3", "1"), ("3", "1")]
+    assert [(row["frame_index"], row["late"]) for row in every] == [
+        ("4", "0"),
+        ("4", "0"),
+        ("2", "1"),
+        ("2", "1"),
+    ]
     rows = every[:2]
     assert [row["origin"] for row in rows] == list(expected)
-    assert [(row["frame"], row["id"], row["class"], row["refined"]) for row in rows] == [
-        ("5", "3", "car", "0"),
-        ("5", "9", "bus", "1"),
+    assert [(row["frame_index"], row["id"], row["class"], row["refined"]) for row in rows] == [
+        ("4", "3", "car", "0"),
+        ("4", "9", "bus", "1"),
     ]

@@ -99,7 +99,7 @@ def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, long_sce
         assert verified(second)
         assert f"recording of {name}" in ground.told
         table = next(link.folder.glob(f"hvt-{name}-*.csv"))
-        assert max(map(int, columns(table, "frame"))) > min(frames[1]), "the table went on"
+        assert max(map(int, columns(table, "frame_index"))) > min(frames[1]), "the table went on"
     shown = [kind for kind in columns(link.folder / "timing.csv", "kind") if kind == "base"]
     assert len(shown) == sum(summary["frames"] for summary in summaries), "no line of any message is missing"
 

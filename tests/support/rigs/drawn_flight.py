@@ -112,16 +112,16 @@ def fly_into_all_sinks(folder: Path) -> DrawnFlight:
 
 
 @functools.lru_cache(maxsize=FRAMES)
-def _truth(frame: int) -> tuple[np.ndarray, list[np.ndarray]]:
+def _truth(frame_index: int) -> tuple[np.ndarray, list[np.ndarray]]:
     """Boxes in base pixels and places (latitude, longitude) of all that is there."""
-    truth, middles = scene().truth((frame - 1) / FPS), scene().places((frame - 1) / FPS)
+    truth, middles = scene().truth(frame_index / FPS), scene().places(frame_index / FPS)
     places = [np.array(scene().geographic(*middles[one])) for one in truth.ids.tolist()]
     return VIEW.to_base(truth.boxes_source_px), places
 
 
 def off_m(row: Mapping[str, str]) -> float | None:
     """How far the place in a row of the tracks table is from its object's; None where no object is in its box."""
-    boxes, places = _truth(int(row["frame"]))
+    boxes, places = _truth(int(row["frame_index"]))
     x, y, wide, high = (float(row[name]) for name in "xywh")
     overlap = iou(np.array([[x, y, x + wide, y + high]], np.float32), boxes)[0]
     if overlap.max() < 0.6:

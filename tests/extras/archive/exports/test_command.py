@@ -138,15 +138,15 @@ def test_the_tracks_are_those_that_the_ground_had(recording, events, tmp_path):
     assert len(rows) == len(table) == len(mot) == FRAMES * TRACKS
     off = []
     for row, typed in zip(rows, table, strict=True):
-        frame, track = int(row["frame"]), int(row["id"])
-        overlay = overlays[frame - 1]
+        frame, track = int(row["frame_index"]), int(row["id"])
+        overlay = overlays[frame]
         at = int(np.flatnonzero(overlay.track_ids == track)[0])
         assert (row["class"], row["base_class"]) == (overlay.classes[at], overlay.base_classes[at])
         assert row["refined"] == str(int(overlay.refined[at]))
-        assert (typed["frame"], typed["id"], typed["class"]) == (frame, track, row["class"])
+        assert (typed["frame_index"], typed["id"], typed["class"]) == (frame, track, row["class"])
         x1, y1, x2, y2 = overlay.boxes_base_px[at].tolist()
         off.append(np.subtract([float(row[one]) for one in "xywh"], [x1, y1, x2 - x1, y2 - y1]))
-        assert mot.loc[(frame, track), "Width"] == pytest.approx(float(row["w"]), abs=0.06)
+        assert mot.loc[(frame + 1, track), "Width"] == pytest.approx(float(row["w"]), abs=0.06)
     # Boxes are held while they move by less than a pixel, and written less often where bytes are scarce.
     assert np.percentile(np.abs(off), 90) < 3
     assert rows[0]["capture_utc"] == "2026-09-21T14:13:20.000Z"
@@ -159,11 +159,11 @@ def test_the_data_set_opens_in_coco_tools(recording, events, tmp_path):
     assert len(coco.getImgIds()) == FRAMES
     names = {one["name"] for one in coco.loadCats(coco.getCatIds())}
     assert {"car", "van", "truck"} <= names
-    image = coco.loadImgs([31])[0]
+    image = coco.loadImgs([30])[0]
     picture = cv2.imread(str(out / image["file_name"]))
     assert (picture.shape[1], picture.shape[0]) == (image["width"], image["height"]) == SIZE
     assert np.abs(picture.astype(float) - pictures(events)[30]).mean() < 4
-    assert len(coco.getAnnIds(imgIds=[31])) == TRACKS
+    assert len(coco.getAnnIds(imgIds=[30])) == TRACKS
 
 
 def test_the_stills_come_with_what_the_base_showed(recording, events, tmp_path):
@@ -243,10 +243,10 @@ def test_a_ground_that_was_started_again_leaves_no_ghosts(events, tmp_path):
     )
     by_frame: dict[int, list[int]] = {}
     for row in lines(out):
-        by_frame.setdefault(int(row["frame"]), []).append(int(row["id"]))
+        by_frame.setdefault(int(row["frame_index"]), []).append(int(row["id"]))
     assert {len(ids) for ids in by_frame.values()} == {TRACKS}
     # The second begins at its first keyframe.
-    assert min(by_frame[60]) > 50 >= max(by_frame[30])
+    assert min(by_frame[59]) > 50 >= max(by_frame[29])
 
 
 @pytest.mark.parametrize("lost", [50, 3000])
@@ -277,7 +277,7 @@ def test_a_split_session_is_exported_as_one(recording, events, tmp_path):
     assert hvt_ground.cli.main(words) == 0
     shown = [
         [
-            (row["frame"], row["caption"], (folder / row["file"]).read_bytes())
+            (row["frame_index"], row["caption"], (folder / row["file"]).read_bytes())
             for row in lines(folder / "stills.csv")
         ]
         for folder in (stills, tmp_path / "parts")

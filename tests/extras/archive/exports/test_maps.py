@@ -225,7 +225,7 @@ def test_tables_have_places_between_two_poses(recording, tmp_path):
     for row in first[:45]:
         box = np.array([[float(row[name]) for name in "xywh"]], np.float32)
         box[:, 2:] += box[:, :2]
-        truth = places_of_boxes(pose_at(int(row["frame"]) - 1), box, view=VIEW)
+        truth = places_of_boxes(pose_at(int(row["frame_index"])), box, view=VIEW)
         assert truth is not None
         assert [float(row["latitude"]), float(row["longitude"])] == pytest.approx(
             truth.places_deg[0].tolist(), abs=2e-6

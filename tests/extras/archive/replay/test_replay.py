@@ -35,7 +35,7 @@ pytestmark = pytest.mark.integration
 SETTINGS = ("--provider", "cpu", "--quiet")
 RECORDED = Path(__file__).parent / "recorded" / "wire-4.hvtlog"
 """Of schema version 4; the README beside it says how it was made."""
-NAMES = ("frame", "id", "x", "y", "w", "h", "class", "refined", "origin")
+NAMES = ("frame_index", "id", "x", "y", "w", "h", "class", "refined", "origin")
 
 
 def replay(capsys: pytest.CaptureFixture[str], *words: object) -> str:

@@ -23,7 +23,7 @@ def test_atoms_stand_within_their_error_of_the_objects(drawn):
     for event in drawn.events:
         point = event.find("point").attrib
         row = rows.get((event.attrib["uid"].split("-")[-1], point["lat"], point["lon"]))
-        if row is not None and int(row["frame"]) >= FPS and (off := off_m(row)) is not None:
+        if row is not None and int(row["frame_index"]) >= FPS - 1 and (off := off_m(row)) is not None:
             found.append((off, off <= float(point["ce"])))
     assert len(found) > 30
     assert np.median([off for off, _ in found]) < 2.0

@@ -29,7 +29,7 @@ def test_video_tracks_and_places_are_those_of_the_other_sinks(drawn):
     rows = defaultdict(dict)
     for row in drawn.tracks():
         if row["doubted"] == "0":
-            rows[int(row["frame"]) - 1][int(row["id"])] = row
+            rows[int(row["frame_index"])][int(row["id"])] = row
     assert len(found.klv) >= FRAMES
     placed, wide = 0, VIEW.base_size[0]
     for packet in found.klv:
