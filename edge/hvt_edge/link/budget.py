@@ -57,6 +57,17 @@ _WHOLE_NS = 2 * SECOND_NS
 """A window of at most so long is back within the three seconds in which live video has to be."""
 
 
+_PART_MARGIN = 1.03
+"""So much smaller are frames of which a window holds a part more than its share: ``status`` goes beside them."""
+
+
+def frames_bps(base_bps: float, total_bps: float, *, fps: float, window_s: float) -> float:
+    """B_v, or the less of which a window holds all frames that fall into it: of 2.5 a second three, not 2.5."""
+    frames = window_s * fps
+    most_bps = total_bps * frames / max(1, math.ceil(frames - _ROUNDING))
+    return base_bps if base_bps <= most_bps else most_bps / _PART_MARGIN
+
+
 @dataclass(frozen=True, slots=True)
 class BudgetSettings:
     """Rates in line bits a second; times in nanoseconds."""
@@ -119,7 +130,11 @@ class RollingBudget:
         self._forecasts = np.unique(
             np.linspace(0, steps, min(steps, _FORECASTS) + 1).round().astype(np.int64)
         )
-        self._base_peak = BASE_PEAK * settings.base_bps * settings.window_ns / 8 / SECOND_NS
+        window_s, fps = settings.window_ns / SECOND_NS, settings.fps
+        self._step_bytes = (
+            frames_bps(settings.base_bps, settings.total_bps, fps=fps, window_s=window_s) / 8 / fps
+        )
+        self._base_peak = BASE_PEAK * max(steps, window_s * fps) * self._step_bytes
         self._base_steps: deque[int] = deque(maxlen=steps * _MEMORY_WINDOWS)
         self._burst = self._recent_bursts()
         self._cap = settings.still_bps * settings.carry_s / 8
@@ -155,8 +170,8 @@ class RollingBudget:
 
     @property
     def base_step_bytes(self) -> float:
-        """The mean of one base frame at B_v, in line bytes."""
-        return self._settings.base_bps / 8 / self._settings.fps
+        """The mean of one base frame at the rate that x265 was opened for, in line bytes."""
+        return self._step_bytes
 
     @property
     def most_still_bytes(self) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
-from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES
+from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, frames_bps
 
 PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium")
 VBV_S = 0.15
@@ -112,12 +112,14 @@ def encoder_settings(
     total_bps: int,
     base_bps: int,
     edge_id: str,
+    window_s: float = 1.0,
     side_data: bool = False,
 ) -> EncoderSettings:
     """Settings of x265 that keep the base stream within B_v, and its fullest second within B_tot.
 
     Where stills have a share, they yield to the base's peaks. Where video takes (nearly) the whole budget, as in M0,
-    nothing can yield: the VBV is made tighter and the target lowered by the peak that is left.
+    nothing can yield: the VBV is made tighter and the target lowered by the peak that is left. Where a window of
+    ``window_s`` holds no whole number of frames, the target is lowered until it holds all that fall into it.
 
     ``fps`` is the rate of coded frames: with fewer of them less goes into headers, and the VBV holds one at least.
     ``side_data`` is needed by `TrackRegions`.
@@ -125,6 +127,8 @@ def encoder_settings(
     tight = base_bps * _PEAK > total_bps
     line_bps = min(base_bps, total_bps / _TIGHT_PEAK) if tight else base_bps
     payload_bps = line_bps - _beside_bps(line_bps, size=size, fps=fps, edge_id=edge_id)
+    frames_line_bps = line_bps - _debt_bps(size)
+    payload_bps += frames_bps(frames_line_bps, total_bps, fps=fps, window_s=window_s) - frames_line_bps
     return EncoderSettings(
         size=size,
         fps=fps,
@@ -152,5 +156,8 @@ def _vbv_s(fps: float, *, tight: bool = False) -> float:
 
 def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
     # The part of the base's rate beside x265: headers, framing, ``status``, and its debt of keyframes.
-    debt_bps = 8 * usual_keyframe_bytes(size) / _KEYFRAME_EVERY_S
-    return base_overhead_bps(line_bps, fps=fps, edge_id=edge_id) + debt_bps
+    return base_overhead_bps(line_bps, fps=fps, edge_id=edge_id) + _debt_bps(size)
+
+
+def _debt_bps(size: tuple[int, int]) -> float:
+    return 8 * usual_keyframe_bytes(size) / _KEYFRAME_EVERY_S

@@ -172,6 +172,7 @@ def make_encoder(
         total_bps=_video_bps(config, total_bps=total_bps, base_bps=base_bps),
         base_bps=base_bps,
         edge_id=config.edge_id,
+        window_s=config.window,
         side_data=config.roi_depth > 0,
     )
     threads = 1 if config.pace == "lockstep" else min(_MOST_ENCODER_THREADS, os.cpu_count() or 1)

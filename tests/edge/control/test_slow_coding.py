@@ -25,3 +25,19 @@ def test_nearly_every_frame_is_sent_however_long_it_takes_to_be_coded(fps, budge
     ).fly(20)
     assert len(flight.sent) >= 0.95 * 20 * fps
     assert flight.ledger.worst_window_bps.total <= budget
+
+
+@pytest.mark.parametrize("method", ["M0", "M6"])
+@pytest.mark.parametrize("fps", [2.25, 2.5, 3.7, 5.5])
+def test_nearly_every_frame_is_sent_where_a_window_holds_no_whole_number_of_them(fps, method):
+    """Three of 2.5 frames a second fall into some windows, which had room for 2.5: a quarter was left out."""
+    flight = LiveFlight(
+        SteppedLink(((0, 900_000),)),
+        track_bytes=0 if method == "M0" else 250,
+        fps=fps,
+        budget=300_000,
+        method=method,
+        size=(640, 360),
+    ).fly(30)
+    assert len(flight.sent) >= 0.99 * 30 * fps
+    assert flight.ledger.worst_window_bps.total <= 300_000

@@ -290,6 +290,7 @@ class LiveFlight:
             total_bps=max(total_bps - config.metadata_bps, base_bps),
             base_bps=base_bps,
             edge_id=config.edge_id,
+            window_s=config.window,
         )
         return _Encoder(size, asked.fps, asked.bitrate_bps, asked.vbv_s, self.texture, self.chance)
 
