@@ -19,7 +19,7 @@ from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.stills.outbox import Outbox
-from hvt_edge.stills.sending import StillSender
+from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 
 _PART = "reports"

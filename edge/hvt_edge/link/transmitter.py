@@ -40,8 +40,8 @@ from hvt_common.values import AccessUnit, Still
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, RollingBudget
-from hvt_edge.link.envelope import StillEnvelope
 from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.stills import StillEnvelope
 
 STILL_ATTACHMENT_BYTES = 60
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.

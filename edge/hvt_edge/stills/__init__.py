@@ -2,6 +2,6 @@
 
 A still's walk: `stage` reports tracks and hands them to `scheduler`, which asks `suppression` and `policy`, merges
 neighbours (`merging`), crops and codes (`maker`, `crop_job`) what the budget allows, and puts it in the
-`outbox`; `sending` hands it to the link's transmitter, or to the backlog while the link is away. `on_demand` serves
+`outbox`, and `stage` hands it to the link's transmitter, or to the backlog while the link is away. `on_demand` serves
 what grounds request (`on_demand_crop`). `worker` is the thread of all this in real time.
 """

@@ -11,7 +11,7 @@ from enum import Enum
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Still
 from hvt_edge.backlog.entry import FIRST_STORED
-from hvt_edge.link.envelope import StillEnvelope
+from hvt_edge.link.stills import StillEnvelope
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.policy.base import Request
 

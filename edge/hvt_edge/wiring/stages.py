@@ -21,7 +21,7 @@ from hvt_edge.control.link_control import LinkControl
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
-from hvt_edge.link.still_readers import StillReaders
+from hvt_edge.link.stills import StillReaders
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.pose import PoseSource, PoseStage
@@ -30,8 +30,7 @@ from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
 from hvt_edge.status import InfoReporter
 from hvt_edge.stills.outbox import Outbox
-from hvt_edge.stills.sending import StillSender
-from hvt_edge.stills.stage import StillStage
+from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.video.frame_skip import LimitedFrameSkip
 from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.passthrough import PassthroughStage, VideoStage

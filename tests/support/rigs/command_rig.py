@@ -28,7 +28,7 @@ from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
-from hvt_edge.stills.sending import StillSender
+from hvt_edge.stills.stage import StillSender
 from hvt_edge.stills.suppression import Suppression
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.wiring.video import make_encoder, reconfiguration_settings

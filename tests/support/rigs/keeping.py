@@ -40,7 +40,7 @@ from hvt_edge.operating import Operating
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxStill
-from hvt_edge.stills.sending import StillSender
+from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage

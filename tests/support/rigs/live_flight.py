@@ -34,7 +34,7 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import Operating
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox
-from hvt_edge.stills.sending import StillSender
+from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.frame_skip import LimitedFrameSkip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 from hvt_common.protocol.messages import InfoRequest
-from hvt_edge.link.still_readers import StillReaders
+from hvt_edge.link.stills import StillReaders
 
 S = 1_000_000_000
 
