@@ -8,12 +8,17 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from hvt_common.config import load, to_toml
-from hvt_common.errors import exit_with_sentence
+from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import START_LOGGER, start_log
+from hvt_common.runtime.plug_ins import the_one
 from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
 from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
 
+_EXTRA_COMMANDS = "hvt.edge_commands"
+"""Entry points of commands that extras bring: each takes its words and returns the exit code."""
+_BROUGHT = "doctor"
+"""The command of the extras that come with HVT."""
 _DESCRIPTION = (
     "Publish a camera or clip over Zenoh: a low-bitrate HEVC base stream, and sharp stills of what matters, "
     "within a hard bit budget. hvt-edge doctor [SETTINGS] checks what a flight needs; hvt-edge status tells how "
@@ -37,11 +42,13 @@ def _run(argv: Sequence[str] | None) -> int:
         from hvt_edge.health import watch  # noqa: PLC0415 - each command imports its own
 
         return watch.run(words[1:])
-    if words and words[0] == "doctor":
-        from hvt_edge.doctor import command as doctor  # noqa: PLC0415
-
-        limit_malloc_arenas()
-        return doctor.run(words[1:])
+    if words and not words[0].startswith("-"):
+        entry = the_one(_EXTRA_COMMANDS, words[0], what="command", built_in=False)
+        if entry is not None:
+            limit_malloc_arenas()
+            return int(entry.load()(words[1:]))
+        if words[0] == _BROUGHT:
+            raise UserError("hvt-edge doctor is of an extra that is not installed: pip install 'hvt[edge]'")
     config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
     config = with_profile(config, given=given.values)
     redaction = Redaction([*words, *given.values.values()])

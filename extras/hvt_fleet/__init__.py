@@ -1,1 +1,1 @@
-"""For many edges and grounds: `pki` makes their keys, and says who may do what (``hvt-ground keys``)."""
+"""For many edges and grounds: `pki` makes their keys, and says who may do what; `edge_doctor` examines one edge."""
