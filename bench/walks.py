@@ -10,13 +10,16 @@ import sys
 import tempfile
 import threading
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from hvt_common.config import load
 from hvt_common.errors import UserError
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.control.commands import Commands
 from hvt_ground.app import Ground
 from hvt_ground.control import EdgeClient
 from hvt_ground.extras import checked, config_class
@@ -24,7 +27,7 @@ from hvt_ground.extras import checked, config_class
 _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("hvt_common", "hvt_edge", "hvt_ground")
 _CODECS = "hvt_common/video/still_codecs"
-_FRAMES = 200
+_FRAMES = 120
 
 # Function: name and bound of its walk, the largest that is allowed.
 _WALKS = {
@@ -69,10 +72,23 @@ class Walks:
             _, _, files = walks.pop()
             self.largest[what] = max(self.largest[what], files, key=len)
 
+    def followed(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The same function, for threads that Python has not begun."""
+
+        def call(*given: object) -> object:
+            sys.setprofile(self.profile)
+            try:
+                return function(*given)
+            finally:
+                sys.setprofile(None)
+
+        return call
+
 
 def fly(walks: Walks) -> None:
     """Edge and ground at their defaults, over Zenoh on this machine; the demo scene, and one command."""
     threading.setprofile(walks.profile)
+    Commands.answer = walks.followed(Commands.answer)  # type: ignore[method-assign]
     with tempfile.TemporaryDirectory() as folder:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
@@ -80,7 +96,7 @@ def fly(walks: Walks) -> None:
         words = ["--listen", endpoint, "--record", f"{folder}/a.rrd", "--once", "--quiet", "--wait", "300s"]
         ground_config, _ = load(config_class(), words, program="hvt-ground", description="")
         words = ["--source", "demo", "--max-frames", str(_FRAMES), "--budget", "400kbps", "--quiet"]
-        words += ["--connect", endpoint, "--wait", "60s"]
+        words += ["--connect", endpoint, "--wait", "60s", "--fps", "5"]
         edge_config, given = load(EdgeConfig, words, program="hvt-edge", description="")
         edge_config = check(with_profile(edge_config, given=given.values))
         stop = threading.Event()
