@@ -24,8 +24,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.control.link_control import wait_for_ground
-from hvt_edge.health.heartbeat import Heartbeat
-from hvt_edge.health.state import StateMaker, lacks
+from hvt_edge.health.state import Heartbeat, StateMaker, lacks
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace

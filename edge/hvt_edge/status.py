@@ -26,8 +26,7 @@ from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import View
 from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.config import EdgeConfig
-from hvt_edge.health.heartbeat import Heartbeat
-from hvt_edge.health.state import EdgeState, LinkState
+from hvt_edge.health.state import EdgeState, Heartbeat, LinkState
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.cpu import Cores
 from hvt_edge.operating import Levers, LoopClock, Operating

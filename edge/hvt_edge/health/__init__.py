@@ -1,4 +1,4 @@
-"""The state of an edge: `state` once a second as one value, by the `heartbeat` of its loop.
+"""The state of an edge: `state` once a second as one value, by the heartbeat of its loop.
 
-`metrics` and `watch` tell it to programs and to people in another shell; `system` reads what the machine tells.
+`metrics` and `watch` tell it to programs and to people in another shell.
 """

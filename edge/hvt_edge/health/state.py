@@ -6,6 +6,7 @@ they have in common, so that none of them says what another does not. What is no
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -19,11 +20,11 @@ from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.protocol.messages import WIRE_VERSION
 from hvt_common.runtime.failures import FailedPart, Failures
+from hvt_common.runtime.process import notify_systemd
 from hvt_common.units import SECOND_NS
 from hvt_common.values import View
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
-from hvt_edge.health.system import SystemReading, read_system
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
@@ -35,9 +36,47 @@ from hvt_edge.stills.stage import StillStage
 
 _LEAST_OLD_S = 1.0
 """Boxes that are younger are not called old."""
+_ZONES = "sys/class/thermal/thermal_zone*/temp"
+_WIRELESS = "proc/net/wireless"
+_HEAD_LINES = 2
 
 Phase = Literal["waiting", "running", "ended"]
 """``waiting``: a clip waits for its first ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class SystemReading:
+    """The machine's temperature and the quality of its wireless link; None where the system does not tell."""
+
+    temperature_c: float | None = None
+    """The temperature of the hottest zone."""
+    wireless_quality: float | None = None
+    """The driver's count, of 70 with most."""
+    wireless_dbm: float | None = None
+
+
+def read_system(root: Path = Path("/")) -> SystemReading:
+    """Read it now; ``root`` is where ``sys`` and ``proc`` are."""
+    quality, level = _wireless(root / _WIRELESS)
+    return SystemReading(_hottest_c(root), quality, level)
+
+
+def _hottest_c(root: Path) -> float | None:
+    hottest: float | None = None
+    for zone in root.glob(_ZONES):
+        with contextlib.suppress(OSError, ValueError):  # a sensor that is switched off answers with an error
+            here = int(zone.read_text(encoding="ascii")) / 1000
+            hottest = here if hottest is None else max(hottest, here)
+    return hottest
+
+
+def _wireless(path: Path) -> tuple[float | None, float | None]:
+    # Quality and level of the first interface (proc(5)): ``wlan0: 0000 54. -56. -256 …``.
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        _, _, rest = path.read_text(encoding="ascii").splitlines()[_HEAD_LINES].partition(":")
+        _, quality, level = (float(one) for one in rest.split()[:3])
+        return quality, level if level < 0 else None  # above, a driver of old counts in units of its own
+    return None, None
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,3 +384,30 @@ def _free_bytes(folder: Path) -> int | None:
         except OSError:
             break
     return None
+
+
+class Heartbeat:
+    """The frame loop reports once a second that it turns: a state for watchers, a message for systemd's watchdog.
+
+    A long wait in the loop turns it meanwhile: a clip waits for its ground, a lost camera yields a step without a
+    frame each second. Only a loop that hangs reports nothing. ``clock`` is wall time, in lockstep too.
+    """
+
+    def __init__(self, maker: StateMaker, *, clock: Callable[[], int]) -> None:
+        self._maker = maker
+        self._clock = clock
+        self._due_ns = 0
+        self.state: EdgeState | None = None
+        """The newest; None before the first. Any thread may read it."""
+
+    def beat(self, phase: Phase) -> EdgeState:
+        """Make a state now."""
+        self._due_ns = self._clock() + SECOND_NS
+        self.state = self._maker.make(phase)
+        notify_systemd("WATCHDOG=1")
+        return self.state
+
+    def turn(self, phase: Phase) -> None:
+        """Make one if the last is a second old."""
+        if self._clock() >= self._due_ns:
+            self.beat(phase)

@@ -124,7 +124,7 @@ class BaseStage:
                 raise
             self._recover(error, now_ns=now_ns)
             return None
-        assert unit.keyframe or not decision.keyframe, "others than x265 are checked (encoders.checked)"
+        assert unit.keyframe or not decision.keyframe, "others than x265 are checked (CheckedEncoder)"
         if self._begins_anew and self.failures is not None:
             self.failures.works(_PART)
         self._begins_anew = False

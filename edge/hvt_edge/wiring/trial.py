@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from hvt_common.inference.detect import FailingDetector
@@ -17,10 +18,10 @@ from hvt_edge.perception.shadow import UNMEASURED, Shadow
 from hvt_edge.source.contract import Source
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.video.encoder_settings import least_base_bps
+from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.encoders.registry import X265
 from hvt_edge.video.preset import PresetChoice, choose_preset, share_of
 from hvt_edge.video.share import FIRST_SHARE
-from hvt_edge.video.trial import trial_frames, trial_quantiser
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.link import SPARSE_SHARE, lever_settings
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
@@ -30,6 +31,10 @@ _FINE = 33.5
 """Of `trial_quantiser`: below it all frames are coded. Measured as `PROMPT` was."""
 _MOST_NS = 3 * SECOND_NS
 """On a slow machine comparing ends after so long: a flight is not to wait for its detector."""
+_TRIAL_S = 0.85
+"""The time of two comparisons of the shadow ground."""
+_LAST = 3
+"""The last so many count: those before still pay for the keyframe."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,3 +126,23 @@ def _share(config: EdgeConfig, view: View, decimation: int, seen: Shadow = UNMEA
     seen = replace(seen, suppressed=0.0, suppressed_p=0.0)
     pay = lever_settings(config, view).tracks_pay(seen.measured, total_bps=config.budget_bps)
     return FIRST_SHARE if pay and not method(config.method).video_only else share
+
+
+def trial_frames(fps: float) -> int:
+    """Number of coded frames of a trial, at so many a second; as many as count, at least."""
+    return max(_LAST, 1 + math.floor(_TRIAL_S * fps))
+
+
+def trial_quantiser(
+    encoder: Encoder, scene: Iterable[Frame], *, count: int, on_unit: Callable[[Frame, AccessUnit], object]
+) -> float:
+    """Mean quantiser (0…51) of the last of ``count`` frames; NaN for a shorter scene, or an encoder that tells none.
+
+    ``on_unit`` takes each frame with its unit.
+    """
+    quantisers = []
+    for number, frame in enumerate(scene):
+        unit = encoder.encode(frame, keyframe=number == 0)
+        quantisers.append(encoder.mean_qp)
+        on_unit(frame, unit)
+    return sum(quantisers[-_LAST:]) / _LAST if len(quantisers) == count else math.nan

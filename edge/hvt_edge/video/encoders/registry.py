@@ -6,11 +6,14 @@ it is named.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
 from hvt_common.errors import UserError
 from hvt_common.runtime.plug_ins import installed, loaded, the_one
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.encoders.contract import Encoder
-from hvt_edge.video.encoders.hardware_rows import HARDWARE
 
 GROUP = "hvt.encoders"
 """The entry points' group."""
@@ -18,8 +21,42 @@ X265 = "x265"
 """HVT's own, measured encoder: the only one that takes regions and needs no qualification."""
 PASSTHROUGH = "passthrough"
 """None at all: the units of a camera that makes HEVC itself."""
-_OWN = frozenset({X265, PASSTHROUGH}) | HARDWARE.keys()
 _WHAT = "encoder"
+
+
+@dataclass(frozen=True, slots=True)
+class HardwareRow:
+    """One encoder of FFmpeg."""
+
+    codec: str
+    """Its name there, and of ``--encoder``."""
+    pixel_format: str
+    needs: str
+    """The hardware that it needs."""
+    options: Mapping[str, str] = field(default_factory=dict)
+    """Zero latency, constant rate, and an IDR where a keyframe is forced."""
+
+
+# None of them has been run by the project: the rows were written from FFmpeg's documentation. What keeps a wrong row
+# from a flight is the qualification run at the start.
+_ROWS = (
+    HardwareRow(
+        "hevc_nvenc",
+        "yuv420p",
+        "an NVIDIA GPU with NVENC and its driver",
+        {"preset": "p4", "tune": "ull", "rc": "cbr", "delay": "0", "zerolatency": "1", "forced-idr": "1"},
+    ),
+    HardwareRow(
+        "hevc_qsv",
+        "nv12",
+        "an Intel GPU with Quick Sync and its driver",
+        {"preset": "medium", "async_depth": "1", "low_delay_brc": "1", "look_ahead": "0", "forced_idr": "1"},
+    ),
+    HardwareRow("hevc_v4l2m2m", "nv12", "a board whose kernel has an HEVC encoder as a V4L2 device"),
+)
+HARDWARE: Mapping[str, HardwareRow] = MappingProxyType({row.codec: row for row in _ROWS})
+"""By name."""
+_OWN = frozenset({X265, PASSTHROUGH}) | HARDWARE.keys()
 
 
 def encoder_names() -> tuple[str, ...]:
@@ -38,7 +75,7 @@ def check_encoder(name: str) -> None:
 def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
     """Open it. Raises `UserError` where there is none, or it does not load or take the settings."""
     # Imported for who opens one: names alone are checked at each start.
-    from hvt_edge.video.encoders.checked import CheckedEncoder  # noqa: PLC0415
+    from hvt_edge.video.encoders.contract import CheckedEncoder  # noqa: PLC0415
     from hvt_edge.video.encoders.hardware import HardwareEncoder  # noqa: PLC0415
     from hvt_edge.video.encoders.passthrough import Passthrough  # noqa: PLC0415
     from hvt_edge.video.x265 import BaseEncoder  # noqa: PLC0415
