@@ -8,7 +8,7 @@ UV     := $(shell command -v uv 2>/dev/null)
 # Containers often forbid bytecode; each start of a program would then compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test check arm lint type format docs bench bench-board bench-fleet bench-stills bench-walks bench-compare bench-peers link soak kills failures fuzz training clean help
+.PHONY: setup demo test check arm lint type format docs bench bench-board bench-fleet bench-stills walks bench-compare bench-peers link soak kills failures fuzz training clean help
 
 .PHONY: nightly nightly-tests
 
@@ -82,8 +82,8 @@ bench-board: setup ## an edge with a quarter of two cores for a minute: no frame
 bench-fleet: setup ## one ground with 1, 2, 4, 8 and 16 played edges: frames a second and core, delay, memory
 	@$(BIN)/python -m bench.fleet
 
-bench-walks: setup ## the files that a frame, a still and a command enter; fails where a walk is longer than its bound
-	@$(BIN)/python -m bench.walks
+walks: setup ## the files that a frame, a still and a command enter; fails where a walk is longer than its bound
+	@$(BIN)/python -m lab.walks
 
 bench-stills: setup ## still codecs on real crops: bytes at equal quality, time to encode and decode
 	@$(BIN)/python -m bench.stills

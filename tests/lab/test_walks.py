@@ -15,7 +15,7 @@ def test_no_walk_is_longer_than_its_bound():
     """Who follows a frame, a still or a command by reading would get lost."""
     root = Path(__file__).parents[2]
     done = subprocess.run(
-        [sys.executable, "-m", "bench.walks"],
+        [sys.executable, "-m", "lab.walks"],
         cwd=root,
         capture_output=True,
         text=True,
