@@ -9,6 +9,7 @@ import socket
 import sys
 import tempfile
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,8 @@ _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("hvt_common", "hvt_edge", "hvt_ground")
 _CODECS = "hvt_common/video/still_codecs"
 _FRAMES = 120
+_MOST_FLIGHTS = 3
+"""On a busy machine no still may go in the first."""
 
 # Function: name and bound of its walk, the largest that is allowed.
 _WALKS = {
@@ -88,7 +91,6 @@ class Walks:
 def fly(walks: Walks) -> None:
     """Edge and ground at their defaults, over Zenoh on this machine; the demo scene, and one command."""
     threading.setprofile(walks.profile)
-    Commands.answer = walks.followed(Commands.answer)  # type: ignore[method-assign]
     with tempfile.TemporaryDirectory() as folder:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
@@ -112,11 +114,12 @@ def fly(walks: Walks) -> None:
 
 
 def _command(endpoint: str, edge: str) -> None:
-    for _ in range(30):
+    for _ in range(60):
         try:
             with EdgeClient.connect(endpoint) as edges:
                 edges[edge].set_budget(300_000)
         except UserError:  # the ground, or the edge, is not there yet
+            time.sleep(0.5)
             continue
         return
 
@@ -124,7 +127,11 @@ def _command(endpoint: str, edge: str) -> None:
 def main() -> int:
     """Print each walk; 1 where one is longer than its bound."""
     walks = Walks()
-    fly(walks)
+    Commands.answer = walks.followed(Commands.answer)  # type: ignore[method-assign]
+    for _ in range(_MOST_FLIGHTS):
+        fly(walks)
+        if all(walks.largest[one] for one in _WALKS):
+            break
     missed = 0
     for function, (name, bound) in _WALKS.items():
         files = walks.largest[function]
