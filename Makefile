@@ -82,7 +82,7 @@ bench-board: setup ## an edge with a quarter of two cores for a minute: no frame
 bench-fleet: setup ## one ground with 1, 2, 4, 8 and 16 played edges: frames a second and core, delay, memory
 	@$(BIN)/python -m bench.fleet
 
-walks: setup ## the files that a frame, a still and a command enter; fails where a walk is longer than its bound
+walks: setup ## the files that a frame and a still enter; fails where a walk is longer than its bound
 	@$(BIN)/python -m lab.walks
 
 bench-stills: setup ## still codecs on real crops: bytes at equal quality, time to encode and decode

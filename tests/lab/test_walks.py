@@ -1,4 +1,4 @@
-"""How far a frame, a still and a command walk through the code, over a real link."""
+"""How far a frame and a still walk through the code, over a real link."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 @pytest.mark.nightly
 @pytest.mark.integration
 def test_no_walk_is_longer_than_its_bound():
-    """Who follows a frame, a still or a command by reading would get lost."""
+    """Who follows a frame or a still by reading would get lost."""
     root = Path(__file__).parents[2]
     done = subprocess.run(
         [sys.executable, "-m", "lab.walks"],
