@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
+import re
+
 from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failure
+from hvt_edge import app
+from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.loop.cpu import Cores
 from hvt_edge.status import in_vain, summary, table, title
+from programs.summary_page import unexplained
 
 
 def summary_of(**changed):
@@ -85,3 +91,13 @@ def test_what_is_stored_for_later_is_no_flight_in_vain():
     assert title(unborn) == (
         "uav-1: NOT SENT (nobody subscribed to its video): it ended before its first picture"
     )
+
+
+def test_every_key_stands_on_the_page_of_the_summary():
+    """Who reads the JSON would look `given_up` up in the source."""
+    failure = Failure("source", "gone", 1, 10**18, 10**18)
+    content = summary_of(store=StoreNumbers(), failed=(failure,))
+    _, _, call = inspect.getsource(app).partition("return summary(")
+    given = set(re.findall(r"^ +(\w+)=", call, re.MULTILINE))
+    assert given - content.keys() == {"unanalyzed", "cores"}, "the facts of a real flight"
+    assert unexplained(content) == set()

@@ -39,6 +39,8 @@ STILL_WORDS: Mapping[str, str] = MappingProxyType(
         "overflow": "too many at once",
         "undecodable": "damaged",
         "base_missing": "of a frame that the ground does not have",
+        # More kinds than are counted by name.
+        "other": "for other reasons",
     }
 )
 """Word of the code → the text behind a number of stills."""

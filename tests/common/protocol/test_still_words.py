@@ -50,9 +50,9 @@ def test_each_reason_that_the_code_can_give_is_said_in_plain_words():
 
 
 def test_the_page_has_all_words_of_a_summary():
-    """Who reads the JSON would find keys that nothing explains."""
+    """Who reads the JSON would find words that nothing explains."""
     page = (ROOT / "docs" / "summary.md").read_text()
-    rows = dict(re.findall(r"^\| `([^`]+)` \| (.+?) \|$", page, re.MULTILINE))
+    rows = dict(re.findall(r"^- `([^`]+)`: (.+)$", page, re.MULTILINE))
     groups = {name: said.format(frame_rate="the frame rate") for name, said in FRAME_GROUPS.items()}
     assert set(get_args(FrameGroup)) == groups.keys()
     assert groups.items() <= rows.items()

@@ -28,6 +28,7 @@ from hvt_ground.web.feed import SessionFeed, state_message
 from hvt_ground.web.viewers import EdgePage
 from programs.processes import eventually
 from programs.rrd import Recording
+from programs.summary_page import unexplained
 from rigs.flight import Flight, Port, pipeline_of
 
 
@@ -204,6 +205,7 @@ def test_what_could_not_be_written_is_named_of_the_edge_it_concerns(ground):
     assert content["missing_events"] == {
         part: content["missing_events"][part] for part in ("second recording of uav-1", "recording of uav-10")
     }
+    assert unexplained(content) == set(), "who reads the JSON would look them up in the source"
     rows = [text for name, text in table(content) if name in ("failed", "missing")]
     assert any("second recording of uav-1" in row and "did not work again" in row for row in rows)
     assert any("events in second recording of uav-1" in row for row in rows)
