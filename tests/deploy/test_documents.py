@@ -112,7 +112,7 @@ def test_pages_named_in_the_code_exist() -> None:
     """A message or a docstring sends its reader to a page that is gone."""
     files = (
         path
-        for room in ("common", "edge", "ground", "study", "lab", "bench", "deploy")
+        for room in ("common", "edge", "ground", "extras", "study", "lab", "bench", "deploy")
         for path in (ROOT / room).rglob("*")
         if path.suffix in {".py", ".toml", ".service", ".yaml", ".json5"}
     )
