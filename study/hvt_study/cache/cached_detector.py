@@ -25,7 +25,7 @@ from hvt_common.inference.runtimes.ir_file import files_of
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Detections, Image
-from hvt_study.cache.code_digest import code_digest
+from hvt_study.cache.code_digest import DETECTING, code_digest
 from hvt_study.cache.results import CacheError, file_digest
 
 _log = logging.getLogger(__name__)
@@ -87,7 +87,7 @@ class CachedDetector(OnnxDetector):
 
 @cache
 def _versions() -> tuple[str, ...]:
-    found = [f"code {code_digest('hvt_common')}"]
+    found = [f"code {code_digest(*DETECTING)}"]
     for name in _PACKAGES:
         try:
             found.append(f"{name} {version(name)}")

@@ -8,15 +8,18 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-_FLYING = ("hvt_common", "hvt_edge", "hvt_ground", "hvt_study")
+DETECTING = ("hvt_common", "hvt_models")
+"""Has a say in what a detector finds."""
+FLYING = (*DETECTING, "hvt_codecs", "hvt_edge", "hvt_ground", "hvt_study")
+"""Has one in a flight and its figures."""
 _BESIDE = ("hvt_study/commands", "hvt_study/report")
 """Has no say in a flight or in its figures."""
 _DIGITS = 16
 
 
 def flight_code() -> str:
-    """Of all that decides a flight and its figures: the three packages that fly, and the study that measures."""
-    return code_digest(*_FLYING, without=_BESIDE)
+    """Of all that decides a flight and its figures: what flies, with the extras that have a say, and the study."""
+    return code_digest(*FLYING, without=_BESIDE)
 
 
 @cache

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+from importlib.metadata import entry_points
 
-from hvt_study.cache.code_digest import code_digest, flight_code, tree_digest
+import pytest
+
+from hvt_study.cache.code_digest import DETECTING, FLYING, code_digest, flight_code, tree_digest
 from hvt_study.runs.materials import software_versions
 
 
@@ -40,3 +43,13 @@ def test_what_runs_here_is_in_every_row():
     assert len(flight_code()) == 16
     assert code_digest("hvt_common") != flight_code()
     assert {"machine", "pillow", "msgpack"} <= versions.keys()
+
+
+@pytest.mark.parametrize(
+    ("group", "packages"), [("hvt.models", DETECTING), ("hvt.models", FLYING), ("hvt.still_codecs", FLYING)]
+)
+def test_what_comes_through_a_door_is_code_too(group, packages):
+    """A head or a codec would be mended, and the figures of the broken one would stand."""
+    own = {one.module.partition(".")[0] for one in entry_points(group=group) if one.dist.name == "hvt"}
+    assert own
+    assert own <= set(packages)
