@@ -16,6 +16,12 @@ PACKAGES = (
     "common/hvt_common",
     "edge/hvt_edge",
     "ground/hvt_ground",
+    "extras/hvt_archive",
+    "extras/hvt_codecs",
+    "extras/hvt_fleet",
+    "extras/hvt_gateways",
+    "extras/hvt_geo",
+    "extras/hvt_models",
     "study/hvt_scene",
     "study/hvt_study",
     "study/hvt_train",
@@ -50,6 +56,20 @@ def test_every_folder_of_a_package_says_what_happens_there():
         if not ast.get_docstring(ast.parse((ROOT / folder / "__init__.py").read_text(encoding="utf-8")))
     ]
     assert silent == []
+
+
+def test_a_room_names_what_is_there():
+    """Its first lines would send a newcomer to a file that is gone."""
+    rooms = {one.parent for one in modules() if one.name == "__init__.py" and str(one).startswith(PACKAGES)}
+    known = {part for one in modules() for part in one.with_suffix("").parts}
+    gone = set()
+    for room in rooms:
+        told = ast.get_docstring(ast.parse((ROOT / room / "__init__.py").read_text(encoding="utf-8"))) or ""
+        named = {one for one in re.findall(r"(?<!`)`(\w+)`(?!`)", told) if one not in known}
+        code = [one.read_text(encoding="utf-8") for one in (ROOT / room).rglob("*.py")] if named else []
+        words = {word for text in code for word in re.findall(r"\w+", text.partition('"""\n')[2])}
+        gone |= {(str(room), one) for one in named - words}
+    assert gone == set()
 
 
 def imported(path: PurePosixPath) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Decoded base and source in, tracks and candidates out: `analyzer`, `guarded_detector`, `candidates`.
+"""Decoded base and source in, tracks and candidates out: `analyzer`, `candidates`.
 
 `shadow` measures what the ground would miss, and how far the ground's own count differs; by that `levers` decides
 what ``auto`` sends. `crop` says where a still is cut and what the base lost there; `frame_ring` keeps source frames.
