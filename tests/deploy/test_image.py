@@ -63,7 +63,7 @@ def test_extras_are_those_of_the_distribution() -> None:
 
 
 def test_what_is_copied_builds_the_wheel(tmp_path: Path) -> None:
-    """hatchling leaves out a package that was not copied, and says nothing: its commands would fail in the air."""
+    """Hatchling leaves out a package that was not copied, and says nothing: its commands would fail in the air."""
     pytest.importorskip("hatchling", reason="hatchling is not installed: nothing to build a wheel with")
     for sources, destination in _copies():
         if destination.startswith("/"):
