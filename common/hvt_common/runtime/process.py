@@ -42,6 +42,8 @@ _MMAP_THRESHOLD_BYTES = 4 << 20
 """A 1080p frame is mapped on its own and given back at once; a 720p frame is not, which would cost a tenth of the
 edge's time."""
 _TRIM_THRESHOLD_BYTES = 16 << 20
+_ours = threading.Event()
+"""Set once the allocator is as a program of this project wants it."""
 
 
 def stop_on_signals() -> threading.Event:
@@ -187,28 +189,21 @@ def limit_malloc_arenas() -> None:
 
     Where the environment has any ``MALLOC_*``, nothing is changed.
     """
+    if sys.platform != "linux" or any(name.startswith("MALLOC_") for name in os.environ):
+        return
     with contextlib.suppress(OSError, AttributeError):  # another C library
-        if (library := _malloc()) is None:
-            return
-        mallopt = library.mallopt
+        mallopt = ctypes.CDLL(None).mallopt
         mallopt(_M_ARENA_MAX, _ARENAS)
         mallopt(_M_MMAP_THRESHOLD, _MMAP_THRESHOLD_BYTES)
         mallopt(_M_TRIM_THRESHOLD, _TRIM_THRESHOLD_BYTES)
+        _ours.set()
 
 
 def give_back_holes() -> None:
-    """Return the free pages between pictures to the system, which takes a millisecond; only with glibc.
+    """Return the free pages between pictures to the system, which takes a millisecond.
 
-    Once a second it holds a flight's peak to what its parts hold at the same time. Where the environment has any
-    ``MALLOC_*``, nothing is done.
+    Once a second it holds a flight's peak to what its parts hold at the same time. Only after `limit_malloc_arenas`:
+    in a program that is not ours all its memory would be gone through, each second.
     """
-    with contextlib.suppress(OSError, AttributeError):
-        if (library := _malloc()) is not None:
-            library.malloc_trim(0)
-
-
-@functools.cache
-def _malloc() -> ctypes.CDLL | None:
-    # The C library whose allocator is ours to set.
-    others = any(name.startswith("MALLOC_") for name in os.environ)
-    return None if others or not sys.platform.startswith("linux") else ctypes.CDLL(None)
+    if _ours.is_set():
+        ctypes.CDLL(None).malloc_trim(0)

@@ -7,10 +7,12 @@ import platform
 import subprocess
 import sys
 import threading
+from unittest.mock import Mock
 
 import pytest
 
-from hvt_common.runtime.process import NewThreads, lower_priority
+from hvt_common.runtime import process
+from hvt_common.runtime.process import NewThreads, give_back_holes, limit_malloc_arenas, lower_priority
 
 only_with_glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is about glibc's heaps")
 
@@ -92,6 +94,22 @@ def test_what_lies_between_pictures_is_given_back():
         [sys.executable, "-c", HOLES], capture_output=True, text=True, check=True, timeout=60
     )
     assert int(done.stdout) >= 40, "of 60"
+
+
+@pytest.mark.parametrize(
+    ("set_up", "trims"), [((), 0), ((limit_malloc_arenas,), 1)], ids=["another program", "ours"]
+)
+def test_the_memory_of_another_program_is_left_alone(set_up, trims, monkeypatch):
+    """An edge within a program that holds gigabytes would go through all of them each second, with its locks held."""
+    libc = Mock()
+    monkeypatch.setattr(process.ctypes, "CDLL", Mock(return_value=libc))
+    monkeypatch.setattr(process, "_ours", threading.Event())
+    monkeypatch.setattr(process.sys, "platform", "linux")
+    monkeypatch.setattr(process.os, "environ", {})
+    for one in set_up:
+        one()
+    give_back_holes()
+    assert libc.malloc_trim.call_count == trims
 
 
 DETECTING = """
