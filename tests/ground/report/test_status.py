@@ -176,9 +176,9 @@ def test_a_camera_whose_clock_is_wrong_is_as_old_as_its_arrival(tmp_path):
     assert edge.session.picture_age_s == pytest.approx(4.0, abs=0.2)
     assert edge.session.delay_p50_ms is None
     shown = Shown()
-    ground.sessions.session.sinks.append(
-        SessionFeed(flight.info(), EdgePage("uav-1"), shown, clock=ground.clock)
-    )
+    sinks = ground.sessions.session.sinks
+    assert isinstance(sinks, list)
+    sinks.append(SessionFeed(flight.info(), EdgePage("uav-1"), shown, clock=ground.clock))
     ground.sessions.handle(replace(flight.base(5), received_ns=now_ns[0]))
     ground.sessions.session.note("info", "a line")
     came_ms = (now_ns[0] - 4 * SECOND_NS + SECOND_NS // 15) / 1e6  # it waited behind the hole
