@@ -125,6 +125,7 @@ def test_a_third_party_codec_codes_and_decodes(installed, target):
         ("import nowhere_to_be_found", "does not load: ModuleNotFoundError"),
         ("", "does not load: AttributeError"),
         ("class C: pass", "its name is None"),
+        ("class C:\n def lacking(self): pass", "does not load: TypeError"),
         ("class C: name = 'other'", "its name is 'other', and has to be the entry point's"),
         ("class C: name, media_type = 'acme', 'picture'", "its media_type is 'picture'"),
         ("class C: name, media_type = 'acme', 'image/x'", "its needs_base is None"),
@@ -141,6 +142,15 @@ def test_a_broken_plug_in_is_named_and_hinders_nobody(installed, source, says):
     assert still_codec("jpeg").name == "jpeg"
     with pytest.raises(UserError, match=f"'acme' of package acme_broken .*{says}"):
         still_codec("acme")
+
+
+@pytest.mark.parametrize("source", ["raise RuntimeError('no licence')", "class C: name = 'webp'"])
+def test_another_webp_hinders_nobody(installed, source):
+    """Every ground with that package would end at its start, which asks for the names, or say that it reads webp."""
+    installed({"webp": "C"}, module="acme_webp", source=source)
+    assert "webp" not in still_codec_names()
+    with pytest.raises(UserError, match="still codec 'webp' comes from both package"):
+        still_codec("webp")
 
 
 def test_a_name_that_is_taken_is_refused(installed):

@@ -7,6 +7,7 @@ its codec is requested by name, so that a broken plug-in matters only where it i
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Mapping
 from functools import cache
@@ -45,7 +46,7 @@ _REMOVED = ("jpeg-lite", "avif-lite", "hevc-intra")
 def still_codec_names() -> tuple[str, ...]:
     """The names that `still_codec` takes on this machine: HVT's own, then plug-ins by name; loads none of these."""
     found = installed(GROUP)
-    own = [name for name in _BROUGHT_BY if name in found and _part(found[name][0])[1] is None]
+    own = [name for name in _BROUGHT_BY if name in found and _works(name)]
     return (*_BUILT_IN, *own, *sorted(found.keys() - _BUILT_IN.keys() - _BROUGHT_BY.keys()))
 
 
@@ -69,18 +70,23 @@ def still_codec(name: str) -> StillCodec:
     raise UserError(f"still codec {name!r} is not known: choose one of {', '.join(still_codec_names())}")
 
 
-def _part(entry: EntryPoint) -> tuple[Any, str | None]:
-    # The entry's object, and why it does not work on this machine, if it tells.
-    part = loaded(entry, lambda part: part, what=_WHAT)
-    return part, part.lacking() if hasattr(part, "lacking") else None
+def _works(name: str) -> bool:
+    with contextlib.suppress(UserError):
+        return still_codec(name) is not None
+    return False
 
 
 def _plugged_in(entry: EntryPoint) -> StillCodec:
-    part, lacking = _part(entry)
+    def made(part: Any) -> tuple[Any, str | None]:
+        # The codec, or why it does not work on this machine, if it tells.
+        lacking = part.lacking() if hasattr(part, "lacking") else None
+        wanted = lacking is None and (isinstance(part, type) or not hasattr(part, "encode"))
+        return part() if wanted else part, lacking
+
+    found: tuple[StillCodec, str | None] = loaded(entry, made, what=_WHAT)
+    codec, lacking = found
     if lacking is not None:
         raise UserError(f"still codec {entry.name!r} is not available: {lacking}")
-    made = isinstance(part, type) or not hasattr(part, "encode")
-    codec: StillCodec = loaded(entry, lambda part: part() if made else part, what=_WHAT)
     wrong = _faults(entry.name, codec)
     if wrong:
         raise UserError(f"still codec {entry.name!r} of {origin(entry)} breaks the contract: {wrong}")
