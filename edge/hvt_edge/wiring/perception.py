@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Literal, cast
@@ -90,11 +89,15 @@ def make_analyzer(
 
 
 def make_shadow(
-    config: EdgeConfig, detector: FailingDetector, *, before: Shadow = UNMEASURED
+    config: EdgeConfig,
+    detector: FailingDetector,
+    *,
+    before: Shadow = UNMEASURED,
+    spent_ns: Callable[[], int] | None = None,
 ) -> ShadowGround | None:
     """The shadow ground, which measures how much of the source the base shows; None where nothing depends on it.
 
-    It goes on from what was measured ``before``.
+    It goes on from what was measured ``before``, and looks less often where that takes long by ``spent_ns``.
 
     `MOTION` remembers the pictures of one stream, and those of the base are another.
     """
@@ -109,7 +112,7 @@ def make_shadow(
         whole,
         settings=ShadowSettings(confidence=track_confidence(config)),
         before=before,
-        spent_ns=None if config.pace == "lockstep" else time.thread_time_ns,
+        spent_ns=spent_ns,
     )
 
 

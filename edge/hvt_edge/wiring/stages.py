@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -265,7 +266,9 @@ def build_stages(
         keyframes=keyframes,
         tracks_used=config.tracks_used,
         reporter=TrackReporter(transmitter, session_id=session_id) if config.send_tracks else None,
-        shadow=make_shadow(config, detector, before=beginning.shadow),
+        shadow=make_shadow(
+            config, detector, before=beginning.shadow, spent_ns=None if lockstep else time.thread_time_ns
+        ),
         levers=levers,
     )
     commands = Commands(
