@@ -66,8 +66,11 @@ def test_a_report_that_cannot_be_used_lowers_the_rate_and_video_goes_on(tmp_path
         assert (failed.part, failed.working) == ("reports", False)
         assert "OverflowError: too much" in failed.reason
         inbox.broken = False
-        rig.play(105, 205, reports=True)
-        assert rig.pacer.rate_bps > 100_000, "it grows again"
+        rates = []
+        for first in range(105, 205, 10):
+            rig.play(first, first + 10, reports=True)
+            rates.append(rig.pacer.rate_bps)
+        assert max(rates) > 100_000, "it grows again"
         assert rig.failures.parts[0].working
     finally:
         rig.backlog.close()
