@@ -161,7 +161,7 @@ class Traffic:
     """Base, stills, metadata and transport overhead."""
     budget_bps: float
     receive_latency_ms: float | None
-    """Capture to receive, the newest frame; None where clocks do not allow it (lockstep)."""
+    """Capture to receive, the newest frame; None where clocks do not tell (lockstep, a camera's that is wrong)."""
     overlay_latency_ms: float | None
     """Capture to overlay."""
     tracks: int

@@ -59,8 +59,9 @@ class DecodedFrame:
 
     frame_index: int
     capture_ns: int
-    reference_ns: int
-    """The moment on our clock that latency counts from: capture, or in lockstep the receiving."""
+    reference_ns: int | None
+    """The moment on our clock that latency counts from: capture, or in lockstep the receiving; None where the
+    camera's clock cannot be right."""
     picture: Image | YuvPicture
     """Converted to BGR by whom it is analyzed."""
 

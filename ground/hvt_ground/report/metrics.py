@@ -47,7 +47,7 @@ _GAUGES: Table[SessionState] = {
     "hvt_view_trust_ratio": ("Mean confidence of the ground's detector.", lambda one: one.view_trust),
     "hvt_view_unlike": (
         "1: the view is unlike what the ground's detector knows.",
-        lambda one: int(one.view_unlike),
+        lambda one: None if one.view_trust is None else int(one.view_unlike),
     ),
     "hvt_stills_pending": ("To be read.", lambda one: one.stills_pending),
     "hvt_budget_used_ratio": ("Of the edge's budget.", lambda one: one.budget_share),

@@ -182,10 +182,11 @@ class GroundSession:
         self._emit(VideoSample(header.frame_index, header.capture_ns, item.payload, header.keyframe))
         self.backlog.live(header.frame_index, item.payload, keyframe=header.keyframe, after_gap=starts_run)
         # In lockstep capture and sending are media time and say nothing of delay: count from here.
-        reference_ns = (
-            item.received_ns if self.lockstep else self._capture_clock.to_local_ns(header.capture_ns)
-        )
-        self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
+        reference_ns = item.received_ns if self.lockstep else None
+        if self.knows_delay:
+            reference_ns = self._capture_clock.to_local_ns(header.capture_ns)
+        if reference_ns is not None:
+            self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
         self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, picture))
         if self._account.traffic_due(header):
             self._account.traffic(header, tracks=self.perceived.tracks, tracks_refined=self.perceived.refined)
@@ -487,7 +488,8 @@ class GroundSession:
     def _analyze(self, picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - called by the worker only
         self.pipeline.analyze(picture, hurry=hurry)
         self._analyzed = (picture.frame_index, self.pipeline.objects_detected)
-        self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
+        if picture.reference_ns is not None:
+            self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
         self._collect_results()
         if self.lockstep:
             self.report()

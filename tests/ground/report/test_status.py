@@ -134,6 +134,8 @@ def test_who_gets_no_stills_reads_why(ground):
 def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground):
     """Who came later, or reads tables alone, took guesses for objects."""
     assert "UNKNOWN VIEW" not in ground.line()
+    text = metrics_text(ground.maker.make([("uav-1", ground.sessions)])).decode()
+    assert "hvt_view_unlike{" not in text, "nobody knows yet"
     trust = ground.opened[0].pipeline.trust
     trust.mean, trust.unlike = 0.53, True
     assert "refined  UNKNOWN VIEW" in ground.line()
@@ -171,6 +173,8 @@ def test_a_camera_whose_clock_is_wrong_is_as_old_as_its_arrival(tmp_path):
     for index in range(5):
         now_ns[0] += SECOND_NS // 15
         ground.sessions.handle(replace(flight.base(index), received_ns=now_ns[0]))
+    traffic = ground.sessions.session.traffic(now_ns[0])
+    assert (traffic.receive_latency_ms, traffic.overlay_latency_ms) == (None, None), "a recording plots them"
     now_ns[0] += 4 * SECOND_NS
     (edge,) = ground.maker.make([("uav-1", ground.sessions)]).edges
     assert edge.session.picture_age_s == pytest.approx(4.0, abs=0.2)
@@ -185,6 +189,11 @@ def test_a_camera_whose_clock_is_wrong_is_as_old_as_its_arrival(tmp_path):
     assert shown.captured_ms == pytest.approx(came_ms, abs=5)
     ground.sessions.close()
     ground.outputs.close()
+    content = summary(ground.ended[0])
+    assert content["frames_decoded"] == 6
+    assert content["latency_ms"]["p50"] is None
+    assert "latency" not in dict(table(content)), "it said ``capture to overlay: p50 12 ms``"
+    assert content["receive_latency_ms"]["p50"] is None
     said = [text for _, _, text in Recording(ground.path).events()]
     assert sum("the camera's clock is" in one and "s off" in one for one in said) == 1
 
