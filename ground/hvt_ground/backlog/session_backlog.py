@@ -104,12 +104,14 @@ class LateStills:
             return
         classes = zip(overlay.classes, stills, strict=True)
         confidences = zip(overlay.confidences.tolist(), stills, strict=True)
+        guesses = [False] * len(tracks) if overlay.doubted is None else overlay.doubted.tolist()
+        doubts = zip(guesses, stills, strict=True)
         yield replace(
             overlay,
             classes=tuple(still.class_after if still else name for name, still in classes),
             confidences=np.array([s.confidence if s else own for own, s in confidences], np.float32),
             refined=np.array([still is not None for still in stills], np.bool_),
-            doubted=np.array([still is not None and still.doubted for still in stills], np.bool_),
+            doubted=np.array([s.doubted if s else own for own, s in doubts], np.bool_),
         )
 
 

@@ -6,6 +6,7 @@ import csv
 import itertools
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -27,9 +28,12 @@ from hvt_common.protocol.messages import (
 from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.transport.inbox import Received
+from hvt_common.values import Posterior
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import FIRST_TRACK_ID, BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
+from hvt_ground.backlog.session_backlog import LateStills
+from hvt_ground.events import Overlay
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job, RealtimeWorker
@@ -46,6 +50,7 @@ from programs.small_disk import small_disk
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
 from rigs.flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from rigs.handled import WatchedInbox, check, end
+from rigs.stills import seen
 
 FIRST_STORED = 2**31
 PICTURE = DecodedFrame(0, 0, 0, np.zeros((8, 8, 3), np.uint8))
@@ -386,6 +391,22 @@ def test_stills_of_an_outage_name_the_tracks_of_its_video(flight, tmp_path, own)
     before, after = (recording.boxes(frame)[FIRST_TRACK_ID] for frame in (43, 50))
     assert (before.class_after, before.refined) == ("car", False)
     assert (after.class_after, after.refined, after.label) == ("bus", True, f"{FIRST_TRACK_ID} bus")
+
+
+def test_a_still_names_its_own_track_and_no_guess_beside_it():
+    """One named car in stored video made every guess around it as firm as itself."""
+    late = LateStills()
+    bus = Posterior("bus", 0.9, 0.3, np.array([0.1, 0.9], np.float32))
+    late.take(replace(seen(0, 5, bus, (0.0, 0.0, 20.0, 20.0), edge=1).event, stored=True))
+    boxes = np.array([(0, 0, 20, 20), (50, 50, 60, 60), (80, 80, 90, 90)], np.float32)
+    overlay = Overlay(
+        *(5, 0, np.arange(1, 4), boxes, ("car",) * 3, ("car",) * 3, np.full(3, 0.4, np.float32)),
+        refined=np.zeros(3, np.bool_),
+        stored=True,
+        doubted=np.array([True, True, False]),
+    )
+    *_, shown = late.named(overlay)
+    assert shown.words == ("bus", "something", "car")
 
 
 def test_a_still_at_a_frame_that_is_known_speaks_on_its_track(flight, tmp_path):
