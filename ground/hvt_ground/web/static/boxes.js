@@ -1,6 +1,6 @@
 // Boxes and names on the picture, in step with it; a click or a drag is a box too.
 
-import { boxWords } from "./words.js";
+import { boxWords, trackName } from "./words.js";
 
 /** @typedef {{id: number, box: number[], name: string, sureness: number, read?: 1, doubted?: 1, sure?: 1}} Track */
 /** @typedef {{frame: number, captured: number, tracks: Track[], colours: Record<string, string>}} Overlay */
@@ -122,7 +122,7 @@ export class Boxes {
   /** Those that are drawn. */
   drawn() {
     if (!this.shown) return [];
-    return (this.current()?.tracks ?? []).filter((track) => !this.left.has(track.name));
+    return (this.current()?.tracks ?? []).filter((track) => !this.left.has(trackName(track)));
   }
 
   /** @param {string} name */

@@ -297,11 +297,12 @@ function listTracks() {
 
 /**
  * A button for each class that was there, in its colour.
- * @param {{name: string}[]} tracks
+ * @param {{name: string, doubted?: 1}[]} tracks
  */
 function listClasses(tracks) {
   const known = new Set([...by("classes").children].map((one) => one.dataset.name));
-  for (const { name } of tracks) {
+  for (const track of tracks) {
+    const name = words.trackName(track);
     if (known.has(name) || known.size >= 24) continue;
     known.add(name);
     const button = make("button", "", by("classes"));

@@ -177,8 +177,8 @@ export function tracksTitle(count, behind) {
   return behind ? `Tracks: ${count} (${behind})` : `Tracks: ${count}`;
 }
 
-/** @param {TrackFacts} track */
-const trackName = (track) => (track.doubted ? "something" : track.name);
+/** @param {{name: string, doubted?: 1}} track */
+export const trackName = (track) => (track.doubted ? "something" : track.name);
 
 /** @param {TrackFacts} track */
 export const trackWords = (track) => `${trackName(track)} ${track.id}, ${percent(track.sureness)}`;
@@ -210,7 +210,7 @@ export const BASE_ALT = "what the base stream showed";
 // Commands, and what came of them
 
 /** @param {TrackFacts | null} track */
-const place = (track) => (track ? `${track.name} ${track.id}` : "this place");
+const place = (track) => (track ? `${trackName(track)} ${track.id}` : "this place");
 
 /** @param {string} edge @param {TrackFacts | null} track */
 export const askingStill = (edge, track) => `asking ${edge} for ${place(track)}`;
