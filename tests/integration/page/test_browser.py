@@ -109,9 +109,9 @@ def test_the_picture_moves_at_the_rate_of_the_stream(page):
 
     def moved() -> bool:
         seen.add(page.evaluate(_PIXELS))
-        return len(seen) > 8
+        return len(seen) > 20
 
-    eventually(moved, within_s=90, what="other pixels")
+    eventually(moved, within_s=20, what="other pixels")
     assert frame(page) - first > 4 * (time.monotonic() - began_s), "a stream of 15, on a machine that is busy"
     assert "H.264" in page.inner_text("#rung") or "HEVC" in page.inner_text("#rung")
     assert int(page.locator("#age").get_attribute("data-ms")) < 3000
