@@ -152,6 +152,7 @@ class Ground:
             )
             try:
                 self._serve(link, factory, line, watch, models, page, group)
+                models.give_up()
                 self._close_edges()
             except Exception as error:
                 if models.error is not None:

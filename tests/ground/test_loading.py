@@ -5,16 +5,19 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
+from hvt_ground import app
 from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception import models as ground_models
+from hvt_ground.perception.pipeline import NotOpenError
 from hvt_ground.report.state import StateMaker
-from hvt_ground.report.status import status_text, summary
+from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.sinks import Outputs
 from hvt_ground.wiring import Models, SessionFactory
@@ -49,6 +52,11 @@ def compiler(monkeypatch: pytest.MonkeyPatch):
     compiler.done.set()
 
 
+def nothing(_info: object):
+    """A program that takes nothing, in place of a recording."""
+    return lambda: SimpleNamespace(path=None, log=lambda _: None, close=lambda _=None: None)
+
+
 def test_video_is_recorded_while_the_detector_loads_and_boxes_come_with_it(compiler, tmp_path: Path) -> None:
     """A viewer on a busy machine saw nothing for 40 s, and nothing of them was recorded."""
     config = check(GroundConfig(classifier="none", record=tmp_path / "a.rrd"))
@@ -75,11 +83,37 @@ def test_video_is_recorded_while_the_detector_loads_and_boxes_come_with_it(compi
     assert len(Recording(tmp_path / "a.rrd").video()) == FRAMES
 
 
-def test_the_link_is_open_before_the_detector(compiler, free_port: int) -> None:
+def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(compiler) -> None:
+    """Whoever stopped a ground in lockstep read that no edge was heard, and waited for the detector to learn it."""
+    config = check(GroundConfig(classifier="none"))
+    outputs, models = Outputs(Failures(time.time_ns)), Models(config)
+    factory = SessionFactory(config, models, clock=time.time_ns, outputs=outputs, view=None, program=nothing)
+    ended, flight, port = [], Flight(2, pace="lockstep"), Port()
+    port.flight = flight
+    sessions = EdgeSessions(port, open_session=factory.open_session, on_ended=ended.append)
+    for index in range(2):
+        sessions.handle(flight.base(index))
+    models.give_up()
+    closing = threading.Thread(target=sessions.close, daemon=True)
+    closing.start()
+    closing.join(20)
+    assert not closing.is_alive()
+    content = summary(ended[0])
+    assert (content["frames_decoded"], content["failure"]) == (2, "")
+    told = completed(content, sessions)
+    assert dict(table(told))["tracks"] == "not known: the detector has looked at no picture"
+    outputs.close()
+
+
+def test_the_link_is_open_before_the_detector(compiler, free_port: int, monkeypatch) -> None:
     """An edge would find nobody, and fly its first minute for no one."""
     stop = threading.Event()
     config = check(GroundConfig(listen=(f"tcp/127.0.0.1:{free_port}",), classifier="none", quiet=True))
+    made: list[Models] = []
+    monkeypatch.setattr(app, "Models", lambda config: made.append(Models(config)) or made[-1])
     assert Ground(config, stop=stop, on_started=stop.set).run() == []
+    with pytest.raises(NotOpenError, match="the run ended before"):
+        made[0].take()
 
 
 def test_a_detector_that_is_none_after_all_ends_the_run_with_its_sentence(compiler, free_port: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from functools import partial
 
 from hvt_common.inference.classify import Classifier, open_classifier
@@ -17,6 +17,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.process import lower_priority
 from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
+from hvt_ground.perception.pipeline import NotOpenError
 from hvt_ground.perception.stills.vocabulary import check_common
 from hvt_ground.perception.turns import Turns
 
@@ -48,7 +49,7 @@ class Models:
     @property
     def loading(self) -> bool:
         """Whether they are not open yet."""
-        return not self._opened.done()
+        return self._opened.cancelled() or not self._opened.done()
 
     @property
     def error(self) -> BaseException | None:
@@ -58,19 +59,32 @@ class Models:
     def take(self) -> ModelSet:
         """A detector, and a classifier where one is wanted, once they are open; each `MOTION` detector is a new one.
 
-        It remembers pictures. Raises `UserError` where a setting or a file of them cannot be used.
+        It remembers pictures. Raises `UserError` where a setting or a file of them cannot be used, and
+        `NotOpenError` where nobody is to wait for them any more.
         """
-        opened = self._opened.result()
+        try:
+            opened = self._opened.result()
+        except CancelledError:
+            raise NotOpenError("the run ended before the detector was open") from None
         return (self._open_detector(), opened[1]) if self._config.detector == MOTION else opened
+
+    def give_up(self) -> None:
+        """The run ends: whoever waits for them waits no longer."""
+        self._opened.cancel()
 
     def _load(self) -> None:
         if self._config.threads > 1:  # workers have the priority of whoever opens the network
             lower_priority()
+        opened, failed = None, None
         try:
             opened = self._open()
             self._check(opened)
         except BaseException as error:  # noqa: BLE001 - raised where they are taken
-            self._opened.set_exception(error)
+            failed = error
+        if not self._opened.set_running_or_notify_cancel():
+            return
+        if failed is not None or opened is None:
+            self._opened.set_exception(failed)
         else:
             self._opened.set_result(opened)
 

@@ -166,6 +166,11 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     lossless = (
         "no gaps" if not content["gaps"] else f"{content['gaps']} gaps, {content['lost']} messages lost"
     )
+    tracks = (
+        f"{content['tracks']}, {content['tracks_refined']} refined, {content['class_changes']} class changes"
+    )
+    if not (content["tracks"] or content["detections_run"]):
+        tracks = "not known: the detector has looked at no picture"
     rows = [
         ("session", f"{content['session']}, {content['method']}"),
         ("frames", f"{content['frames_decoded']} decoded in {content['duration_s']:.1f} s, {lossless}"),
@@ -181,10 +186,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
             + (f" ({outcomes})" if outcomes else "")
             + (f"; the edge did not send: {not_sent}" if not_sent else ""),
         ),
-        (
-            "tracks",
-            f"{content['tracks']}, {content['tracks_refined']} refined, {content['class_changes']} class changes",
-        ),
+        ("tracks", tracks),
         ("keyframes", f"{content['keyframe_requests']} requested"),
     ]
     if content["view_unlike"]:

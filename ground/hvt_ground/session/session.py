@@ -7,8 +7,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from functools import partial
+from contextlib import ExitStack, suppress
+from functools import partial, wraps
+from typing import ParamSpec
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.clock_offset import ClockOffset
@@ -40,7 +41,13 @@ from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.receiver import BasePacket
 from hvt_ground.link.sequence_window import StillSequenceWindow
 from hvt_ground.link.statistics import ReceptionStatistics, SessionAccount
-from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
+from hvt_ground.perception.pipeline import (
+    DecodedFrame,
+    NothingPerceived,
+    NotOpenError,
+    Pipeline,
+    ReceivedStill,
+)
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.poses import NOWHERE, Locator, SessionPoses
 from hvt_ground.session.edge_port import ReceiverReports
@@ -56,6 +63,18 @@ _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""
 
 WorkerFactory = Callable[[Analyze, Step, Read], PerceptionWorker]
+
+P = ParamSpec("P")
+
+
+def _perceives(act: Callable[P, None]) -> Callable[P, None]:
+    # Of the worker's calls: there is nothing to do where the run ends before models are open.
+    @wraps(act)
+    def acts(*given: P.args, **named: P.kwargs) -> None:
+        with suppress(NotOpenError):
+            act(*given, **named)
+
+    return acts
 
 
 class GroundSession:
@@ -485,6 +504,7 @@ class GroundSession:
 
     # In the worker's thread
 
+    @_perceives
     def _analyze(self, picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - called by the worker only
         self.pipeline.analyze(picture, hurry=hurry)
         self._analyzed = (picture.frame_index, self.pipeline.objects_detected)
@@ -494,13 +514,16 @@ class GroundSession:
         if self.lockstep:
             self.report()
 
+    @_perceives
     def _pass_over(self, frame_index: int, capture_ns: int) -> None:
         self.pipeline.pass_over(frame_index, capture_ns)
 
+    @_perceives
     def _step(self, tracks: Tracks, capture_ns: int) -> None:
         self.pipeline.edge_step(tracks, capture_ns=capture_ns)
         self._collect_results()
 
+    @_perceives
     def _read(self, stills: Sequence[ReceivedStill]) -> None:
         self.pipeline.read(stills)
         self._emit(StillsRead(tuple(one.header.sequence for one in stills), self._clock()))

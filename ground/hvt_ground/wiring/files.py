@@ -40,7 +40,7 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
 
 
 def make_record_folder(config: GroundConfig) -> None:
-    """Comes after all that may be refused: a failed start leaves nothing behind."""
+    """Comes after all that may be refused at once: a start that is refused leaves nothing behind."""
     record = config.record
     if record is None or record.suffix == ".rrd":
         return
