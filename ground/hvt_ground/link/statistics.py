@@ -233,7 +233,7 @@ class SessionAccount:
         at_ns, ledger = header.send_ns, self.ledger
         self._next_traffic_ns = at_ns + SECOND_NS // 2
         to_bps = 8 * SECOND_NS / self._info.window_ns
-        told = self._info.pace != "lockstep" and self._clock_offset.is_sound
+        sound = self._info.pace != "lockstep" and self._clock_offset.is_sound
         self.last_traffic = Traffic(
             frame_index=header.frame_index,
             capture_ns=header.capture_ns,
@@ -241,8 +241,8 @@ class SessionAccount:
             roi_bps=ledger.window_bytes(Account.ROI, at_ns) * to_bps,
             total_bps=ledger.window_bytes(None, at_ns) * to_bps,
             budget_bps=self.budget_bps,
-            receive_latency_ms=self.receive_latency.percentile(50) if told else None,
-            overlay_latency_ms=self.overlay_latency.percentile(50) if told else None,
+            receive_latency_ms=self.receive_latency.percentile(50) if sound else None,
+            overlay_latency_ms=self.overlay_latency.percentile(50) if sound else None,
             tracks=tracks,
             tracks_refined=tracks_refined,
         )
