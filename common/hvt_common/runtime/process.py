@@ -42,7 +42,7 @@ _MMAP_THRESHOLD_BYTES = 4 << 20
 """A 1080p frame is mapped on its own and given back at once; a 720p frame is not, which would cost a tenth of the
 edge's time."""
 _TRIM_THRESHOLD_BYTES = 16 << 20
-_ours = threading.Event()
+allocator_set = threading.Event()
 """Set once the allocator is as a program of this project wants it."""
 
 
@@ -196,7 +196,7 @@ def limit_malloc_arenas() -> None:
         mallopt(_M_ARENA_MAX, _ARENAS)
         mallopt(_M_MMAP_THRESHOLD, _MMAP_THRESHOLD_BYTES)
         mallopt(_M_TRIM_THRESHOLD, _TRIM_THRESHOLD_BYTES)
-        _ours.set()
+        allocator_set.set()
 
 
 def give_back_holes() -> None:
@@ -205,5 +205,5 @@ def give_back_holes() -> None:
     Once a second it holds a flight's peak to what its parts hold at the same time. Only after `limit_malloc_arenas`:
     in a program that is not ours all its memory would be gone through, each second.
     """
-    if _ours.is_set():
+    if allocator_set.is_set():
         ctypes.CDLL(None).malloc_trim(0)

@@ -103,7 +103,7 @@ def test_the_memory_of_another_program_is_left_alone(set_up, trims, monkeypatch)
     """An edge within a program that holds gigabytes would go through all of them each second, with its locks held."""
     libc = Mock()
     monkeypatch.setattr(process.ctypes, "CDLL", Mock(return_value=libc))
-    monkeypatch.setattr(process, "_ours", threading.Event())
+    monkeypatch.setattr(process, "allocator_set", threading.Event())
     monkeypatch.setattr(process.sys, "platform", "linux")
     monkeypatch.setattr(process.os, "environ", {})
     for one in set_up:
