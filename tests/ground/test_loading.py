@@ -15,7 +15,7 @@ from hvt_ground import app
 from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception import models as ground_models
-from hvt_ground.perception.pipeline import NotOpenError
+from hvt_ground.perception.models import NotOpenError
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_sessions import EdgeSessions

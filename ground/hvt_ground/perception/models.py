@@ -17,7 +17,6 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.process import lower_priority
 from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
-from hvt_ground.perception.pipeline import NotOpenError
 from hvt_ground.perception.stills.vocabulary import check_common
 from hvt_ground.perception.turns import Turns
 
@@ -27,6 +26,10 @@ _USUAL_SIZE = (1280, 720)
 """The usual size of base streams; an edge's own is known with its first picture."""
 
 ModelSet = tuple[FailingDetector, Classifier | None]
+
+
+class NotOpenError(Exception):
+    """The run ends, and its models are not open: nobody looks at what has come."""
 
 
 class Models:

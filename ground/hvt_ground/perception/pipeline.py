@@ -30,7 +30,7 @@ from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 from hvt_ground.perception.turns import Turns
 
-__all__ = ["DecodedFrame", "NotOpenError", "NothingPerceived", "Pipeline", "PipelineParts", "ReceivedStill"]
+__all__ = ["DecodedFrame", "NothingPerceived", "Pipeline", "PipelineParts", "ReceivedStill"]
 
 _FARTHEST_S = 5
 """A step further ahead of all that is known is not plausible: nothing that comes after it could be shown."""
@@ -87,10 +87,6 @@ class PipelineParts:
     """None where the detector's scores are no probabilities."""
     patient: bool = False
     """Wait for a turn, however long: what is due is always detected, as lockstep needs it."""
-
-
-class NotOpenError(Exception):
-    """The run ends, and its models are not open: nobody looks at what has come."""
 
 
 class NothingPerceived:

@@ -41,13 +41,8 @@ from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.receiver import BasePacket
 from hvt_ground.link.sequence_window import StillSequenceWindow
 from hvt_ground.link.statistics import ReceptionStatistics, SessionAccount
-from hvt_ground.perception.pipeline import (
-    DecodedFrame,
-    NothingPerceived,
-    NotOpenError,
-    Pipeline,
-    ReceivedStill,
-)
+from hvt_ground.perception.models import NotOpenError
+from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.poses import NOWHERE, Locator, SessionPoses
 from hvt_ground.session.edge_port import ReceiverReports
