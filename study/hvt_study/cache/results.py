@@ -17,6 +17,8 @@ from hvt_common.errors import UserError
 
 _log = logging.getLogger(__name__)
 _CHUNK_BYTES = 1 << 20
+FLIGHTS = "flights"
+"""Of the cache: results of flights."""
 
 
 class CacheError(UserError):

@@ -1,7 +1,11 @@
-"""How far a study is: a bar on a terminal; elsewhere a line at once, one with the first estimate, one a minute."""
+"""How far a study is: a bar on a terminal; elsewhere a line at once, one with the first estimate, one a minute.
+
+The first line comes also while what is measured is still opened.
+"""
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from datetime import timedelta
@@ -12,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 _LINE_EVERY_S = 60
-_FIRST_LINE_S = 2
+_FIRST_LINE_S = 1.0
 """What cannot be done at all says so sooner."""
 _REMEMBERED = 64
 _LEAST = 4
@@ -38,6 +42,9 @@ class RunProgress:
             transient=True,
         )
         self._task = self._bar.add_task(what, total=None, more="")
+        self._lock = threading.Lock()
+        self._first_line = threading.Timer(_FIRST_LINE_S, self._say_first)
+        self._first_line.daemon = True
 
     def update(self, done: int, of: int, left_s: float | None = None, *, failed: int = 0) -> None:
         """So many are done, of so many; ``left_s`` where the time left is known better than by how fast they were."""
@@ -48,12 +55,13 @@ class RunProgress:
             self._steps.append((now_s, done))
         more = self._more(time_left_s(self._steps, of) if left_s is None else left_s, failed)
         self._bar.update(self._task, completed=done, total=of, more=more)
-        first = not self._said and now_s - self._began_s >= _FIRST_LINE_S
-        news = first or (bool(more) and not self._estimated) or done == of
-        if not self._console.is_terminal and (news or now_s - self._said_s >= _LINE_EVERY_S):
-            self._said, self._estimated, self._said_s = True, self._estimated or bool(more), now_s
-            gone = timedelta(seconds=round(now_s - self._began_s))
-            self.note(f"{self._what}: {done} of {of} in {gone}" + f", {more}" * bool(more))
+        news = (bool(more) and not self._estimated) or done == of
+        with self._lock:
+            first = not self._said and now_s - self._began_s >= _FIRST_LINE_S
+            if not self._console.is_terminal and (news or first or now_s - self._said_s >= _LINE_EVERY_S):
+                self._said, self._estimated, self._said_s = True, self._estimated or bool(more), now_s
+                gone = timedelta(seconds=round(now_s - self._began_s))
+                self.note(f"{self._what}: {done} of {of} in {gone}" + f", {more}" * bool(more))
 
     def note(self, text: str) -> None:
         """Say something that stays."""
@@ -62,13 +70,22 @@ class RunProgress:
     def __enter__(self) -> Self:
         if self._console.is_terminal:
             self._bar.start()
+        else:
+            self._first_line.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._first_line.cancel()
         if self._console.is_terminal:
             self._bar.stop()
+
+    def _say_first(self) -> None:
+        with self._lock:
+            if not self._said:
+                self._said, self._said_s = True, time.monotonic()
+                self.note(f"{self._what}: opening what they need")
 
     def _more(self, left_s: float, failed: int) -> str:
         words = [f"{failed} failed"] if failed else []

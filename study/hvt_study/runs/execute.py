@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hvt_common.errors import FlightError, UserError
-from hvt_study.cache.results import CacheError, ResultCache, content_key
+from hvt_study.cache.results import FLIGHTS, CacheError, ResultCache, content_key
 from hvt_study.runs.columns import COLUMNS
 from hvt_study.runs.match_total import first_budget, match, within
 from hvt_study.runs.materials import Materials, open_materials
@@ -27,8 +27,6 @@ from hvt_study.runs.video_shape import VideoShape, competing_sizes, search_shape
 RunRow = dict[str, Any]
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
-FLIGHTS = "flights"
-"""Of the cache: results of flights."""
 _in_flight = threading.Lock()
 """Flights of one process take turns with its detectors; a Dask worker may have several threads."""
 

@@ -2,11 +2,42 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections import deque
 
 import pytest
 
-from hvt_study.commands.progress import time_left_s
+from hvt_study.commands import progress
+from hvt_study.commands.progress import RunProgress, time_left_s
+from programs.processes import eventually
+
+
+def test_who_waits_reads_a_line_while_all_is_still_opened(capsys, monkeypatch):
+    """Ten seconds of silence look like a program that hangs."""
+    monkeypatch.setattr(progress, "_FIRST_LINE_S", 0.02)
+    said = ""
+
+    def read() -> bool:
+        nonlocal said
+        said += capsys.readouterr().err
+        return bool(said)
+
+    with RunProgress("flights") as flights:
+        eventually(read, within_s=20, what="the first line")
+        flights.update(0, 7)
+        flights.update(7, 7)
+    assert said == "flights: opening what they need\n"
+    assert capsys.readouterr().err == "flights: 7 of 7 in 0:00:00\n"
+
+
+def test_compare_loads_what_it_flies_with_where_it_flies():
+    """What scores the flights takes seconds to load, and the first line would wait for it."""
+    code = "import sys, hvt_study.commands.compare; print(*{'scipy.stats', 'rerun'} & {*sys.modules})"
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert found.stdout == "\n"
 
 
 def test_the_time_left_is_that_of_the_last_steps():
