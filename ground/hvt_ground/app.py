@@ -26,7 +26,6 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
 from hvt_ground.link.group import GroundGroup
-from hvt_ground.perception.models import stills_calibrated
 from hvt_ground.recordings.folder import RecordingsFolder
 from hvt_ground.recordings.retention import Retention
 from hvt_ground.report.state import GroundState, StateMaker
@@ -220,7 +219,7 @@ class Ground:
             self._clock,
             detector=Path(config.detector).name,
             classifier=Path(config.classifier or "none").name,
-            calibrated=stills_calibrated(config),
+            calibrated=models.facts.stills_calibrated,
             failures=models.failures,
             loading=lambda: models.loading,
             group=group,

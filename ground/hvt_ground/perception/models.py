@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 from concurrent.futures import CancelledError, Future
+from dataclasses import dataclass
 from functools import partial
+from typing import Self
 
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import FailingDetector, open_detector, warm_up
@@ -28,6 +30,29 @@ _USUAL_SIZE = (1280, 720)
 ModelSet = tuple[FailingDetector, Classifier | None]
 
 
+@dataclass(frozen=True, slots=True)
+class ModelFacts:
+    """What the files of the models say, read once: later sessions go on though a file is gone, or another."""
+
+    track_confidence: float
+    """From where a detection starts a track: as given, else as the detector's file says."""
+    calibrated: bool
+    """Whether the detector's scores are probabilities."""
+    stills_calibrated: bool
+    """Whether the model that reads stills gives probabilities."""
+
+    @classmethod
+    def of(cls, config: GroundConfig) -> Self:
+        """Raises `UserError` where a file cannot be used."""
+        confidence, reader = config.confidence, config.classifier
+        calibrated = is_calibrated(config.detector, role="detector")
+        return cls(
+            default_confidence(config.detector) if confidence is None else confidence,
+            calibrated,
+            calibrated if reader == DETECTOR else _reads_calibrated(reader),
+        )
+
+
 class NotOpenError(Exception):
     """The run ends, and its models are not open: nobody looks at what has come."""
 
@@ -45,7 +70,7 @@ class Models:
         """Models whose run raised."""
         self.turns = Turns()
         """With the detector."""
-        stills_calibrated(config), track_confidence(config)  # a file that is not there is refused at once
+        self.facts = ModelFacts.of(config)  # a file that is not there is refused at once
         self._opened: Future[ModelSet] = Future()
         threading.Thread(target=self._load, name="hvt-models", daemon=True).start()
 
@@ -97,24 +122,24 @@ class Models:
             open_detector,
             config.detector,
             labels=config.detector_labels,
-            confidence=weak_confidence(track_confidence(config)),
+            confidence=weak_confidence(self.facts.track_confidence),
             nms_iou=config.nms_iou,
             head=config.head,
             threads=config.threads,
             provider=config.provider,
         )
-        hint = FewFoundHint(config.detector, confidence=track_confidence(config))
+        hint = FewFoundHint(config.detector, confidence=self.facts.track_confidence)
         return RetriedDetector(open_one, self.failures, hint=hint)
 
     def _check(self, opened: ModelSet) -> None:
         # Refuse a classifier that has nothing to say of the detector's tracks; say which scores mean little.
         config, (detector, classifier) = self._config, opened
-        if config.detector != MOTION and not is_calibrated(config.detector, role="detector"):
+        if config.detector != MOTION and not self.facts.calibrated:
             _log.warning("%s", uncalibrated("detector", config.detector))
         if classifier is None or config.classifier is None:
             return
         check_common(config.detector, detector.class_names, config.classifier, classifier.class_names)
-        if not is_calibrated(config.classifier, role="classifier"):
+        if not self.facts.stills_calibrated:
             _log.warning("%s, and no class gets a check mark", uncalibrated("classifier", config.classifier))
 
     def _open(self) -> ModelSet:
@@ -134,15 +159,5 @@ class Models:
         return detector, RetriedClassifier(open_one, "classifier", self.failures)
 
 
-def track_confidence(config: GroundConfig) -> float:
-    """From where a detection starts a track: as given, else as the detector's file says."""
-    return default_confidence(config.detector) if config.confidence is None else config.confidence
-
-
-def stills_calibrated(config: GroundConfig) -> bool:
-    """Whether the model that reads stills gives probabilities."""
-    if config.classifier in (None, NONE):
-        return False
-    if config.classifier == DETECTOR:
-        return is_calibrated(config.detector, role="detector")
-    return is_calibrated(config.classifier, role="classifier")
+def _reads_calibrated(classifier: str | None) -> bool:
+    return classifier is not None and classifier != NONE and is_calibrated(classifier, role="classifier")

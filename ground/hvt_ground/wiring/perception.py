@@ -8,7 +8,6 @@ from typing import Literal, cast
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import FailingDetector, detect_every
 from hvt_common.inference.few_found import ViewTrust
-from hvt_common.inference.scores import is_calibrated
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_ground.backlog.perception import BacklogPerception
@@ -17,7 +16,7 @@ from hvt_ground.events import Event
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.guesses import Guesses
-from hvt_ground.perception.models import Models, stills_calibrated, track_confidence
+from hvt_ground.perception.models import ModelFacts, Models
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader
 from hvt_ground.perception.stills.refine import Refiner
@@ -40,20 +39,20 @@ def make_pipeline(
     path = CameraPath(ahead_frames=max(1, round(info.fps)))
     parts = PipelineParts(
         detector=detector,
-        tracker=_tracker(config, info),
+        tracker=_tracker(config, models.facts, info),
         reader=reader,
         refiner=Refiner(
             cast('Literal["replace", "fuse"]', config.refine),
             fps=info.fps,
             vocabulary=vocabulary,
-            calibrated=stills_calibrated(config),
+            calibrated=models.facts.stills_calibrated,
         ),
         vocabulary=vocabulary,
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path, base_per_source=info.view.scale),
         path=path,
         turns=models.turns,
         trust=trust or make_trust(config),
-        guesses=_guesses(config, info),
+        guesses=_guesses(models.facts, info),
         # In lockstep the same input gives the same detections, however long they take.
         patient=info.pace == "lockstep",
     )
@@ -79,22 +78,22 @@ def make_backlog_perception(
     return BacklogPerception(
         info,
         take_models=models.take,
-        tracker_of=lambda: _tracker(config, info),
+        tracker_of=lambda: _tracker(config, models.facts, info),
         reader_of=lambda detector, classifier: _reader(config, detector, classifier, info=info),
         detect_every=detect_every(config.detect_every, fps=info.fps),
         trust=trust,
-        guesses_of=lambda: _guesses(config, info),
+        guesses_of=lambda: _guesses(models.facts, info),
     )
 
 
-def _guesses(config: GroundConfig, info: Info) -> Guesses | None:
-    return Guesses(fps=info.fps) if is_calibrated(config.detector, role="detector") else None
+def _guesses(facts: ModelFacts, info: Info) -> Guesses | None:
+    return Guesses(fps=info.fps) if facts.calibrated else None
 
 
-def _tracker(config: GroundConfig, info: Info) -> ByteTracker:
+def _tracker(config: GroundConfig, facts: ModelFacts, info: Info) -> ByteTracker:
     motion = cast('Literal["off", "flow"]', config.camera_motion)
-    confidence = track_confidence(config)
-    return ByteTracker(TrackerSettings.starting_at(confidence, camera_motion=motion), fps=info.fps)
+    settings = TrackerSettings.starting_at(facts.track_confidence, camera_motion=motion)
+    return ByteTracker(settings, fps=info.fps)
 
 
 def _reader(

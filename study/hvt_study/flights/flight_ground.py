@@ -29,6 +29,7 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.link.reassemble import Arrival as AccessUnitArrival
 from hvt_ground.link.receiver import BasePacket
+from hvt_ground.perception.models import ModelFacts
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.turns import Turns
 from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
@@ -70,10 +71,17 @@ class InlineExecutor(ThreadPoolExecutor):
 
 
 class SharedModels(Models):
-    """Models that are open already; flights of one process take turns with them."""
+    """Models that are open already, of this configuration; flights of one process take turns with them."""
 
-    def __init__(self, detector: FailingDetector, classifier: Classifier | None = None) -> None:
+    def __init__(
+        self,
+        detector: FailingDetector,
+        classifier: Classifier | None = None,
+        *,
+        config: GroundConfig | None = None,
+    ) -> None:
         self._shared = detector, classifier
+        self.facts = ModelFacts.of(config or GroundConfig())
         self.turns = Turns()
 
     def take(self) -> tuple[FailingDetector, Classifier | None]:
@@ -130,7 +138,7 @@ class GroundSide:
         self._captures = CaptureTimes()
         self._now_ns = info.started_ns
         detector, classifier = models.take()
-        shared = SharedModels(detector, classifier)
+        shared = SharedModels(detector, classifier, config=config)
         self._session = GroundSession(
             info,
             pipeline_of=lambda emit: make_pipeline(config, shared, info=info, emit=self._observed_by(emit)),

@@ -17,7 +17,7 @@ from hvt_ground.config import GroundConfig, check
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.models import Models
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
-from hvt_ground.wiring import make_pipeline
+from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline, make_trust
 from media.onnx_models import colour_classifier, colour_detector
 from rigs.flight import Flight
 
@@ -113,3 +113,19 @@ def test_a_still_is_shown_though_nobody_can_name_it(tmp_path: Path, classifier: 
         "classifier" if classifier == "file" else "detector"
     ]
     pipeline.end()
+
+
+def test_a_session_begins_though_the_files_of_the_models_are_gone(tmp_path: Path) -> None:
+    """A ground whose models were cleared away, or brought up to date, would record no edge that comes later."""
+    detector, classifier = (
+        colour_detector(tmp_path / "d.onnx", "yolox"),
+        colour_classifier(tmp_path / "c.onnx"),
+    )
+    config = check(GroundConfig(detector=str(detector), classifier=str(classifier), provider="cpu"))
+    models, info = Models(config), Flight(1).info()
+    models.take()
+    detector.unlink()
+    classifier.unlink()
+    make_pipeline(config, models, info=info, emit=lambda _: None).end()
+    with make_backlog_perception(config, models, info=info, trust=make_trust(config)).track(lambda _: None):
+        pass
