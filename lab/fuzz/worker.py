@@ -23,7 +23,10 @@ from typing import Any
 
 import atheris
 
-with atheris.instrument_imports(include=["hvt_common", "hvt_edge", "hvt_ground"]):
+_ROOMS = ("common", "edge", "ground", "extras")
+FLIES = [one.name for room in _ROOMS for one in (Path(__file__).parents[2] / room).glob("hvt_*")]
+
+with atheris.instrument_imports(include=FLIES):
     from lab.fuzz.contract import Target, checked_seeds
     from lab.fuzz.table import TARGETS
 

@@ -10,6 +10,7 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from importlib.util import find_spec
 from pathlib import Path
 from random import Random
@@ -116,6 +117,16 @@ def test_the_fuzzer_finds_a_planted_bug_and_keeps_its_input(tmp_path):
     kept = next((tmp_path / "found").glob("planted-crash-*"))
     with pytest.raises(ValueError, match="here to be found"):
         PLANTED.run(kept.read_bytes())
+
+
+@pytest.mark.skipif(find_spec("atheris") is None, reason="atheris is not installed")
+def test_the_fuzzer_sees_all_code_that_flies():
+    """What moves to another package would be fuzzed blindly: no input would be kept for what it reaches."""
+    from lab.fuzz.worker import FLIES
+
+    build = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]
+    packages = [Path(one) for one in build["targets"]["wheel"]["packages"]]
+    assert set(FLIES) == {one.name for one in packages if one.parent.name != "study"}
 
 
 @pytest.mark.skipif(find_spec("atheris") is None, reason="atheris is not installed")

@@ -23,11 +23,14 @@ from hvt_common.values import Orientation, Pose, View
 from hvt_geo.camera import ground_points, places_of_boxes
 from hvt_geo.elevation import ElevationModel
 from hvt_geo.extra import GeoExtra
+from hvt_geo.locator import SurfaceLocator
+from hvt_geo.surface import Surface
 from hvt_geo.terrain import Terrain
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.config import check
 from hvt_ground.extras import config_class
 from hvt_ground.link.capture_clock import CaptureClock
+from hvt_ground.poses import Locator
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.sinks import Outputs
 from hvt_ground.wiring import Models, SessionFactory
@@ -72,6 +75,11 @@ def model(folder: Path, height_m, *, dtype: str = "float32", nodata: float | Non
 
 def terrain_of(path: Path) -> Terrain:
     return Terrain(ElevationModel(path), "uav-1")
+
+
+def surface_of(locator: Locator) -> Surface:
+    assert isinstance(locator, SurfaceLocator)
+    return locator.surface
 
 
 def flat_file(path: Path, corner: tuple[float, float], *, size=(200, 200), **profile) -> Path:
@@ -332,7 +340,7 @@ def test_a_model_that_goes_in_flight_ends_no_flight(tmp_path, caplog):
     finally:
         outputs.close()
     caplog.clear()
-    terrain = GeoExtra().locators(model(tmp_path, lambda north, east: 500.0))("uav-1").surface
+    terrain = surface_of(GeoExtra().locators(model(tmp_path, lambda north, east: 500.0))("uav-1"))
     path.unlink()
     assert not terrain.usable(POSE)
     (notice,) = caplog.records
@@ -345,6 +353,6 @@ def test_each_flight_has_a_ground_below_its_own_first_pose(tmp_path):
     above = replace(POSE, altitude_m=None, height_m=100.0)
     for flight, north in (("uav-1", 0.0), ("uav-2", 400.0)):
         pose = replace(above, latitude_deg=47.0 + north / NORTH_M)
-        surface = locator_of(flight).surface
-        assert surface.usable(pose)
-        assert surface.below_m(pose, np.zeros((1, 2)))[0] == pytest.approx(100.0, abs=0.1)
+        ground = surface_of(locator_of(flight))
+        assert ground.usable(pose)
+        assert ground.below_m(pose, np.zeros((1, 2)))[0] == pytest.approx(100.0, abs=0.1)
