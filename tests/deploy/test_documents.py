@@ -108,8 +108,8 @@ def _anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads}
 
 
-def test_pages_named_in_the_code_exist() -> None:
-    """A message or a docstring sends its reader to a page that is gone."""
+def test_pages_and_tests_named_in_the_code_exist() -> None:
+    """A message or a docstring sends its reader to a page or a test that is gone."""
     files = (
         path
         for room in ("common", "edge", "ground", "extras", "study", "lab", "bench", "deploy")
@@ -119,7 +119,7 @@ def test_pages_named_in_the_code_exist() -> None:
     named = {
         (str(path.relative_to(ROOT)), page)
         for path in files
-        for page in re.findall(r"docs/[\w/-]+\.md", path.read_text(encoding="utf-8"))
+        for page in re.findall(r"(?:docs/[\w/-]+\.md|tests/[\w/-]+\.py)", path.read_text(encoding="utf-8"))
     }
     assert named, "the pattern finds nothing any more"
     assert {(path, page) for path, page in named if not (ROOT / page).exists()} == set()

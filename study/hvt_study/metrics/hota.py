@@ -1,7 +1,7 @@
 """HOTA, after Luiten et al., "HOTA: A Higher Order Metric for Evaluating Multi-Object Tracking", IJCV 129 (2021).
 
 Written here because the authors' package (``trackeval``) brings ``opencv-python`` with it, which overwrites the
-headless OpenCV of HVT. It gives the authors' figures to the last digit (tests/study/test_metrics_tracking.py).
+headless OpenCV of HVT. It gives the authors' figures to the last digit (tests/study/metrics/test_tracking.py).
 """
 
 from __future__ import annotations
