@@ -94,9 +94,9 @@ def open_detector(
     ``head`` is one of `heads.choose.HEAD_NAMES`; else the file tells, or what it answers. ``confidence`` is the least
     of a detection, ``nms_iou`` the largest overlap of two of one class, both 0…1. ``size`` is (width, height) of the
     network's input where the model leaves it free; else each image gets the multiples of the network's stride that
-    hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). A
-    plug-in gets none of these; ``confidence`` is applied to its answer. For ``A+B`` (see `ensemble`) it is on the
-    scale of A, and ``labels``, ``head`` and ``size`` are refused.
+    hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). A plug-in gets none of these;
+    ``confidence`` is applied to its answer. For ``A+B`` (`hvt_models.ensemble`) it is on the scale of A, and
+    ``labels``, ``head`` and ``size`` are refused.
     Raises `UserError` where there is no such model, it is no detector, its labels do not fit, or a setting is out of
     its range.
     """

@@ -87,7 +87,7 @@ class Suppression:
 class Gate:
     """Refuses a still where the base shows enough; refuses nothing at 0 dB. Frozen, without state.
 
-    The edge decodes its own stream and knows what the base lost of each candidate (`base_loss`). Both conditions have
+    The edge decodes its own stream and knows what the base lost of each candidate (`BaseLoss`). Both conditions have
     to hold, because each has its blind spot: PSNR is high on a dark or smooth object whatever became of its edges,
     and lost detail is small on a coarse object that is plainly wrong in colour. docs/stills.md has the figures.
     """
