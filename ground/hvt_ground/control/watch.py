@@ -45,6 +45,7 @@ def _table(state: dict[str, Any]) -> Table:
         for one in state["edges"]
         if one["session"] and one["session"].get("edge_frames")
     ]
+    said += ["detector loading"] * state.get("loading", False)
     said += [f"{one['part']}: {one['reason']}" for one in state["failed"]]
     table.caption = "; ".join(said) or None
     return table
@@ -65,5 +66,6 @@ def _session_cells(session: dict[str, Any] | None) -> tuple[str, ...]:
         "" if p95 is None else f"{p95:.0f} ms",
         "" if age is None else f"{age:.1f} s old",
         f"{session['stills_received']}" + (f" (not sent: {counts_text(why, most=2)})" if why else ""),
-        f"{session['tracks']}, {session['tracks_refined']} refined",
+        f"{session['tracks']}, {session['tracks_refined']} refined"
+        + ", UNKNOWN VIEW" * session.get("view_unlike", False),
     )

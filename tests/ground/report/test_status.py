@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import time
+import urllib.request
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +18,7 @@ from hvt_common.protocol.messages import FailedPart, Info, Status
 from hvt_common.protocol.still_words import STILL_WORDS
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
+from hvt_ground.control import watch
 from hvt_ground.report.metrics import metrics_text
 from hvt_ground.report.state import SessionState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
@@ -131,7 +134,7 @@ def test_who_gets_no_stills_reads_why(ground):
     ]
 
 
-def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground):
+def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground, monkeypatch, capsys):
     """Who came later, or reads tables alone, took guesses for objects."""
     assert "UNKNOWN VIEW" not in ground.line()
     text = metrics_text(ground.maker.make([("uav-1", ground.sessions)])).decode()
@@ -146,6 +149,13 @@ def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground):
     text = metrics_text(state).decode()
     assert 'hvt_view_trust_ratio{edge="uav-1"} 0.53' in text
     assert 'hvt_view_unlike{edge="uav-1"} 1.0' in text
+    said = json.dumps(replace(state, loading=True).as_dict()).encode()
+    monkeypatch.setattr(urllib.request, "urlopen", lambda *_, **__: io.BytesIO(said))
+    monkeypatch.setenv("COLUMNS", "300")
+    assert watch.run([]) == 0
+    said = capsys.readouterr().out
+    assert "0 refined, UNKNOWN VIEW" in said
+    assert "detector loading" in said
     ground.sessions.close()
     ground.outputs.close()
     content = summary(ground.ended[0])
