@@ -25,8 +25,9 @@ _LEAST = 4
 class RunProgress:
     """Of ``what``, such as runs. The time left is told by how fast the last ones were done."""
 
-    def __init__(self, what: str) -> None:
+    def __init__(self, what: str, *, first_line_s: float = _FIRST_LINE_S) -> None:
         self._what = what
+        self._first_line_s = first_line_s
         self._console = Console(stderr=True, highlight=False)
         self._began_s = self._said_s = time.monotonic()
         self._said = self._estimated = False
@@ -43,7 +44,7 @@ class RunProgress:
         )
         self._task = self._bar.add_task(what, total=None, more="")
         self._lock = threading.Lock()
-        self._first_line = threading.Timer(_FIRST_LINE_S, self._say_first)
+        self._first_line = threading.Timer(first_line_s, self._say_first)
         self._first_line.daemon = True
 
     def update(self, done: int, of: int, left_s: float | None = None, *, failed: int = 0) -> None:
@@ -57,7 +58,7 @@ class RunProgress:
         self._bar.update(self._task, completed=done, total=of, more=more)
         news = (bool(more) and not self._estimated) or done == of
         with self._lock:
-            first = not self._said and now_s - self._began_s >= _FIRST_LINE_S
+            first = not self._said and now_s - self._began_s >= self._first_line_s
             if not self._console.is_terminal and (news or first or now_s - self._said_s >= _LINE_EVERY_S):
                 self._said, self._estimated, self._said_s = True, self._estimated or bool(more), now_s
                 gone = timedelta(seconds=round(now_s - self._began_s))
