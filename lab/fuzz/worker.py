@@ -24,7 +24,7 @@ from typing import Any
 import atheris
 
 _ROOMS = ("common", "edge", "ground", "extras")
-FLIES = [one.name for room in _ROOMS for one in (Path(__file__).parents[2] / room).glob("hvt_*")]
+FLIES = [one.name for side in _ROOMS for one in (Path(__file__).parents[2] / side).glob("hvt_*")]
 
 with atheris.instrument_imports(include=FLIES):
     from lab.fuzz.contract import Target, checked_seeds
