@@ -257,8 +257,8 @@ def test_no_setting_is_accepted_and_ignored():
     import hvt_edge
 
     folder = Path(hvt_edge.__file__).parent
-    code = {file.name: file.read_text(encoding="utf-8") for file in folder.rglob("*.py")}
-    own = code.pop("config.py")  # its properties derive from settings
+    code = {file: file.read_text(encoding="utf-8") for file in folder.rglob("*.py")}
+    own = code.pop(folder / "config.py")  # its properties derive from settings
     others = "\n".join(code.values())
     names = [one.name for one in dataclasses.fields(EdgeConfig)]
     unread = [
