@@ -22,7 +22,7 @@ from typing import Any, NoReturn, Protocol, TypeVar, cast
 
 import tomli_w
 
-from hvt_common.errors import UserError, check_not_read
+from hvt_common.errors import UserError, absent, check_not_read
 from hvt_common.redaction import Redaction
 from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse_share, parse_size
 
@@ -343,7 +343,7 @@ def _from_file(config_class: type, file: Path) -> dict[str, Any]:
     try:
         table = tomllib.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise UserError(f"--config {file} does not exist: give a TOML file") from None
+        raise absent(file)(f"--config {file} does not exist: give a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise UserError(f"--config {file} cannot be read ({reason}): give a TOML file") from None

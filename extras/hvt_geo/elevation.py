@@ -21,7 +21,7 @@ from rasterio.transform import from_bounds
 from rasterio.warp import reproject, transform, transform_bounds
 from rasterio.windows import Window
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, absent
 from hvt_common.geodesy import metres_per_degree, turned_deg
 from hvt_geo.surface import Points
 
@@ -110,7 +110,7 @@ class ElevationModel:
                     if placed:
                         _cell_in_the_middle(file)
         except ModelError as error:
-            raise UserError(f"--terrain {path} is no elevation model that can be read: {error}") from None
+            raise absent(path)(f"--terrain {path} is no elevation model that can be read: {error}") from None
         if not placed:
             raise UserError(f"--terrain {path} does not say where it lies: give a GeoTIFF with coordinates")
 

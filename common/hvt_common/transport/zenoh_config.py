@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, absent
 from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
 from hvt_common.runtime.host_names import is_loopback
 
@@ -136,7 +136,7 @@ def _read_config(path: Path | None) -> tuple[zenoh.Config, dict[str, Any]]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise UserError(f"{path}: cannot read the Zenoh configuration: {reason}") from None
+        raise absent(path)(f"{path}: cannot read the Zenoh configuration: {reason}") from None
     try:
         said = json5.loads(text)
     except (ValueError, RecursionError) as error:

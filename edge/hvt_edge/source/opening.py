@@ -24,7 +24,7 @@ from hvt_edge.source.live import LiveSource
 from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber, is_description
 from hvt_edge.source.video import VideoSource
 
-__all__ = ["REENCODE", "Source", "check_shape", "open_source", "shown"]
+__all__ = ["REENCODE", "Source", "check_shape", "is_local", "open_source", "shown"]
 
 _ACCEPTED = (
     "a video file, a folder of images, rtsp://…, rtmp://…, http://…, udp://…, FILE.sdp, /dev/videoN, demo or "
@@ -99,6 +99,8 @@ def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
     if not _is_there(spec):
         kind = NotYetError if growing else UserError
         raise kind(f"source {shown(spec)!r} does not exist; accepted is {_ACCEPTED}")
+    if growing and Path(spec).is_file() and not Path(spec).stat().st_size:
+        raise NotYetError(f"source {spec!r} is empty so far")
 
 
 def shown(spec: str) -> str:

@@ -28,7 +28,7 @@ with warnings.catch_warnings():
     import pytak
     from pytak.client_functions import get_ssl_ctx, get_tls_config
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, absent
 from hvt_common.runtime.host_names import is_group
 from hvt_gateways.cot.event import CotMessage
 
@@ -121,7 +121,7 @@ def _check_readable(name: str, settings: Mapping[str, str]) -> None:
         with open(path, "rb"):  # noqa: PTH123 - a text from the environment
             pass
     except OSError as error:
-        raise UserError(
+        raise absent(Path(path))(
             f"{name} {path} cannot be read ({error.strerror}): give a file that is there"
         ) from None
 

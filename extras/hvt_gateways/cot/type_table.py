@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, absent
 from hvt_common.inference.class_names import kind_of
 
 _TYPE: Final = re.compile(r"[A-Za-z0-9]+(-[A-Za-z0-9]+)*")
@@ -67,7 +67,7 @@ def read_types(path: Path | None) -> TypeTable:
             raise UserError(f"--cot-types {path} is larger than 1 MiB: give a table of types, TOML")
         content = tomllib.loads(data.decode())
     except OSError as error:
-        raise UserError(f"--cot-types {path} cannot be read: {error.strerror}") from None
+        raise absent(path)(f"--cot-types {path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # no TOML, or no UTF-8
         raise UserError(f"--cot-types {path} is no TOML: {error}") from None
     return table.extended(_parsed(content, where=f"--cot-types {path}"))

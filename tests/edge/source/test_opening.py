@@ -561,3 +561,6 @@ def test_a_file_that_another_program_will_write_is_waited_for(tmp_path):
     """An edge that starts before the recorder would end with code 2, and no supervisor starts it again."""
     with pytest.raises(NotYetError, match="does not exist"):
         open_source(str(tmp_path / "growing.ts"), size=(320, 180), fps=15, fit="letterbox", growing=True)
+    (tmp_path / "growing.ts").touch()
+    with pytest.raises(NotYetError, match="empty so far"):
+        open_source(str(tmp_path / "growing.ts"), size=(320, 180), fps=15, fit="letterbox", growing=True)

@@ -16,14 +16,18 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
-from hvt_common.errors import NotYetError, UserError, exit_with_sentence
+from hvt_common.config import load
+from hvt_common.errors import FlightError, NotYetError, UserError, exit_with_sentence
 from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.runtime.health_server import Answer, HealthServer
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.transport.session import LinkSettings, open_session
+from hvt_common.transport.zenoh_config import configure
+from hvt_edge.config import EdgeConfig
 from hvt_edge.loop.pose import open_pose
 from hvt_edge.source.live import LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
+from hvt_edge.world import World
 from hvt_ground.sinks.rerun.live_view import LiveView, listening
 from hvt_ground.web import WebPage
 from programs.processes import eventually, free_ports
@@ -198,6 +202,16 @@ class Silent:
         raise SignalLost("no frame")
 
 
+def read_settings(path: str) -> object:
+    """As of a command line."""
+    return load(EdgeConfig, ("--config", path), program="hvt-edge", description="")
+
+
+def read_keys(path: str) -> object:
+    """As for a link."""
+    return configure(LinkSettings("edge", zenoh_config=Path(path)))
+
+
 @pytest.mark.parametrize(
     ("open_it", "kind"),
     [
@@ -209,6 +223,15 @@ class Silent:
             id="no picture yet",
         ),
         pytest.param(lambda: open_source("clip.mp4", size=(64, 64), fps=5), UserError, id="no clip"),
+        pytest.param(
+            lambda: World().open_source(EdgeConfig(source="/not/mounted/a.mp4")),
+            FlightError,
+            id="no disk of clips",
+        ),
+        pytest.param(lambda: read_settings("/not/mounted/a.toml"), NotYetError, id="no disk of settings"),
+        pytest.param(lambda: read_settings("none.toml"), UserError, id="no settings"),
+        pytest.param(lambda: read_keys("/not/mounted/a.json5"), NotYetError, id="no disk of keys"),
+        pytest.param(lambda: read_keys("none.json5"), UserError, id="no keys"),
         pytest.param(
             lambda: check_writable(Path("/not/mounted/a.rrd"), name="--record"), NotYetError, id="no disk yet"
         ),
@@ -222,10 +245,10 @@ def test_only_what_can_never_work_ends_with_code_2(open_it, kind, capsys):
         open_it()
         return 0
 
-    with pytest.raises(UserError) as raised:
+    with pytest.raises((UserError, FlightError)) as raised:
         open_it()
     assert type(raised.value) is kind
-    assert exit_with_sentence(run, program="hvt", argv=None) == (1 if kind is NotYetError else 2)
+    assert exit_with_sentence(run, program="hvt", argv=None) == (2 if kind is UserError else 1)
     assert capsys.readouterr().err.count("\n") == 1
 
 

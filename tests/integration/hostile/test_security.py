@@ -312,7 +312,7 @@ def own_handlers() -> Iterator[None]:
         ("expired", "KEYS/uav-1.pem: this certificate expired on "),
         (
             "missing",
-            "/nowhere/uav-1.key, the connect_private_key of --zenoh-config, cannot be read (No such file",
+            "/etc/none-1.key, the connect_private_key of --zenoh-config, cannot be read (No such file",
         ),
     ],
 )
@@ -325,7 +325,7 @@ def test_an_edge_with_unfit_keys_does_not_start(
     if case == "expired":
         own.reissue("uav-1", now=EXPIRED)
     elif case == "missing":
-        file = own.changed("uav-1", connect_private_key="/nowhere/uav-1.key")
+        file = own.changed("uav-1", connect_private_key="/etc/none-1.key")
     who = ("--edge-id", "uav-2") if case == "another id" else ()
     asked = [*_words(scene), "--connect", "tls/127.0.0.1:9", "--zenoh-config", str(file), *who]
     assert hvt_edge.cli.main(asked) == 2

@@ -18,7 +18,7 @@ from typing import Any
 
 import zenoh
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, absent
 from hvt_common.transport.zenoh_config import connect_endpoints
 
 _log = logging.getLogger(__name__)
@@ -194,7 +194,7 @@ def _check_readable(path: Path, *, setting: str) -> None:
         with path.open("rb"):
             pass
     except OSError as error:
-        raise UserError(
+        raise absent(path)(
             f"{path}, the {setting} of --zenoh-config, cannot be read ({error.strerror}): name a file that "
             "this user can read"
         ) from None
