@@ -11,7 +11,7 @@ from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import START_LOGGER, start_log
-from hvt_common.runtime.plug_ins import the_one
+from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
 from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
 
@@ -46,7 +46,7 @@ def _run(argv: Sequence[str] | None) -> int:
         entry = the_one(_EXTRA_COMMANDS, words[0], what="command", built_in=False)
         if entry is not None:
             limit_malloc_arenas()
-            return int(entry.load()(words[1:]))
+            return int(loaded(entry, lambda run: run, what="command")(words[1:]))
         if words[0] == _BROUGHT:
             raise UserError("hvt-edge doctor is of an extra that is not installed: pip install 'hvt[edge]'")
     config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
+import hvt_edge.cli
 from hvt_common.config import load
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, open_detector
@@ -53,6 +55,23 @@ def test_a_command_of_an_extra_that_is_absent(command, monkeypatch, capsys):
     assert capsys.readouterr().err == (
         f"hvt-ground: hvt-ground {command} is of an extra that is not installed: pip install 'hvt[ground]'\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("found", "says"),
+    [
+        ({}, "hvt-edge doctor is of an extra that is not installed: pip install 'hvt[edge]'"),
+        (
+            {"doctor": (EntryPoint("doctor", "hvt_nowhere:run", "hvt.edge_commands"),)},
+            "command 'doctor' of hvt_nowhere:run does not load: ModuleNotFoundError: No module named 'hvt_nowhere'",
+        ),
+    ],
+)
+def test_an_edge_without_its_doctor_says_so(found, says, monkeypatch, capsys):
+    """Half an installation would end in a traceback."""
+    monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: found)
+    assert hvt_edge.cli.main(["doctor"]) == 2
+    assert capsys.readouterr().err == f"hvt-edge: {says}\n"
 
 
 def test_the_names_of_heads_are_those_that_the_library_reads():
