@@ -83,7 +83,7 @@ def test_names_are_terms_of_the_field():
     found = {
         f"{file}:{number}: {name}"
         for file in _tracked(
-            "common/*.py", "edge/*.py", "ground/*.py", "study/*.py", "bench/*.py", "lab/*.py"
+            "common/*.py", "edge/*.py", "ground/*.py", "extras/*.py", "study/*.py", "bench/*.py", "lab/*.py"
         )
         for number, name in _names(file)
         if _forbidden(name)
