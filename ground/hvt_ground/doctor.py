@@ -54,7 +54,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _models(config: GroundConfig) -> Finding:
-    detector, classifier = Models(config).take()
+    detector, classifier = Models(config).wait()
     picture = np.full((_USUAL_SIZE[1], _USUAL_SIZE[0], 3), 128, np.uint8)
     began_s = time.monotonic()
     detector.detect(picture)

@@ -83,8 +83,12 @@ def test_video_is_recorded_while_the_detector_loads_and_boxes_come_with_it(compi
     assert len(Recording(tmp_path / "a.rrd").video()) == FRAMES
 
 
-def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(compiler) -> None:
-    """Whoever stopped a ground in lockstep read that no edge was heard, and waited for the detector to learn it."""
+@pytest.mark.parametrize("fails", [False, True], ids=["stopped", "no detector"])
+def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(compiler, *, fails: bool) -> None:
+    """Whoever stopped a ground in lockstep read that no edge was heard, and waited for the detector to learn it.
+
+    And where the detector was none, that all else goes on, a line before the end.
+    """
     config = check(GroundConfig(classifier="none"))
     outputs, models = Outputs(Failures(time.time_ns)), Models(config)
     factory = SessionFactory(config, models, clock=time.time_ns, outputs=outputs, view=None, program=nothing)
@@ -93,6 +97,10 @@ def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(comp
     sessions = EdgeSessions(port, open_session=factory.open_session, on_ended=ended.append)
     for index in range(2):
         sessions.handle(flight.base(index))
+    if fails:
+        compiler.error = UserError("d.onnx is not a detector")
+        compiler.done.set()
+        eventually(lambda: models.error is not None, within_s=20, what="it is known")
     models.give_up()
     closing = threading.Thread(target=sessions.close, daemon=True)
     closing.start()
@@ -101,6 +109,7 @@ def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(comp
     content = summary(ended[0])
     assert (content["frames_decoded"], content["failure"]) == (2, "")
     told = completed(content, sessions)
+    assert told["failed"] == []
     assert dict(table(told))["tracks"] == "not known: the detector has looked at no picture"
     outputs.close()
 
@@ -112,7 +121,7 @@ def test_the_link_is_open_before_the_detector(compiler, free_port: int, monkeypa
     made: list[Models] = []
     monkeypatch.setattr(app, "Models", lambda config: made.append(Models(config)) or made[-1])
     assert Ground(config, stop=stop, on_started=stop.set).run() == []
-    with pytest.raises(NotOpenError, match="the run ended before"):
+    with pytest.raises(NotOpenError, match="the run ends before"):
         made[0].take()
 
 

@@ -150,7 +150,7 @@ class _Replay:
         infos = _infos(self._messages())
         make_record_folder(self._config)
         models = Models(self._config)
-        models.take()  # the log waits for them
+        models.wait()  # the log waits for them
         ended: list[tuple[dict[str, Any], GroundSession]] = []
         edges: dict[str, EdgeSessions] = {}
         with ExitStack() as stack:

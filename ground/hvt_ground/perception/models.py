@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from typing import Self
@@ -84,16 +84,22 @@ class Models:
         """Why they cannot be opened; None while that is not known."""
         return None if self.loading else self._opened.exception()
 
-    def take(self) -> ModelSet:
-        """A detector, and a classifier where one is wanted, once they are open; each `MOTION` detector is a new one.
+    def wait(self) -> ModelSet:
+        """A detector, and a classifier where one is wanted, once they are open.
 
-        It remembers pictures. Raises `UserError` where a setting or a file of them cannot be used, and
-        `NotOpenError` where nobody is to wait for them any more.
+        Raises `UserError` where a setting or a file of them cannot be used.
+        """
+        return self._opened.result()
+
+    def take(self) -> ModelSet:
+        """Like `wait`, for a session; each `MOTION` detector is a new one, for it remembers pictures.
+
+        Raises `NotOpenError` where they cannot be opened, of which `error` tells, or nobody is to wait any more.
         """
         try:
             opened = self._opened.result()
-        except CancelledError:
-            raise NotOpenError("the run ended before the detector was open") from None
+        except Exception:  # noqa: BLE001 - the run ends with it, and says it once
+            raise NotOpenError("the run ends before the detector is open") from None
         return (self._open_detector(), opened[1]) if self._config.detector == MOTION else opened
 
     def give_up(self) -> None:
