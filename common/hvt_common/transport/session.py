@@ -248,6 +248,8 @@ def _open_failure(text: str, listen: tuple[str, ...], config: zenoh.Config) -> s
         )
     if "Cannot assign requested address" in text:
         return f"cannot listen on {endpoint}: this machine has no such address"
+    if "No such device" in text:
+        return f"cannot listen on {', '.join(listen)}: this machine has no such interface"
     if nobody := re.search(r"Unable to connect to any of \[(.+)\]", text):
         endpoints = ", ".join(re.findall(r"\(([^()]+)\)", nobody[1])) or nobody[1]
         if "tls/" in endpoints:  # the other side may answer, and refuse

@@ -338,10 +338,14 @@ def test_a_port_in_use_names_the_endpoint():
             open_session(ground(endpoint)).__enter__()
 
 
-def test_an_address_of_another_machine_is_one_sentence():
-    """The same for a mistyped address."""
-    settings = LinkSettings("ground", listen=("tcp/192.0.2.1:7447",), insecure=True)
-    with pytest.raises(UserError, match="this machine has no such address"):
+@pytest.mark.parametrize(
+    ("endpoint", "lacks"),
+    [("tcp/192.0.2.1:7447", "address"), ("tcp/0.0.0.0:7447#iface=none-9", "interface")],
+)
+def test_what_another_machine_has_is_one_sentence(endpoint, lacks):
+    """The same for a mistyped address, or the interface of a VPN that is not up."""
+    settings = LinkSettings("ground", listen=(endpoint,), insecure=True)
+    with pytest.raises(UserError, match=f"^cannot listen on {endpoint}: this machine has no such {lacks}$"):
         open_session(settings).__enter__()
 
 
