@@ -10,12 +10,15 @@ from types import SimpleNamespace
 import pytest
 
 from hvt_common.errors import UserError
+from hvt_common.protocol.messages import RoiHeader
 from hvt_common.runtime.failures import Failures
 from hvt_ground import app
 from hvt_ground.app import Ground
+from hvt_ground.backlog.jobs import Destination, StillJob
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception import models as ground_models
 from hvt_ground.perception.models import NotOpenError
+from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_sessions import EdgeSessions
@@ -112,6 +115,28 @@ def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(comp
     assert told["failed"] == []
     assert dict(table(told))["tracks"] == "not known: the detector has looked at no picture"
     outputs.close()
+
+
+def test_a_stored_still_that_nobody_read_before_the_run_ended_comes_again(compiler) -> None:
+    """The edge would take it for recorded, and forget it."""
+    models = Models(check(GroundConfig(classifier="none")))
+    outputs, config = Outputs(Failures(time.time_ns)), GroundConfig(classifier="none")
+    factory = SessionFactory(config, models, clock=time.time_ns, outputs=outputs, view=None, program=nothing)
+    flight, port, done = Flight(2), Port(), list[bool | None]()
+    port.flight = flight
+    sessions = EdgeSessions(port, open_session=factory.open_session)
+    sessions.handle(flight.base(0))
+    item = flight.still(0, 0)
+    still = ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
+    backlog = sessions.session.backlog
+    job = StillJob(still, Destination(lambda: backlog, lambda _: None), done=done.append)
+    models.give_up()
+    with pytest.raises(NotOpenError) as gone:
+        job.step()
+    job.fail(gone.value)
+    assert done == [None]
+    assert backlog.is_new_still(still.header.sequence)
+    sessions.close()
 
 
 def test_the_link_is_open_before_the_detector(compiler, free_port: int, monkeypatch) -> None:

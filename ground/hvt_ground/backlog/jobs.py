@@ -13,6 +13,7 @@ from hvt_common.protocol.messages import BacklogUnit
 from hvt_common.values import Image
 from hvt_ground.backlog.perception import StretchTracker
 from hvt_ground.backlog.session_backlog import SessionBacklog
+from hvt_ground.perception.models import NotOpenError
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job, PerceptionWorker
 from hvt_ground.sinks import Receipt
@@ -177,4 +178,4 @@ class _BoxesJob(Job):
 
 
 def _usable(error: Exception) -> bool | None:
-    return None if isinstance(error, OSError | UserError) else False
+    return None if isinstance(error, OSError | UserError | NotOpenError) else False

@@ -151,7 +151,7 @@ class GroundSession:
             info,
             log=self._emit,
             perception=backlog_perception,
-            read=lambda still: self._read([still]),
+            read=lambda still: self._read_stills([still]),
             stills=self._still_window,
             able=lambda: all(one.is_open() for one in outputs),
             outputs=outputs,
@@ -520,6 +520,9 @@ class GroundSession:
 
     @_perceives
     def _read(self, stills: Sequence[ReceivedStill]) -> None:
+        self._read_stills(stills)
+
+    def _read_stills(self, stills: Sequence[ReceivedStill]) -> None:
         self.pipeline.read(stills)
         self._emit(StillsRead(tuple(one.header.sequence for one in stills), self._clock()))
         self._collect_results()
