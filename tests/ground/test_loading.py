@@ -86,8 +86,10 @@ def test_video_is_recorded_while_the_detector_loads_and_boxes_come_with_it(compi
     assert len(Recording(tmp_path / "a.rrd").video()) == FRAMES
 
 
-@pytest.mark.parametrize("fails", [False, True], ids=["stopped", "no detector"])
-def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(compiler, *, fails: bool) -> None:
+@pytest.mark.parametrize("fails_before", [None, 0, 2], ids=["stopped", "no detector", "none after all"])
+def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(
+    compiler, fails_before: int | None
+) -> None:
     """Whoever stopped a ground in lockstep read that no edge was heard, and waited for the detector to learn it.
 
     And where the detector was none, that all else goes on, a line before the end.
@@ -98,12 +100,13 @@ def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(comp
     ended, flight, port = [], Flight(2, pace="lockstep"), Port()
     port.flight = flight
     sessions = EdgeSessions(port, open_session=factory.open_session, on_ended=ended.append)
-    for index in range(2):
-        sessions.handle(flight.base(index))
-    if fails:
-        compiler.error = UserError("d.onnx is not a detector")
-        compiler.done.set()
-        eventually(lambda: models.error is not None, within_s=20, what="it is known")
+    for index in range(3):
+        if index == fails_before:
+            compiler.error = UserError("d.onnx is not a detector")
+            compiler.done.set()
+            eventually(lambda: models.error is not None, within_s=20, what="it is known")
+        if index < 2:
+            sessions.handle(flight.base(index))
     models.give_up()
     closing = threading.Thread(target=sessions.close, daemon=True)
     closing.start()
