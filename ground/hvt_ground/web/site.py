@@ -143,7 +143,7 @@ class Site:
             try:
                 message = json.loads(await socket.receive_text())
                 self._obey(viewer, message)
-                if message["type"] == "watch":  # each sends all that is known, and may begin a stream anew
+                if message["type"] != "time":  # each sends all that is known, and may have pictures made anew
                     await asyncio.sleep(_WATCH_PAUSE_S)
             except (WebSocketDisconnect, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError):
                 return

@@ -75,8 +75,8 @@ function onState(state, why) {
   by("connection").textContent = words.connectionWords(connected, why);
   by("connection").classList.toggle("bad", !connected);
   if (state !== "connected") return;
-  connection.send({ type: "wall", shown: true });
   if (chosen) watch();
+  connection.send({ type: "wall", shown: true });
 }
 
 /** @param {Message} message @param {Uint8Array} payload */
