@@ -19,6 +19,7 @@ from av.video.reformatter import Interpolation
 
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.clock import SteadyClock
+from hvt_edge.source.decoding import container
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.folder import sequence_files
 from hvt_edge.source.live import LiveSource
@@ -557,10 +558,12 @@ def test_impossible_rates_are_refused(fps):
     assert "source-fps" in refused("demo", source_fps=-1.0)
 
 
-def test_a_file_that_another_program_will_write_is_waited_for(tmp_path):
+def test_a_file_that_another_program_will_write_is_waited_for(tmp_path, monkeypatch):
     """An edge that starts before the recorder would end with code 2, and no supervisor starts it again."""
     with pytest.raises(NotYetError, match="does not exist"):
         open_source(str(tmp_path / "growing.ts"), size=(320, 180), fps=15, fit="letterbox", growing=True)
-    (tmp_path / "growing.ts").touch()
-    with pytest.raises(NotYetError, match="empty so far"):
-        open_source(str(tmp_path / "growing.ts"), size=(320, 180), fps=15, fit="letterbox", growing=True)
+    monkeypatch.setattr(container, "_QUIET_S", 0.0)
+    for content, says in ((b"", "empty so far"), (bytes(100), "is not a video that can be read")):
+        (tmp_path / "growing.ts").write_bytes(content)
+        with pytest.raises(NotYetError, match=says):
+            open_source(str(tmp_path / "growing.ts"), size=(320, 180), fps=15, fit="letterbox", growing=True)

@@ -17,7 +17,7 @@ import av
 import av.error
 from av.stream import Disposition
 
-from hvt_common.errors import UserError
+from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
 from hvt_edge.source.decoding.timeline import LONG_PAUSE_S, LONG_STEP_S, Stamps, presented, surveyed
 
@@ -79,9 +79,11 @@ def open_video(
 ) -> tuple[Any, Any]:
     """Open a file or a URL, and the stream that is its film. ``note`` is told which, where there are several.
 
-    With ``growing`` a file that grows is read as it does. Raises `UserError` where there is none.
+    With ``growing`` a file that grows is read as it does. Raises `UserError` where there is none, `NotYetError` where
+    what grows is too short so far.
     """
     name, local = name_of(spec), is_local(spec)
+    refusal = NotYetError if local and growing else UserError
     if local and Path(spec).stat().st_size == 0 and not growing:
         raise UserError(f"source {spec!r} is an empty file; accepted is a video file")
     try:
@@ -90,7 +92,7 @@ def open_video(
         container = av.open(_GrowingFile(spec) if local and growing else where, timeout=(_OPEN_S, _READ_S))
     except (av.error.FFmpegError, OSError, ValueError) as error:
         unfinished = _lacks_index(Path(spec)) if local else ""
-        raise UserError(
+        raise refusal(
             f"source {name!r} is {unfinished}"
             if unfinished
             else f"source {name!r} is not a video that can be read ({cause_of(error)}); accepted is any video file "
@@ -99,7 +101,7 @@ def open_video(
     stream = choose_stream(container, note=note)
     if stream is None:
         container.close()
-        raise UserError(f"source {name!r} holds no video; accepted is any video file that FFmpeg decodes")
+        raise refusal(f"source {name!r} holds no video; accepted is any video file that FFmpeg decodes")
     stream.thread_type = "AUTO"
     codec = stream.codec_context
     # Each thread decodes a picture of its own, and holds it and what it builds on.
