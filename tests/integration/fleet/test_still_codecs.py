@@ -12,10 +12,9 @@ from programs.processes import Link, eventually
 pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(180)]
 
 EDGE = (
-    *("--edge-id", "uav-1", "--size", "640x360", "--fps", "5", "--preset", "ultrafast"),
+    *("--source", "demo", "--edge-id", "uav-1", "--size", "640x360", "--fps", "5", "--preset", "ultrafast"),
     *("--budget", "400kbps", "--video-share", "0.6", "--method", "permissive", "--gate", "0", "--wait", "0s"),
     *("--still-codec", "residual", "--fallback-codec", "h264-intra", "--pace", "realtime"),
-    *("--source-fps", "5"),
 )
 
 
@@ -25,10 +24,10 @@ def info(session: zenoh.Session, *codecs: str, requester: int) -> Info:
     return Info.parse(answer(session, "hvt/uav-1/info", request.pack()) or b"")
 
 
-def test_an_edge_sends_only_what_every_ground_reads(tmp_path, long_scene):
+def test_an_edge_sends_only_what_every_ground_reads(tmp_path):
     """A ground without the codec would show no still, and all of their bits would be for nothing."""
     with Link(tmp_path) as link:
-        edge = link.edge("--source", str(long_scene), *EDGE, listens=True)
+        edge = link.edge(*EDGE, listens=True)
         edge.until("no ground yet")
         with joined(link.edge_endpoint) as session:
             eventually(lambda: answer(session, "hvt/uav-1/info"), within_s=20, what="the edge answers info")
