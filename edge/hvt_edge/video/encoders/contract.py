@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from hvt_common.values import AccessUnit, Frame
@@ -65,3 +66,16 @@ class CheckedEncoder:
             raise ValueError(f"frame {frame.index} was to be a keyframe, and is no IDR with VPS, SPS and PPS")
         self._begun = True
         return AccessUnit(frame.index, frame.capture_ns, data, keyframe=begins)
+
+
+@dataclass(frozen=True, slots=True)
+class HardwareRow:
+    """One encoder of FFmpeg."""
+
+    codec: str
+    """Its name there, and of ``--encoder``."""
+    pixel_format: str
+    needs: str
+    """The hardware that it needs."""
+    options: Mapping[str, str] = field(default_factory=dict)
+    """Zero latency, constant rate, and an IDR where a keyframe is forced."""

@@ -1,4 +1,4 @@
-"""Encoders of graphics cards and boards, through PyAV: one class for all (`registry.HardwareRow`)."""
+"""Encoders of graphics cards and boards, through PyAV: one class for all (`HardwareRow`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from av.video.reformatter import VideoReformatter
 from hvt_common.errors import UserError
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.encoders.registry import HardwareRow
+from hvt_edge.video.encoders.contract import HardwareRow
 from hvt_edge.video.regions import Region
 from hvt_edge.video.x265 import encoder_context, mean_qp_of, yuv_picture
 

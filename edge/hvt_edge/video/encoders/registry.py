@@ -7,13 +7,12 @@ it is named.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.plug_ins import installed, loaded, the_one
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.encoders.contract import Encoder
+from hvt_edge.video.encoders.contract import Encoder, HardwareRow
 
 GROUP = "hvt.encoders"
 """The entry points' group."""
@@ -22,19 +21,6 @@ X265 = "x265"
 PASSTHROUGH = "passthrough"
 """None at all: the units of a camera that makes HEVC itself."""
 _WHAT = "encoder"
-
-
-@dataclass(frozen=True, slots=True)
-class HardwareRow:
-    """One encoder of FFmpeg."""
-
-    codec: str
-    """Its name there, and of ``--encoder``."""
-    pixel_format: str
-    needs: str
-    """The hardware that it needs."""
-    options: Mapping[str, str] = field(default_factory=dict)
-    """Zero latency, constant rate, and an IDR where a keyframe is forced."""
 
 
 # None of them has been run by the project: the rows were written from FFmpeg's documentation. What keeps a wrong row
