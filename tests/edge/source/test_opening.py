@@ -562,7 +562,7 @@ def test_a_file_that_another_program_will_write_is_waited_for(tmp_path, monkeypa
     """An edge that starts before the recorder would end with code 2, and no supervisor starts it again."""
     with pytest.raises(NotYetError, match="does not exist"):
         open_source(str(tmp_path / "growing.ts"), size=(320, 180), fps=15, fit="letterbox", growing=True)
-    monkeypatch.setattr(container, "_QUIET_S", 0.0)
+    monkeypatch.setattr(container, "QUIET_S", 0.0)
     for content, says in ((b"", "empty so far"), (bytes(100), "is not a video that can be read")):
         (tmp_path / "growing.ts").write_bytes(content)
         with pytest.raises(NotYetError, match=says):

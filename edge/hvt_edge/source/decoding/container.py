@@ -38,7 +38,7 @@ _MOST_FPS = 240
 """A stream that says more has its clock there, or was told no rate: 500, 90000."""
 _SURVEYED = 256
 """Packets at the start of a clip whose stamps are looked at."""
-_QUIET_S, _POLL_S = 10.0, 0.1
+QUIET_S, _POLL_S = 10.0, 0.1
 """A file that has not grown for so long has ended."""
 _MOST_BOXES = 64
 _TS_BYTES = (188, 192, 204)
@@ -68,7 +68,7 @@ class _GrowingFile:
 
     def read(self, size: int) -> bytes:
         """At most ``size`` bytes; nothing once it has not grown for ten seconds."""
-        until_s = time.monotonic() + _QUIET_S
+        until_s = time.monotonic() + QUIET_S
         while not (data := os.read(self._file, size)) and time.monotonic() < until_s:
             time.sleep(_POLL_S)
         return data
