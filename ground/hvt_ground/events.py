@@ -85,6 +85,8 @@ class Overlay:
     all are in a view that the detector does not know; None is nowhere."""
     sure: npt.NDArray[np.bool_] | None = None
     """(N,) True where stills agree on the class with a calibrated probability above .9; None is nowhere."""
+    looked_ns: int | None = None
+    """Capture time of the picture from which the list goes on, where its own was not looked at; None is its own."""
     places: Places | None = None
     """Their places on the ground; None without a pose."""
 

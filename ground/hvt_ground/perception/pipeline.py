@@ -224,7 +224,7 @@ class Pipeline:
         """
         if index > self._now.frame_index and self._own is not None:
             self._now = Progress(index, capture_ns, self._now.picture_index)
-            self._show(self._own_at(index), capture_ns)
+            self._show(self._own_at(index), capture_ns, looked_ns=self._picture_ns)
 
     def edge_step(self, step: Tracks, *, capture_ns: int | None = None) -> None:
         """Take what the edge's tracker listed at one frame: ids and class ids the edge's, boxes in base pixels.
@@ -321,7 +321,7 @@ class Pipeline:
 
     # The list
 
-    def _show(self, own: Tracks, capture_ns: int) -> None:
+    def _show(self, own: Tracks, capture_ns: int, *, looked_ns: int | None = None) -> None:
         # Put the list at the frame of ``own`` on record and, where nothing newer has been shown, give it out.
         self._carry_merges()
         fused = self._parts.fusion.listed(own)
@@ -336,7 +336,8 @@ class Pipeline:
                 self._parts.guesses.update(fused.tracks, shown.base_classes, step, scores=fused.means)
             self.doubted = int(shown.doubted.sum())
             shown = self._doubting(fused, shown)
-            self._emit(_overlay(fused, shown, capture_ns, base_size=self._base_size))
+            overlay = _overlay(fused, shown, capture_ns, base_size=self._base_size)
+            self._emit(replace(overlay, looked_ns=looked_ns))
 
     def _doubting(self, fused: FusedTracks, shown: ShownClasses) -> ShownClasses:
         # In a view that our detector does not know all its tracks are guesses, and no class is certain. What the

@@ -124,7 +124,9 @@ class SessionFeed:
             for track, box, name, sureness, read, doubt, known in rows
         ]
         colours = {name: "#{:02x}{:02x}{:02x}".format(*class_colour(name)) for name in set(item.classes)}
-        return self._text("overlay", item, tracks=tracks, colours=colours)
+        looked_ns = item.capture_ns if item.looked_ns is None else item.looked_ns
+        looked_ms = round(self._captured_ms(looked_ns), 1)
+        return self._text("overlay", item, looked=looked_ms, tracks=tracks, colours=colours)
 
     def _still(self, item: Refinement) -> None:
         still = still_name(self._info, item)

@@ -66,6 +66,10 @@ def test_boxes_go_on_over_pictures_that_were_passed_over(pictures):
         looked_at.pipeline.analyze(picture, hurry=False)
     seen, expected = rig.of(Overlay), looked_at.of(Overlay)
     assert [one.frame_index for one in seen] == list(range(16))
+    looked_ns = pictures[11].capture_ns
+    assert [one.looked_ns for one in seen] == [None] * 12 + [looked_ns] * 3 + [None], (
+        "else they pass for seen"
+    )
     for one, right, still in zip(seen[12:15], expected[12:15], expected[11:14], strict=True):
         assert one.track_ids.tolist() == right.track_ids.tolist()
         off_px = np.abs(one.boxes_base_px - right.boxes_base_px).max()

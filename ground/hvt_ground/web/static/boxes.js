@@ -3,7 +3,7 @@
 import { boxWords, trackName } from "./words.js";
 
 /** @typedef {{id: number, box: number[], name: string, sureness: number, read?: 1, doubted?: 1, sure?: 1}} Track */
-/** @typedef {{frame: number, captured: number, tracks: Track[], colours: Record<string, string>}} Overlay */
+/** @typedef {{frame: number, captured: number, looked: number, tracks: Track[], colours: Record<string, string>}} Overlay */
 
 const MOST = 4000;
 export const OLD_MS = 500; // a list so old says nothing of this picture
@@ -100,10 +100,10 @@ export class Boxes {
     return null;
   }
 
-  /** How far the boxes are behind the picture, ms; null where there are none at all. */
+  /** How far the picture that the boxes were seen in is behind this one, ms; null where there are none at all. */
   behind() {
     const found = this.newest();
-    return found ? Math.max(0, this.captured - found.captured) : null;
+    return found ? Math.max(0, this.captured - found.looked) : null;
   }
 
   /** @param {boolean} shown whether boxes are drawn at all */
@@ -152,7 +152,7 @@ export class Boxes {
     const letter = (width / ratio < 500 ? 9 : 12) * ratio;
     context.font = `${letter}px system-ui, sans-serif`;
     const list = this.current();
-    context.globalAlpha = list && this.captured - list.captured > FADED_MS ? 0.5 : 1;
+    context.globalAlpha = list && this.captured - list.looked > FADED_MS ? 0.5 : 1;
     /** @type {number[][]} */
     const taken = [];
     const tracks = this.drawn();

@@ -89,8 +89,8 @@ export const emptyWords = (state) =>
   state === "ended" ? "the flight has ended" : state === "stale" ? "no picture comes" : "waiting for a picture";
 
 /**
- * How old the list of boxes is that belongs to this picture; null where none has come.
- * @param {number | null} behindMs @param {number} oldMs beyond, no box is drawn
+ * How old the look is that the boxes of this picture rest on; null where none has come.
+ * @param {number | null} behindMs @param {number} oldMs beyond, it is said
  */
 export function boxesWords(behindMs, oldMs) {
   if (behindMs === null) return "no boxes yet";
