@@ -85,7 +85,28 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("a float of 32 bits is unknown", "case 0xca: return view.getFloat32(take(4));", ""),
     Mutant("a map of 16 bits is unknown", "case 0xde: return map(size(2), depth + 1);", ""),
     Mutant("an array of 32 bits is unknown", "case 0xdd: return array(size(4), depth + 1);", ""),
-    Mutant("a text of 32 bits is unknown", "case 0xdb: return text(size(4));", ""),
+    *(
+        Mutant(f"{what} is unknown", f"case 0x{tag}: return {code};", "")
+        for what, tag, code in (
+            ("a text of 16 bits", "da", "text(size(2))"),
+            ("a text of 32 bits", "db", "text(size(4))"),
+            ("an array of 16 bits", "dc", "array(size(2), depth + 1)"),
+            ("a number of 8 bits", "cc", "BigInt(size(1))"),
+            ("a number of 64 bits", "cf", "view.getBigUint64(take(8))"),
+            ("bytes of 16 bits", "c5", "bytes(size(2))"),
+            ("bytes of 32 bits", "c6", "bytes(size(4))"),
+        )
+    ),
+    Mutant(
+        "a number must be as short as may be",
+        "return view.getBigUint64(take(8));",
+        '{ const n = view.getBigUint64(take(8)); if (n < 2n ** 32n) throw new Refused("long"); return n; }',
+    ),
+    Mutant(
+        "an unknown field may not be NaN",
+        "return view.getFloat64(take(8));",
+        '{ const n = view.getFloat64(take(8)); if (isNaN(n)) throw new Refused("NaN"); return n; }',
+    ),
     Mutant("a signed byte has no sign", "view.getInt8(take(1))", "view.getUint8(take(1))"),
     Mutant("16 signed bits have no sign", "view.getInt16(take(2))", "view.getUint16(take(2))"),
     Mutant("32 signed bits have no sign", "view.getInt32(take(4))", "view.getUint32(take(4))"),
@@ -275,6 +296,12 @@ MUTANTS: tuple[Mutant, ...] = (
         "a repetition that stands by itself is read",
         "sequence <= this.sequence ||",
         "(sequence <= this.sequence && reference !== -1) ||",
+    ),
+    Mutant(
+        "a step's frame is looked at before its reference",
+        "if (sequence <= this.sequence ||",
+        'if (frame <= this.frame && sequence > this.sequence) return "damaged";\n'
+        "        if (sequence <= this.sequence ||",
     ),
     Mutant("a step may stand still", "need(frame > this.frame,", "need(frame >= this.frame,"),
     Mutant("a step is not sorted", "return found.sort((a, b) => a.id - b.id);", "return found;"),

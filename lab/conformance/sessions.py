@@ -118,7 +118,9 @@ def _damaged() -> Iterator[dict[str, Any]]:
         except WireError:
             yield {"hex": step.pack().hex(), "damaged": True}
     yield {"hex": replace(second, frame_index=0).pack().hex(), "damaged": True}
-    yield {"hex": replace(second, sequence=9, reference=8).pack().hex(), "skipped": True}
+    for frame_index in (second.frame_index, 0):
+        lost = replace(second, sequence=9, reference=8, frame_index=frame_index)
+        yield {"hex": lost.pack().hex(), "skipped": True}
     yield {"hex": first.pack().hex(), "skipped": True}
     yield {"hex": second.pack().hex(), "tracks": _rows(_read(second, state, before=first.frame_index))}
 

@@ -37,7 +37,7 @@ from lab.conformance.dialogues import backlog_dialogues, report_traces, still_si
 from lab.conformance.schema import PATH, name_of, schema
 from lab.conformance.sessions import poses, track_steps
 from lab.conformance.stills import still_cases
-from rigs.messages import BASE, EXAMPLES, INFO, REQUEST, ROI
+from rigs.messages import BASE, EXAMPLES, INFO, REQUEST, ROI, STEP
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "conformance"
 _PAYLOADS: Mapping[type[Message], bytes] = {BaseHeader: b"an access unit", StillWire: b"a still"}
@@ -299,6 +299,12 @@ def _good_envelopes() -> Iterator[dict[str, Any]]:
     yield _vector(BASE, "an unknown field as deep as may be", _packed([*values, deepest], payload))
     maps = _nested(DEEPEST - 1, map_of=True)
     yield _vector(BASE, "maps as deep as may be", _packed([*values, maps], payload))
+    numbers: list[Any] = [math.nan, math.inf, 2**64 - 1, -(2**63), "\x07"]
+    yield _vector(BASE, "unknown fields that no known one may hold", _packed([*values, *numbers], payload))
+    for length, what in enumerate(("8 bits", "16 bits", "32 bits", "64 bits")):
+        coded = bytes((0xCC + length,)) + (5).to_bytes(2**length, "big")
+        spelt = replace(BASE, send_delay_ns=5)
+        yield _vector(spelt, f"a number in {what}", _coded(spelt, {"send_delay_ns": coded}))
     small = replace(BASE, send_delay_ns=-5)
     for what, coded in (
         ("a number in a signed byte", b"\xd0\xfb"),
@@ -308,10 +314,15 @@ def _good_envelopes() -> Iterator[dict[str, Any]]:
     ):
         yield _vector(small, what, _coded(small, {"send_delay_ns": coded}))
     yield _vector(INFO, "a float of 32 bits", _coded(INFO, {"fps": b"\xca" + struct.pack(">f", INFO.fps)}))
-    long_text = b"\xdb" + struct.pack(">I", len(INFO.edge)) + INFO.edge.encode()
-    yield _vector(INFO, "a text with a long length", _coded(INFO, {"edge": long_text}))
-    sides = b"\xdd\0\0\0\x02" + b"".join(map(msgpack.packb, INFO.base_size))
-    yield _vector(INFO, "an array with a long length", _coded(INFO, {"base_size": sides}))
+    sides = b"".join(map(msgpack.packb, INFO.base_size))
+    for first, packed, what in ((0xD9, ">B", "8"), (0xDA, ">H", "16"), (0xDB, ">I", "32")):
+        text = bytes((first,)) + struct.pack(packed, len(INFO.edge)) + INFO.edge.encode()
+        yield _vector(INFO, f"a text with a length of {what} bits", _coded(INFO, {"edge": text}))
+        boxes = bytes((first - 0xD9 + 0xC4,)) + struct.pack(packed, len(STEP.boxes)) + STEP.boxes
+        yield _vector(STEP, f"bytes with a length of {what} bits", _coded(STEP, {"boxes": boxes}))
+    for head, what in ((b"\xdc\0\x02", "16"), (b"\xdd\0\0\0\x02", "32")):
+        array = _coded(INFO, {"base_size": head + sides})
+        yield _vector(INFO, f"an array with a length of {what} bits", array)
     request = replace(REQUEST, arguments={"bps": 5})
     for what, coded in (("a map with a length of 16 bits", b"\xde\0\x01"), ("of 32 bits", b"\xdf\0\0\0\x01")):
         yield _vector(request, what, _coded(request, {"arguments": coded + b"\xa3bps\x05"}))

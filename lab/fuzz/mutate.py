@@ -117,7 +117,10 @@ def _one_changed(value: Any, rng: Random, raw: Bytes) -> Any:
         if dice < 0.05:
             del value[place]
         elif dice < 0.1:
-            value[place:place] = [value[rng.randrange(len(value))]] * rng.choice((1, 1, 2, 40, 3000))
+            copied = value[rng.randrange(len(value))]
+            # An array that holds thousands already, thousands of times, would be gigabytes.
+            most = 2 if isinstance(copied, list | dict) else 3000
+            value[place:place] = [copied] * min(most, rng.choice((1, 1, 2, 40, 3000)))
         else:
             value[place] = _one_changed(value[place], rng, raw)
         return value

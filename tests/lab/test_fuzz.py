@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from random import Random
 
+import msgpack
 import pytest
 
 from hvt_common.protocol.messages import Status
@@ -55,6 +56,13 @@ def test_no_input_breaks_anything(name):
 def test_what_was_found_once_stays_mended(path):
     """It would come back with the next change."""
     TARGETS[path.parent.name].run(path.read_bytes())
+
+
+def test_a_mutation_of_a_long_message_does_not_fill_the_memory():
+    """Its array of thousands was repeated thousands of times, and each further round multiplied again."""
+    long_message = with_checksum(msgpack.packb([[*range(3000)], 5, 6, 0])[:-1])
+    sizes = [len(changed_values(long_message, rng, plain(rng))) for rng in map(Random, range(1200))]
+    assert max(sizes) < 20 * len(long_message)
 
 
 def test_mutations_get_past_the_checksum():
