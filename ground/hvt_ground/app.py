@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hvt_common.errors import FlightError, needs_extra
 from hvt_common.protocol.channels import check_edge_pattern
@@ -20,11 +20,12 @@ from hvt_common.runtime.process import give_back_holes, notify_systemd
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
-from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings, key_pair
+from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
+from hvt_ground.extras import Service, all_extras
 from hvt_ground.link.group import GroundGroup
 from hvt_ground.recordings.folder import RecordingsFolder
 from hvt_ground.recordings.retention import Retention
@@ -44,9 +45,6 @@ from hvt_ground.wiring import (
     make_link_settings,
     make_record_folder,
 )
-
-if TYPE_CHECKING:
-    from hvt_ground.web import WebPage
 
 _POLL_S = 0.1
 _STATUS_EVERY_POLLS = 10
@@ -109,33 +107,31 @@ class Ground:
             index = RecordingsFolder(config.record_folder, retention, failures=models.failures)
             stack.enter_context(index)
             settings = make_link_settings(config)
-            page = (
-                None
-                if config.web is None
-                else stack.enter_context(self._open_page(config.web, settings, models.failures))
-            )
+            offered = (one.serve(config, clock=self._clock, failures=models.failures) for one in all_extras())
+            services = [stack.enter_context(one) for one in offered if one is not None]
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)
             session = stack.enter_context(open_session(settings, failures=models.failures))
-            if page is not None:
-                page.use(EdgeClient.of_session(session, settings))
             make_record_folder(config)
             index.open()
+            client = EdgeClient.of_session(session, settings)
+            for one in services:
+                one.begin(client)
             factory = SessionFactory(
                 config,
                 models,
                 clock=self._clock,
                 outputs=outputs,
                 view=view,
-                page=page,
+                services=services,
                 index=index,
                 program=self._program,
             )
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             group = None
             if config.group is not None:
-                address = "" if page is None or page.is_local else page.address
-                group = stack.enter_context(GroundGroup(session, config.group, page=address))
+                shown = "".join([one.shown_to_others for one in services][:1])
+                group = stack.enter_context(GroundGroup(session, config.group, page=shown))
             link = stack.enter_context(
                 GroundLink(
                     session, edges=config.edges, clock=self._clock, group=group, log=factory.message_log
@@ -146,11 +142,14 @@ class Ground:
             notify_systemd("READY=1")
             self._say_where(
                 line,
-                pages=(*(() if view is None else (view.page,)), *(page.links if page else ())),
+                pages=(
+                    *([] if view is None else [view.page]),
+                    *(link for one in services for link in one.links),
+                ),
                 late={one.part for one in models.failures.now},
             )
             try:
-                self._serve(link, factory, line, watch, models, page, group)
+                self._serve(link, factory, line, watch, models, services, group)
                 models.give_up()
                 self._close_edges()
             except Exception as error:
@@ -168,18 +167,6 @@ class Ground:
         ]
 
     # Before anything is received
-
-    def _open_page(self, address: str, settings: LinkSettings, failures: Failures) -> WebPage:
-        with needs_extra("'hvt[web]'"):  # only now: who serves none starts faster
-            from hvt_ground.web import WebPage  # noqa: PLC0415
-        return WebPage(
-            address,
-            clock=self._clock,
-            failures=failures,
-            keys=key_pair(settings),
-            proxy=self._config.web_proxy,
-            recorded=self._config.record is not None,
-        )
 
     def _say_where(self, line: StatusLine, *, pages: Sequence[str], late: Collection[str]) -> None:
         config = self._config
@@ -211,7 +198,7 @@ class Ground:
         line: StatusLine,
         watch: LinkWatch,
         models: Models,
-        page: WebPage | None,
+        services: Sequence[Service],
         group: GroundGroup | None,
     ) -> None:
         config, polls = self._config, 0
@@ -240,8 +227,8 @@ class Ground:
             if polls % _STATUS_EVERY_POLLS == 0:
                 give_back_holes()
                 self._state = maker.make([(edge, one.sessions) for edge, one in sorted(self._edges.items())])
-                if page is not None:
-                    page.show(self._state)
+                for one in services:
+                    one.show(self._state)
                 line.show(status_text(self._state) or ("no link" if watch.trouble else "no edge yet"))
             if config.once and self._all_ended(loading=models.loading):
                 return

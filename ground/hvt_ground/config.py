@@ -20,7 +20,6 @@ from hvt_common.units import Limit, parse_limit
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
 LEAST_LOG_BYTES = 20_000_000
 """Twice the largest message that there is, and room for a flight between."""
-DEFAULT_PAGE = "127.0.0.1:8080"
 
 
 def _age(text: str, *, name: str) -> Limit:
@@ -151,17 +150,6 @@ class GroundConfig:
     )
     view: bool = _FILES.switch("also open the Rerun viewer")
     serve: bool = _FILES.switch("also serve the Rerun web viewer on this machine")
-    web: str | None = _FILES.option(
-        TEXT,
-        None,
-        f"also serve the page for browsers at HOST:PORT; alone: {DEFAULT_PAGE}; beyond this machine it takes a token",
-        bare=DEFAULT_PAGE,
-    )
-    web_proxy: str | None = _FILES_RARE.option(
-        TEXT,
-        None,
-        "a reverse proxy shows the page at this host; it says in X-HVT-Role who is viewer or operator",
-    )
     metrics: str | None = _FILES.option(
         TEXT,
         None,
@@ -195,8 +183,6 @@ def check(config: GroundConfig, *, files: Iterable[tuple[str, Path]] = ()) -> Gr
     """
     _check_files(config, files)
     _check_retention(config)
-    if config.web_proxy is not None and config.web is None:
-        raise UserError(f"--web-proxy {config.web_proxy} is given without --web: give --web too")
     if config.group is not None:
         GroupKeys(config.group)
     if config.log_size < LEAST_LOG_BYTES:

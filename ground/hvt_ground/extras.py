@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, make_dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar, Self, cast
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.plug_ins import installed, loaded
@@ -19,13 +19,24 @@ from hvt_ground.config import GroundConfig, check
 if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no recording
     from hvt_common.protocol.messages import Info
     from hvt_common.runtime.checkup import Finding
+    from hvt_common.runtime.failures import Failures
+    from hvt_ground.control import EdgeClient
     from hvt_ground.events import Event, Refinement
     from hvt_ground.poses import Locator
     from hvt_ground.recordings.recorded import Recorded
+    from hvt_ground.report.state import GroundState
     from hvt_ground.sinks import Outputs, SinkWriter
 
 _GROUP = "hvt.ground"
-_BROUGHT_BY = {"cot": "cot", "cot-types": "cot", "mcap": "mcap", "terrain": "terrain", "ts": "ground"}
+_BROUGHT_BY = {
+    "cot": "cot",
+    "cot-types": "cot",
+    "mcap": "mcap",
+    "terrain": "terrain",
+    "ts": "ground",
+    "web": "web",
+    "web-proxy": "web",
+}
 """Settings of the extras that come with HVT, and the package to install for each."""
 
 _ABSENT = "is of an extra that is not installed: pip install 'hvt[{}]'"
@@ -63,6 +74,35 @@ class Opening:
 OpenSinks = Callable[[Flight], Iterable[Opening]]
 
 
+class Service:
+    """What an extra does for a whole run of a ground: a context, from before the link is open until after its end."""
+
+    links: Sequence[str] = ()
+    """Where somebody can watch."""
+    shown_to_others: str = ""
+    """Such a link that other machines reach, without secrets."""
+
+    def begin(self, client: EdgeClient) -> None:
+        """Nothing can be refused any more, the folder of ``--record`` is there, and ``client`` reaches the edges."""
+
+    def sinks(self, flight: Flight) -> Iterable[Opening]:  # noqa: ARG002
+        """The sinks of a session."""
+        return ()
+
+    def still_address(self, info: Info, still: Refinement) -> str:  # noqa: ARG002
+        """Where the picture of a still can be seen; empty where nowhere."""
+        return ""
+
+    def show(self, state: GroundState) -> None:
+        """Take how all edges are, once a second."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End it."""
+
+
 class Extra:
     """The parts that an extra may bring; each method gets the whole configuration, an instance of ``options`` too."""
 
@@ -88,6 +128,16 @@ class Extra:
     def checks(self, config: GroundConfig) -> Mapping[str, Callable[[], Finding]]:  # noqa: ARG002
         """Its checks in ``hvt-ground doctor``, by name."""
         return {}
+
+    def serve(
+        self,
+        config: GroundConfig,  # noqa: ARG002
+        *,
+        clock: Callable[[], int],  # noqa: ARG002
+        failures: Failures,  # noqa: ARG002
+    ) -> Service | None:
+        """What it does for one whole run by the ground's ``clock``; `UserError` where it cannot."""
+        return None
 
     def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
         """Open the parts that all sessions share; return the function that opens the sinks of one, here none."""

@@ -26,6 +26,7 @@ from hvt_ground.poses import NOWHERE
         (["--mcap=a.mcap"], "mcap"),
         (["--ts", "a.ts"], "ground"),
         (["--terrain", "a.tif"], "terrain"),
+        (["--web"], "web"),
     ],
 )
 def test_a_setting_of_an_extra_that_is_absent(words, package):
@@ -43,7 +44,7 @@ def test_a_setting_of_an_extra_that_is_absent(words, package):
 def test_extras_bring_what_the_core_has_not():
     """Two of one name would hide each other."""
     settings = [one for extra in all_extras() for one in vars(extra.options)["__annotations__"]]
-    assert sorted(settings) == ["cot", "cot_types", "mcap", "terrain", "ts"]
+    assert sorted(settings) == ["cot", "cot_types", "mcap", "terrain", "ts", "web", "web_proxy"]
     assert not set(settings) & set(GroundConfig.__annotations__)
 
 

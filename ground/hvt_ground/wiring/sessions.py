@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Received
@@ -18,7 +18,7 @@ from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.recordings import BacklogRecording
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Refinement
-from hvt_ground.extras import Flight, all_extras, locators
+from hvt_ground.extras import Flight, Service, all_extras, locators
 from hvt_ground.perception.models import Models
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
@@ -35,9 +35,6 @@ from hvt_ground.sinks.tracks_table import TrackTable
 from hvt_ground.wiring.files import backlog_path, free_path, output_path
 from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline, make_trust
 
-if TYPE_CHECKING:  # who serves no page needs no web server
-    from hvt_ground.web import WebPage
-
 S = TypeVar("S", bound=SinkWriter[Any])
 
 OpenSink = Callable[[Info], Callable[[], SinkWriter[Event]]]
@@ -51,8 +48,8 @@ _LOCKSTEP_WAIT_S = 10.0
 class SessionFactory:
     """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
-    All that they write to is of ``outputs``; ``view`` is a viewer and ``page`` the page for browsers, None shows
-    nothing live; ``index`` learns of the recordings, and ``program`` opens a sink of another program.
+    All that they write to is of ``outputs``; ``view`` is a viewer, None shows nothing there; ``services`` are of
+    extras; ``index`` learns of the recordings, and ``program`` opens a sink of another program.
     """
 
     def __init__(
@@ -63,7 +60,7 @@ class SessionFactory:
         clock: Callable[[], int],
         outputs: Outputs,
         view: LiveView | None,
-        page: WebPage | None = None,
+        services: Sequence[Service] = (),
         index: Sink[RecordingRow] | None = None,
         program: OpenSink | None = None,
     ) -> None:
@@ -72,7 +69,7 @@ class SessionFactory:
         self._clock = clock
         self._outputs = outputs
         self._view = view
-        self._page = page
+        self._services = services
         self._index = index
         self._program = program
         self.records = program is None or config.record is not None
@@ -81,7 +78,10 @@ class SessionFactory:
         """Taken by this process."""
         self._naming = threading.Lock()
         self._locator_of = locators(getattr(config, "terrain", None))
-        self._extras = [extra.start(config, outputs) for extra in all_extras()]
+        self._extras = [
+            *(one.sinks for one in services),
+            *(extra.start(config, outputs) for extra in all_extras()),
+        ]
         self._timing: QueuedSink[str] | None = None
         if config.timing is not None:
             names = partial(free_path, [config.timing], number=2, may_exist=config.timing)
@@ -114,9 +114,6 @@ class SessionFactory:
         if self._view is not None:
             open_live = partial(_live_recorder, settings, self._view)
             sinks.append(self._outputs.open(f"live view of {edge}", open_live, longest_pause_s=_LIVE_PAUSE_S))
-        if self._page is not None:
-            part, opens = f"web page of {edge}", self._page.feed(info)
-            sinks.append(self._outputs.open(part, opens, longest_pause_s=_LIVE_PAUSE_S))
         files: dict[str, QueuedSink[Event]] = {}
         for target, what, suffix, make in (
             (config.tracks, "tracks table", ".csv", TrackTable),
@@ -170,12 +167,11 @@ class SessionFactory:
         return partial(self._opened, make, names)
 
     def _still_address(self, info: Info, files: QueuedSink[Event] | None) -> Callable[[Refinement], str]:
-        # Where the picture of a still is: on the page, else in the folder of ``--stills``, else nowhere.
-        page = self._page
-
+        # Where the picture of a still is: with a service, else in the folder of ``--stills``, else nowhere.
         def address(still: Refinement) -> str:
-            if page is not None:
-                return page.still_address(info, still)
+            for one in self._services:
+                if found := one.still_address(info, still):
+                    return found
             if files is None or not files.files or still.still_bgr is None or still.crop_base_px is None:
                 return ""
             return str(picture_of(still, files.files[-1].resolve()))

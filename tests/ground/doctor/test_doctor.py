@@ -29,7 +29,7 @@ def test_it_names_the_edges_that_are_there(tmp_path, capsys, long_scene):
     assert found["link"] == {"check": "link", "state": "ok", "found": "edges: uav-7", "todo": ""}
     assert "GB are free" in found["recordings"]["found"]
     assert not (tmp_path / "flights").exists(), "it changes nothing"
-    assert (code, found["ports"]["state"]) == (0, "ok")
+    assert (code, found["page"]["state"]) == (0, "ok")
 
 
 def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
@@ -49,7 +49,7 @@ def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
             ),
         )
     assert code == 2
-    for name in ("models", "recordings", "ports"):
+    for name in ("models", "recordings", "page"):
         assert found[name]["state"] == "wrong", found[name]
         assert found[name]["todo"], found[name]
     assert found["link"]["state"] == "warning", "edges may come later"

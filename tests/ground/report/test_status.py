@@ -27,8 +27,8 @@ from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.web.feed import SessionFeed, state_message
-from hvt_ground.web.viewers import EdgePage
+from hvt_web.feed import SessionFeed, state_message
+from hvt_web.viewers import EdgePage
 from programs.processes import eventually
 from programs.rrd import Recording
 from programs.summary_page import unexplained

@@ -29,7 +29,7 @@ from hvt_edge.source.live import LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_edge.world import World
 from hvt_ground.sinks.rerun.live_view import LiveView, listening
-from hvt_ground.web import WebPage
+from hvt_web.server import WebPage
 from programs.processes import eventually, free_ports
 from programs.rtsp_camera import RtspCamera
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 from hvt_ground.events import VideoSample
-from hvt_ground.web import WebPage
+from hvt_web.server import WebPage
 from media.moving_square import FPS, SIZE, moving_square
 from programs.processes import eventually, free_ports
 from rigs.messages import INFO

@@ -17,8 +17,8 @@ from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_ground.events import Event, MessageTiming, Notice, Overlay, Refinement, VideoSample
 from hvt_ground.report.state import EdgeState, GroundState, SessionState
 from hvt_ground.sinks.palette import class_colour
-from hvt_ground.web.pictures import Pictures, jpeg
-from hvt_ground.web.viewers import EdgePage, Hub, text
+from hvt_web.video.pictures import Pictures, jpeg
+from hvt_web.viewers import EdgePage, Hub, text
 
 _LATE_NS = 300_000_000
 """So far behind the link, pictures are decoded and not coded again until it has caught up."""

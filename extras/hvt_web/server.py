@@ -11,10 +11,9 @@ import struct
 import threading
 import time
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 from urllib.parse import urlsplit
 
@@ -28,12 +27,13 @@ from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.runtime.host_names import host_and_port, is_loopback
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Refinement
+from hvt_ground.extras import Flight, Opening, Service
 from hvt_ground.report.state import GroundState
-from hvt_ground.web.access import Access, crowding, own_tokens
-from hvt_ground.web.feed import SessionFeed, state_loads, state_message, still_name
-from hvt_ground.web.requests import EdgeRequests
-from hvt_ground.web.site import MOST_MESSAGE_BYTES, make_site
-from hvt_ground.web.viewers import EdgePage, Hub
+from hvt_web.access import Access, crowding, own_tokens
+from hvt_web.feed import SessionFeed, state_loads, state_message, still_name
+from hvt_web.requests import EdgeRequests
+from hvt_web.site import MOST_MESSAGE_BYTES, make_site
+from hvt_web.viewers import EdgePage, Hub
 
 MOST_CONNECTIONS = 256
 MOST_OPEN = MOST_CONNECTIONS + 64
@@ -48,9 +48,11 @@ _END_S = 2.0
 _LIST_ADDRESSES, _ROW_BYTES = 0x8912, 40 if struct.calcsize("P") == 8 else 32
 """SIOCGIFCONF and struct ifreq of netdevice(7)."""
 _MOST_ADDRESSES = 3
+_PAUSE_S = 5.0
+"""At most so long somebody who looks waits for what failed."""
 
 
-class WebPage:
+class WebPage(Service):
     """Serves the page at ``address`` (HOST:PORT) while the context lasts; ``clock`` is the ground's.
 
     An address that is not there yet, or a port that is not free, is waited for; without ``failures`` nobody hears.
@@ -85,8 +87,7 @@ class WebPage:
         start = f"{'http' if keys is None else 'https'}://{shown}:{port}/"
         self.address = start if proxy is None else f"https://{proxy}/"
         """Without a token."""
-        self.is_local = proxy is None and not tokens
-        """Whether only this machine reaches it."""
+        self.shown_to_others = "" if proxy is None and not tokens else self.address
         scheme = start.partition(":")[0]
         others = [f"{scheme}://{one}:{port}/" for one in own_addresses()] if host == "0.0.0.0" else []  # noqa: S104
         by_token = tuple(
@@ -120,9 +121,14 @@ class WebPage:
         self._server = _Server(config)
         self._thread = threading.Thread(target=self._run, name="hvt-web", daemon=True)
 
-    def use(self, client: EdgeClient) -> None:
+    def begin(self, client: EdgeClient) -> None:
         """Ask edges through it from now on."""
         self._client = client
+
+    def sinks(self, flight: Flight) -> Iterable[Opening]:
+        """Show the session."""
+        opens = self.feed(flight.info)
+        yield Opening(f"web page of {flight.info.edge}", opens, waits=False, longest_pause_s=_PAUSE_S)
 
     def feed(self, info: Info) -> Callable[[], SessionFeed]:
         """Make the function that opens a sink for a session, in the sink's thread."""
@@ -143,9 +149,7 @@ class WebPage:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._server.should_exit = True
         self._thread.join(_END_S + 1)

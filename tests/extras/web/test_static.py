@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-import hvt_ground.web
+import hvt_web
 
-STATIC = Path(hvt_ground.web.__file__).parent / "static"
+STATIC = Path(hvt_web.__file__).parent / "static"
 
 
 @pytest.mark.skipif(shutil.which("tsc") is None, reason="needs tsc (Debian: apt install node-typescript)")

@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 
 import hvt_ground
-import hvt_ground.web
+import hvt_web
 from hvt_common.protocol.still_words import STILL_WORDS
 
-STATIC = Path(hvt_ground.web.__file__).parent / "static"
+STATIC = Path(hvt_web.__file__).parent / "static"
 NODE = shutil.which("node")
 LIVE = {
     "connected": True, "refused": False, "goneMs": 0, "link": "up", "silentMs": 100, "chosen": True, "shown": True,
@@ -268,10 +268,10 @@ REFUSALS = {
 
 def test_every_event_and_every_refusal_is_read():
     """What the ground says on the page comes from many places: each text stands here, and was read."""
-    ground = Path(hvt_ground.__file__).parent
-    found = {text for path in ground.rglob("*.py") for text in noted(path)}
+    ground, page = Path(hvt_ground.__file__).parent, STATIC.parent
+    found = {text for folder in (ground, page) for path in folder.rglob("*.py") for text in noted(path)}
     assert found == EVENTS
-    web = [ground / "web" / f"{name}.py" for name in ("access", "site", "requests", "viewers", "server")]
+    web = [page / f"{name}.py" for name in ("access", "site", "requests", "viewers", "server")]
     said = {text for path in web for text in sentences(path)}
     assert said >= REFUSALS
     answers = {

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from hvt_ground.web.fmp4 import Fragment, Start
-from hvt_ground.web.pictures import Made
-from hvt_ground.web.viewers import EdgePage, Hub, StillPictures, Viewer, packed
+from hvt_web.video.fmp4 import Fragment, Start
+from hvt_web.video.pictures import Made
+from hvt_web.viewers import EdgePage, Hub, StillPictures, Viewer, packed
 
 
 def fragment(number: int, *, keyframe: bool = False, size: int = 10) -> Made:

@@ -21,7 +21,7 @@ from hvt_common.protocol.messages import Info
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import VideoSample
-from hvt_ground.web.fmp4 import Codec, Fragment, Muxer, Start
+from hvt_web.video.fmp4 import Codec, Fragment, Muxer, Start
 
 Rung = Literal["hevc", "h264", "jpeg", "thumbnail"]
 RUNGS: tuple[Rung, ...] = ("hevc", "h264", "jpeg")

@@ -3,9 +3,3 @@
 A sink (`feed`) turns each session into messages, `viewers` gives them out, `site` says what can be requested, and
 `server` runs it. The pages' own files are in ``static``.
 """
-
-from __future__ import annotations
-
-from hvt_ground.web.server import WebPage
-
-__all__ = ["WebPage"]

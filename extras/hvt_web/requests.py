@@ -12,7 +12,7 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Info
 from hvt_ground.control import EdgeClient, RefusedError
-from hvt_ground.web.pictures import jpeg
+from hvt_web.video.pictures import jpeg
 
 _MOST_AT_ONCE = 4
 _LEAST_SIDE_PX = 16

@@ -7,7 +7,7 @@ from threading import Barrier
 
 import pytest
 
-from hvt_ground.web.access import Access, cookie_name, crowding, own_tokens
+from hvt_web.access import Access, cookie_name, crowding, own_tokens
 
 GROUNDS = 8
 OPERATOR = {"x-hvt-role": "operator"}

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from hvt_ground.events import VideoSample
-from hvt_ground.web.fmp4 import Fragment, Start
-from hvt_ground.web.pictures import Pictures
+from hvt_web.video.fmp4 import Fragment, Start
+from hvt_web.video.pictures import Pictures
 from media.moving_square import FPS, SIZE, STEP_PX, moving_square
 from rigs.messages import INFO
 

@@ -20,10 +20,10 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from hvt_common.errors import UserError
-from hvt_ground.web.access import HEADERS, Access, Role, cookie_name, crowding
-from hvt_ground.web.pictures import RUNGS
-from hvt_ground.web.requests import BadRequestError, BusyError, EdgeRequests
-from hvt_ground.web.viewers import Hub, Viewer, packed, text
+from hvt_web.access import HEADERS, Access, Role, cookie_name, crowding
+from hvt_web.requests import BadRequestError, BusyError, EdgeRequests
+from hvt_web.video.pictures import RUNGS
+from hvt_web.viewers import Hub, Viewer, packed, text
 
 MOST_MESSAGE_BYTES = 4096
 MOST_VIEWERS = 64
@@ -33,7 +33,7 @@ _COOKIE_S = 30 * 86400
 _KINDS = {"js": "text/javascript", "css": "text/css", "html": "text/html", "svg": "image/svg+xml"}
 _FILES = {
     one.name: (one.read_bytes(), _KINDS[kind])
-    for one in files("hvt_ground.web").joinpath("static").iterdir()
+    for one in files("hvt_web").joinpath("static").iterdir()
     if (kind := one.name.rpartition(".")[2]) in _KINDS
 }
 """Read once: a requested file is a name of this table, never a path."""

@@ -7,7 +7,7 @@ import io
 import av
 import pytest
 
-from hvt_ground.web.fmp4 import Muxer
+from hvt_web.video.fmp4 import Muxer
 from media.moving_square import FPS, SIZE, moving_square
 
 

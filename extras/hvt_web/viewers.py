@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from hvt_ground.web.fmp4 import Fragment, Start
-from hvt_ground.web.pictures import RUNGS, THUMBNAIL, Made, Rung
+from hvt_web.video.fmp4 import Fragment, Start
+from hvt_web.video.pictures import RUNGS, THUMBNAIL, Made, Rung
 
 _MOST_QUEUED = 400
 _MOST_QUEUED_BYTES = 4 * 2**20

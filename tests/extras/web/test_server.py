@@ -21,9 +21,10 @@ from websockets.sync.client import ClientConnection, connect
 from hvt_common.errors import UserError
 from hvt_common.transport.zenoh_config import key_pair
 from hvt_ground.events import Notice, Refinement
-from hvt_ground.web import WebPage, server, site
-from hvt_ground.web.requests import BadRequestError, EdgeRequests
-from hvt_ground.web.viewers import Hub
+from hvt_web import server, site
+from hvt_web.requests import BadRequestError, EdgeRequests
+from hvt_web.server import WebPage
+from hvt_web.viewers import Hub
 from programs.fleet_keys import Fleet
 from programs.processes import eventually, free_ports
 from rigs.flight import Flight

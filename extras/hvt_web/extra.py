@@ -1,0 +1,79 @@
+"""The settings of the page for browsers, and how the ground comes to serve it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from hvt_common.config import TEXT, Group
+from hvt_common.errors import UserError, needs_extra
+from hvt_ground.config import GroundConfig
+from hvt_ground.extras import Extra, Service
+
+if TYPE_CHECKING:  # who serves none starts faster
+    from hvt_common.runtime.checkup import Finding
+    from hvt_common.runtime.failures import Failures
+
+_PAGE = Group("page for browsers")
+_HERE = "127.0.0.1:8080"
+
+
+@dataclass(frozen=True)
+class WebOptions:
+    """The settings of ``hvt-ground`` for it."""
+
+    web: str | None = _PAGE.option(
+        TEXT,
+        None,
+        f"also serve the page for browsers at HOST:PORT; alone: {_HERE}; beyond this machine it takes a token",
+        bare=_HERE,
+    )
+    web_proxy: str | None = replace(_PAGE, rare=True).option(
+        TEXT,
+        None,
+        "a reverse proxy shows the page at this host; it says in X-HVT-Role who is viewer or operator",
+    )
+
+
+class WebExtra(Extra):
+    """One page for all edges."""
+
+    options = WebOptions
+
+    def check(self, config: GroundConfig) -> None:
+        """Refuse a proxy without a page."""
+        if isinstance(config, WebOptions) and config.web_proxy is not None and config.web is None:
+            raise UserError(f"--web-proxy {config.web_proxy} is given without --web: give --web too")
+
+    def checks(self, config: GroundConfig) -> Mapping[str, Callable[[], Finding]]:
+        """Whether it could be served."""
+        if not isinstance(config, WebOptions) or config.web is None:
+            return {}
+        return {"page": partial(_found, config.web)}
+
+    def serve(self, config: GroundConfig, *, clock: Callable[[], int], failures: Failures) -> Service | None:
+        """Serve the page, encrypted by the keys of the link."""
+        if not isinstance(config, WebOptions) or config.web is None:
+            return None
+        with needs_extra("'hvt[web]'"):
+            from hvt_web.server import WebPage  # noqa: PLC0415
+        from hvt_common.transport.zenoh_config import key_pair  # noqa: PLC0415
+        from hvt_ground.wiring import make_link_settings  # noqa: PLC0415
+
+        return WebPage(
+            config.web,
+            clock=clock,
+            failures=failures,
+            keys=key_pair(make_link_settings(config)),
+            proxy=config.web_proxy,
+            recorded=config.record is not None,
+        )
+
+
+def _found(address: str) -> Finding:
+    from hvt_common.runtime.checkup import Finding, check_port  # noqa: PLC0415
+
+    check_port(address, name="--web", packages=("starlette", "uvicorn", "websockets"))
+    return Finding("ok", f"{address} is free")
