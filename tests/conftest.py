@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from hvt_common.runtime.process import STOP_SIGNALS
 from media.pictures import write_scene
 from programs.golden import once
 from programs.processes import free_ports
@@ -48,6 +52,24 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker("nightly")
         if item.get_closest_marker("nightly") and not config.getoption("nightly"):
             item.add_marker(pytest.mark.skip(reason="`make nightly` runs it"))
+
+
+@pytest.fixture(autouse=True)
+def _process_as_found() -> Iterator[None]:
+    """A program that a test calls in this process takes signals, log and hooks for itself: the next finds its own."""
+    signals = {one: signal.getsignal(one) for one in STOP_SIGNALS}
+    hooks = sys.excepthook, threading.excepthook
+    yield
+    sys.excepthook, threading.excepthook = hooks
+    for one, handler in signals.items():
+        signal.signal(one, handler)
+    logging.captureWarnings(capture=False)
+    root = logging.getLogger()
+    for held in [one for one in root.handlers if type(one).__module__.startswith("hvt_")]:
+        root.removeHandler(held)
+    for name, logger in root.manager.loggerDict.items():
+        if name.startswith("hvt") and isinstance(logger, logging.Logger) and logger.level:
+            logger.setLevel(logging.NOTSET)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -182,7 +182,6 @@ def test_other_words_stay_as_they_are():
 def test_neither_log_nor_traceback_nor_sentence_has_it(capsys, form):
     """The one line that nobody has thought of would give the camera away."""
     address = f"rtsp://admin:{SECRET}#1[@10.0.0.5/x"
-    hooks = sys.excepthook
 
     def run(_words):
         log = start_log("program", quiet=False, form=form, redaction=Redaction([address]))
@@ -195,11 +194,7 @@ def test_neither_log_nor_traceback_nor_sentence_has_it(capsys, form):
         sys.excepthook(type(bug), bug, bug.__traceback__)
         raise UserError(f"source {address!r} is wrong")
 
-    try:
-        assert exit_with_sentence(run, program="program", argv=["--source", address]) == 2
-    finally:
-        sys.excepthook = hooks
-        logging.basicConfig(force=True)
+    assert exit_with_sentence(run, program="program", argv=["--source", address]) == 2
     said = "".join(capsys.readouterr())
     assert "cannot open" in said
     assert "ValueError" in said

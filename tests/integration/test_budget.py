@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
-import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,7 +28,6 @@ EACH_TIME = ("M0", "M5")
 @pytest.fixture
 def run(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
     """Play six seconds of drone_carpark with more settings, keyframes among them, without a ground."""
-    handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
 
     def run(*settings: str) -> dict[str, Any]:
         (port,) = free_ports(1)
@@ -44,10 +41,7 @@ def run(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
         assert main([*arguments, *settings]) == 1, capsys.readouterr().err  # nobody listens
         return json.loads(summary.read_text())
 
-    yield run
-    for one, handler in handlers.items():
-        signal.signal(one, handler)
-    logging.getLogger().handlers.clear()
+    return run
 
 
 def held(summary: dict[str, Any], *, budget_bps: int, base_bps: int) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -13,7 +11,6 @@ import pytest
 
 import hvt_edge.cli
 import hvt_ground.cli
-from hvt_common.runtime.process import STOP_SIGNALS
 from programs.refusal import checked, snapshot
 
 Refused = Callable[..., str]
@@ -29,10 +26,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def refused(here: Path, capfd: pytest.CaptureFixture[str]) -> Iterator[Refused]:
+def refused(here: Path, capfd: pytest.CaptureFixture[str]) -> Refused:
     """Run a program in this process with wrong settings; return the sentence it refuses them with."""
-    handlers = {one: signal.getsignal(one) for one in STOP_SIGNALS}
-    kept = logging.getLogger().handlers[:]
 
     def refused(program: str, *settings: str, code: int = 2) -> str:
         before = snapshot(here)
@@ -41,10 +36,7 @@ def refused(here: Path, capfd: pytest.CaptureFixture[str]) -> Iterator[Refused]:
         assert out == ""
         return checked(err, program=program, left=snapshot(here) - before)
 
-    yield refused
-    for one, handler in handlers.items():
-        signal.signal(one, handler)
-    logging.getLogger().handlers[:] = kept
+    return refused
 
 
 @pytest.fixture

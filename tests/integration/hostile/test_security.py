@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,7 +15,6 @@ import zenoh
 
 import hvt_edge.cli
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
-from hvt_common.runtime.process import STOP_SIGNALS
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings, configure
@@ -290,18 +288,6 @@ def test_who_may_not_is_told_by_its_own_program_and_goes_on(told: dict[str, Runn
         assert "the other side wants a certificate" in process.summary()["unreached"]
 
 
-@pytest.fixture
-def own_handlers() -> Iterator[None]:
-    """A program in this process takes signals and logging for itself."""
-    handlers = {one: signal.getsignal(one) for one in STOP_SIGNALS}
-    kept = logging.getLogger().handlers[:]
-    yield
-    for one, handler in handlers.items():
-        signal.signal(one, handler)
-    logging.getLogger().handlers[:] = kept
-
-
-@pytest.mark.usefixtures("own_handlers")
 @pytest.mark.parametrize(
     ("case", "says"),
     [
