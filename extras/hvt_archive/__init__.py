@@ -1,4 +1,4 @@
-"""Tools for recordings after the flight: `exports` for other programs, `replay` with other models.
+"""What comes after the recording: an `index` of a folder, `exports` for other programs, `replay` with other models.
 
-Each is a command of ``hvt-ground`` behind the entry point ``hvt.ground_commands``; nothing of the ground imports one.
+`reading` opens recordings for the others. Nothing of the ground imports one.
 """

@@ -27,8 +27,6 @@ from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
 from hvt_ground.extras import Service, all_extras
 from hvt_ground.link.group import GroundGroup
-from hvt_ground.recordings.folder import RecordingsFolder
-from hvt_ground.recordings.retention import Retention
 from hvt_ground.report.state import GroundState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary
 from hvt_ground.session.edge_port import EdgePort
@@ -103,9 +101,6 @@ class Ground:
                 view = stack.enter_context(LiveView("spawn" if config.view else "serve", later=True))
             if config.metrics is not None:
                 stack.enter_context(self._health_server(config.metrics, models.failures))
-            retention = Retention(config.keep, config.keep_video)
-            index = RecordingsFolder(config.record_folder, retention, failures=models.failures)
-            stack.enter_context(index)
             settings = make_link_settings(config)
             offered = (one.serve(config, clock=self._clock, failures=models.failures) for one in all_extras())
             services = [stack.enter_context(one) for one in offered if one is not None]
@@ -113,7 +108,6 @@ class Ground:
             stack.callback(outputs.close)
             session = stack.enter_context(open_session(settings, failures=models.failures))
             make_record_folder(config)
-            index.open()
             client = EdgeClient.of_session(session, settings)
             for one in services:
                 one.begin(client)
@@ -124,7 +118,6 @@ class Ground:
                 outputs=outputs,
                 view=view,
                 services=services,
-                index=index,
                 program=self._program,
             )
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))

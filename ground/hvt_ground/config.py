@@ -22,15 +22,7 @@ LEAST_LOG_BYTES = 20_000_000
 """Twice the largest message that there is, and room for a flight between."""
 
 
-def _age(text: str, *, name: str) -> Limit:
-    limit = parse_limit(text, name=name)
-    if limit.seconds is None:
-        raise UserError(f"{name} {text!r} is no time: write 3days or 12h")
-    return limit
-
-
 _LIMIT = SettingType("LIMIT", parse_limit)
-_AGE = SettingType("AGE", _age)
 
 _LINK, _MODELS, _FILES = Group("link and edges"), Group("models"), Group("files and views")
 _LINK_RARE, _MODELS_RARE, _FILES_RARE = (replace(group, rare=True) for group in (_LINK, _MODELS, _FILES))
@@ -123,16 +115,6 @@ class GroundConfig:
     split: Limit | None = _FILES.option(
         _LIMIT, None, "begin a new file of the recording after so much, at the next keyframe"
     )
-    keep: tuple[Limit, ...] = _FILES.option(
-        _LIMIT,
-        (),
-        "remove recordings of the folder of --record that are older, or the oldest beyond so many bytes",
-        many=True,
-        shown_default="all are kept",
-    )
-    keep_video: Limit | None = _FILES.option(
-        _AGE, None, "remove the video of older recordings; stills, boxes and events stay until --keep"
-    )
     tracks: Path | None = _FILES.option(
         PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
     )
@@ -182,7 +164,6 @@ def check(config: GroundConfig, *, files: Iterable[tuple[str, Path]] = ()) -> Gr
     ``files`` are further ones that are written, each with the option that names it.
     """
     _check_files(config, files)
-    _check_retention(config)
     if config.group is not None:
         GroupKeys(config.group)
     if config.log_size < LEAST_LOG_BYTES:
@@ -204,21 +185,6 @@ def check(config: GroundConfig, *, files: Iterable[tuple[str, Path]] = ()) -> Gr
         classifier = EMBEDDED_CLASSIFIER if embedded else DETECTOR
         return replace(config, classifier=classifier)
     return config
-
-
-def _check_retention(config: GroundConfig) -> None:
-    ages = [one for one in config.keep if one.seconds is not None]
-    for same in (ages, [one for one in config.keep if one not in ages]):
-        if len(same) > 1:
-            raise UserError(
-                f"--keep {same[0]} and --keep {same[1]} are both given: give one time and one size"
-            )
-    for name, given in (("--keep", config.keep[:1]), ("--keep-video", (config.keep_video,))):
-        if any(given) and config.record_folder is None:
-            raise UserError(
-                f"{name} {given[0]} needs a folder of recordings, and --record {config.record or 'is not given'}"
-                f"{' is a file' if config.record else ''}: give --record FOLDER/"
-            )
 
 
 def _check_files(config: GroundConfig, more: Iterable[tuple[str, Path]]) -> None:

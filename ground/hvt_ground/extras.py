@@ -23,7 +23,8 @@ if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no reco
     from hvt_ground.control import EdgeClient
     from hvt_ground.events import Event, Refinement
     from hvt_ground.poses import Locator
-    from hvt_ground.recordings.recorded import Recorded
+    from hvt_ground.recordings.contract import Recorded
+    from hvt_ground.recordings.row import RecordingRow
     from hvt_ground.report.state import GroundState
     from hvt_ground.sinks import Outputs, SinkWriter
 
@@ -34,6 +35,8 @@ _BROUGHT_BY = {
     "mcap": "mcap",
     "terrain": "terrain",
     "ts": "ground",
+    "keep": "ground",
+    "keep-video": "ground",
     "web": "web",
     "web-proxy": "web",
 }
@@ -95,6 +98,9 @@ class Service:
 
     def show(self, state: GroundState) -> None:
         """Take how all edges are, once a second."""
+
+    def recorded(self, row: RecordingRow) -> None:
+        """Take the facts of a file of a recording: when it begins and ends, and every few seconds; in any thread."""
 
     def __enter__(self) -> Self:
         return self

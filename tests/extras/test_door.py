@@ -27,6 +27,7 @@ from hvt_ground.poses import NOWHERE
         (["--ts", "a.ts"], "ground"),
         (["--terrain", "a.tif"], "terrain"),
         (["--web"], "web"),
+        (["--keep", "3days"], "ground"),
     ],
 )
 def test_a_setting_of_an_extra_that_is_absent(words, package):
@@ -44,11 +45,21 @@ def test_a_setting_of_an_extra_that_is_absent(words, package):
 def test_extras_bring_what_the_core_has_not():
     """Two of one name would hide each other."""
     settings = [one for extra in all_extras() for one in vars(extra.options)["__annotations__"]]
-    assert sorted(settings) == ["cot", "cot_types", "mcap", "terrain", "ts", "web", "web_proxy"]
+    assert sorted(settings) == [
+        "cot",
+        "cot_types",
+        "keep",
+        "keep_video",
+        "mcap",
+        "terrain",
+        "ts",
+        "web",
+        "web_proxy",
+    ]
     assert not set(settings) & set(GroundConfig.__annotations__)
 
 
-@pytest.mark.parametrize("command", ["export", "keys", "replay"])
+@pytest.mark.parametrize("command", ["export", "keys", "recordings", "replay"])
 def test_a_command_of_an_extra_that_is_absent(command, monkeypatch, capsys):
     """It would be an unrecognised argument of the ground."""
     monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})

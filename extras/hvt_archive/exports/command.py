@@ -15,10 +15,11 @@ from hvt_archive.exports.pictures import write_coco, write_stills
 from hvt_archive.exports.tables import write_csv, write_mot, write_parquet
 from hvt_archive.exports.video import CONTAINERS, write_video
 from hvt_archive.exports.whole import whole_file, whole_folder
+from hvt_archive.reading.recorded import read_recordings
 from hvt_common.errors import Parser, UserError, check_not_read
 from hvt_common.runtime.reporting import say
 from hvt_ground.extras import all_extras, locators
-from hvt_ground.recordings.recorded import Recorded, read_recordings
+from hvt_ground.recordings.contract import Recorded
 
 _FOLDERS: dict[str, Callable[[Recorded, Path], None]] = {"coco": write_coco, "stills": write_stills}
 _SUFFIXES = {"mot": ".txt"}

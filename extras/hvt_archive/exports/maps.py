@@ -19,7 +19,7 @@ from hvt_archive.exports.ways import Fix, line, parts_of
 from hvt_common.errors import UserError
 from hvt_common.geodesy import metres_per_degree, moved, turned_deg
 from hvt_common.units import SECOND_NS
-from hvt_ground.recordings.recorded import Recorded
+from hvt_ground.recordings.contract import Recorded
 from hvt_ground.sinks.palette import class_colour
 from hvt_ground.sinks.tracks_table import utc_text
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hvt_ground.recordings.recorded import Recorded
+from hvt_ground.recordings.contract import Recorded
 from hvt_ground.sinks.tracks_table import COLUMNS, track_rows
 
 _BATCH_ROWS = 100_000

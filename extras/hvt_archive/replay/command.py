@@ -19,6 +19,7 @@ from typing import Any
 
 from rich.progress import Progress
 
+from hvt_archive.reading.recorded import read_recordings
 from hvt_archive.replay.from_recording import messages_of
 from hvt_common.config import load
 from hvt_common.errors import Parser, UserError
@@ -32,7 +33,6 @@ from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import checked, config_class
 from hvt_ground.perception.models import Models
-from hvt_ground.recordings.recorded import read_recordings
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import InfoAnswer
 from hvt_ground.session.edge_sessions import EdgeSessions

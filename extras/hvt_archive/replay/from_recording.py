@@ -16,7 +16,7 @@ from hvt_common.protocol.messages import BaseHeader, Flags, PoseEncoder, RoiHead
 from hvt_common.transport.inbox import Received
 from hvt_common.video.annex_b import parameter_sets
 from hvt_ground.events import PoseUpdate, VideoSample
-from hvt_ground.recordings.recorded import Recorded, RecordedStill
+from hvt_ground.recordings.contract import Recorded, RecordedStill
 
 _OF_EVERY_POSE = 0
 """Each report stands by itself, so that none is lost with another."""

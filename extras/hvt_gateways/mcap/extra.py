@@ -15,7 +15,7 @@ from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 
 if TYPE_CHECKING:
     from hvt_gateways.mcap.file import McapFile
-    from hvt_ground.recordings.recorded import Recorded
+    from hvt_ground.recordings.contract import Recorded
     from hvt_ground.sinks import Outputs
 
 
@@ -61,7 +61,7 @@ class McapExtra(Extra):
 
 
 def _export(recorded: Recorded, path: Path) -> None:
-    from hvt_ground.recordings.recorded import RecordedStill  # noqa: PLC0415 - it brings Rerun
+    from hvt_ground.recordings.contract import RecordedStill  # noqa: PLC0415 - it brings PyAV
 
     file = _file()(path, edge=recorded.edge)
     try:

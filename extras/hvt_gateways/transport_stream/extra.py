@@ -13,7 +13,7 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 
 if TYPE_CHECKING:  # what writes it opens PyAV, which settings alone do without
-    from hvt_ground.recordings.recorded import Recorded
+    from hvt_ground.recordings.contract import Recorded
     from hvt_ground.sinks import Outputs
 
 

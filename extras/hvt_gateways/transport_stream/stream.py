@@ -35,7 +35,7 @@ from hvt_ground.events import Event, Overlay, PoseUpdate, VideoSample
 from hvt_ground.poses import PoseTrail
 
 if TYPE_CHECKING:
-    from hvt_ground.recordings.recorded import Recorded
+    from hvt_ground.recordings.contract import Recorded
 
 _BUFFER_BYTES: Final = 24 * 7 * 188
 """A buffer of whole datagrams of whole packets."""

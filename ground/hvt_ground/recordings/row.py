@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import re
-import time
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 
-_OWN = re.compile(r"hvt-.+-(\d{8}-\d{6})(-\d+|-backlog)*\.rrd")
 _MOST_REMEMBERED = 4096
 """Tracks and stills that are known again; one that comes back after so many others counts twice."""
 _LATEST_NS = 2**63 - 1
@@ -45,22 +41,6 @@ class RecordingRow:
     """False once the video was removed."""
     whole: bool = False
     """It was closed; otherwise it is written to, or its program was killed."""
-
-
-def is_own_name(name: str) -> bool:
-    """Whether a ground gives such names of its own accord: a copy that somebody named is his."""
-    return _OWN.fullmatch(name) is not None
-
-
-def begun_ns(name: str) -> int | None:
-    """The beginning of a file's session by its name, Unix time; None where that says nothing."""
-    found = _OWN.fullmatch(name)
-    try:
-        return (
-            None if found is None else int(time.mktime(time.strptime(found[1], "%Y%m%d-%H%M%S"))) * SECOND_NS
-        )
-    except (ValueError, OverflowError):
-        return None
 
 
 class FileAccount:

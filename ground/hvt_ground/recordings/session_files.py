@@ -12,7 +12,7 @@ import threading
 import time
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import chain, count
@@ -21,7 +21,6 @@ from pathlib import Path
 from hvt_common.units import SECOND_NS, Limit
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.row import FileAccount, RecordingRow
-from hvt_ground.sinks import Sink
 from hvt_ground.sinks.line_file import claim_name
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.recording_file import RecordingFile
@@ -40,8 +39,8 @@ class SessionFiles:
     """A sink, as `Recorder`. Without ``split`` all goes into the file of ``settings``.
 
     Otherwise that gives the names: ``flight.rrd`` becomes ``flight-0001.rrd``, ``flight-0002.rrd`` and, for what
-    comes late, ``flight-0001-backlog.rrd``; none is written over. ``index`` learns of each file when it begins and
-    ends, and every few seconds.
+    comes late, ``flight-0001-backlog.rrd``; none is written over. ``tell`` gets the facts of each file when it begins
+    and ends, and every few seconds.
     """
 
     def __init__(
@@ -49,11 +48,11 @@ class SessionFiles:
         settings: RecorderSettings,
         *,
         split: Limit | None = None,
-        index: Sink[RecordingRow] | None = None,
+        tell: Callable[[RecordingRow], None] | None = None,
         backlog: bool = False,
     ) -> None:
         assert settings.path is not None, "a viewer is no file"
-        self._settings, self._split, self._index, self._backlog = settings, split, index, backlog
+        self._settings, self._split, self._tell, self._backlog = settings, split, tell, backlog
         self._base = settings.path
         first = self._base if split is None else self._numbered(1)
         self._recorder = Recorder(replace(settings, path=first))
@@ -184,7 +183,7 @@ class SessionFiles:
         base = self._base
         return _free(base.with_name(f"{base.stem}-{one:04d}{base.suffix}") for one in count(number))
 
-    # What the index learns
+    # What others learn
 
     def _opened(self, file: RecordingFile, *, backlog: bool = False) -> RecordingFile:
         self._accounts[file] = FileAccount(backlog=backlog or self._backlog)
@@ -204,10 +203,10 @@ class SessionFiles:
             self._report(file)
 
     def _report(self, file: RecordingFile) -> None:
-        if self._index is None or file.path is None:
+        if self._tell is None or file.path is None:
             return
         account = self._accounts[file]
-        self._index.log(
+        self._tell(
             RecordingRow(
                 file=file.path.name,
                 edge=self._settings.edge_id,

@@ -61,7 +61,6 @@ class SessionFactory:
         outputs: Outputs,
         view: LiveView | None,
         services: Sequence[Service] = (),
-        index: Sink[RecordingRow] | None = None,
         program: OpenSink | None = None,
     ) -> None:
         self._config = config
@@ -70,7 +69,6 @@ class SessionFactory:
         self._outputs = outputs
         self._view = view
         self._services = services
-        self._index = index
         self._program = program
         self.records = program is None or config.record is not None
         """Whether there are recordings: a program takes their place unless they are requested."""
@@ -182,8 +180,12 @@ class SessionFactory:
         self, settings: RecorderSettings, *, split: Limit | None = None, backlog: bool = False
     ) -> Callable[[Path], SessionFiles]:
         return lambda path: SessionFiles(
-            replace(settings, path=path), split=split, index=self._index, backlog=backlog
+            replace(settings, path=path), split=split, tell=self._recorded, backlog=backlog
         )
+
+    def _recorded(self, row: RecordingRow) -> None:
+        for one in self._services:
+            one.recorded(row)
 
     def _opened(self, make: Callable[[Path], S], name: Callable[..., Path]) -> S:
         # A sink with a file; a name that could not be used is free again.

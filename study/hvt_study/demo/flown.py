@@ -11,10 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hvt_archive.reading.recorded import read_recordings
 from hvt_common.errors import UserError
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
-from hvt_ground.recordings.recorded import read_recordings
 from hvt_study.metrics.track_table_score import Labelled, read_tracks
 
 

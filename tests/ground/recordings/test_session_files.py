@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hvt_archive.index.files import described
+from hvt_archive.reading.recorded import read_recordings
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS, Limit
 from hvt_common.values import Pose, View
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, VideoSample
-from hvt_ground.recordings.files import described
-from hvt_ground.recordings.recorded import read_recordings
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks.rerun.live_view import viewer_program
@@ -59,14 +59,11 @@ class Rows:
         """Take the newest row of a file."""
         self.rows[item.file] = item
 
-    def close(self, hurry: object = None) -> None:
-        """Nothing to do."""
-
 
 def recorded(folder: Path, events: list[Event], split: Limit = SPLIT) -> tuple[list[Path], Rows]:
     """The files, in the order of their names."""
     rows = Rows()
-    sink = SessionFiles(settings(folder / "flight.rrd"), split=split, index=rows)
+    sink = SessionFiles(settings(folder / "flight.rrd"), split=split, tell=rows.log)
     for event in events:
         sink.log(event)
     sink.close()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import hvt_ground.cli
-from hvt_ground.recordings.database import INDEX, read_index
+from hvt_archive.index.database import INDEX, read_index
 from programs.processes import Link, eventually
 from programs.rrd import Recording
 

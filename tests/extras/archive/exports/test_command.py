@@ -261,7 +261,7 @@ def test_a_recording_that_breaks_off_is_exported_so_far(recording, tmp_path, los
 def test_a_split_session_is_exported_as_one(recording, events, tmp_path):
     """A video would end where a file did."""
     settings = RecorderSettings(tmp_path / "part.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
-    sink = SessionFiles(settings, split=Limit(seconds=1.2), index=None)
+    sink = SessionFiles(settings, split=Limit(seconds=1.2))
     for event in events:
         sink.log(event)
     sink.close()

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import hvt_ground.cli
+from hvt_archive.reading.recorded import read_recordings
 from hvt_archive.replay.command import messages_in
 from hvt_archive.replay.from_recording import messages_of
 from hvt_common.protocol.channels import Channel, parse_key
@@ -26,7 +27,6 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
-from hvt_ground.recordings.recorded import read_recordings
 from hvt_ground.sinks.message_log import MessageLog, read_log
 from rigs.drawn_flight import FRAMES
 

@@ -18,15 +18,15 @@ from shutil import copytree
 
 import pytest
 
+from hvt_archive.index.database import INDEX, read_index
+from hvt_archive.index.files import claimed, is_claimed
+from hvt_archive.index.folder import IndexWriter, RecordingsFolder
+from hvt_archive.index.retention import Retention
 from hvt_common.errors import UserError
 from hvt_common.runtime.clock import boot_id, since_boot_ns
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import Limit
 from hvt_ground.events import Event, Refinement, VideoSample
-from hvt_ground.recordings.database import INDEX, read_index
-from hvt_ground.recordings.files import claimed, is_claimed
-from hvt_ground.recordings.folder import IndexWriter, RecordingsFolder
-from hvt_ground.recordings.retention import Retention
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks import QueuedSink
@@ -60,8 +60,8 @@ def fly(folder: Path, events: list[Event], retention: Retention = ALL) -> Failur
     """Record them with an index, to the end."""
     failures = Failures(time.time_ns)
     with RecordingsFolder(folder, retention, failures=failures) as index:
-        index.open()
-        sink = SessionFiles(settings(folder), split=SPLIT, index=index)
+        index.begin()
+        sink = SessionFiles(settings(folder), split=SPLIT, tell=index.recorded)
         for event in events:
             sink.log(event)
         sink.close()
@@ -155,8 +155,8 @@ def test_an_index_that_cannot_be_written_disturbs_no_flight(tmp_path, events, ho
     failures = Failures(time.time_ns)
     with closing(blocker), RecordingsFolder(tmp_path, ALL, failures=failures) as index:
         blocker.execute("BEGIN EXCLUSIVE")
-        index.open()
-        sink = SessionFiles(settings(tmp_path), split=SPLIT, index=index)
+        index.begin()
+        sink = SessionFiles(settings(tmp_path), split=SPLIT, tell=index.recorded)
         for event in events:
             sink.log(event)
         sink.close()  # while nobody can write to the index: nobody waits for it
@@ -198,8 +198,8 @@ def test_an_index_that_is_removed_in_flight_is_made_anew(tmp_path, events):
     """All that came after it would be written to a file that is in no folder."""
     failures = Failures(time.time_ns)
     with RecordingsFolder(tmp_path, ALL, failures=failures) as index:
-        index.open()
-        sink = SessionFiles(settings(tmp_path), split=SPLIT, index=index)
+        index.begin()
+        sink = SessionFiles(settings(tmp_path), split=SPLIT, tell=index.recorded)
         eventually(lambda: (tmp_path / INDEX).exists() and read_index(tmp_path), within_s=20, what="a row")
         for one in tmp_path.glob(f"{INDEX}*"):
             one.unlink()
@@ -332,8 +332,8 @@ def test_a_file_in_flight_is_never_removed(tmp_path, events):
     """The flight in the air would be lost: not even where another ground writes it."""
     failures = Failures(time.time_ns)
     with RecordingsFolder(tmp_path, ALL, failures=failures) as index:
-        index.open()
-        sink = SessionFiles(settings(tmp_path), split=SPLIT, index=index)
+        index.begin()
+        sink = SessionFiles(settings(tmp_path), split=SPLIT, tell=index.recorded)
         for event in events:
             sink.log(event)
         eventually(lambda: len(read_index(tmp_path)) == 2, within_s=20, what="the index knows both")
@@ -393,13 +393,13 @@ from pathlib import Path
 sys.path.insert(0, {tests!r})
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import Limit
-from hvt_ground.recordings.folder import RecordingsFolder
-from hvt_ground.recordings.retention import Retention
+from hvt_archive.index.folder import RecordingsFolder
+from hvt_archive.index.retention import Retention
 from hvt_ground.recordings.session_files import SessionFiles
 settings, events = pickle.loads(Path({feed!r}).read_bytes())
 index = RecordingsFolder(Path({folder!r}), Retention(*{retention}), failures=Failures(time.time_ns))
-index.open()
-sink = SessionFiles(settings, split=Limit(seconds=2.0), index=index)
+index.begin()
+sink = SessionFiles(settings, split=Limit(seconds=2.0), tell=index.recorded)
 for event in events:
     sink.log(event)
     print(event.frame_index, flush=True)
@@ -413,7 +413,7 @@ def killed(folder: Path, events: list[Event], *, at: int, retention: str = "()")
     feed = folder.parent / "feed"
     feed.write_bytes(pickle.dumps((settings(folder), events)))
     script = GROUND.format(
-        tests=str(Path(__file__).parents[3] / "tests" / "support"),
+        tests=str(Path(__file__).parents[4] / "tests" / "support"),
         feed=str(feed),
         folder=str(folder),
         retention=retention,

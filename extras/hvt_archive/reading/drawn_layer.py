@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from hvt_archive.reading.spool import SpooledRows, Timed
 from hvt_ground.events import Origin
-from hvt_ground.recordings.spool import SpooledRows, Timed
 from hvt_ground.sinks.rerun.overlays import ORIGINS
 
 TRACK_COMPONENTS = frozenset(

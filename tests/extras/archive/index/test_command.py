@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 import hvt_ground.cli
+from hvt_archive.index.database import INDEX, Index, read_index
 from hvt_common.units import SECOND_NS
-from hvt_ground.recordings.database import INDEX, Index, read_index
 from hvt_ground.recordings.row import RecordingRow
 
 NOON_NS = 1_591_012_800 * SECOND_NS

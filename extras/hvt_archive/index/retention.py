@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
+import time
 from collections import Counter
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS, Limit
-from hvt_ground.recordings.row import RecordingRow, begun_ns
+from hvt_ground.recordings.row import RecordingRow
 
+_OWN = re.compile(r"hvt-.+-(\d{8}-\d{6})(-\d+|-backlog)*\.rrd")
 _CLOCK_SET_NS = 1_577_836_800 * SECOND_NS
 """2020: a name of before was given before the machine knew the time, and nobody knows how old the file is."""
 _TRUSTED_SHARE = 1 / 4
@@ -105,10 +108,26 @@ def _surplus(ordered: Sequence[RecordingRow], most_bytes: int, in_use: Container
             yield row.file
 
 
+def is_own_name(name: str) -> bool:
+    """Whether a ground gives such names of its own accord: a copy that somebody named is his."""
+    return _OWN.fullmatch(name) is not None
+
+
+def _begun_ns(name: str) -> int | None:
+    """The beginning of a file's session by its name, Unix time; None where that says nothing."""
+    found = _OWN.fullmatch(name)
+    try:
+        return (
+            None if found is None else int(time.mktime(time.strptime(found[1], "%Y%m%d-%H%M%S"))) * SECOND_NS
+        )
+    except (ValueError, OverflowError):
+        return None
+
+
 def _older(row: RecordingRow, limit: Limit, now_ns: int) -> bool:
     # Whether it is older, by the index's own time and by its name.
     limit_ns = (limit.seconds or 0.0) * SECOND_NS
     if now_ns - row.written_ns <= limit_ns:
         return False
-    began_ns = begun_ns(row.file)
+    began_ns = _begun_ns(row.file)
     return began_ns is not None and began_ns >= _CLOCK_SET_NS and now_ns - began_ns > limit_ns

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
+from hvt_archive.index.retention import Due, Retention, due
 from hvt_common.units import SECOND_NS, Limit
-from hvt_ground.recordings.retention import Due, Retention, due
 from hvt_ground.recordings.row import RecordingRow
 
 DAY_NS = 86_400 * SECOND_NS

@@ -11,16 +11,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Self
 
+from hvt_archive.index.database import Index
+from hvt_archive.index.files import SCRATCH, claimed, described, is_claimed, remove_video
+from hvt_archive.index.retention import Retention, due, is_own_name
 from hvt_common.errors import UserError
 from hvt_common.runtime.clock import Moment, boot_id, since_boot_ns
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_ground.recordings.database import Index
-from hvt_ground.recordings.files import SCRATCH, claimed, described, is_claimed, remove_video
-from hvt_ground.recordings.retention import Retention, due
-from hvt_ground.recordings.row import RecordingRow, is_own_name
+from hvt_ground.control import EdgeClient
+from hvt_ground.extras import Service
+from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.sinks import QueuedSink
 
 _log = logging.getLogger(__name__)
@@ -169,13 +170,10 @@ class IndexWriter:
         return True
 
 
-class RecordingsFolder:
-    """The index of a folder for all sessions of a ground; a sink for any thread. Nothing happens before `open`.
+class RecordingsFolder(Service):
+    """The index of a folder for all sessions of a ground. Nothing happens before `begin`."""
 
-    Close it after those that tell it of their files.
-    """
-
-    def __init__(self, folder: Path | None, retention: Retention, *, failures: Failures) -> None:
+    def __init__(self, folder: Path, retention: Retention, *, failures: Failures) -> None:
         self._folder = folder
         self._retention = retention
         self._failures = failures
@@ -183,32 +181,24 @@ class RecordingsFolder:
         self._stop = threading.Event()
         self._clock = threading.Thread(target=self._poll, name="hvt-recordings", daemon=True)
 
-    def open(self) -> None:
-        """Begin; the folder is there now."""
-        folder = self._folder
-        if folder is not None:
-            self._sink = QueuedSink(
-                "recordings index", lambda: IndexWriter(folder, self._retention), failures=self._failures
-            )
-            self._clock.start()
+    def begin(self, client: EdgeClient | None = None) -> None:  # noqa: ARG002 - no edge is asked
+        """Open the index; the folder is there now."""
+        self._sink = QueuedSink(
+            "recordings index", lambda: IndexWriter(self._folder, self._retention), failures=self._failures
+        )
+        self._clock.start()
 
-    def log(self, item: RecordingRow) -> None:
+    def recorded(self, row: RecordingRow) -> None:
         """Note the facts of a file."""
         if self._sink is not None:
-            self._sink.log(item)
+            self._sink.log(row)
 
-    def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
+    def __exit__(self, *_: object) -> None:
         """Write the queue, within a few seconds."""
         self._stop.set()
         if self._sink is not None:
             self._clock.join()
             self._sink.join(time.monotonic() + _END_S)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _poll(self) -> None:
         # Files grow old while nobody flies, too.

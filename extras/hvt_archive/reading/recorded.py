@@ -5,7 +5,6 @@ Boxes are as they were drawn: a box is held while it moves by less than a pixel 
 
 from __future__ import annotations
 
-import heapq
 import logging
 import tempfile
 import warnings
@@ -20,13 +19,14 @@ from typing import Any
 import numpy as np
 from rerun.chunk import Chunk, RrdReader
 
+from hvt_archive.reading.drawn_layer import TRACK_COMPONENTS, DrawnLayer
+from hvt_archive.reading.spool import Mapped, Spool, SpooledRows, Timed
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireError
-from hvt_common.video.annex_b import is_keyframe, parameter_sets
+from hvt_common.video.annex_b import is_keyframe
 from hvt_ground.events import Notice, Overlay, PoseUpdate, VideoSample
-from hvt_ground.poses import NOWHERE, Locator, PoseTrail
-from hvt_ground.recordings.drawn_layer import TRACK_COMPONENTS, DrawnLayer
-from hvt_ground.recordings.spool import Mapped, Spool, SpooledRows, Timed
+from hvt_ground.poses import NOWHERE, Locator
+from hvt_ground.recordings.contract import Recorded, RecordedStill
 from hvt_ground.sinks.rerun.blueprint import (
     DOUBTED,
     EVENTS,
@@ -56,50 +56,12 @@ _Rows = dict[tuple[str, str], list[Timed] | SpooledRows]
 """By entity and component; what grows with the flight is on disk."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedStill:
-    """A still as the recording shows it."""
-
-    frame_index: int
-    """At which it was known."""
-    capture_ns: int
-    jpeg: bytes
-    base_jpeg: bytes
-    """The base crop of it; empty if the recording has none."""
-    caption: str
-    """``17  car → van .93``; empty where it was never on the screen."""
-    header: RoiHeader | None = None
-    """The `RoiHeader` of ``jpeg``; None if the recording has none."""
-
-
 @dataclass(frozen=True)
-class Recorded:
-    """One session, from one file or from several that follow each other; pictures and boxes stay on disk."""
-
-    edge: str
-    session: str
-    info: Info | None
-    """The edge's facts of the session; None in a recording of an earlier HVT."""
-    video: Sequence[VideoSample]
-    """The video in order of frames."""
-    stills: Sequence[RecordedStill]
-    notices: Sequence[Notice]
-    poses: Sequence[PoseUpdate]
-    locator: Locator
-    """What places its tracks."""
+class _Read(Recorded):
     _layers: Mapping[str, DrawnLayer] = field(repr=False)
     _samples: SpooledRows = field(repr=False)
 
-    @cached_property
-    def trail(self) -> PoseTrail:
-        """All poses."""
-        trail = PoseTrail(most=len(self.poses))
-        for one in self.poses:
-            trail.add(one.pose)
-        return trail
-
     def overlays(self) -> Iterator[Overlay]:
-        """The boxes at each frame that has a picture or at which boxes changed, in order of frames."""
         timed = [*(rows for layer in self._layers.values() for rows in layer.times()), self._samples]
         frames, captures_ns = (
             np.concatenate([np.asarray(column, np.int64) for column in columns])[::-1]
@@ -109,18 +71,6 @@ class Recorded:
         found, places = np.unique(frames, return_index=True)
         for frame, capture_ns in zip(found, captures_ns[places], strict=True):
             yield self._overlay(int(frame), int(capture_ns))
-
-    def decodable_video(self) -> Sequence[VideoSample]:
-        """The samples from the first that can be decoded on; `UserError` where there is none."""
-        for number, one in enumerate(self.video):
-            if one.keyframe and parameter_sets(one.data):
-                return self.video[number:]
-        raise UserError(f"the recording of {self.edge} has no video: it was removed, or none came")
-
-    def all(self) -> Iterator[VideoSample | Overlay | RecordedStill | Notice | PoseUpdate]:
-        """All of it, in order of frames; of a frame the picture comes first."""
-        streams = (self.video, self.overlays(), self.stills, self.notices, self.poses)
-        return heapq.merge(*streams, key=lambda one: one.frame_index)
 
     def _overlay(self, frame: int, capture_ns: int) -> Overlay:
         rows = sorted(
@@ -209,7 +159,7 @@ def _recorded(edge: str, session: str, rows: _Rows, locator: Locator, spool: Spo
     samples = rows.get((VIDEO, _SAMPLE), SpooledRows(spool, blobs=True))
     assert isinstance(samples, SpooledRows)
     samples.sort(unique=True)
-    return Recorded(
+    return _Read(
         edge=edge,
         session=session,
         info=_info(rows.get((SESSION, _INFO), [])),

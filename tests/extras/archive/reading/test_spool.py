@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from hvt_archive.reading.recorded import read_recordings
+from hvt_archive.reading.spool import Mapped, Spool, SpooledRows
 from hvt_common.errors import UserError
 from hvt_ground.events import VideoSample
-from hvt_ground.recordings.recorded import read_recordings
-from hvt_ground.recordings.spool import Mapped, Spool, SpooledRows
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames
 
@@ -64,7 +64,7 @@ def test_a_full_folder_for_temporary_files_names_the_remedy(monkeypatch: pytest.
         raise OSError(errno.ENOSPC, "No space left on device")
 
     spool = Spool()
-    monkeypatch.setattr("hvt_ground.recordings.spool.os.write", full)
+    monkeypatch.setattr("hvt_archive.reading.spool.os.write", full)
     with pytest.raises(UserError, match="set TMPDIR to a folder with room"):
         spool.put(bytes(2**20))
     monkeypatch.undo()
