@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from hvt_common import __version__
 from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.edge_words import counts_text
 from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import (
@@ -20,7 +21,6 @@ from hvt_common.protocol.messages import (
     Status,
     fitted_text,
 )
-from hvt_common.protocol.still_words import counts_text
 from hvt_common.runtime.failures import Failure, Failures
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import View

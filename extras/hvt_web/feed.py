@@ -9,8 +9,8 @@ from functools import partial
 from typing import Any
 
 from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.edge_words import counts_text, lever_sentences, part_words, still_words
 from hvt_common.protocol.messages import Info
-from hvt_common.protocol.still_words import counts_text, still_words
 from hvt_common.runtime.failures import FailedPart
 from hvt_common.runtime.process import lower_priority
 from hvt_common.units import SECOND_NS, bitrate_text
@@ -189,12 +189,12 @@ def state_message(state: GroundState, *, recorded: bool | None = None) -> str:
             if one.session is None
             else ["the detector is loading: boxes of this ground come then"] * state.loading
             + _words(one.session, calibrated=state.calibrated),
-            "failed": [*map(_failure, one.failed), *_edge_failures(one)],
+            "failed": [*(_failure(part.part, part) for part in one.failed), *_edge_failures(one)],
         }
         for one in state.edges
     }
     elsewhere = {edge: {"member": one.member, "page": one.page} for edge, one in state.elsewhere.items()}
-    failed = [*map(_failure, state.failed)]
+    failed = [_failure(part.part, part) for part in state.failed]
     return text("state", at=state.at_ns // _MILLION, edges=edges, elsewhere=elsewhere, failed=failed)
 
 
@@ -243,7 +243,7 @@ def _short(one: EdgeState) -> str:
     session = one.session
     if session is None:
         return ""
-    said = [_failure(part, "the camera") for part in session.edge_failed if part.part == "source"]
+    said = [_failure(part_words(part.part), part) for part in session.edge_failed if part.part == "source"]
     if session.total_bps is not None:
         thin = "link too thin, " if one.link == "thin" else ""
         said.append(f"{thin}{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")
@@ -256,18 +256,15 @@ def _why(session: SessionState) -> list[str]:
         why.append(f"Not sent as stills: {counts_text(session.stills_not_sent)}.")
     if session.still_outcomes:
         why.append(f"Of the objects in stills: {counts_text(session.still_outcomes)}.")
-    if session.levers:
-        why += [f"{one[:1].upper()}{one[1:]}." for one in session.levers.split("; ")]
-    return why
+    return why + lever_sentences(session.levers)
 
 
 def _edge_failures(one: EdgeState) -> list[str]:
-    return (
-        [] if one.session is None else [f"at the edge: {_failure(part)}" for part in one.session.edge_failed]
-    )
+    failed = () if one.session is None else one.session.edge_failed
+    return [f"at the edge: {_failure(part_words(part.part), part)}" for part in failed]
 
 
-def _failure(part: FailedPart, name: str = "") -> str:
+def _failure(name: str, part: FailedPart) -> str:
     # Without the reason: it may name files of this machine.
     at = time.strftime("%H:%M:%S", time.gmtime(part.since_ns // 1_000_000_000))
-    return f"{name or part.part} has not worked since {at} UTC"
+    return f"{name} has not worked since {at} UTC"

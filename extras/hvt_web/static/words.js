@@ -31,8 +31,11 @@ const MOST_GAP_MS = 12000;
 
 // Numbers
 
-/** @param {number} ms */
-export const seconds = (ms) => (Math.abs(ms) < 9950 ? `${(ms / 1000).toFixed(1)} s` : `${Math.round(ms / 1000)} s`);
+/**
+ * Of a time that has gone by: where two clocks differ a little, it is none.
+ * @param {number} ms
+ */
+export const seconds = (ms) => (ms < 9950 ? `${Math.max(0, ms / 1000).toFixed(1)} s` : whole(ms));
 
 /** @param {number} ms */
 const whole = (ms) => `${Math.max(0, Math.round(ms / 1000))} s`;
@@ -57,7 +60,7 @@ const percent = (share) => `${Math.round(share * 100)} %`;
  * By clocks that agree within the time of a message; of a picture of the future it is not known.
  * @param {number} ms
  */
-const age = (ms) => (ms < -LEAST_GAP_MS ? "age not known" : seconds(Math.max(0, ms)));
+const age = (ms) => (ms < -LEAST_GAP_MS ? "age not known" : seconds(ms));
 
 // On the picture
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from hvt_common.protocol.still_words import counts_text
+from hvt_common.protocol.edge_words import counts_text
 from hvt_common.runtime.status_command import StatusCommand
 from hvt_common.units import SECOND_NS, bitrate_text
 

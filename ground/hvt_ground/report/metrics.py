@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from prometheus_client.core import Metric
 
 from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.still_words import STILL_WORDS
+from hvt_common.protocol.edge_words import STILL_WORDS
 from hvt_common.runtime.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
 from hvt_common.units import SECOND_NS
 from hvt_ground.report.state import GroundState, SessionState

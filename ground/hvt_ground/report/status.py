@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from hvt_common.protocol.still_words import counts_text
+from hvt_common.protocol.edge_words import counts_text
 from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.units import bitrate_text
 from hvt_ground.events import Event

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 from collections import Counter
@@ -13,6 +12,7 @@ from typing import ParamSpec
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.clock_offset import ClockOffset
+from hvt_common.protocol.edge_words import counts_text, lever_decisions, lever_sentences
 from hvt_common.protocol.ledger import Account
 from hvt_common.protocol.messages import (
     MAX_STILL_RESULTS,
@@ -28,7 +28,6 @@ from hvt_common.protocol.messages import (
     TrackStep,
     TrackStepDecoder,
 )
-from hvt_common.protocol.still_words import counts_text
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Tracks
@@ -261,10 +260,10 @@ class GroundSession:
             if not one.working
         }
         self._note_stale(self._last_capture_ns)
-        decided = _decisions(status.levers) != _decisions(self.levers)
+        before, now = ([one for one, _ in lever_decisions(says)] for says in (self.levers, status.levers))
         self.levers = status.levers or self.levers
-        if status.levers and decided:  # numbers alone change each second: they are in the state
-            self.note("info", status.levers)
+        if status.levers and now != before:  # numbers alone change each second: they are in the state
+            self.note("info", " ".join(lever_sentences(status.levers)))
 
     def backlog_chunk(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
         """Count a chunk, of whichever session; ``delivered``: with it an object was whole, and is of use."""
@@ -537,7 +536,3 @@ class GroundSession:
             event = self.poses.located(event)
         for sink in self.sinks:
             sink.log(event)
-
-
-def _decisions(says: str) -> list[str]:
-    return [re.split("[:,]", part)[0] for part in says.split("; ")]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from hvt_common.protocol.edge_words import LEVER_WORDS, lever_decisions
 from hvt_edge.operating import Operating
 from hvt_edge.perception.levers import LeverControl, LeverSettings, Measured
 
@@ -48,6 +49,10 @@ class Rig:
         """The levers so much later."""
         self.at_s += seconds
         self.control.decide(self.at_s * SECOND_NS)
+        says = self.operating.now.levers.says
+        assert {one for one, _ in lever_decisions(says)} <= LEVER_WORDS.keys(), (
+            "the page has a sentence for each"
+        )
         return self.operating.now.levers
 
 

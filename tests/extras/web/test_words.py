@@ -17,8 +17,9 @@ import pytest
 
 import hvt_ground
 import hvt_web
-from hvt_common.protocol.still_words import STILL_WORDS
+from hvt_common.protocol.edge_words import STILL_WORDS
 
+ROOT = Path(__file__).parents[3]
 STATIC = Path(hvt_web.__file__).parent / "static"
 NODE = shutil.which("node")
 LIVE = {
@@ -64,6 +65,8 @@ def test_what_is_not_live_never_says_live():
         ({"follows": False, "ageMs": 5_200}, "REPLAY 5.2 s"),
         ({"link": "lost", "silentMs": 8_000}, "LINK LOST 8 s"),
         ({"link": "ended", "ageMs": 61_000}, "ENDED, picture 61 s old"),
+        ({"link": "ended", "ageMs": -400}, "ENDED, picture 0.0 s old"),
+        ({"follows": False, "plays": False, "ageMs": -400}, "PAUSED 0.0 s"),
         ({"link": "ended", "shown": False}, "ENDED"),
         ({"connected": False, "goneMs": 9_000}, "NO GROUND 9 s"),
         ({"connected": False, "goneMs": 9_000, "refused": True}, "REFUSED 9 s"),
@@ -264,6 +267,79 @@ REFUSALS = {
     "the link is not open yet",
 }
 """Every answer of the page's server that is no picture."""
+ANSWERS = {
+    "a box takes x, y, w and h, all four",
+    "a still is of a track or of a box, not of both",
+    "a still is of a frame or of a time, not of both",
+    "that session has ended",
+    "this edge does not serve …",
+    "too many requests: at most … a second are served",
+    "R0 codes the video in another way from the first frame on: start the edge with it",
+    "this edge stores nothing while its link is away (--store 0)",
+    "nothing is stored that was not sent",
+    "… is too little for …: it takes at least …",
+    "…: … is a whole number from … to …, not …",
+    "…: … is missing",
+    "…: … is missing, or not a word",
+    "… takes no …",
+    "the rates were changed a moment ago: wait two seconds",
+    "there is no frame yet, or none is kept (--ring)",
+    "this edge sends video alone and followed no objects; it does from now on: request again in a second",
+    "… requested stills are pending already: try again later",
+    "nothing is known of a still of the number …",
+    "it could not be coded (…)",
+    "there is no track … at frame …: the edge's own tracks there are …",
+    "… is not held: frames go back … s",
+    "box …,…,…,… is not inside the frame of …x… source pixels (x,y,w,h)",
+    "box …,…,…,… is too small: … pixels a side at least",
+    "frame … is yet to come: the newest is …",
+    "track … is outside the picture at frame …",
+    "… is not a picture that can be written: name it …",
+    "… accepted the still, but it did not come within … s: …",
+    "… refuses: …",
+    "… cannot be written (…): name a file that can",
+    "… sent a still that cannot be decoded: …",
+    "… has ended: the still does not come",
+    "…: …",
+    "the answer of … cannot be used: …",
+}
+"""Every answer of an edge to a command, and what the ground says where there is none that it can use."""
+MORE_ANSWERS = {
+    "edge/hvt_edge/keyframes.py": {
+        "the last keyframe came … s ago, after many others: ask again in … s",
+        (
+            "the camera's own video is sent (--encoder passthrough), and it makes no keyframe on request: the next "
+            "comes by itself, one each … s or so"
+        ),
+    },
+    "edge/hvt_edge/stills/on_demand.py": {
+        "the edge has ended",
+        "in … s …",
+        "the link was never free for it",
+        "the budget had no room for it",
+    },
+    "edge/hvt_edge/stills/requested_coding.py": {"the video already shows it as well as the source does"},
+    "ground/hvt_ground/control/api.py": {
+        "edge … does not answer: is it flying, and does this link reach it?…",
+        "the edge is not there any more: it has ended, or its link is down",
+        "the budget or the link is full",
+    },
+}
+"""Those that are put into a name before, by the module that makes them."""
+
+
+def test_every_answer_to_a_command_is_read():
+    """What the edge says to an operator comes from many places too: each text stands here, and was read."""
+    found = {
+        text
+        for path in ROOT.joinpath("edge").rglob("*.py")
+        for text in given(path, {"RefusedError", "NothingCloser"})
+    }
+    found |= set(given(ROOT / "ground/hvt_ground/control/api.py", {"RefusedError", "UserError"}))
+    assert found == ANSWERS
+    for name, said in MORE_ANSWERS.items():
+        assert said <= set(sentences(ROOT / name)), name
+    assert not any("_" in one for one in ANSWERS | EVENTS)
 
 
 def test_every_event_and_every_refusal_is_read():

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from hvt_common.protocol.edge_words import STILL_WORDS
 from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.messages import FailedPart, Info, Status
-from hvt_common.protocol.still_words import STILL_WORDS
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_ground.control import watch
@@ -115,8 +115,8 @@ def test_the_page_reads_all_of_it_as_sentences(ground):
     assert not code.search(json.dumps([shown[one] for one in ("words", "why", "short", "failed")]))
     assert all(re.fullmatch(r"[A-Z].*[^.]\.", one) for one in shown["why"]), shown["why"]
     assert shown["why"][-2:] == [
-        "Tracks: the video hides 31 objects.",
-        "Stills paused: 0 of 40 renamed something.",
+        "The edge sends its tracks: the video hides 31 objects.",
+        "Stills are paused: 0 of 40 renamed something.",
     ]
 
 

@@ -1,7 +1,11 @@
-"""Texts for the reasons and outcomes of stills; `Status`, JSON and metrics have the words of the code."""
+"""Texts for the words of an edge: reasons and outcomes of stills, failed parts, and what auto sends.
+
+`Status`, JSON and metrics have the words of the code.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -55,3 +59,59 @@ def counts_text(counts: Mapping[str, int], *, most: int | None = None) -> str:
     """``49 the video already shows well, 3 cut by the picture's edge``: the most frequent first, ``most`` of them."""
     ordered = sorted(counts.items(), key=lambda one: (-one[1], one[0]))
     return ", ".join(f"{count} {still_words(name)}" for name, count in ordered[:most])
+
+
+PART_WORDS: Mapping[str, str] = MappingProxyType(
+    {
+        "source": "the camera",
+        "pose": "the source of poses",
+        "encoder": "the encoder",
+        "video": "video at its full size",
+        "passthrough": "the camera's video as it comes",
+        "local copy": "the copy on the edge's disk",
+        "detector": "the detector",
+        "stills": "the choice of stills",
+        "requested stills": "making closer looks",
+        "reports": "taking reports of grounds",
+        "store": "the store for outages",
+        "backlog": "sending what was stored",
+        "info": "telling grounds of the flight",
+        "control": "taking commands",
+        "listener": "waiting for grounds",
+        "metrics": "the port for metrics",
+    }
+)
+"""Part of an edge that may fail → its name for people."""
+
+
+def part_words(part: str) -> str:
+    """For people; a part of a later version is called as it is."""
+    return PART_WORDS.get(part, part)
+
+
+LEVER_WORDS: Mapping[str, str] = MappingProxyType(
+    {
+        "tracks": "The edge sends its tracks",
+        "no tracks": "The edge sends no tracks",
+        "stills": "Stills are sent",
+        "stills show details": "Stills are sent for their details",
+        "stills paused": "Stills are paused",
+        "video alone": "Video alone is sent",
+    }
+)
+"""Decision of ``--profile auto`` → how a sentence on it begins."""
+
+
+def lever_decisions(says: str) -> list[tuple[str, str]]:
+    """Each decision of `Status.levers`, and why: ``tracks: A; stills paused: B``."""
+    parts = [re.split("[:,] ", part, maxsplit=1) for part in says.split("; ") if part]
+    return [(part[0], part[1] if len(part) > 1 else "") for part in parts]
+
+
+def lever_sentences(says: str) -> list[str]:
+    """The same for people; what a later version decides is said as it is."""
+    sentences = []
+    for decision, why in lever_decisions(says):
+        begins = LEVER_WORDS.get(decision, f"{decision[:1].upper()}{decision[1:]}")
+        sentences.append(f"{begins}: {why}." if why else f"{begins}.")
+    return sentences

@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 from typing import get_args
 
+from hvt_common.protocol.edge_words import LEVER_WORDS, PART_WORDS, STILL_WORDS, counts_text, lever_sentences
 from hvt_common.protocol.frame_account import FRAME_GROUPS, FrameGroup
-from hvt_common.protocol.still_words import STILL_WORDS, counts_text
 from hvt_ground.perception.stills.match import Outcome
 
 ROOT = Path(__file__).parents[3]
@@ -24,6 +24,15 @@ EMITTED = (
     ("edge/hvt_edge/stills/maker.py", r"reason: Literal\[(.*)\]"),
     ("ground/hvt_ground/perception", r'(?:dropped|outcomes)\["([\w ]+)"\]'),
 )
+
+PARTS = (
+    ("edge/hvt_edge", r"^\w*PART(?:: Final)?(?:, \w+)? = (.*)$"),
+    ("edge/hvt_edge", r"(?:Awaited|Retried)\([^\"]*?\"([\w ]+)\""),
+    ("common/hvt_common", r"(?:Awaited|Retried)\([^\"]*?\"([\w ]+)\""),
+    ("common/hvt_common/inference/retried.py", r"super\(\).__init__\([^\"]*?\"([\w ]+)\""),
+    ("edge/hvt_edge/link/publisher.py", r"self\._answered\(Channel\.(\w+)"),
+)
+"""Where a part of the edge that fails has its name from."""
 
 
 def words(place: str, pattern: str) -> set[str]:
@@ -47,6 +56,26 @@ def test_each_reason_that_the_code_can_give_is_said_in_plain_words():
         counts_text({"base_good": 2, "border": 1})
         == "2 the video already shows well, 1 cut by the picture's edge"
     )
+
+
+def test_each_part_of_an_edge_that_may_fail_has_a_name_for_people():
+    """``at the edge: source has not worked since 12:00`` would stand before who flies."""
+    found = {name.lower() for place in PARTS for name in words(*place)}
+    assert found == PART_WORDS.keys()
+
+
+def test_what_auto_decides_is_said_in_sentences():
+    """``tracks: …; stills show details, …`` means nothing to who flies; a later edge's decision is said as it is."""
+    assert lever_sentences("no tracks: not measured yet; stills show details, 1 of 2 renamed something") == [
+        "The edge sends no tracks: not measured yet.",
+        "Stills are sent for their details: 1 of 2 renamed something.",
+    ]
+    assert lever_sentences("video alone: this machine is too slow for the detector")[0].startswith(
+        "Video alone"
+    )
+    assert lever_sentences("maps: of snow; all is well") == ["Maps: of snow.", "All is well."]
+    assert lever_sentences("") == []
+    assert all(words[0].isupper() for words in LEVER_WORDS.values())
 
 
 def test_the_page_has_all_words_of_a_summary():
