@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -180,7 +179,7 @@ def state_message(state: GroundState, *, recorded: bool | None = None) -> str:
             "base": None if one.session is None else one.session.base_bps,
             "budget": None if one.session is None else one.session.budget_bps,
             "method": None if one.session is None else one.session.method,
-            "short": "" if one.session is None else _short(one),
+            "short": "" if one.session is None else _short(one, state.at_ns),
             "recording": None
             if recorded is None or one.session is None
             else recorded and not failing & {f"recording of {one.edge}", "recording"},
@@ -189,12 +188,15 @@ def state_message(state: GroundState, *, recorded: bool | None = None) -> str:
             if one.session is None
             else ["the detector is loading: boxes of this ground come then"] * state.loading
             + _words(one.session, calibrated=state.calibrated),
-            "failed": [*(_failure(part.part, part) for part in one.failed), *_edge_failures(one)],
+            "failed": [
+                *(_failure(part.part, part, state.at_ns) for part in one.failed),
+                *_edge_failures(one, state.at_ns),
+            ],
         }
         for one in state.edges
     }
     elsewhere = {edge: {"member": one.member, "page": one.page} for edge, one in state.elsewhere.items()}
-    failed = [_failure(part.part, part) for part in state.failed]
+    failed = [_failure(part.part, part, state.at_ns) for part in state.failed]
     return text("state", at=state.at_ns // _MILLION, edges=edges, elsewhere=elsewhere, failed=failed)
 
 
@@ -239,11 +241,13 @@ def _some(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
 
 
-def _short(one: EdgeState) -> str:
+def _short(one: EdgeState, at_ns: int) -> str:
     session = one.session
     if session is None:
         return ""
-    said = [_failure(part_words(part.part), part) for part in session.edge_failed if part.part == "source"]
+    said = [
+        _failure(part_words(part.part), part, at_ns) for part in session.edge_failed if part.part == "source"
+    ]
     if session.total_bps is not None:
         thin = "link too thin, " if one.link == "thin" else ""
         said.append(f"{thin}{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")
@@ -259,12 +263,17 @@ def _why(session: SessionState) -> list[str]:
     return why + lever_sentences(session.levers)
 
 
-def _edge_failures(one: EdgeState) -> list[str]:
+def _edge_failures(one: EdgeState, at_ns: int) -> list[str]:
     failed = () if one.session is None else one.session.edge_failed
-    return [f"at the edge: {_failure(part_words(part.part), part)}" for part in failed]
+    return [f"at the edge: {_failure(part_words(part.part), part, at_ns)}" for part in failed]
 
 
-def _failure(name: str, part: FailedPart) -> str:
+def _failure(name: str, part: FailedPart, at_ns: int) -> str:
     # Without the reason: it may name files of this machine.
-    at = time.strftime("%H:%M:%S", time.gmtime(part.since_ns // 1_000_000_000))
-    return f"{name} has not worked since {at} UTC"
+    return f"{name} has not worked for {_lasting((at_ns - part.since_ns) // SECOND_NS)}"
+
+
+def _lasting(seconds: int) -> str:
+    if seconds < 100:
+        return f"{max(0, seconds)} s"
+    return f"{round(seconds / 60)} min" if seconds < 6000 else f"{round(seconds / 3600)} h"

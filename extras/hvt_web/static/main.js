@@ -87,8 +87,7 @@ function onMessage(message, payload) {
       ({ role } = message);
       document.body.className = role;
       by("role").textContent = role;
-      stills.reset();
-      by("events").replaceChildren();
+      forgetEvents();
       break;
     case "session":
       if (mine && sessions.get(chosen)?.session !== message.session) forget(); // it begins anew, with other frames
@@ -102,6 +101,7 @@ function onMessage(message, payload) {
       break;
     case "loads":
       plot.fill(message.edge, message.rows);
+      if (mine) forgetEvents(); // all that there are follow
       break;
     case "thumbnail":
       wall.thumbnail(message.edge, payload, Math.min(message.captured, connection.now())); // none is of the future
@@ -184,11 +184,15 @@ function forget() {
   listTracks();
 }
 
+function forgetEvents() {
+  stills.reset();
+  by("events").replaceChildren();
+}
+
 function watch() {
   player.reset();
   boxes.reset();
-  stills.reset();
-  by("events").replaceChildren();
+  forgetEvents();
   connection.send({ type: "watch", edge: chosen, rung: rungs[0] });
   by("rung").textContent = words.RUNG_WORDS[rungs[0]];
 }
@@ -224,6 +228,7 @@ function onShown(picture) {
   age.dataset.ms = String(ms);
   age.dataset.frame = String(picture.frame);
   if (by("stage").classList.contains("old")) showAge();
+  showBehind();
   if (performance.now() - tracksAt > 1000) listTracks();
 }
 
@@ -253,7 +258,7 @@ function showAge() {
   stage.classList.toggle("old", !live && shown.frame >= 0 && name !== "paused");
   by("standing").textContent = said;
   const gone = name === "gone";
-  by("behind").textContent = shown.frame < 0 || gone ? "" : words.boxesWords(boxes.behind(), OLD_MS);
+  showBehind();
   by("on-link").textContent = state && !gone && name !== "lost" ? state.short : "";
   by("recording").textContent = gone ? "" : words.recordingWords(state?.recording ?? null, !["lost", "stale", "ended"].includes(name));
   by("recording").classList.toggle("bad", state?.recording === false);
@@ -261,14 +266,22 @@ function showAge() {
   by("gap").textContent = words.emptyWords(name);
   by("age").textContent = shown.frame < 0 || player.live ? "" : words.pictureWords(shown.captured, ms);
   by("now").disabled = player.live;
+  by("back").disabled = by("forward").disabled = jpeg; // none of those is kept
   by("pause").textContent = words.pauseWords(!by("video").paused || player.live);
 }
 setInterval(showAge, 200);
+
+/** With each picture: boxes that stand beside their objects are never without a word. */
+function showBehind() {
+  const unknown = shown.frame < 0 || by("stage").dataset.state === "gone";
+  by("behind").textContent = unknown ? "" : words.boxesWords(boxes.behind(), OLD_MS);
+}
+
 setInterval(() => {
   const told = connected && performance.now() - stateAt < STATE_OLD_MS;
   wall.tick(connection.now(), told);
   if (performance.now() - tracksAt > 1000) listTracks();
-  by("commands").disabled = !told;
+  by("commands").disabled = !told || states.get(chosen)?.link === "ended";
   if (told) return;
   plot.tick(connection.now());
   if (by("link-text").textContent) by("link-text").textContent = words.UNKNOWN_LINK;
@@ -282,7 +295,8 @@ function listTracks() {
   if (list.contains(document.activeElement)) return; // not under somebody's fingers
   const newest = boxes.newest();
   const tracks = newest?.tracks ?? [];
-  by("objects-title").textContent = words.tracksTitle(newest ? tracks.length : null, newest ? words.boxesWords(boxes.behind(), OLD_MS) : "");
+  const old = by("stage").classList.contains("old") ? words.OF_LAST_PICTURE : words.boxesWords(boxes.behind(), OLD_MS);
+  by("objects-title").textContent = words.tracksTitle(newest ? tracks.length : null, old);
   listClasses(tracks);
   if (!by("objects").open) return;
   list.replaceChildren();

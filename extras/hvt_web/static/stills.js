@@ -47,11 +47,14 @@ export class Stills {
     for (const still of this.pending.splice(0)) this.show(still);
   }
 
-  /** @param {Still} still */
+  /** @param {Still} still once for all objects of it of which the same is to be said */
   show(still) {
+    const title = stillTitle(still);
+    if ([...this.list.querySelectorAll("button")].some((one) => one.dataset.still === still.id && one.dataset.said === title)) return;
     const item = document.createElement("li");
     const button = make("button", "", item);
     button.dataset.still = still.id;
+    button.dataset.said = title;
     const pair = make("span", "pair", button);
     for (const which of ["still", "base"]) {
       if (!still.shows.includes(which)) {

@@ -28,6 +28,7 @@ export const RUNG_WORDS = {
 };
 const LEAST_GAP_MS = 1000;
 const MOST_GAP_MS = 12000;
+const LATE_MS = 2000;
 
 // Numbers
 
@@ -81,7 +82,10 @@ export function standing(facts) {
   const patience = Math.min(MOST_GAP_MS, Math.max(LEAST_GAP_MS, 2.5 * facts.periodMs));
   // Who comes later is shown a picture that may be old already.
   if (sinceMs > patience || ageMs > MOST_GAP_MS) return { state: "stale", words: `NO NEW PICTURE ${whole(Math.max(sinceMs, ageMs))}`, live: false };
-  return { state: "live", words: facts.lockstep ? "lockstep: no age" : `live, ${age(ageMs)}`, live: true };
+  if (facts.lockstep) return { state: "live", words: "lockstep: no age", live: true };
+  // As old as it was when it came: the picture moves, and is not that of now.
+  if (ageMs - sinceMs > LATE_MS) return { state: "late", words: `LATE, ${seconds(ageMs)} old`, live: true };
+  return { state: "live", words: `live, ${age(ageMs)}`, live: true };
 }
 
 /**
@@ -179,6 +183,8 @@ export function tracksTitle(count, behind) {
   if (count === null) return "Tracks: not known yet";
   return behind ? `Tracks: ${count} (${behind})` : `Tracks: ${count}`;
 }
+
+export const OF_LAST_PICTURE = "of the last picture";
 
 /** @param {{name: string, doubted?: 1}} track */
 export const trackName = (track) => (track.doubted ? "something" : track.name);

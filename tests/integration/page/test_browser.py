@@ -326,4 +326,11 @@ def test_an_operator_sets_the_budget(flight):
     page.locator("#budget-form button").click()
     refused = ("wait two seconds", "takes at least")
     eventually(lambda: any(map(said, refused)), within_s=20, what="the edge's refusal")
+    page.reload()
+    events = page.locator("#events li")
+    eventually(
+        lambda: "300 kbps" in events.first.inner_text(), within_s=20, what="the events that there were"
+    )
+    told = events.all_inner_texts()
+    assert len(told) == len(set(told)), "each stands there once"
     page.context.close()
