@@ -273,6 +273,7 @@ class Pacer:
                     arrived_ns=feedback.send_ns - held_ns,
                     serialization_ns=sent.serialization_ns,
                     arrived_bytes=sent.up_to_bytes,
+                    delivery_bps=8e9 * sent.line_bytes / max(1, now_ns - sent.sent_ns - held_ns),
                     messages=sent.messages,
                     lost=feedback.lost,
                 )

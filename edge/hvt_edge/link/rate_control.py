@@ -39,7 +39,8 @@ _SOME_OFF, _SOME_NS = 0.08, 3 * SECOND_NS
 _LITTLE_OFF = 0.02
 """At the ceiling, where the rate will stay."""
 _REST_NS = 1_500 * _MS
-"""Between two openings."""
+"""Between two openings; a third of it where the rate is by so much (`_FAR_MORE`) higher: it grows in steps."""
+_FAR_MORE = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +82,9 @@ class Progress:
     """Its delay on a link of the rate of that time, behind the edge's own messages."""
     arrived_bytes: int
     """Line bytes sent up to and with it: they have all arrived, or are lost."""
+    delivery_bps: float = 0.0
+    """Its own line bits over its round trip, without the time for which the ground held the report: a link of less
+    would have needed longer."""
     messages: int = 0
     """So many messages of base and stills were sent up to and with it."""
     lost: int = 0
@@ -342,8 +346,9 @@ class RateController:
             return
         curve_ns = self._curve_ns + step_ns
         wanted = self._on_curve(curve_ns)
-        # What never arrived proves nothing: where little is sent, the rate does not run away from it.
-        proven = 2 * self._lately_bps()
+        # What never arrived proves nothing: where little is sent, the rate does not run away from it. After a silence
+        # little is, however good the link: on the way back to the former rate one message that came quickly suffices.
+        proven = max(2 * self._lately_bps(), min(self._cubic_max, self._delivery_bps()))
         if wanted <= proven:
             self._curve_ns = curve_ns
         self._rate = min(float(settings.ceiling_bps), max(self._rate, min(wanted, proven)))
@@ -354,6 +359,12 @@ class RateController:
             return self._cubic_max - (self._cubic_max - self._low) * left**3
         beyond_s = (curve_ns - self._plateau_ns) / SECOND_NS
         return self._cubic_max * (1 + self._settings.beyond_per_s3 * beyond_s**3)
+
+    def _delivery_bps(self) -> float:
+        # The most that one message of about the last second has proved.
+        last_ns = self._recent[-1].progress.arrived_ns
+        of_late = (one.progress for one in self._recent if last_ns - one.progress.arrived_ns <= SECOND_NS)
+        return max(one.delivery_bps for one in of_late)
 
     def _lately_bps(self) -> float:
         # The arrival rate of about the last second; half the rate if that is not known yet.
@@ -390,7 +401,8 @@ class ReconfigurationTrigger:
             self._off_ns = None
             return False
         self._off_ns = now_ns if self._off_ns is None else self._off_ns
-        if self._done_ns is not None and now_ns - self._done_ns < _REST_NS:
+        rest_ns = _REST_NS if ratio < _FAR_MORE else _REST_NS // 3
+        if self._done_ns is not None and now_ns - self._done_ns < rest_ns:
             return False
         much = not _MUCH_LESS < ratio < _MUCH_MORE
         return much or now_ns - self._off_ns >= _SOME_NS
