@@ -18,7 +18,7 @@ import zenoh
 
 from hvt_common.config import PATH, TEXT, Group, load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
-from hvt_common.transport.doctor.diagnose import LinkWatch
+from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 
@@ -68,7 +68,7 @@ def run(argv: Sequence[str] | None) -> int:
     zenoh.init_log_from_env_or("error")
     # Blocked before Zenoh starts its threads, so that the signals wait for sigwait and reach nobody else.
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
-    with open_session(settings) as session, LinkWatch(session, settings, served=lambda _name: True):
+    with open_session(settings) as session, link_doctor().watch(session, settings, served=lambda _name: True):
         print(f"{PROGRAM} {session.zid()} listens on {', '.join(listen) or 'nothing'}", flush=True)
         signal.sigwait(STOP_SIGNALS)
     return 0

@@ -16,16 +16,9 @@ from hvt_common.errors import UserError
 from hvt_common.inference.detect import Detector, detect_every
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.redaction import Redaction
-from hvt_common.runtime.checkup import (
-    Finding,
-    check_clock,
-    check_folder,
-    check_port,
-    print_findings,
-    run_checks,
-)
+from hvt_common.runtime.host_names import check_port
+from hvt_common.runtime.reporting import Finding
 from hvt_common.transport.duplicate_edge import refuse_duplicate_edge
-from hvt_common.transport.reach import check_link
 from hvt_common.transport.session import declare_publisher
 from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
@@ -47,6 +40,8 @@ from hvt_edge.wiring import (
     store_folder,
 )
 from hvt_edge.world import World
+from hvt_fleet.checkup import check_clock, check_folder, print_findings, run_checks
+from hvt_fleet.link.reach import check_link
 
 _DESCRIPTION = (
     "Check what a flight with these settings needs; takes the settings of hvt-edge. --json is for programs."

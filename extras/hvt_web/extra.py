@@ -13,8 +13,8 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Service
 
 if TYPE_CHECKING:  # who serves none starts faster
-    from hvt_common.runtime.checkup import Finding
     from hvt_common.runtime.failures import Failures
+    from hvt_common.runtime.reporting import Finding
 
 _PAGE = Group("page for browsers")
 _HERE = "127.0.0.1:8080"
@@ -73,7 +73,8 @@ class WebExtra(Extra):
 
 
 def _found(address: str) -> Finding:
-    from hvt_common.runtime.checkup import Finding, check_port  # noqa: PLC0415
+    from hvt_common.runtime.host_names import check_port  # noqa: PLC0415
+    from hvt_common.runtime.reporting import Finding  # noqa: PLC0415
 
     check_port(address, name="--web", packages=("starlette", "uvicorn", "websockets"))
     return Finding("ok", f"{address} is free")

@@ -18,7 +18,7 @@ from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.runtime.health_server import HealthServer, state_answers
 from hvt_common.runtime.process import give_back_holes, notify_systemd
 from hvt_common.runtime.reporting import StatusLine
-from hvt_common.transport.doctor.diagnose import LinkWatch
+from hvt_common.transport.link_doctor import LinkWatch, link_doctor
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_ground.backlog.recordings import BacklogRecordings
@@ -130,7 +130,7 @@ class Ground:
                     session, edges=config.edges, clock=self._clock, group=group, log=factory.message_log
                 )
             )
-            watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
+            watch = stack.enter_context(link_doctor().watch(session, settings, served=link.is_known))
             self._on_started()
             notify_systemd("READY=1")
             self._say_where(

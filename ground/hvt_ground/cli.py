@@ -28,13 +28,12 @@ Other commands, each with --help:
   hvt-ground edges                       which edges are there
   hvt-ground keys                        make keys, and say who may do what"""
 _COMMANDS = {
-    "doctor": "hvt_ground.doctor",
     "status": "hvt_ground.control.watch",
 }
 """By name, the module whose ``run`` takes the words that follow; imported for none but its own."""
 _EXTRA_COMMANDS = "hvt.ground_commands"
 """Entry points of commands that extras bring: each is such a ``run``."""
-_BROUGHT = ("export", "keys", "recordings", "replay")
+_BROUGHT = ("doctor", "export", "keys", "recordings", "replay")
 """Commands of the extras that come with HVT."""
 
 

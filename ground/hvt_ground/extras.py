@@ -18,8 +18,8 @@ from hvt_ground.config import GroundConfig, check
 
 if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no recording
     from hvt_common.protocol.messages import Info
-    from hvt_common.runtime.checkup import Finding
     from hvt_common.runtime.failures import Failures
+    from hvt_common.runtime.reporting import Finding
     from hvt_ground.control import EdgeClient
     from hvt_ground.events import Event, Refinement
     from hvt_ground.poses import Locator

@@ -13,6 +13,9 @@ from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.store import library_part
+from hvt_common.transport.link_doctor import link_doctor
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_ground.cli import main
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import all_extras, config_class, locators
@@ -59,7 +62,7 @@ def test_extras_bring_what_the_core_has_not():
     assert not set(settings) & set(GroundConfig.__annotations__)
 
 
-@pytest.mark.parametrize("command", ["export", "keys", "recordings", "replay"])
+@pytest.mark.parametrize("command", ["doctor", "export", "keys", "recordings", "replay"])
 def test_a_command_of_an_extra_that_is_absent(command, monkeypatch, capsys):
     """It would be an unrecognised argument of the ground."""
     monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})
@@ -84,6 +87,14 @@ def test_an_edge_without_its_doctor_says_so(found, says, monkeypatch, capsys):
     monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: found)
     assert hvt_edge.cli.main(["doctor"]) == 2
     assert capsys.readouterr().err == f"hvt-edge: {says}\n"
+
+
+def test_a_link_without_its_doctor_is_a_link(monkeypatch, free_port):
+    """Who leaves an extra out would have no link, in place of one that nobody explains."""
+    monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})
+    settings = LinkSettings(role="edge", connect=(f"tls/127.0.0.1:{free_port}",), name="uav-1")
+    with open_session(settings) as session, link_doctor().watch(session, settings, served=bool) as watch:
+        assert (watch.trouble, watch.may_command("uav-1")) == ("", True)
 
 
 def test_the_names_of_heads_are_those_that_the_library_reads():

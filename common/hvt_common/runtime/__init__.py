@@ -2,5 +2,4 @@
 
 `health_server` answers who watches one, `prometheus` in the words of metrics, `status_command` in a table;
 `host_names` are those under which a browser may ask.
-`checkup` is what a program checks before its start.
 """

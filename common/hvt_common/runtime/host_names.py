@@ -1,4 +1,4 @@
-"""Names and addresses at which this machine serves HTTP, and by which a browser may ask for it.
+"""Names and addresses at which this machine serves, and by which a browser may ask for it.
 
 A site may have its own name lead to an address of this machine (DNS rebinding): its pages could then read all that
 a server answers, and command. So a server answers only to names that no stranger can have.
@@ -9,6 +9,8 @@ from __future__ import annotations
 import ipaddress
 import re
 import socket
+from collections.abc import Sequence
+from importlib.util import find_spec
 from urllib.parse import urlsplit
 
 from hvt_common.errors import UserError
@@ -64,3 +66,20 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     except ValueError:
         return None
     return getattr(address, "ipv4_mapped", None) or address
+
+
+def check_port(address: str, *, name: str, packages: Sequence[str] = ()) -> None:
+    """Raise `UserError` where HOST:PORT cannot be listened on now, or a package is missing that serves there."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise UserError(f"{name} needs the package {package!r}: pip install 'hvt[{name.strip('-')}]'")
+    host, _, port = address.rpartition(":")
+    if not (host and port.isdecimal() and 0 < int(port) < 2**16):
+        raise UserError(f"{name} {address!r} is not accepted: give HOST:PORT")
+    try:
+        family, *_, where = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(where)
+    except OSError as error:
+        raise UserError(f"{name} {address} cannot be listened on ({error.strerror}): give another") from None

@@ -1,4 +1,4 @@
-"""The report of a run: a status line, and at its end a table and a JSON file."""
+"""The report of a run: a status line, and at its end a table and a JSON file; and what a check before it found."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import logging
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TextIO
+from typing import Any, Literal, Self, TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -22,6 +23,15 @@ from hvt_common.runtime.log import STATUS_LOGGER
 from hvt_common.units import shown_text
 
 _PLAIN_EVERY = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of a check, for people; ``todo`` is one line with the remedy, if there is one."""
+
+    state: Literal["ok", "unknown", "warning", "wrong"]
+    found: str
+    todo: str = ""
 
 
 class StatusLine:

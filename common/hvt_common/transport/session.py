@@ -21,9 +21,8 @@ import zenoh
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, EdgeKeys
 from hvt_common.runtime.failures import Awaited, Failures
-from hvt_common.transport.doctor.certificate import check_own_keys
-from hvt_common.transport.doctor.diagnose import visit
 from hvt_common.transport.inbox import Inbox, Received, ReceivedQueue
+from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings, configure, without_build_paths
 
 __all__ = [
@@ -59,7 +58,7 @@ def open_session(settings: LinkSettings, *, failures: Failures | None = None) ->
     for endpoints, files, keys and ports that cannot be used. With RUST_LOG set, Zenoh logs to stderr.
     """
     config, listen = configure(settings)
-    check_own_keys(config, listen=listen, name=settings.name, now_s=time.time())
+    link_doctor().check_keys(config, listen=listen, name=settings.name, now_s=time.time())
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
     stop = threading.Event()
     try:
@@ -252,8 +251,9 @@ def _open_failure(text: str, listen: tuple[str, ...], config: zenoh.Config) -> s
         return f"cannot listen on {', '.join(listen)}: this machine has no such interface"
     if nobody := re.search(r"Unable to connect to any of \[(.+)\]", text):
         endpoints = ", ".join(re.findall(r"\(([^()]+)\)", nobody[1])) or nobody[1]
-        if "tls/" in endpoints:  # the other side may answer, and refuse
-            return "no link: " + "; ".join(visit(config))
+        # With TLS the other side may answer, and refuse.
+        if "tls/" in endpoints and (why := link_doctor().why_no_link(config)):
+            return "no link: " + "; ".join(why)
         return f"nobody answers at {endpoints}: start a ground or a router there, or connect to where one is"
     where = f"cannot listen on {endpoint}" if listen else "cannot open the Zenoh session"
     return f"{where}: {without_build_paths(text)}"

@@ -20,9 +20,9 @@ from hvt_common.protocol.messages import (
     WireError,
 )
 from hvt_common.runtime.failures import Failures
-from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.duplicate_edge import refuse_duplicate_edge
 from hvt_common.transport.flood import FloodWatch
+from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_edge.link.transmitter import Outlet
@@ -89,7 +89,7 @@ class ZenohLink:
         self._publishers = {
             channel: declare_publisher(self._session, channel, keys=self._keys) for channel in _PUBLISHED
         }
-        watch = LinkWatch(self._session, settings, served=lambda _ground: self.has_ground())
+        watch = link_doctor().watch(self._session, settings, served=lambda _ground: self.has_ground())
         self._watch = self._stack.enter_context(watch)
 
     @property

@@ -3,7 +3,7 @@
 Both ends of a link check. A ground or a router lets an edge write under its own id only and tells each only what is
 meant for it; an edge or a router answers the grounds it knows, and passes ``control`` on from those that may command.
 Zenoh identifies who is at the other end by the common name of the certificate. What is not allowed is dropped in
-silence, so `hvt_common.transport.doctor.diagnose` says in its own words why nothing comes.
+silence, so `hvt_fleet.link.diagnose` says in its own words why nothing comes.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 
 if TYPE_CHECKING:
-    from hvt_common.runtime.checkup import Finding
+    from hvt_common.runtime.reporting import Finding
     from hvt_ground.sinks import Outputs
 
 _GATEWAYS = Group("gateways", rare=True)
@@ -86,7 +86,7 @@ class CotExtra(Extra):
 
     def _found(self, config: CotOptions) -> Finding:
         self.check_outputs(config, reads=())  # type: ignore[arg-type]
-        from hvt_common.runtime.checkup import Finding  # noqa: PLC0415
+        from hvt_common.runtime.reporting import Finding  # noqa: PLC0415
 
         return Finding("ok", f"to {', '.join(config.cot)}; types and certificates can be read")
 

@@ -36,8 +36,8 @@ from hvt_common.protocol.messages import (
     UnknownVersionError,
     WireError,
 )
-from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.transport.link_doctor import control_unanswered
 from hvt_common.transport.rights import Rights
 from hvt_common.transport.session import open_session, query, subscribe
 from hvt_common.transport.zenoh_config import LinkSettings, configure

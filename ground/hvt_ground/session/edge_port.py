@@ -24,9 +24,9 @@ from hvt_common.protocol.messages import (
     UnknownVersionError,
     WireError,
 )
-from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.transport.link_doctor import control_unanswered
 from hvt_common.transport.session import declare_publisher, query_later
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.link.statistics import LinkMeasurement

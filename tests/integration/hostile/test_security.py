@@ -15,9 +15,9 @@ import zenoh
 
 import hvt_edge.cli
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
-from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_fleet.link.diagnose import Watch
 from programs.fleet_keys import EXPIRED, Fleet
 from programs.processes import Running, eventually, free_ports
 
@@ -103,9 +103,7 @@ def refused(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
             session = stack.enter_context(_unchecked(settings))
             watches[name] = (
                 session,
-                stack.enter_context(
-                    LinkWatch(session, settings, served=lambda _: True, patience_s=PATIENCE_S)
-                ),
+                stack.enter_context(Watch(session, settings, served=lambda _: True, patience_s=PATIENCE_S)),
             )
         eventually(
             lambda: all(watch.trouble for _, watch in watches.values()), within_s=40, what="all are explained"
@@ -135,7 +133,7 @@ def _edge(fleet: Fleet, endpoint: str, *, name: str = "uav-1") -> Iterator[zenoh
         serve(session, Channel.INFO, keys=UAV1, answer=lambda _question: b"info")
         serve(session, Channel.CONTROL, keys=UAV1, answer=lambda _question: b"done")
         token = session.liveliness().declare_token(UAV1.key(Channel.ALIVE))
-        with LinkWatch(session, settings, served=lambda _ground: False, patience_s=PATIENCE_S):
+        with Watch(session, settings, served=lambda _ground: False, patience_s=PATIENCE_S):
             yield session
         token.undeclare()  # type: ignore[no-untyped-call]
 
@@ -161,7 +159,7 @@ def test_an_edge_cannot_write_as_another(
             open_session(replace(fleet.settings("uav-1", "edge", connect=(endpoint,)), name=None))
         )
         stack.enter_context(
-            LinkWatch(
+            Watch(
                 ground,
                 ground_settings,
                 served=lambda name: f"hvt/{name}/alive" in came,

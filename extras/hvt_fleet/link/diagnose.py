@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
 
@@ -19,11 +19,11 @@ import zenoh
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
-from hvt_common.transport.doctor.certificate import TlsFiles
-from hvt_common.transport.doctor.probe import why_no_link
-from hvt_common.transport.doctor.strangers import Strangers, listening_ports
-from hvt_common.transport.rights import Rights
-from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
+from hvt_common.transport.link_doctor import LinkDoctor, LinkWatch
+from hvt_common.transport.zenoh_config import LinkSettings, connect_endpoints
+from hvt_fleet.link.certificate import TlsFiles, check_own_keys
+from hvt_fleet.link.probe import why_no_link
+from hvt_fleet.link.strangers import Strangers, listening_ports
 
 _log = logging.getLogger(__name__)
 
@@ -37,19 +37,7 @@ _MAX_NAMES = 256
 """Names that are remembered. Each takes a certificate of the CA, so a fleet of that size comes first."""
 
 
-def control_unanswered(edge: str, *, who: str = "this ground") -> str:
-    """The sentence for a request on ``control`` without an answer, while the edge is present.
-
-    The edge itself, or a ground or a router on the way, may have dropped it: all of them check rights.
-    """
-    return (
-        f"{edge} does not answer on control: {who} may lack the right to command it (hvt-ground keys list shows who "
-        f"has it; add-ground without --watch-only gives it, then copy {edge}.json5 to the edge, and the others that "
-        "changed with it), or the link is full"
-    )
-
-
-class LinkWatch:
+class Watch(LinkWatch):
     """Watches the links of one session, in a thread of its own; a context manager.
 
     ``served(name)`` says, in that thread, whether an edge of that name has appeared or a ground subscribes. A link
@@ -66,11 +54,11 @@ class LinkWatch:
         patience_s: float = PATIENCE_S,
         examine: Callable[[zenoh.Config], list[str]] | None = None,
     ) -> None:
+        super().__init__(settings)
         self._session = session
         self._patience_s = patience_s
         self._examine = examine or visit
-        self._config, listen = configure(settings)
-        self._strangers = Strangers(listening_ports(listen))
+        self._strangers = Strangers(listening_ports(self.listen))
         # A link that stood for less than a look was one all the same.
         self._link_events = session.info.declare_link_events_listener(
             zenoh.handlers.RingChannel(_MOST_EVENTS), history=True
@@ -78,10 +66,9 @@ class LinkWatch:
         self._file = settings.zenoh_config
         self._edge = settings.name
         self._served = served
-        self._rights = Rights.of(self._config)
         self._trouble = ""
         self._said_s = 0.0
-        self._two_links = _connected_twice(self._config)
+        self._two_links = _connected_twice(self.config)
         """Places that are called twice."""
         self._had_two: set[str] = set()
         self._halved_s: float | None = None
@@ -97,12 +84,6 @@ class LinkWatch:
     def trouble(self) -> str:
         """Why there is no link, in a sentence; empty while there is one, or nothing is known."""
         return self._trouble
-
-    def may_command(self, edge: str) -> bool:
-        """Whether our own configuration lets questions on ``control`` of this edge out at all."""
-        return self._rights.allow_somebody(
-            flow="egress", message="query", key=EdgeKeys(edge).key(Channel.CONTROL)
-        )
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -200,7 +181,7 @@ class LinkWatch:
         return any(zid in self._had_two | called for zid in standing.keys() - twice)
 
     def _explain(self) -> None:
-        reasons = self._examine(self._config)
+        reasons = self._examine(self.config)
         if self._stop.is_set() or not reasons:
             return
         trouble = "; ".join(reasons)
@@ -211,13 +192,13 @@ class LinkWatch:
         self._trouble = trouble
 
     def _check_names(self, names: dict[str, bool], now_s: float) -> None:
-        if not self._rights.enabled:
+        if not self.rights.enabled:
             return
         for name, router in names.items():
             if name in self._named or len(self._first_seen_s) >= _MAX_NAMES:
                 continue
             since_s = self._first_seen_s.setdefault(name, now_s)
-            if not self._rights.knows(name):
+            if not self.rights.knows(name):
                 self._say(name, self._stranger(name))
             elif now_s - since_s > self._patience_s and not router and self._is_hiding(name):
                 self._say(name, self._hidden(name))
@@ -232,7 +213,7 @@ class LinkWatch:
             key = EdgeKeys(name).key(Channel.STATUS)
         except UserError:
             return False
-        return self._rights.allow(name, flow="ingress", message="put", key=key)
+        return self.rights.allow(name, flow="ingress", message="put", key=key)
 
     def _stranger(self, name: str) -> str:
         kind = "add-ground" if self._edge else "add-edge or add-ground"
@@ -267,6 +248,26 @@ def visit(config: zenoh.Config) -> list[str]:
         ]
     except UserError as error:
         return [str(error)]
+
+
+class Doctor(LinkDoctor):
+    """The one of this extra."""
+
+    def check_keys(
+        self, config: zenoh.Config, *, listen: Sequence[str], name: str | None, now_s: float
+    ) -> None:
+        """See `check_own_keys`."""
+        check_own_keys(config, listen=listen, name=name, now_s=now_s)
+
+    def why_no_link(self, config: zenoh.Config) -> list[str]:
+        """See `visit`."""
+        return visit(config)
+
+    def watch(
+        self, session: zenoh.Session, settings: LinkSettings, *, served: Callable[[str], bool]
+    ) -> LinkWatch:
+        """See `Watch`."""
+        return Watch(session, settings, served=served)
 
 
 def _connected_twice(config: zenoh.Config) -> set[str]:

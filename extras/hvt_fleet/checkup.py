@@ -7,38 +7,25 @@ import json
 import logging
 import os
 import shutil
-import socket
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from importlib.util import find_spec
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Literal
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from hvt_common.errors import UserError
-from hvt_common.runtime.reporting import say
+from hvt_common.runtime.reporting import Finding, say
 
-State = Literal["ok", "unknown", "warning", "wrong"]
-_STYLES: Mapping[State, str] = {"ok": "green", "unknown": "cyan", "warning": "yellow", "wrong": "bold red"}
+_STYLES: Mapping[str, str] = {"ok": "green", "unknown": "cyan", "warning": "yellow", "wrong": "bold red"}
 
 _PATIENCE_S = 30.0
 _TIME_ERROR = 5
 """adjtimex(2): the clock is not synchronised."""
 _TIMEX_BYTES = 512
 """More than ``struct timex`` has anywhere; with ``modes`` 0 the call changes nothing."""
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """The result of a check, for people; ``todo`` is one line with the remedy, if there is one."""
-
-    state: State
-    found: str
-    todo: str = ""
 
 
 def run_checks(
@@ -85,23 +72,6 @@ def check_clock() -> Finding:
             "start a time service such as systemd-timesyncd or chrony: certificates and recordings depend on it",
         )
     return Finding("ok", "the clock is synchronised")
-
-
-def check_port(address: str, *, name: str, packages: Sequence[str] = ()) -> None:
-    """Raise `UserError` where HOST:PORT cannot be listened on now, or a package is missing that serves there."""
-    for package in packages:
-        if find_spec(package) is None:
-            raise UserError(f"{name} needs the package {package!r}: pip install 'hvt[{name.strip('-')}]'")
-    host, _, port = address.rpartition(":")
-    if not (host and port.isdecimal() and 0 < int(port) < 2**16):
-        raise UserError(f"{name} {address!r} is not accepted: give HOST:PORT")
-    try:
-        family, *_, where = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(where)
-    except OSError as error:
-        raise UserError(f"{name} {address} cannot be listened on ({error.strerror}): give another") from None
 
 
 def check_folder(path: Path, *, name: str) -> int:

@@ -10,11 +10,11 @@ import threading
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.runtime.checkup import (
+from hvt_common.runtime.host_names import check_port
+from hvt_fleet.checkup import (
     Finding,
     check_clock,
     check_folder,
-    check_port,
     print_findings,
     run_checks,
 )

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 
 import zenoh
 
-from hvt_common.runtime.checkup import Finding
-from hvt_common.transport.doctor.diagnose import visit
+from hvt_common.runtime.reporting import Finding
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_fleet.link.diagnose import visit
 
 _PATIENCE_S = 3.0
 _SAMPLE_S = 0.1

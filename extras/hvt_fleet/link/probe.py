@@ -14,7 +14,7 @@ from contextlib import closing
 from dataclasses import dataclass
 
 from hvt_common.errors import UserError
-from hvt_common.transport.doctor.certificate import (
+from hvt_fleet.link.certificate import (
     NO_CHECK_TIME,
     Certificate,
     TlsFiles,

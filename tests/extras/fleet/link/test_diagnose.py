@@ -16,12 +16,12 @@ import pytest
 import zenoh
 
 from hvt_common.errors import UserError
-from hvt_common.transport.doctor.certificate import KeyPair, TlsFiles
-from hvt_common.transport.doctor.diagnose import LinkWatch, visit
-from hvt_common.transport.doctor.probe import why_no_link
 from hvt_common.transport.rights import Rights
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_fleet.link.certificate import KeyPair, TlsFiles
+from hvt_fleet.link.diagnose import Watch, visit
+from hvt_fleet.link.probe import why_no_link
 from programs.fleet_keys import EXPIRED, Fleet
 from programs.outsider import joined
 from programs.processes import free_ports
@@ -148,7 +148,7 @@ def test_the_watch_explains_once_and_is_quiet_when_the_link_comes(
     """A line a second in the log of a drone that waits for its ground hides everything else."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
     settings = LinkSettings("edge", connect=(endpoint,), name="uav-1")
-    with open_session(settings) as session, LinkWatch(session, settings, served=lambda _: True) as watch:
+    with open_session(settings) as session, Watch(session, settings, served=lambda _: True) as watch:
         assert watch.trouble == ""
         _until(lambda: watch.trouble)
         assert "nobody listens" in watch.trouble
@@ -173,7 +173,7 @@ def test_a_second_link_that_does_not_come_is_said_once(
         open_session(settings) as session,
     ):
         _until(session.info.links)
-        with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch:
+        with Watch(session, settings, served=lambda _: True, patience_s=0.2) as watch:
             _until(lambda: caplog.records)
             time.sleep(0.6)
             assert watch.trouble == ""
@@ -191,7 +191,7 @@ def test_a_guest_with_one_link_is_no_half(
     settings = LinkSettings("edge", listen=(own,), connect=(other,), name="uav-1", links=2)
     with open_session(LinkSettings("ground", listen=(other,), links=2)), open_session(settings) as session:
         _until(lambda: len(session.info.links()) == 2)
-        with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch, joined(own):
+        with Watch(session, settings, served=lambda _: True, patience_s=0.2) as watch, joined(own):
             _until(lambda: len(session.info.links()) == 3)
             time.sleep(1.5)
             assert watch.trouble == ""
@@ -221,7 +221,7 @@ def test_the_watch_ends_with_its_session_and_holds_nobody_up(fleet: Fleet) -> No
 
     settings = fleet.settings("uav-1", "edge", connect=("tls/127.0.0.1:9",))
     with open_session(settings) as session:
-        with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2, examine=dead):
+        with Watch(session, settings, served=lambda _: True, patience_s=0.2, examine=dead):
             assert visiting.wait(25)
         assert _watching(), "nobody has waited for the visit"
     gone.set()

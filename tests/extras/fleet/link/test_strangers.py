@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from hvt_common.transport.doctor.diagnose import LinkWatch
-from hvt_common.transport.doctor.strangers import Strangers, listening_ports
 from hvt_common.transport.session import open_session
+from hvt_fleet.link.diagnose import Watch
+from hvt_fleet.link.strangers import Strangers, listening_ports
 from programs.fleet_keys import Fleet
 from programs.processes import eventually
 
@@ -39,7 +39,7 @@ def test_a_stranger_is_named_and_an_edge_is_not(tmp_path: Path, free_port: int, 
     with (
         caplog.at_level(logging.WARNING),
         open_session(ground) as session,
-        LinkWatch(session, ground, served=lambda _name: True),
+        Watch(session, ground, served=lambda _name: True),
     ):
         for _ in range(4):
             with open_session(edge) as own:

@@ -1,0 +1,92 @@
+"""The door for whoever explains a link that is missing: an extra, by the entry point ``hvt.link``, or nobody."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Self, cast
+
+import zenoh
+
+from hvt_common.protocol.channels import Channel, EdgeKeys
+from hvt_common.runtime.plug_ins import loaded, the_one
+from hvt_common.transport.rights import Rights
+from hvt_common.transport.zenoh_config import LinkSettings, configure
+
+_GROUP = "hvt.link"
+
+
+class LinkWatch:
+    """Watches the links of one session while the context lasts; this one finds nothing."""
+
+    def __init__(self, settings: LinkSettings) -> None:
+        self.config, self.listen = configure(settings)
+        self.rights = Rights.of(self.config)
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no link, in a sentence; empty while there is one, or nothing is known."""
+        return ""
+
+    def may_command(self, edge: str) -> bool:
+        """Whether our own configuration lets questions on ``control`` of this edge out at all."""
+        return self.rights.allow_somebody(
+            flow="egress", message="query", key=EdgeKeys(edge).key(Channel.CONTROL)
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+
+class LinkDoctor:
+    """Explains links; this one explains nothing."""
+
+    def check_keys(
+        self, config: zenoh.Config, *, listen: Sequence[str], name: str | None, now_s: float
+    ) -> None:
+        """Raise `UserError` for keys that no other side would accept.
+
+        ``name`` is who this machine has to be by its certificate: the id of an edge; None for anybody. ``now_s`` is
+        Unix time.
+        """
+
+    def why_no_link(self, config: zenoh.Config) -> list[str]:  # noqa: ARG002
+        """One sentence for each endpoint that it connects to. Blocks for some seconds an endpoint."""
+        return []
+
+    def watch(
+        self,
+        session: zenoh.Session,  # noqa: ARG002
+        settings: LinkSettings,
+        *,
+        served: Callable[[str], bool],  # noqa: ARG002
+    ) -> LinkWatch:
+        """``served(name)`` says whether an edge of that name has appeared, or a ground subscribes (any thread)."""
+        return LinkWatch(settings)
+
+
+def link_doctor() -> LinkDoctor:
+    """The one that is installed; `UserError` where it does not load."""
+    entry = the_one(_GROUP, "doctor", what="link doctor", built_in=False)
+    return (
+        LinkDoctor()
+        if entry is None
+        else cast("LinkDoctor", loaded(entry, lambda of: of(), what="link doctor"))
+    )
+
+
+def control_unanswered(edge: str, *, who: str = "this ground") -> str:
+    """The sentence for a request on ``control`` without an answer, while the edge is present.
+
+    The edge itself, or a ground or a router on the way, may have dropped it: all of them check rights.
+    """
+    return (
+        f"{edge} does not answer on control: {who} may lack the right to command it (hvt-ground keys list shows who "
+        f"has it; add-ground without --watch-only gives it, then copy {edge}.json5 to the edge, and the others that "
+        "changed with it), or the link is full"
+    )
