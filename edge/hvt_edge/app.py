@@ -5,18 +5,18 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from typing import Any
 
-from hvt_common.errors import FlightError, UserError, needs_extra
+from hvt_common.errors import FlightError, UserError
 from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.inference.retried import RetriedDetector
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.failures import Awaited
-from hvt_common.runtime.health_server import HealthServer, state_answers
+from hvt_common.runtime.health import health_server
 from hvt_common.runtime.log import START_LOGGER
 from hvt_common.runtime.process import give_back_holes, notify_systemd, with_lower_priority
 from hvt_common.runtime.reporting import StatusLine
@@ -24,16 +24,16 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.control.link_control import wait_for_ground
-from hvt_edge.health.state import Heartbeat, StateMaker, lacks
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating import LoopClock
+from hvt_edge.report.state import Heartbeat, StateMaker, lacks
+from hvt_edge.report.status import StatusReporter, status_text, summary
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.source.live import SOURCE_PART, closing_on
-from hvt_edge.status import StatusReporter, status_text, summary
 from hvt_edge.wiring import (
     Stages,
     as_the_camera_is,
@@ -304,19 +304,17 @@ class Edge:
             raise FlightError(f"stopped before the source was there: {awaited.error}")
         return source
 
-    def _health_server(self, address: str) -> HealthServer:
-        with needs_extra("'hvt[metrics]'"):
-            from hvt_edge.health.metrics import metrics_text  # noqa: PLC0415 - who is not watched needs no Prometheus
-
+    def _health_server(self, address: str) -> AbstractContextManager[object]:
         frame_s = 1 / self._config.nominal_fps
-        answers = state_answers(
+        return health_server(
+            "edge",
+            address,
             lambda: None if self._heartbeat is None else self._heartbeat.state,
             clock=self._world.clock,
             stuck_s=_STUCK_S + 2 * frame_s,
-            metrics_text=metrics_text,
+            failures=self._failures,
             lacks=lambda state: lacks(state, patience_s=_SILENT_S + 2 * frame_s),
         )
-        return HealthServer(address, answers, name="--metrics", failures=self._failures)
 
     def _say_goodbye(self, stages: Stages, link: EdgeLink, status: StatusReporter) -> None:
         transmitter = stages.transmitter

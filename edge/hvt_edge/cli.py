@@ -17,8 +17,8 @@ from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
 
 _EXTRA_COMMANDS = "hvt.edge_commands"
 """Entry points of commands that extras bring: each takes its words and returns the exit code."""
-_BROUGHT = "doctor"
-"""The command of the extras that come with HVT."""
+_BROUGHT = ("doctor", "status")
+"""Commands of the extras that come with HVT."""
 _DESCRIPTION = (
     "Publish a camera or clip over Zenoh: a low-bitrate HEVC base stream, and sharp stills of what matters, "
     "within a hard bit budget. hvt-edge doctor [SETTINGS] checks what a flight needs; hvt-edge status tells how "
@@ -38,17 +38,15 @@ def program() -> NoReturn:
 
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
-    if words and words[0] == "status":
-        from hvt_edge.health import watch  # noqa: PLC0415 - each command imports its own
-
-        return watch.run(words[1:])
     if words and not words[0].startswith("-"):
         entry = the_one(_EXTRA_COMMANDS, words[0], what="command", built_in=False)
         if entry is not None:
             limit_malloc_arenas()
             return int(loaded(entry, lambda run: run, what="command")(words[1:]))
-        if words[0] == _BROUGHT:
-            raise UserError("hvt-edge doctor is of an extra that is not installed: pip install 'hvt[edge]'")
+        if words[0] in _BROUGHT:
+            raise UserError(
+                f"hvt-edge {words[0]} is of an extra that is not installed: pip install 'hvt[edge]'"
+            )
     config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
     config = with_profile(config, given=given.values)
     redaction = Redaction([*words, *given.values.values()])
@@ -58,7 +56,7 @@ def _run(argv: Sequence[str] | None) -> int:
     config = check(config)
     from hvt_common.runtime.reporting import print_table, write_json  # noqa: PLC0415
     from hvt_edge.app import Edge  # noqa: PLC0415
-    from hvt_edge.status import in_vain, table, title  # noqa: PLC0415
+    from hvt_edge.report.status import in_vain, table, title  # noqa: PLC0415
     from hvt_edge.world import World  # noqa: PLC0415
 
     limit_malloc_arenas()

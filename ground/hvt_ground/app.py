@@ -11,11 +11,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hvt_common.errors import FlightError, needs_extra
+from hvt_common.errors import FlightError
 from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
-from hvt_common.runtime.failures import Failures, reason_of
-from hvt_common.runtime.health_server import HealthServer, state_answers
+from hvt_common.runtime.failures import reason_of
+from hvt_common.runtime.health import health_server
 from hvt_common.runtime.process import give_back_holes, notify_systemd
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.transport.link_doctor import LinkWatch, link_doctor
@@ -100,7 +100,15 @@ class Ground:
             if config.view or config.serve:
                 view = stack.enter_context(LiveView("spawn" if config.view else "serve", later=True))
             if config.metrics is not None:
-                stack.enter_context(self._health_server(config.metrics, models.failures))
+                server = health_server(
+                    "ground",
+                    config.metrics,
+                    lambda: self._state,
+                    clock=self._clock,
+                    stuck_s=_STUCK_S,
+                    failures=models.failures,
+                )
+                stack.enter_context(server)
             settings = make_link_settings(config)
             offered = (one.serve(config, clock=self._clock, failures=models.failures) for one in all_extras())
             services = [stack.enter_context(one) for one in offered if one is not None]
@@ -172,15 +180,6 @@ class Ground:
             line.note(f"hvt-ground: watch at {page}")
 
     # Who watches
-
-    def _health_server(self, address: str, failures: Failures) -> HealthServer:
-        with needs_extra("'hvt[metrics]'"):
-            from hvt_ground.report.metrics import metrics_text  # noqa: PLC0415 - who is not watched needs no Prometheus
-
-        answers = state_answers(
-            lambda: self._state, clock=self._clock, stuck_s=_STUCK_S, metrics_text=metrics_text
-        )
-        return HealthServer(address, answers, name="--metrics", failures=failures)
 
     # Serving
 

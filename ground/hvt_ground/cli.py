@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
@@ -27,13 +26,9 @@ Other commands, each with --help:
   hvt-ground set-budget | set-method     command it
   hvt-ground edges                       which edges are there
   hvt-ground keys                        make keys, and say who may do what"""
-_COMMANDS = {
-    "status": "hvt_ground.control.watch",
-}
-"""By name, the module whose ``run`` takes the words that follow; imported for none but its own."""
 _EXTRA_COMMANDS = "hvt.ground_commands"
-"""Entry points of commands that extras bring: each is such a ``run``."""
-_BROUGHT = ("doctor", "export", "keys", "recordings", "replay")
+"""Entry points of commands that extras bring: each takes the words that follow, and returns the exit code."""
+_BROUGHT = ("doctor", "export", "keys", "recordings", "replay", "status")
 """Commands of the extras that come with HVT."""
 
 
@@ -49,11 +44,6 @@ def program() -> NoReturn:
 
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
-    if words and words[0] in _COMMANDS:
-        with needs_extra("'hvt[ground]'"):
-            command = import_module(_COMMANDS[words[0]])
-        code: int = command.run(words[1:])
-        return code
     if words and not words[0].startswith("-"):
         entry = the_one(_EXTRA_COMMANDS, words[0], what="command", built_in=False)
         if entry is not None:

@@ -14,8 +14,8 @@ from hvt_common.protocol.messages import BaseHeader
 from hvt_common.values import Frame
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
+from hvt_edge.report.status import table
 from hvt_edge.source.contract import Source
-from hvt_edge.status import table
 from hvt_edge.world import World
 from media.pictures import write_scene
 from programs.outsider import Tap, joined

@@ -11,7 +11,7 @@ from hvt_common.runtime.failures import Failure
 from hvt_edge import app
 from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.loop.cpu import Cores
-from hvt_edge.status import in_vain, summary, table, title
+from hvt_edge.report.status import in_vain, summary, table, title
 from programs.summary_page import unexplained
 
 

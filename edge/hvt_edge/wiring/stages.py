@@ -27,9 +27,9 @@ from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.pose import PoseSource, PoseStage
 from hvt_edge.operating import LoopClock, Operating, base_rate_bps
+from hvt_edge.report.status import InfoReporter
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
-from hvt_edge.status import InfoReporter
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.video.frame_skip import LimitedFrameSkip

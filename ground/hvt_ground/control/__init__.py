@@ -1,6 +1,6 @@
 """Asking edges for more: a still, a keyframe, another budget or method. For people and for programs.
 
-Programs use what is listed here; `command` gives people the same on the command line, `watch` how a ground is.
+Programs use what is listed here; `command` gives people the same on the command line.
 """
 
 from __future__ import annotations

@@ -18,8 +18,8 @@ from hvt_common.protocol.frame_account import FrameAccount
 from hvt_common.protocol.messages import FailedPart, Info, Status
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_ground.control import watch
-from hvt_ground.report.metrics import metrics_text
+from hvt_fleet.health import ground_status as watch
+from hvt_fleet.health.ground_metrics import metrics_text
 from hvt_ground.report.state import SessionState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_port import ReceiverReports

@@ -19,7 +19,6 @@ from pymavlink.dialects.v20 import ardupilotmega
 from hvt_common.config import load
 from hvt_common.errors import FlightError, NotYetError, UserError, exit_with_sentence
 from hvt_common.runtime.failures import Awaited, Failures
-from hvt_common.runtime.health_server import Answer, HealthServer
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.transport.session import LinkSettings, open_session
 from hvt_common.transport.zenoh_config import configure
@@ -28,6 +27,7 @@ from hvt_edge.loop.pose import open_pose
 from hvt_edge.source.live import LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_edge.world import World
+from hvt_fleet.health.server import Answer, HealthServer
 from hvt_ground.sinks.rerun.live_view import LiveView, listening
 from hvt_web.server import WebPage
 from programs.processes import eventually, free_ports

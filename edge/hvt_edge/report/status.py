@@ -26,10 +26,10 @@ from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import View
 from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.config import EdgeConfig
-from hvt_edge.health.state import EdgeState, Heartbeat, LinkState
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.cpu import Cores
 from hvt_edge.operating import Levers, LoopClock, Operating
+from hvt_edge.report.state import EdgeState, Heartbeat, LinkState
 
 _PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
 _RATES = (

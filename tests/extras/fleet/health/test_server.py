@@ -11,7 +11,7 @@ from contextlib import suppress
 import pytest
 
 from hvt_common.runtime.failures import Failures
-from hvt_common.runtime.health_server import Answer, HealthServer
+from hvt_fleet.health.server import Answer, HealthServer
 from programs.processes import eventually, free_ports
 
 STATE = {"/state.json": lambda: Answer(json.dumps({"latitude_deg": 52.1}).encode())}

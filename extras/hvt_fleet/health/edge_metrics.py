@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 from prometheus_client.core import Metric
 
 from hvt_common.protocol.frame_account import FRAME_GROUPS
-from hvt_common.runtime.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
 from hvt_common.units import SECOND_NS
-from hvt_edge.health.state import BacklogState, EdgeState
+from hvt_edge.report.state import BacklogState, EdgeState
+from hvt_fleet.health import server
+from hvt_fleet.health.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
 
 _GAUGES: Table[EdgeState] = {
     "hvt_budget_bits_per_second": ("The edge's budget.", lambda one: one.operating.budget_bps),
@@ -62,6 +64,9 @@ _STORE_COUNTERS: Table[BacklogState] = {
 def metrics_text(state: EdgeState) -> bytes:
     """The text format. Counters are of this run."""
     return exposition(_metrics(state))
+
+
+serve = partial(server.serve, metrics_text)
 
 
 def _metrics(state: EdgeState) -> Iterator[Metric]:

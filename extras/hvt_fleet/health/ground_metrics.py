@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections import Counter as Counts
 from collections.abc import Iterator
+from functools import partial
 
 from prometheus_client.core import Metric
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.edge_words import STILL_WORDS
-from hvt_common.runtime.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
 from hvt_common.units import SECOND_NS
+from hvt_fleet.health import server
+from hvt_fleet.health.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
 from hvt_ground.report.state import GroundState, SessionState
 
 _LINKS = ("waiting", "up", "thin", "lost", "ended")
@@ -74,6 +76,9 @@ _COUNTERS: Table[SessionState] = {
 def metrics_text(state: GroundState) -> bytes:
     """The text format. Counters are of the open session, and begin anew with the next."""
     return exposition(_metrics(state))
+
+
+serve = partial(server.serve, metrics_text)
 
 
 def _metrics(state: GroundState) -> Iterator[Metric]:

@@ -56,18 +56,17 @@ class State(Protocol):
 _State = TypeVar("_State", bound=State)
 
 
-def state_answers(
+def serve(
+    metrics_text: Callable[[_State], bytes],
+    address: str,
     newest: Callable[[], _State | None],
     *,
     clock: Callable[[], int],
     stuck_s: float,
-    metrics_text: Callable[[_State], bytes],
-    lacks: Callable[[_State], str] = lambda _state: "",
-) -> dict[str, Callable[[], Answer]]:
-    """Answers of a program that makes a state each second; after ``stuck_s`` without it stands still.
-
-    ``lacks`` says what keeps it from serving though it is alive; empty for nothing.
-    """
+    failures: Failures,
+    lacks: Callable[[_State], str],
+) -> HealthServer:
+    """See `hvt_common.runtime.health.health_server`; ``metrics_text(state)`` is for Prometheus."""
 
     def of_state(make: Callable[[_State], Answer]) -> Answer:
         state = newest()
@@ -85,7 +84,7 @@ def state_answers(
     def alive() -> Answer:  # while networks load it is, and not ready
         return Answer(b"starting\n") if newest() is None else of_state(lambda state: said(state, ready=False))
 
-    return {
+    answers = {
         "/metrics": lambda: of_state(lambda state: Answer(metrics_text(state), _METRICS_TYPE)),
         "/state.json": lambda: of_state(
             lambda state: Answer(json.dumps(state.as_dict()).encode(), "application/json")
@@ -93,6 +92,7 @@ def state_answers(
         "/healthz": alive,
         "/readyz": lambda: of_state(lambda state: said(state, ready=True)),
     }
+    return HealthServer(address, answers, name="--metrics", failures=failures)
 
 
 class HealthServer:

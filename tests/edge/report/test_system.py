@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hvt_edge.health.state import SystemReading, read_system
+from hvt_edge.report.state import SystemReading, read_system
 
 WIRELESS = """\
 Inter-| sta-|   Quality        |   Discarded packets               | Missed | WE

@@ -8,8 +8,8 @@ from typing import Any
 from rich.table import Table
 
 from hvt_common.protocol.edge_words import counts_text
-from hvt_common.runtime.status_command import StatusCommand
 from hvt_common.units import SECOND_NS, bitrate_text
+from hvt_fleet.health.status_command import StatusCommand
 
 
 def run(argv: Sequence[str]) -> int:

@@ -8,8 +8,8 @@ from typing import Any
 from rich.table import Table
 
 from hvt_common.protocol.edge_words import counts_text
-from hvt_common.runtime.status_command import StatusCommand
 from hvt_common.units import SECOND_NS, bitrate_text
+from hvt_fleet.health.status_command import StatusCommand
 
 _COLUMNS = ("edge", "link", "of budget", "delay p95", "picture", "stills", "tracks", "does not work")
 _FRESH_S = 3.0
