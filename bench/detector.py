@@ -18,8 +18,8 @@ import numpy.typing as npt
 from bench.bars import measured
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import OnnxDetector
-from hvt_common.inference.motion import MotionDetector
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
+from hvt_models.detectors.motion import MotionDetector
 
 DATA = Path(os.environ.get("HVT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
 MODELS = (

@@ -122,6 +122,7 @@ def test_the_embedded_detector_needs_no_library(monkeypatch):
             "detector 'yolox-s' is not known: give one of motion, aerial-nano, aerial-cls, or an",
         ),
         ("aerial-nano+motionless", None, "detector 'aerial-nano+motionless' is not available: "),
+        ("motion", None, "detector motion is not available: "),
         ("aerial-nano", "yolov8", "head yolov8 is not available: "),
     ],
 )

@@ -19,13 +19,12 @@ from hvt_common.inference.heads.contract import Head
 from hvt_common.inference.heads.trial import Trial, trial_pictures
 from hvt_common.inference.labels import KNOWN_LABELS, class_labels, read_labels
 from hvt_common.inference.letterbox import Letterboxer, as_bgr
-from hvt_common.inference.motion import MOTION, MotionDetector
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
 from hvt_common.inference.preparation import Preparation, prepared_as
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
 from hvt_common.inference.scores import USUAL_CONFIDENCE, default_confidence
-from hvt_common.inference.store import model_names, needed_part, parts_of, resolve_model
+from hvt_common.inference.store import MOTION, library_part, model_names, needed_part, parts_of, resolve_model
 from hvt_common.values import Detections, Image
 
 _log = logging.getLogger(__name__)
@@ -95,7 +94,7 @@ def open_detector(
     of a detection, ``nms_iou`` the largest overlap of two of one class, both 0…1. ``size`` is (width, height) of the
     network's input where the model leaves it free; else each image gets the multiples of the network's stride that
     hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). A plug-in gets none of these;
-    ``confidence`` is applied to its answer. For ``A+B`` (`hvt_models.ensemble`) it is on the scale of A, and
+    ``confidence`` is applied to its answer. For ``A+B`` (`hvt_models.detectors`) it is on the scale of A, and
     ``labels``, ``head`` and ``size`` are refused.
     Raises `UserError` where there is no such model, it is no detector, its labels do not fit, or a setting is out of
     its range.
@@ -115,7 +114,8 @@ def open_detector(
     if head is not None and (spec == MOTION or plug_in is not None):
         raise UserError(f"--head {head} has no say: {spec!r} is no network of a file")
     if spec == MOTION:
-        return MotionDetector(confidence=confidence)
+        motion: Detector = needed_part(MOTION, f"detector {MOTION}")(confidence=confidence)
+        return motion
     if plug_in is not None:
         if labels is not None:
             raise UserError(f"labels file {labels} has no say: detector {spec!r} brings its own class names")
@@ -152,7 +152,8 @@ def warm_up(detector: FailingDetector, size: tuple[int, int]) -> None:
 
     The motion detector, which remembers pictures, is left alone.
     """
-    if not isinstance(detector, MotionDetector):
+    motion = library_part(MOTION)
+    if motion is None or not isinstance(detector, motion):
         detector.detect(np.zeros((size[1], size[0], 3), np.uint8))
 
 

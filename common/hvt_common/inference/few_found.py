@@ -16,9 +16,8 @@ import cv2
 import numpy as np
 
 from hvt_common.inference.letterbox import as_bgr
-from hvt_common.inference.motion import MOTION, MotionDetector
 from hvt_common.inference.scores import default_confidence
-from hvt_common.inference.store import EMBEDDED_DETECTOR
+from hvt_common.inference.store import EMBEDDED_DETECTOR, MOTION, library_part
 from hvt_common.values import Detections, Image
 
 _log = logging.getLogger(__name__)
@@ -48,7 +47,8 @@ class FewFoundHint:
         self._lock = threading.Lock()
         self._open = detector != MOTION
         self._runs = self._with_something = self._with_motion = 0
-        self._motion = MotionDetector() if self._open and detector != EMBEDDED_DETECTOR else None
+        motion = library_part(MOTION) if self._open and detector != EMBEDDED_DETECTOR else None
+        self._motion = None if motion is None else motion()
 
     def take(self, found: Detections, image_bgr: Image, detect: Callable[[Image], Detections | None]) -> None:
         """Count what was found on one picture; at the last run that counts it may be said.
@@ -65,8 +65,8 @@ class FewFoundHint:
             if self._runs < _RUNS or not self._open:
                 return
             self._open = False
-            motion, self._motion = self._motion, None
-        if motion is None:
+            self._motion = None
+        if self._detector == EMBEDDED_DETECTOR:
             if self._with_something < _LEAST_SHARE * _RUNS:
                 self._say_other_model()
         elif not self._with_something:

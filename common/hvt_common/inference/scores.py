@@ -7,11 +7,10 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_common.inference.labels import metadata_labels
-from hvt_common.inference.motion import MOTION
 from hvt_common.inference.runtimes.ir_file import ir_metadata, is_ir
 from hvt_common.inference.runtimes.onnx_file import onnx_metadata
 from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
-from hvt_common.inference.store import parts_of, resolve_model
+from hvt_common.inference.store import MOTION, parts_of, resolve_model
 
 USUAL_CONFIDENCE = 0.25
 """From where detections count, where neither the user nor the model says."""

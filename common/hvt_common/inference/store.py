@@ -21,6 +21,9 @@ EMBEDDED_DETECTOR = "aerial-nano"
 EMBEDDED_CLASSIFIER = "aerial-cls"
 """Names the objects of stills."""
 
+MOTION = "motion"
+"""The word that stands for the detector without weights, which is of the model library; it remembers pictures."""
+
 _GROUP = "hvt.models"
 _JOIN = "+"
 _MOST_PARTS = 3
@@ -42,7 +45,7 @@ class ModelStore(Protocol):
 
 
 def library_part(name: str) -> Any | None:
-    """A part of the model library: ``heads``, ``store`` or ``ensemble``; None where it is not installed."""
+    """A part of the model library: ``heads``, ``store``, ``ensemble`` or `MOTION`; None where it is not installed."""
     found = installed(_GROUP).get(name)
     return None if found is None else loaded(found[0], lambda part: part, what="model library")
 

@@ -9,7 +9,6 @@ from typing import Literal, cast
 
 from hvt_common.inference.detect import Detector, FailingDetector, detect_every, open_detector, warm_up
 from hvt_common.inference.few_found import ViewTrust
-from hvt_common.inference.motion import MOTION
 from hvt_common.inference.retried import RetriedDetector
 from hvt_common.inference.scores import (
     declared_class_names,
@@ -17,6 +16,7 @@ from hvt_common.inference.scores import (
     is_calibrated,
     uncalibrated,
 )
+from hvt_common.inference.store import MOTION
 from hvt_common.inference.tiles import detect_whole, tiled
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.values import Detections, Image, View

@@ -14,9 +14,8 @@ from hvt_common.errors import UserError
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.labels import first_synonym
-from hvt_common.inference.motion import MOTION
 from hvt_common.inference.runtimes.plug_in import plug_in_of
-from hvt_common.inference.store import EMBEDDED_DETECTOR, parts_of
+from hvt_common.inference.store import EMBEDDED_DETECTOR, MOTION, parts_of
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 from hvt_common.video.still_codecs import still_codec

@@ -16,10 +16,10 @@ from hvt_common.inference.detect import OnnxDetector, detect_every, open_detecto
 from hvt_common.inference.heads.decode import YoloxCells
 from hvt_common.inference.heads.trial import anchor_count
 from hvt_common.inference.letterbox import Letterbox, Letterboxer, as_bgr
-from hvt_common.inference.motion import MotionDetector
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
 from hvt_common.inference.preparation import Preparation
 from hvt_common.inference.runtimes.model import open_model
+from hvt_models.detectors.motion import MotionDetector
 from hvt_models.forms import Dense, Listed
 from media.head_models import family_model
 from media.onnx_models import STRIDES, cells, colour_classifier, colour_detector, constant_model

@@ -14,7 +14,7 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.inference.scores import declared_class_names, default_confidence, is_calibrated
 from hvt_common.inference.store import parts_of
 from hvt_common.values import Detections, Image
-from hvt_models.ensemble import EnsembleDetector, on_scale_of
+from hvt_models.detectors.ensemble import EnsembleDetector, on_scale_of
 from hvt_models.store import Store
 from media.onnx_models import colour_detector
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from hvt_common.inference.few_found import ViewTrust
-from hvt_common.inference.motion import MOTION
+from hvt_common.inference.store import MOTION
 from hvt_common.protocol.channels import MSGPACK_ENCODING
 from hvt_common.protocol.messages import (
     BaseHeader,

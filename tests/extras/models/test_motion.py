@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_common.inference.motion import MotionDetector
+from hvt_models.detectors.motion import MotionDetector
 
 CALLS = 18
 SETTLED = 6  # calls after which the memory is full

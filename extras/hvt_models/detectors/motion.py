@@ -33,9 +33,6 @@ from hvt_common.inference.letterbox import as_bgr
 from hvt_common.inference.nms import MAX_DETECTIONS, components
 from hvt_common.values import Detections, Image
 
-MOTION = "motion"
-"""The word that stands for the detector without weights."""
-
 _Gray = npt.NDArray[np.uint8]
 _Floats = npt.NDArray[np.float64]
 
