@@ -11,7 +11,7 @@ import * as words from "./words.js";
 /** @typedef {import("./connection.js").Message} Message */
 
 const STATE_OLD_MS = 4000; // one comes each second
-const PERIODS = 8; // between pictures, of which the longest counts
+const PERIODS = 8; // between pictures
 const KEYFRAME_MS = 8000;
 const MOST_EVENTS = 200;
 const SET_MS = 30000;
@@ -249,7 +249,7 @@ function showAge() {
     plays: !by("video").paused && !jpeg,
     ageMs: ms,
     sinceMs: now - shown.at,
-    periodMs: Math.max(jpeg ? 500 : 0, ...periods),
+    periodsMs: periods.length ? periods : [1000 / (sessions.get(chosen)?.fps ?? 10)],
     lastMs: wall.age(chosen, connection.now()),
     lockstep: sessions.get(chosen)?.pace === "lockstep",
   });

@@ -2,10 +2,10 @@
 
 /**
  * @typedef {{connected: boolean, refused: boolean, goneMs: number, link: string, silentMs: number | null, chosen: boolean,
- *    shown: boolean, follows: boolean, plays: boolean, ageMs: number, sinceMs: number, periodMs: number,
+ *    shown: boolean, follows: boolean, plays: boolean, ageMs: number, sinceMs: number, periodsMs: number[],
  *    lastMs: number | null, lockstep: boolean}} Facts
  * Whether the ground answers or refuses this page, and since when not; the link and for how long nothing has come;
- * whether a picture is shown, follows the newest, plays on; its age, when it was shown, what usually lies between two; the age of the newest
+ * whether a picture is shown, follows the newest, plays on; its age, when it was shown, what lay between the last ones; the age of the newest
  * one of this edge, wherever it is shown.
  */
 /** @typedef {{track: number | null, before: string, after: string, sureness: number, reason: string, why: string,
@@ -79,7 +79,9 @@ export function standing(facts) {
   if (!facts.follows) {
     return { state: "paused", words: `${facts.plays ? "REPLAY" : "PAUSED"} ${seconds(ageMs)}`, live: false };
   }
-  const patience = Math.min(MOST_GAP_MS, Math.max(LEAST_GAP_MS, 2.5 * facts.periodMs));
+  // By the middle one: a hiccup before the camera went would leave its last picture bright for as long.
+  const period = [...facts.periodsMs].sort((one, other) => one - other)[facts.periodsMs.length >> 1] ?? 0;
+  const patience = Math.min(MOST_GAP_MS, Math.max(LEAST_GAP_MS, 2.5 * period));
   // Who comes later is shown a picture that may be old already.
   if (sinceMs > patience || ageMs > MOST_GAP_MS) return { state: "stale", words: `NO NEW PICTURE ${whole(Math.max(sinceMs, ageMs))}`, live: false };
   if (facts.lockstep) return { state: "live", words: "lockstep: no age", live: true };

@@ -24,10 +24,11 @@ from hvt_common.protocol.messages import (
     UnknownVersionError,
     WireError,
 )
-from hvt_common.transport.flood import FloodWatch
+from hvt_common.transport.flood import FloodWatch, TokenBucket
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.transport.link_doctor import control_unanswered
 from hvt_common.transport.session import declare_publisher, query_later
+from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.link.statistics import LinkMeasurement
 
@@ -38,6 +39,8 @@ _INBOX_SHARE = 0.75
 """Share of the inbox for one channel: reports by the thousand do not keep pictures out."""
 _MOST_PER_S = 2000
 """Messages of one row from one edge. A camera has 240 pictures a second at the very most."""
+_MOST_REPORTS_PER_S = 100
+"""An edge says each second how it is, in lockstep each second of its clip. What costs all sinks a turn is bounded."""
 _ANSWER_S = 1.0
 _MOST_ANSWERS, _MOST_ERRORS = 4, 16
 _UNANSWERED = 3
@@ -73,6 +76,7 @@ class EdgePort:
         self._log = log
         self.inbox = Inbox(capacity=_INBOX_MESSAGES, share=_INBOX_SHARE)
         self._flood = FloodWatch(most_per_s=_MOST_PER_S)
+        self._reports = TokenBucket(burst=_MOST_REPORTS_PER_S, every_ns=SECOND_NS // _MOST_REPORTS_PER_S)
         self.present = threading.Event()
         """Set while the edge's liveliness token is there."""
         self.used = threading.Event()
@@ -142,7 +146,9 @@ class EdgePort:
             raise self._errors.popleft()
 
     def put(self, item: Received, row: Channel) -> None:
-        """Take a message in, or drop it without room."""
+        """Take a message in, or drop it: without room, or where an edge reports without end."""
+        if row == Channel.STATUS and not self._reports.take(item.received_ns):
+            return
         if self._log is not None:
             self._log(item)
         self.inbox.put(item)

@@ -24,7 +24,7 @@ STATIC = Path(hvt_web.__file__).parent / "static"
 NODE = shutil.which("node")
 LIVE = {
     "connected": True, "refused": False, "goneMs": 0, "link": "up", "silentMs": 100, "chosen": True, "shown": True,
-    "follows": True, "plays": True, "ageMs": 300, "sinceMs": 80, "periodMs": 100, "lastMs": 300, "lockstep": False,
+    "follows": True, "plays": True, "ageMs": 300, "sinceMs": 80, "periodsMs": [100], "lastMs": 300, "lockstep": False,
 }  # fmt: skip
 
 
@@ -60,7 +60,7 @@ def test_what_is_not_live_never_says_live():
         ({}, "live, 0.3 s"),
         ({"lockstep": True}, "lockstep: no age"),
         ({"ageMs": 5_400}, "LATE, 5.4 s old"),
-        ({"ageMs": 2_400, "sinceMs": 900, "periodMs": 1_000}, "live, 2.4 s"),
+        ({"ageMs": 2_400, "sinceMs": 900, "periodsMs": [1_000]}, "live, 2.4 s"),
         ({"ageMs": -40}, "live, 0.0 s"),
         ({"ageMs": -3_600_000}, "live, age not known"),
         ({"follows": False, "plays": False, "ageMs": 14_000}, "PAUSED 14 s"),
@@ -77,7 +77,8 @@ def test_what_is_not_live_never_says_live():
         ({"shown": False, "lastMs": 94_000}, "NO PICTURE 94 s"),
         ({"ageMs": 27_000, "sinceMs": 400}, "NO NEW PICTURE 27 s"),
         ({"sinceMs": 4_000}, "NO NEW PICTURE 4 s"),
-        ({"sinceMs": 1_400, "periodMs": 1_000}, "live, 0.3 s"),
+        ({"sinceMs": 1_400, "periodsMs": [1_000, 900, 1_100]}, "live, 0.3 s"),
+        ({"sinceMs": 1_400, "periodsMs": [100, 3_000, 200]}, "NO NEW PICTURE 1 s"),
     ]
     found = said([("standing", [LIVE | changed]) for changed, _ in cases])
     assert [one["words"] for one in found] == [words for _, words in cases]

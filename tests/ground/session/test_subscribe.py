@@ -15,8 +15,10 @@ import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import InfoRequest
+from hvt_common.transport.inbox import Received
 from hvt_common.transport.session import open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_common.units import SECOND_NS
 from hvt_common.video.still_codecs import still_codec_names
 from hvt_ground.session.edge_port import EdgePort
 from hvt_ground.session.subscribe import MAX_EDGES, GroundLink
@@ -220,6 +222,17 @@ def test_nothing_is_declared_in_a_callback(free_port: int) -> None:
 
             eventually(reported, within_s=20, what="the edge gets reports all the same")
             assert declarations.threads == [threading.current_thread().name]
+
+
+def test_who_reports_without_end_is_heard_a_hundred_times_a_second():
+    """Each report is a turn of all sinks: 1,500 a second in one edge's name took half of what others were shown."""
+    port = EdgePort(None, "uav-1", clock=time.time_ns)  # type: ignore[arg-type]
+    heard = {Channel.STATUS: 0, Channel.BASE: 0}
+    for number in range(1500):
+        for row in heard:
+            port.put(Received(f"hvt/uav-1/{row}", b"", b"", "", number * SECOND_NS // 1500), row)
+            heard[row] += port.inbox.get(timeout_s=0) is not None
+    assert heard == {Channel.STATUS: pytest.approx(200, abs=2), Channel.BASE: 1500}, "after a hundred at once"
 
 
 def test_an_edge_that_is_left_while_a_report_goes_out(free_port: int) -> None:
