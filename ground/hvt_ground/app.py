@@ -50,6 +50,8 @@ _STUCK_S = 5.0
 """A ground that has made no state for so long does not serve its edges either."""
 _MOST_SUMMARIES = 256
 """Limit for an edge: one that restarts for weeks must not fill the memory."""
+_MOST_MOVED = 256
+"""Limit of edges that have left, for the same reason."""
 
 
 class Ground:
@@ -76,7 +78,7 @@ class Ground:
         self._leaving: list[EdgeThread] = []
         """Threads of edges that are served no more: they finish."""
         self._moved: dict[str, EdgeSessions] = {}
-        """Sessions of edges that another member of the group serves now."""
+        """Sessions of edges that have left their place to another edge, or to another member of the group."""
         self._ended: defaultdict[str, deque[tuple[dict[str, Any], Sequence[Sink[Event]]]]] = defaultdict(
             partial(deque, maxlen=_MOST_SUMMARIES)
         )
@@ -242,7 +244,7 @@ class Ground:
         self._ended[session.info.edge].append((summary(session), session.sinks))
 
     def _leave_edges(self, ports: list[EdgePort], link: GroundLink) -> None:
-        # The link has left those that never were more than a name, for others, and those that moved.
+        # The link has left those without a session, for others, and those that moved.
         for one in [one for one in self._edges.values() if one.sessions.port not in ports]:
             del self._edges[one.sessions.port.edge]
             one.stop()
@@ -253,6 +255,10 @@ class Ground:
             self._leaving.remove(one)
             if one.sessions.ended:
                 self._moved[one.sessions.port.edge] = one.sessions
+            if len(self._moved) > _MOST_MOVED:
+                del self._moved[oldest := next(iter(self._moved))]
+                if oldest not in self._edges:
+                    self._ended.pop(oldest, None)
             link.closed(one.sessions.port)
 
     def _say_rights(self, port: EdgePort, line: StatusLine, watch: LinkWatch) -> None:

@@ -80,7 +80,7 @@ class EdgePort:
         self.present = threading.Event()
         """Set while the edge's liveliness token is there."""
         self.used = threading.Event()
-        """Set once there is more to this edge than messages under its name: a session."""
+        """Set while there is more to this edge than messages under its name: a session that is open."""
         self._unanswered = 0
         self._version_said = False
         self._session = session

@@ -328,6 +328,7 @@ class EdgeSessions:
                 step()
             except Exception as error:  # noqa: BLE001 - the steps after it are due all the same
                 self._say_failed(error, session)
+        self.port.used.clear()
         log_fields(session="")
 
     def _report_end(self, session: GroundSession) -> None:

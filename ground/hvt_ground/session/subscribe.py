@@ -75,7 +75,7 @@ class GroundLink:
         )
 
     def ports(self) -> list[EdgePort]:
-        """All edges that are served; one that never had a session may leave again, and one that moved."""
+        """All edges that are served; one without a session may leave again, and one that moved."""
         if self._group is not None:
             self._share(self._group)
         with self._lock:
@@ -175,7 +175,7 @@ class GroundLink:
             return port
 
     def _make_space(self) -> bool:
-        # Leave one that is not there and never was more than a name.
+        # Leave one that is not there and has no session: a ground may run for years.
         for edge, port in self._ports.items():
             if not port.present.is_set() and not port.used.is_set():
                 del self._ports[edge]

@@ -202,3 +202,13 @@ def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path,
     assert rig.sessions.failures.parts[0].working
     assert rig.thread.close(timeout_s=60)
     assert sum("all else goes on" in one.getMessage() for one in caplog.records) == 1
+
+
+def test_a_flight_that_has_ended_holds_no_place(tmp_path):
+    """A ground that runs for years would refuse every drone after the sixty-fourth."""
+    rig = Rig(Flight(1), Consumer(tmp_path))
+    rig.put(0)
+    assert rig.port.used.is_set()
+    rig.thread.close()
+    assert rig.decoded == [1]
+    assert not rig.port.used.is_set()

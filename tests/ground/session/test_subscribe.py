@@ -72,8 +72,8 @@ def test_invented_names_do_not_lock_out_a_real_edge(link, caplog):
         assert ground.is_known("uav-1")
 
 
-def test_edges_that_are_there_or_have_flown_keep_their_place(link):
-    """A stranger's token would end a flight, or take its summary."""
+def test_edges_that_are_there_or_fly_keep_their_place(link):
+    """A stranger's token would end a flight."""
     ground, outsider = link
     tokens = [
         outsider.liveliness().declare_token(f"hvt/real-{number}/alive") for number in range(MAX_EDGES - 1)
