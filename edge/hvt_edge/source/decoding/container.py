@@ -62,15 +62,19 @@ class _GrowingFile:
 
     def __init__(self, path: str) -> None:
         self._file = os.open(path, os.O_RDONLY)
+        self._ended = False
 
     def __del__(self) -> None:
         os.close(self._file)  # PyAV lets go of it, and does not close it
 
     def read(self, size: int) -> bytes:
-        """At most ``size`` bytes; nothing once it has not grown for ten seconds."""
+        """At most ``size`` bytes; nothing, also to later calls, once it has not grown for ten seconds."""
         until_s = time.monotonic() + QUIET_S
-        while not (data := os.read(self._file, size)) and time.monotonic() < until_s:
-            time.sleep(_POLL_S)
+        while not (data := os.read(self._file, size)) and not self._ended:
+            if time.monotonic() >= until_s:
+                self._ended = True
+            else:
+                time.sleep(_POLL_S)
         return data
 
 

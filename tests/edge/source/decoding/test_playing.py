@@ -5,9 +5,8 @@ from __future__ import annotations
 import gc
 import logging
 import shutil
-import threading
-import time
 from fractions import Fraction
+from types import SimpleNamespace
 
 import av
 import cv2
@@ -17,6 +16,7 @@ from av.stream import Disposition
 from PIL import Image
 
 from hvt_common.errors import UserError
+from hvt_edge.source.decoding import container
 from hvt_edge.source.decoding.container import open_video
 from hvt_edge.source.opening import open_source
 from media.numbered import disc, number_of, numbered, patch, write_numbered
@@ -409,24 +409,25 @@ def test_a_cut_clip_says_that_it_is_unfinished(tmp_path, caplog, name, options):
     assert f"{name} is unfinished: " in caplog.text
 
 
-def test_a_file_that_grows_is_followed(tmp_path):
-    """Who flies what is still recorded would get its first second."""
+def test_a_file_that_grows_is_followed(tmp_path, monkeypatch):
+    """Who flies what is still recorded would get its first second; or sit before its end for a minute."""
     whole = write_numbered(tmp_path / "whole.ts", 90, g="10", bf="0").read_bytes()
     growing = tmp_path / "growing.ts"
     half = len(whole) // 2 // 188 * 188
     growing.write_bytes(whole[:half])
+    slept = []
 
-    def grow():
-        time.sleep(0.5)
-        with growing.open("ab") as file:
-            file.write(whole[half:])
+    def sleep(seconds):
+        slept.append(seconds)
+        if len(slept) == 5:
+            with growing.open("ab") as file:
+                file.write(whole[half:])
 
-    writer = threading.Thread(target=grow)
+    monkeypatch.setattr(container, "time", SimpleNamespace(sleep=sleep, monotonic=lambda: sum(slept)))
     with open_source(str(growing), size=lambda size: size, fps=30, growing=True) as source:
-        writer.start()
         played = [number_of(frame.source_bgr) for frame in source.frames(start_ns=0)]
-    writer.join()
     assert played == list(range(90))
+    assert sum(slept) < 2.5 * container.QUIET_S, "once where stamps are looked at, once at the end"
 
 
 def test_a_file_that_has_grown_says_how_to_follow_it(tmp_path, caplog):
