@@ -107,16 +107,19 @@ class _Painter:
         }
         colour, fine, middle, coarse = materials[kind]
         gain = self._appearance.texture_gain
-        tint, soil = (np.array(one, np.float32) for one in (colour, appearance.soil_bgr))
+        natural = kind in {"grass", "island"}  # dry patches lean towards the soil
         for region in _strips(*self._slice(rect)):
-            noise = (
-                fine * self._fine[region] + middle * self._middle[region] + coarse * self._coarse[region]
-            ) * gain + 1
-            picture = tint
-            if kind in {"grass", "island"}:  # dry patches lean towards the soil
-                dry = np.clip(0.20 + 0.22 * self._coarse[region] + 0.1 * self._middle[region], 0, 0.75)
-                picture = tint * (1 - dry[..., None]) + soil * dry[..., None]
-            self.bgr[region] = np.clip(picture * noise[..., None], 0, 255)
+            fine_noise, middle_noise, coarse_noise = (
+                one[region] for one in (self._fine, self._middle, self._coarse)
+            )
+            noise = (fine * fine_noise + middle * middle_noise + coarse * coarse_noise) * gain + 1
+            if natural:
+                dry = np.clip(0.20 + 0.22 * coarse_noise + 0.1 * middle_noise, 0, 0.75)
+                fresh = 1 - dry
+            for channel in range(3):  # plane by plane: numpy is slow along an axis of three
+                tint, soil = np.float32(colour[channel]), np.float32(appearance.soil_bgr[channel])
+                plane = (tint * fresh + soil * dry) * noise if natural else tint * noise
+                self.bgr[region][..., channel] = np.clip(plane, 0, 255, out=plane)
         if kind in {"lot", "court"}:
             self.frame(rect, wide_m=0.25, colour=_gain(appearance.paving_bgr, 0.98))
         if kind == "court":
@@ -178,12 +181,14 @@ class _Painter:
             radius = round(0.92 * tree.r / self._m_per_px * 16)
             cv2.circle(self._shade, centre.tolist(), radius, 225, -1, cv2.LINE_AA, _SHIFT)
         self._shade = np.asarray(cv2.blur(self._shade, (5, 5)), np.uint8)
-        for region in _strips(*(slice(0, length) for length in self._shade.shape)):
-            dark = 1 - self._appearance.shadow_strength * (self._shade[region].astype(np.float32) / 255)
-            # Skylight is blue, so a shadow keeps a little more of it.
-            for channel, share in enumerate((1.10, 1.03, 1.0)):
-                plane = self.bgr[region][..., channel]
-                plane[:] = plane * np.minimum(dark * np.where(dark < 1, share, 1), 1)
+        where = np.flatnonzero(self._shade)
+        dark = 1 - self._appearance.shadow_strength * (self._shade.ravel()[where].astype(np.float32) / 255)
+        pixels = self.bgr.reshape(-1, 3)
+        # Skylight is blue, so a shadow keeps a little more of it.
+        for channel, share in enumerate((1.10, 1.03, 1.0)):
+            pixels[where, channel] = pixels[where, channel] * np.minimum(
+                dark * np.where(dark < 1, share, 1), 1
+            )
 
     def canopy(self, tree: Tree, picture: npt.NDArray[np.uint8]) -> None:
         """Lay a tree's crown over the ground."""
