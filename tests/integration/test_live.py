@@ -167,83 +167,9 @@ def test_ctrl_c_ends_an_edge_with_a_summary_and_its_ground_with_it(late):
     assert count_frames(late.folder / "base.mkv") == late.edge["frames"] + late.edge["frames_stored"]
 
 
-@dataclass
-class Fleet:
-    """One ground, three edges, of which one was killed and started again."""
-
-    ground: list[dict[str, Any]]
-    killed_file: Path
-    edges: dict[str, dict[str, Any]]
-    folder: Path
-
-
-@pytest.fixture(scope="module")
-def fleet(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
-    """uav-1 is killed and comes back, uav-2 plays through it, rover-1 is none of this ground's."""
-    folder = tmp_path_factory.mktemp("fleet")
-    with Link(folder) as link:
-        ground = link.ground(*ANALYSES, "--record", "recordings", "--once", "--edges", "uav-*")
-        steady = link.edge(*arguments(scene, "uav-2", "--max-frames", "100"), name="uav-2")
-        other = link.edge(*arguments(scene, "rover-1", "--max-frames", "20", "--wait", "1s"), name="rover-1")
-        killed = link.edge(*arguments(scene, "uav-1", "--record-base", "killed.mkv"), name="uav-1-killed")
-        eventually(lambda: "uav-1: " in served(ground), within_s=30, what="the ground serves uav-1")
-        eventually(
-            lambda: served(ground).count("uav-1: ") >= 3, within_s=60, what="some seconds of uav-1 are shown"
-        )
-        killed.kill()
-        again = link.edge(*arguments(scene, "uav-1", "--max-frames", "40"), name="uav-1-again")
-        edges = {"uav-1": again.finish(), "uav-2": steady.finish(), "rover-1": other.finish()}
-        summaries = ground.finish(within_s=20)
-    return Fleet(ground=summaries, killed_file=folder / "killed.mkv", edges=edges, folder=folder)
-
-
 def served(ground: Running) -> str:
     """The ground's status lines that speak of frames."""
     return "\n".join(line for line in ground.said.splitlines() if " s  " in line)
-
-
-def test_each_session_of_each_edge_has_a_recording(fleet):
-    """Two drones would overwrite each other's flight, or a restart the flight before it."""
-    assert [one["edge"] for one in fleet.ground] == ["uav-1", "uav-1", "uav-2"]
-    assert len({one["session"] for one in fleet.ground}) == 3
-    files = {Path(fleet.folder / one["recording"]).resolve() for one in fleet.ground}
-    written = {file.resolve() for file in (fleet.folder / "recordings").glob("*.rrd")}
-    # What the killed edge had kept is sent by the next one, and is a recording of its own.
-    assert files == {file for file in written if not file.stem.endswith("-backlog")}
-    assert len(files) == 3
-    for one in fleet.ground:
-        whole(Recording(fleet.folder / one["recording"]), one)
-
-
-def test_two_edges_at_once_are_both_whole(fleet):
-    """One drone's picture would suffer from the other's."""
-    by_session = {one["session"]: one for one in fleet.ground}
-    for name in ("uav-1", "uav-2"):
-        edge = fleet.edges[name]
-        seen = by_session[edge["session"]]
-        assert seen["frames_decoded"] == seen["frames"] == edge["frames"] > 0
-        assert seen["gaps"] == seen["unusable_messages"] == 0
-        for count in ("base_bytes", "roi_bytes", "meta_bytes", "overhead_bytes", "worst_window_bps"):
-            assert seen[count] == edge[count], count
-        assert edge["worst_window_bps"]["total"] <= 300_000
-
-
-def test_an_edge_that_was_not_asked_for_is_not_served(fleet):
-    """A shared link would carry the streams of everybody to everybody."""
-    assert fleet.edges["rover-1"]["frames"] > 0
-    assert all(one["edge"] != "rover-1" for one in fleet.ground)
-
-
-def test_the_killed_edge_left_a_base_file_that_plays(fleet):
-    """A crash in the air would take its own evidence with it."""
-    (killed,) = (
-        one
-        for one in fleet.ground
-        if one["session"] != fleet.edges["uav-1"]["session"] and one["edge"] == "uav-1"
-    )
-    shown = count_frames(fleet.killed_file)
-    assert killed["frames_decoded"] >= 20
-    assert shown >= killed["frames_decoded"] - 3, "a fifth of a second may be missing at the end"
 
 
 @pytest.mark.parametrize(

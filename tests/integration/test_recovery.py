@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -61,91 +60,6 @@ def more_is_shown(folder: Path, *, than: int, name: str = "timing.csv") -> None:
     eventually(
         lambda: len(shown(folder, name=name)) >= than + 10, within_s=SOON_S, what="the picture goes on"
     )
-
-
-def ended(file: Path) -> bool:
-    """Whether a recording is whole, with the end of its session in it."""
-    events = Recording(file).events() if file.exists() else []
-    return bool(events) and events[-1][2].endswith("ended")
-
-
-# Killed and started again
-
-
-@dataclass
-class Restarts:
-    """A flight in which the edge is killed and started again, then the ground, and both get a SIGHUP at last."""
-
-    edge: dict[str, Any]
-    """Of the second edge."""
-    first_was_whole: bool
-    """The first session's recording, while its ground went on with the second."""
-    files: list[Path]
-    """The killed ground's recordings."""
-    frames_before: int
-    """Shown by the killed ground, of the second session."""
-    second: dict[str, Any]
-    """Of the second ground."""
-    folder: Path
-
-
-@pytest.fixture(scope="module")
-def restarts(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Restarts:
-    """Both are killed with -9, one after the other."""
-    folder = tmp_path_factory.mktemp("restarts")
-    repeated(scene, folder / "scene")
-    with Link(folder) as link:
-        ground = link.ground(*SEES, "--record", "flights", "--timing", "timing.csv")
-        edge = link.edge(*PLAYS, name="killed")
-        more_is_shown(folder, than=10)
-        edge.kill()
-        began = len(shown(folder))
-        edge = link.edge(*PLAYS)
-        more_is_shown(folder, than=began + 10)
-        files = sorted((folder / "flights").glob("*.rrd"))
-        whole = ended(files[0])
-        ground.kill()
-        seen = len(shown(folder)) - began
-        again = link.ground(*SEES, "--record", "again.rrd", "--timing", "again.csv", name="again")
-        more_is_shown(folder, than=10, name="again.csv")
-        assert edge.alive, edge.said
-        again.stop(signal.SIGHUP)
-        edge.stop(signal.SIGHUP)
-        return Restarts(
-            edge=edge.finish(within_s=0),
-            first_was_whole=whole,
-            files=files,
-            frames_before=seen,
-            second=again.finish(within_s=0),
-            folder=folder,
-        )
-
-
-def test_a_killed_edge_leaves_a_whole_recording_and_its_successor_begins_another(restarts):
-    """The flight before the crash would be lost, or run on into the one after it."""
-    assert restarts.first_was_whole
-    assert len(restarts.files) == 2
-    assert len(Recording(restarts.files[0]).video()) >= 10
-
-
-def test_a_killed_ground_leaves_a_recording_that_can_be_read(restarts):
-    """The crash would take the evidence of all that led to it."""
-    assert len(Recording(restarts.files[1]).video()) >= restarts.frames_before - 5 >= 10
-
-
-def test_a_ground_started_in_mid_flight_shows_the_edge_that_never_stopped(restarts):
-    """The drone would have to be landed to be seen again."""
-    assert restarts.second["session"] == restarts.edge["session"]
-    assert restarts.second["frames_decoded"] >= 20
-    assert restarts.edge["frames"] > restarts.second["frames_decoded"] + restarts.frames_before / 2
-
-
-def test_sighup_ends_both_with_summary_and_whole_recording(restarts):
-    """A terminal that closes would cut the recording off, and nobody would get the account."""
-    assert ended(restarts.folder / "again.rrd")
-    assert (
-        restarts.edge["frames"] > 0
-    )  # the summary is there, and both said goodbye with 0: see `Running.finish`
 
 
 # A router that goes

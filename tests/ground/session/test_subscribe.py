@@ -7,6 +7,7 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import msgpack
@@ -27,16 +28,23 @@ from programs.processes import eventually
 from rigs.messages import FEEDBACK, INFO
 
 
-@pytest.fixture
-def link(free_port: int) -> Iterator[tuple[GroundLink, zenoh.Session]]:
-    """A ground, and somebody else who is joined to it."""
-    endpoint = f"tcp/127.0.0.1:{free_port}"
+@contextmanager
+def ground_of(edges: str, port: int, **named) -> Iterator[tuple[GroundLink, zenoh.Session]]:
+    """A ground that asks for these edges, and somebody else who is joined to it."""
+    endpoint = f"tcp/127.0.0.1:{port}"
     with (
         open_session(LinkSettings("ground", listen=(endpoint,))) as session,
-        GroundLink(session, edges="*") as link,
+        GroundLink(session, edges=edges, **named) as link,
         joined(endpoint) as outsider,
     ):
         yield link, outsider
+
+
+@pytest.fixture
+def link(free_port: int) -> Iterator[tuple[GroundLink, zenoh.Session]]:
+    """One that asks for all."""
+    with ground_of("*", free_port) as both:
+        yield both
 
 
 def invent(outsider: zenoh.Session, count: int) -> None:
@@ -48,6 +56,15 @@ def invent(outsider: zenoh.Session, count: int) -> None:
 def served(link: GroundLink) -> set[str]:
     """The names of all ports."""
     return {port.edge for port in link.ports()}
+
+
+def test_an_edge_that_was_not_asked_for_is_not_served(free_port):
+    """A shared link would carry the streams of everybody to everybody."""
+    with ground_of("uav-*", free_port) as (ground, outsider):
+        for edge in ("rover-1", "uav-1"):
+            outsider.put(f"hvt/{edge}/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        eventually(lambda: served(ground), within_s=20, what="one is served")
+        assert served(ground) == {"uav-1"}
 
 
 def test_invented_names_do_not_lock_out_a_real_edge(link, caplog):
@@ -158,12 +175,8 @@ class Clock:
 
 def test_an_error_in_a_callback_reaches_the_edges_thread(free_port: int, capfd) -> None:
     """Zenoh would print a traceback for every message, and nobody would learn that nothing comes in any more."""
-    endpoint, clock = f"tcp/127.0.0.1:{free_port}", Clock()
-    with (
-        open_session(LinkSettings("ground", listen=(endpoint,))) as session,
-        GroundLink(session, edges="*", clock=clock) as ground,
-        joined(endpoint) as outsider,
-    ):
+    clock = Clock()
+    with ground_of("*", free_port, clock=clock) as (ground, outsider):
         for edge in ("uav-1", "uav-2"):
             outsider.put(f"hvt/{edge}/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
         eventually(lambda: len(served(ground)) == 2, within_s=20, what="both are served")
