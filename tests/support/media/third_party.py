@@ -77,11 +77,10 @@ from hvt_edge.video.x265 import BaseEncoder
 class Obedient:
     """Codes at once, at the rate that it was opened for."""
 
-    factor, least_bps = 1.0, 0
+    factor = 1.0
 
     def __init__(self, settings):
-        bitrate_bps = round(max(self.least_bps, settings.bitrate_bps * self.factor))
-        self._encoder = BaseEncoder(replace(settings, bitrate_bps=bitrate_bps))
+        self._encoder = BaseEncoder(replace(settings, bitrate_bps=round(settings.bitrate_bps * self.factor)))
 
     def encode(self, frame, *, keyframe):
         return self._encoder.encode(frame, keyframe=keyframe)
@@ -91,12 +90,6 @@ class Greedy(Obedient):
     """Takes half as much again."""
 
     factor = 1.5
-
-
-class Deaf(Obedient):
-    """Takes as much as it likes."""
-
-    least_bps = 3_000_000
 
 
 class WithoutKeyframes(Obedient):
@@ -114,14 +107,6 @@ class Late(Obedient):
     def encode(self, frame, *, keyframe):
         self.before, unit = super().encode(frame, keyframe=keyframe), self.before
         return unit
-
-
-class Garbled(Obedient):
-    """Loses the end of each unit but the keyframes."""
-
-    def encode(self, frame, *, keyframe):
-        unit = super().encode(frame, keyframe=keyframe)
-        return unit if unit.keyframe else replace(unit, data=unit.data[:3])
 
 
 class Absent:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.values import AccessUnit
+from hvt_common.values import AccessUnit, Frame
 from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.encoders.qualification import Allowed, allowed, headroom_of, measure, run_frames
 from hvt_edge.video.x265 import BaseEncoder
@@ -23,20 +24,31 @@ def limit() -> Allowed:
     return allowed(size=SIZE, fps=FPS, total_bps=TOTAL_BPS, base_bps=BASE_BPS, window_s=1.0)
 
 
-def opened(share: float, *, factor: float = 1.0, least_bps: int = 0) -> BaseEncoder:
+def opened(
+    share: float, *, kind: type[BaseEncoder] = BaseEncoder, factor: float = 1.0, least_bps: int = 0
+) -> BaseEncoder:
     """X265 that takes ``factor`` of what it is asked for, and never less than ``least_bps``."""
     settings = encoder_settings(
         size=SIZE, fps=FPS, preset="ultrafast", total_bps=TOTAL_BPS, base_bps=BASE_BPS, edge_id="edge-1"
     )
     rate_bps = round(max(settings.bitrate_bps * share * factor, least_bps))
-    return BaseEncoder(replace(settings, bitrate_bps=rate_bps))
+    return kind(replace(settings, bitrate_bps=rate_bps))
 
 
-def headroom(scene=SCENE, **behaviour: float) -> float:
+class Garbled(BaseEncoder):
+    """Loses the end of each unit but the keyframes."""
+
+    def encode(self, frame: Frame, **how: Any) -> AccessUnit:
+        """See there."""
+        unit = super().encode(frame, **how)
+        return unit if unit.keyframe else replace(unit, data=unit.data[:3])
+
+
+def headroom(scene=SCENE, kind: type[BaseEncoder] = BaseEncoder, **behaviour: float) -> float:
     """What such an encoder is given."""
     return headroom_of(
         "acme",
-        open_at=partial(opened, **behaviour),
+        open_at=partial(opened, kind=kind, **behaviour),
         scene=lambda: iter(scene),
         frames=len(SCENE),
         limit=limit(),
@@ -97,6 +109,15 @@ def test_one_that_obeys_too_late_is_refused_though_it_was_asked_for_less():
     """Headroom that does not help would be given all the same."""
     with pytest.raises(UserError, match=r"too much with its target lowered to \d\d%"):
         headroom(least_bps=450_000)
+
+
+def test_one_whose_units_are_no_pictures_is_refused():
+    """A flight would begin whose picture is garbage all the time."""
+    says = (
+        r"--encoder acme does not work here \(ValueError: its unit of frame 1 gives no picture.*: take x265"
+    )
+    with pytest.raises(UserError, match=says):
+        headroom(kind=Garbled)
 
 
 def test_no_scene_is_no_fault():
