@@ -11,7 +11,7 @@ from lab.link.carriers.relay import Relay
 from lab.link.timeline import LinkState, Phase, Script
 from programs.processes import Link
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.nightly, pytest.mark.integration]
 
 THIN = Script(
     phases=(Phase(0.0, LinkState(rate_bps=250_000, delay_s=0.02)),), lasts_s=120.0, queue_bytes=64_000
@@ -40,7 +40,6 @@ def test_the_base_stream_adapts_to_a_link_thinner_than_the_budget(tmp_path, scen
     assert summary["frames"] > 0.6 * 240  # of the rest each would have been late
 
 
-@pytest.mark.nightly
 def test_stills_find_their_moment_between_few_frames(tmp_path, scene):
     """Right behind a base frame the link is busy: at five a second no still would ever go, on the best of links."""
     few = (

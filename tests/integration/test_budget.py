@@ -82,7 +82,8 @@ def test_the_regimes_of_the_paper_are_held_at_full_size(run, method, regime, bud
     held(summary, budget_bps=budget_bps, base_bps=base_bps)
 
 
-@pytest.mark.parametrize("method", ["M1", pytest.param("permissive", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("method", ["M1", "permissive"])
 def test_a_thin_budget_is_held(run, method):
     """On the thinnest links, where one still is a large part of a second, the video would stall most."""
     summary = run("--method", method, "--size", "640x360", "--budget", "300kbps", "--video-share", "0.8")

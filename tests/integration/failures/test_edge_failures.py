@@ -21,7 +21,7 @@ from programs.processes import Link, Running, eventually
 from programs.rtsp_camera import RtspCamera
 from programs.small_disk import small_disk
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(240)]
 
 SOON_S = 60.0
 SMALL = ("--size", "320x192", "--fps", "10", "--preset", "ultrafast", "--budget", "400kbps")
@@ -107,7 +107,6 @@ def test_a_full_card_ends_the_local_copy_and_nothing_else(link, tmp_path):
     assert "Traceback" not in edge.said
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize("how", ["full", "removed"])
 def test_a_store_that_fails_in_an_outage_costs_what_it_would_have_stored(link, tmp_path, how):
     """A full card, or one that is pulled out while the link is down, would end the flight, or storing for good."""
@@ -141,7 +140,6 @@ def test_a_store_that_fails_in_an_outage_costs_what_it_would_have_stored(link, t
     assert "Traceback" not in edge.said
 
 
-@pytest.mark.nightly
 def test_a_model_that_fails_leaves_the_video(link, tmp_path):
     """The flight would end in the first bright minute of a model that cannot bear light."""
     model = failing_in_the_light(tmp_path / "model.onnx")
@@ -174,7 +172,6 @@ def test_a_model_that_fails_leaves_the_video(link, tmp_path):
     assert "Traceback" not in edge.said
 
 
-@pytest.mark.nightly
 def test_a_camera_that_comes_back_begins_with_a_keyframe(link, free_port):
     """The operator would look at smear after each loose contact, or never learn why the picture stands."""
     camera = RtspCamera(free_port)

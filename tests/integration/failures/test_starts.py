@@ -301,6 +301,7 @@ def test_an_autopilot_that_starts_later_is_waited_for(kind, caplog):
         assert not source.trouble
 
 
+@pytest.mark.nightly
 def test_a_whole_ground_waits_and_serves(link, scene):
     """All of it at once, as a service meets it after a boot."""
     holders = [Holder() for _ in range(3)]

@@ -11,10 +11,11 @@ import pytest
 
 from studies.small_study import PATIENT_S, REGIME, arguments, entries, flights, said, study, table, until
 
+pytestmark = pytest.mark.nightly
+
 METHODS = ("--methods", "M0,R0,M5", "--regimes", REGIME)
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize("full_for", ["detections", "flights"])
 def test_a_full_disk_is_one_sentence_and_what_is_finished_stays(scene, tmp_path, full_for):
     """Hours of flights would be lost with the one that no longer fitted."""
@@ -40,7 +41,6 @@ def test_a_full_disk_is_one_sentence_and_what_is_finished_stays(scene, tmp_path,
     assert (out / "results.parquet").read_bytes() == rows
 
 
-@pytest.mark.nightly
 def test_killed_in_the_middle_it_goes_on_from_there(scene, tmp_path):
     """A lost machine would cost all that was flown on it."""
     out, words = tmp_path / "out", (*METHODS, "--jobs", "2")
@@ -60,7 +60,7 @@ def test_killed_in_the_middle_it_goes_on_from_there(scene, tmp_path):
     assert all(row["matched"] for row in table(out))
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_nothing_is_left_running(scene, tmp_path, how):
     """Interrupted, it would go on in the background for hours, beside the study that is started again."""
     out = tmp_path / "out"
