@@ -303,7 +303,7 @@ def test_silent_edges_hold_up_nobody(free_port: int) -> None:
             port.request_info(INFO.session_id)
         took_s = time.monotonic() - began_s
         eventually(lambda: len(asked) == 8, within_s=20, what="all are asked")
-        assert took_s < 1.0, "one answer is waited for that long"
+        assert took_s < 4.0, "a second for each, where an answer is waited for"
         ports = {port.edge: port for port in ground.ports()}
         assert all(port.take_info() is None for port in ports.values())
         late = next(one for one in asked if str(one.key_expr) == "hvt/uav-3/info")

@@ -93,7 +93,7 @@ def test_what_sends_to_others_is_made_again_after_the_longest_pause(caplog):
 
     failures = Failures(time.time_ns)
     sink: QueuedSink[str] = Outputs(failures).open("CoT", cut, longest_pause_s=0.01)
-    eventually(lambda: len(tries) > 4, within_s=5, what="it is tried again")
+    eventually(lambda: len(tries) > 4, within_s=10, what="it is tried again")
     assert sink.join(time.monotonic() + 5)
     assert sum("tried again" in one.message for one in caplog.records) == 1
 

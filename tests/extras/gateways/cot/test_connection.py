@@ -265,7 +265,7 @@ def test_what_waits_at_the_end_is_sent(port):
         for number in range(500):
             sink.log(message(f"uid-{number}"))
         assert ended(sink)
-        eventually(lambda: len(server.uids) == 500, within_s=5, what="all of it")
+        eventually(lambda: len(server.uids) == 500, within_s=20, what="all of it")
         assert failures.parts == ()
     finally:
         server.close()
