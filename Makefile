@@ -30,10 +30,11 @@ endif
 demo: setup      ## three edges and one ground on the drawn scene: a table, demo.png, demo.rrd
 	@$(BIN)/python deploy/demo.py
 
-# A flight is three processes, and its networks give way to everything else: more at once than there are processors would
-# leave them none. Nothing has a second chance. All tests of a file run in one process, so what a module flies is flown
-# once; xdist 3.8 does not see its own groups with pytest 9.2.
-JOBS ?= $(shell getconf _NPROCESSORS_ONLN)
+# One worker more than there are processors, for a worker often waits for the programs that it started. At night, where
+# flights in real time are most of it, one less. Nothing has a second chance. All tests of a file run in one process, so
+# what a module flies is flown once; xdist 3.8 does not see its own groups with pytest 9.2.
+CORES := $(shell getconf _NPROCESSORS_ONLN)
+JOBS ?= $(shell expr $(CORES) + 1)
 AT_ONCE = $(if $(CORE),--ignore=tests/extras) --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS= CORE=1
@@ -45,6 +46,7 @@ nightly: setup   ## an hour: the nightly tests, training, every scenario at full
 		$(MAKE) --no-print-directory COUNT= RUNS= LASTS= STRICT=1 $$part || failed="$$failed, $${part%% *}"; done; \
 		test -z "$$failed" || { echo "failed$$failed"; exit 1; }
 
+nightly-tests: JOBS := $(CORES)
 nightly-tests: setup ## the tests that `make test` leaves out: JOBS at once, then alone those that a busy machine would spoil
 	@$(BIN)/python -m pytest --nightly -m 'nightly and not realtime' $(AT_ONCE); \
 		together=$$?; $(BIN)/python -m pytest --nightly -m realtime && exit $$together
