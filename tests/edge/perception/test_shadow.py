@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_common.inference.detect import open_detector
+from hvt_common.inference.detect import Detector, open_detector
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Detections, Frame, Tracks
@@ -300,33 +300,31 @@ def test_no_more_than_its_share_of_the_processor():
 
 def test_a_thin_base_hides_what_a_rich_one_shows():
     """On real x265, the real detector and the drawn scene: else the levers would follow noise."""
-    size = (320, 180)
-    gains = {kbps: _measured(size, kbps) for kbps in (40, 1_500)}
+    detector = open_detector(EMBEDDED_DETECTOR, threads=2, confidence=0.1)
+    with DemoSource(size=(320, 180), fps=FPS, fit="letterbox", seed=0, max_frames=12) as source:
+        frames = list(source.frames(start_ns=0))
+    gains = {kbps: _measured(detector, source, frames, kbps) for kbps in (40, 1_500)}
     assert gains[40] > gains[1_500] + 0.05, gains
 
 
-def _measured(size: tuple[int, int], kbps: int) -> float:
-    detector = open_detector(EMBEDDED_DETECTOR, threads=2, confidence=0.1)
-    encoder = BaseEncoder(
-        encoder_settings(
-            size=size,
-            fps=FPS,
-            preset="veryfast",
-            total_bps=1000 * kbps,
-            base_bps=1000 * kbps,
-            edge_id="edge-1",
-        )
+def _measured(detector: Detector, source: DemoSource, frames: list[Frame], kbps: int) -> float:
+    settings = encoder_settings(
+        size=source.view.base_size,
+        fps=FPS,
+        preset="veryfast",
+        total_bps=1000 * kbps,
+        base_bps=1000 * kbps,
+        edge_id="edge-1",
     )
-    shadow = ShadowGround(detector.detect, settings=SETTINGS)
-    with DemoSource(size=size, fps=FPS, fit="letterbox", seed=0, max_frames=12) as source:
-        analyzer = Analyzer(
-            detector,
-            ByteTracker(TrackerSettings.starting_at(0.4, camera_motion="off"), fps=FPS),
-            view=source.view,
-            settings=AnalyzerSettings(candidates="source"),
-        )
-        for frame in source.frames(start_ns=0):
-            shadow.compare(analyzer.analyze(frame, encoder.encode(frame)))
+    shadow, encoder = ShadowGround(detector.detect, settings=SETTINGS), BaseEncoder(settings)
+    analyzer = Analyzer(
+        detector,
+        ByteTracker(TrackerSettings.starting_at(0.4, camera_motion="off"), fps=FPS),
+        view=source.view,
+        settings=AnalyzerSettings(candidates="source"),
+    )
+    for frame in frames:
+        shadow.compare(analyzer.analyze(frame, encoder.encode(frame)))
     assert shadow.now.comparisons > 1
     assert shadow.now.source_p > 5, "there is something to see"
     return shadow.now.gain

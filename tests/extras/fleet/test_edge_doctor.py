@@ -15,7 +15,7 @@ from programs.fleet_keys import Fleet
 from programs.processes import Link, free_ports
 from programs.rtsp_camera import RtspCamera
 
-CHEAP = ("--size", "640x360", "--detector", "motion", "--preset", "ultrafast")
+CHEAP = ("--size", "320x192", "--detector", "motion", "--preset", "ultrafast")
 
 
 def small_scene(folder: Path) -> str:
@@ -39,7 +39,7 @@ def test_all_is_well_where_a_ground_listens(tmp_path, capsys, scene):
     assert code == 0
     assert found["link"]["found"] == "a ground listens"
     assert {one["state"] for name, one in found.items() if name not in ("clock", "processor")} == {"ok"}
-    assert "960x540, sent as 640x360" in found["source"]["found"]
+    assert "960x540, sent as 320x192" in found["source"]["found"]
     assert "cores" in found["processor"]["found"]
 
 

@@ -143,7 +143,7 @@ heard = threading.Event()
 
 def receive(sample):
     heard.set()
-    time.sleep(1)
+    time.sleep(0.5)
 
 def fly():
     with open_session(LinkSettings("edge", (), (sys.argv[1],))) as session:
@@ -154,7 +154,7 @@ def fly():
 flight = threading.Thread(target=fly, daemon=True)
 flight.start()
 flight.join()
-gc.callbacks.append(lambda *_: time.sleep(1))  # Python's end takes longer than the callback
+gc.callbacks.append(lambda *_: time.sleep(0.5))  # Python's end takes longer than the callback
 """
 
 

@@ -36,14 +36,14 @@ from studies.small_study import (
     table,
 )
 
-METHODS = ("--methods", "M0,R0,M5,DDS", "--regimes", REGIME)
+METHODS = ("--methods", "M0,M5,DDS", "--regimes", REGIME)
 
 
 @pytest.fixture(scope="module")
 def done(scene, tmp_path_factory):
     """A finished study with two budgets, of which nothing can be flown at the second."""
     out = tmp_path_factory.mktemp("done") / "new" / "folder"
-    regimes = ("--methods", "M0,R0,M5,DDS", "--regimes", "80kbps,9kbps")
+    regimes = ("--methods", "M0,M5,DDS", "--regimes", "80kbps,9kbps")
     assert main(["run", *arguments(scene, out, *regimes, "--jobs", "1")]) == 0
     return out
 
@@ -56,9 +56,7 @@ def test_a_row_for_every_run(done):
     """A table with holes, or without what its figures were measured with, could not be believed."""
     rows = good(table(done))
     order = [(row["method"], row["matched_to"]) for row in rows]
-    alone = [("M0", ""), ("R0", "")]
-    matched = [step for to in ("M5", "DDS") for step in ((to, ""), ("M0", to), ("R0", to))]
-    assert order == alone + matched
+    assert order == [("M0", ""), ("M5", ""), ("M0", "M5"), ("DDS", ""), ("M0", "DDS")]
     assert {row["labels"] for row in rows} == {"annotations"}
     everywhere = {
         "duration_s",
@@ -93,9 +91,9 @@ def test_a_row_for_every_run(done):
     stills = {column.name for column in COLUMNS if "still" in column.name}
     assert m5["stills"] > 0
     assert not {name for name in stills if m5[name] is None}
-    assert {row["stills"] for row in rows if row["method"] in ("M0", "R0")} == {0}
+    assert {row["stills"] for row in rows if row["method"] == "M0"} == {0}
     # What a ground says of stills is beside the total; what a server asks is in it.
-    assert {row["back_bps"] for row in rows if row["method"] in ("M0", "R0")} == {0}
+    assert {row["back_bps"] for row in rows if row["method"] == "M0"} == {0}
     assert 0 < 8 * 85 / 2 < m5["back_bps"] < 15 * 8 * 400
     dds = next(row for row in rows if row["method"] == "DDS")
     assert 0 < dds["back_bps"] == dds["other_bps"]
@@ -106,7 +104,7 @@ def test_video_spends_what_the_others_really_spent(done):
     rows = good(table(done))
     spent = {row["method"]: row["total_bps"] for row in rows if not row["matched_to"]}
     matching = [row for row in rows if row["matched_to"]]
-    assert len(matching) == 4
+    assert len(matching) == 2
     for row in matching:
         assert row["matched"], row["failed"]
         assert row["target_bps"] == spent[row["matched_to"]]
@@ -142,7 +140,7 @@ def test_totals_are_of_the_bytes_that_were_sent(scene, done, tmp_path):
 def test_a_run_that_cannot_be_flown_is_in_no_average(done):
     """One budget too many would end the study, or count as a bad result."""
     rows = [row for row in table(done) if row["regime"] == "9kbps"]
-    assert [row["method"] for row in rows] == ["M0", "R0", "M5", "DDS"]
+    assert [row["method"] for row in rows] == ["M0", "M5", "DDS"]
     for row in rows:
         assert not row["matched"]
         assert "budget" in row["failed"]
@@ -157,7 +155,7 @@ def test_a_second_run_does_nothing_anew(scene, done):
     cache = done / "cache"
     clocks = (done / "results.parquet").read_bytes()
     before = entries(cache)
-    again = ["run", *arguments(scene, done, "--methods", "M0,R0,M5,DDS", "--regimes", "80kbps,9kbps")]
+    again = ["run", *arguments(scene, done, "--methods", "M0,M5,DDS", "--regimes", "80kbps,9kbps")]
     assert main([*again, "--jobs", "1"]) == 0
     assert entries(cache) == before
     assert (done / "results.parquet").read_bytes() == clocks  # to the byte: what was timed is remembered too
@@ -172,7 +170,7 @@ def test_damaged_entries_are_made_again(scene, done, tmp_path):
     broken[0].write_bytes(broken[0].read_bytes()[:-20])
     broken[1].write_bytes(b"")
     broken[2].write_bytes(b"\0" * 40)
-    again = arguments(scene, done, "--methods", "M0,R0,M5,DDS", "--regimes", "80kbps,9kbps", "--jobs", "1")
+    again = arguments(scene, done, "--methods", "M0,M5,DDS", "--regimes", "80kbps,9kbps", "--jobs", "1")
     process = study("run", *again, folder=tmp_path)
     assert process.wait(PATIENT_S) == 0, said(tmp_path)
     words = said(tmp_path)
@@ -197,7 +195,7 @@ def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkey
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command, "run_all", interrupted)
-    words = arguments(scene, out, "--methods", "M0,R0,M5,DDS", "--regimes", "80kbps,9kbps", "--jobs", "1")
+    words = arguments(scene, out, "--methods", "M0,M5,DDS", "--regimes", "80kbps,9kbps", "--jobs", "1")
     assert main(["run", *words]) == 130
     assert {row["key"] for row in table(out)} == {row["key"] for row in before}
     assert len(table(out)) == len(before)

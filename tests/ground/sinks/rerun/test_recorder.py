@@ -406,9 +406,9 @@ def test_a_recording_is_at_most_half_as_large_again_as_what_was_received(
     data: Path, tmp_path: Path, base_kbps: int, total_kbps: int
 ) -> None:
     """A recording that outgrows its link cannot be kept, sent or archived."""
-    frames = _carpark(data, 150)
+    frames = _carpark(data, 75)
     units = coded(frames, kbps=base_kbps)
-    frames, units = frames * 2, units * 2  # 20 s; the second half begins at a keyframe as the first
+    frames, units = frames * 4, units * 4  # 20 s; each quarter begins at a keyframe as the first
     path = tmp_path / "a.rrd"
     received = 0
     with Recorder(settings(path, base_size=(1280, 720), budget_bps=total_kbps * 1000)) as recorder:
