@@ -124,6 +124,7 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
     assert said["backlog_bytes"] == sent["backlog_bytes"] > 0
 
 
+@pytest.mark.nightly
 def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, scene):
     """What a drone saw before its computer was started again would stay on it for ever."""
     store = tmp_path / "store"
