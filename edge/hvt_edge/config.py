@@ -240,7 +240,10 @@ class EdgeConfig:
         choice("decoded", "source"), "decoded", "detect on the decoded base stream or on the source frame"
     )
     tiles: str = _MODELS_RARE.option(
-        TEXT, "off", "detect in tiles of the source too: CxR, auto, or off; needs --candidates source"
+        TEXT,
+        "off",
+        "detect in tiles of the source too: CxR, off, auto, which finds the scale in real time, or search, which "
+        "always does; needs --candidates source",
     )
     detect_every: int | None = _MODELS_RARE.option(
         integer(1, 1000, unit=" frames"),

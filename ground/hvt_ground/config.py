@@ -75,6 +75,11 @@ class GroundConfig:
         "what the detector's outputs mean, where neither its file nor its answers tell",
         shown_default="found",
     )
+    tiles: str = _MODELS_RARE.option(
+        choice("auto", "search", "off"),
+        "auto",
+        "search: look at quarters of the picture enlarged where they promise far more objects; auto: not in lockstep",
+    )
     detect_every: int | None = _MODELS.option(
         integer(1, 1000, unit=" frames"),
         None,

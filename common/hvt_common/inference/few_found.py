@@ -26,7 +26,8 @@ _RUNS = 45
 _LEAST_SHARE = 0.1
 """Share of the runs that found something at the confidence of use, or in which something moved."""
 _OTHER = "yolox-s"
-_LEAST_BOXES = 45
+_LEAST_BOXES, _LEAST_PICTURES = 45, 10
+"""The newest pictures tell, no more of them than hold so many boxes: older ones may be of another scene."""
 _UNLIKE_BELOW = 0.58
 """People and boats on water have .53, vehicles of 40 pixels aslant .55, every view that it knows .62 to .85."""
 _LIKE_FROM = 0.6
@@ -129,10 +130,14 @@ class ViewTrust:
         counted = found.confidences[found.confidences >= self._counts_from]
         with self._lock:
             self._recent.append((float(np.sum(counted, dtype=np.float64)), len(counted)))
-            boxes = sum(count for _, count in self._recent)
-            if len(self._recent) < _RUNS or boxes < _LEAST_BOXES:
+            total, boxes = 0.0, 0
+            for pictures, (of_one, count) in enumerate(reversed(self._recent), start=1):
+                total, boxes = total + of_one, boxes + count
+                if pictures >= _LEAST_PICTURES and boxes >= _LEAST_BOXES:
+                    break
+            else:
                 return  # too few tell nothing new
-            self.mean = sum(total for total, _ in self._recent) / boxes
+            self.mean = total / boxes
             self.unlike = self.mean < (_LIKE_FROM if self.unlike else _UNLIKE_BELOW)
             if not self.unlike or self._said:
                 return

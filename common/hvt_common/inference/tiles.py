@@ -8,6 +8,7 @@ they count only where no other box covers them (slicing aided inference, Akyon e
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Final, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 Grid = tuple[int, int]
 """(columns, rows)."""
+Tile = tuple[int, int, int, int]
+"""x1, y1, x2, y2 in pixels of the picture."""
 
 MOST_RUNS: Final = 7
 """Runs of the detector at one decision step that ``auto`` may take: the whole picture and at most six tiles."""
@@ -29,6 +32,7 @@ OVERLAP: Final = 0.1
 """Share of a tile that the next one shows too: objects up to that size lie whole in one of them, and the whole
 picture shows the larger ones well enough. With 0.2 small objects get fewer pixels: F1 .61 instead of .64."""
 
+SEARCH: Final = "search"
 _MOST_TILES: Final = 64
 _SMALL_PX: Final = 12
 """The side of an object, source pixels, for which ``auto`` chooses the grid …"""
@@ -50,17 +54,25 @@ class _Sized(Protocol):
 
 
 def parse_tiles(text: str) -> Grid | Literal["auto", "off"]:
-    """The value of ``--tiles``: ``off``, ``auto`` or columns x rows such as ``2x2``; UserError for anything else."""
+    """The value of ``--tiles``: ``off``, ``auto``, which ``search`` is too (see `searches_scale`), or columns x rows.
+
+    UserError for anything else.
+    """
     if text == "off":
         return "off"
-    if text == "auto":
+    if text in {"auto", SEARCH}:
         return "auto"
     found = re.fullmatch(r"([1-9]\d?)[x×]([1-9]\d?)", text)  # noqa: RUF001
     if found is None or int(found[1]) * int(found[2]) > _MOST_TILES:
         raise UserError(
-            f"tiles {text!r} are not accepted; off, auto or CxR such as 2x2, at most {_MOST_TILES} tiles, are"
+            f"tiles {text!r} are not accepted; off, auto, {SEARCH} or CxR such as 2x2, {_MOST_TILES} at most, are"
         )
     return int(found[1]), int(found[2])
+
+
+def searches_scale(tiles: str, *, pace: str) -> bool:
+    """Whether ``--tiles`` lets `scale_search` find the scale: ``auto`` in real time, for lockstep repeats a study."""
+    return tiles == SEARCH or (tiles == "auto" and pace != "lockstep")
 
 
 def tiled(detector: Detector, tiles: str) -> Detector:
@@ -108,9 +120,7 @@ def auto_grid(
     return max(grids, key=worth)
 
 
-def tile_boxes(
-    source_size: tuple[int, int], grid: Grid, *, overlap: float = OVERLAP
-) -> list[tuple[int, int, int, int]]:
+def tile_boxes(source_size: tuple[int, int], grid: Grid, *, overlap: float = OVERLAP) -> list[Tile]:
     """x1, y1, x2, y2 of every tile, source pixels, row by row; all of one size, the last ones at the far borders."""
     starts, sides = [], []
     for length, count in zip(source_size, grid, strict=True):
@@ -173,20 +183,28 @@ class TiledDetector:
 
     def detect(self, image_bgr: Image) -> Detections:
         """Detections in the pixels of this image, best first; at most `MAX_DETECTIONS`."""
-        size = (image_bgr.shape[1], image_bgr.shape[0])
-        grid = self.grid(size)
-        parts = [self._detector.detect(image_bgr)]
-        truncated = [np.zeros(len(parts[0]), bool)]
-        for tile in tile_boxes(size, grid, overlap=self._overlap) if grid != (1, 1) else ():
-            x1, y1, x2, y2 = tile
-            found = self._detector.detect(np.ascontiguousarray(image_bgr[y1:y2, x1:x2]))
-            boxes = found.boxes_xyxy_px + np.array([x1, y1, x1, y1], np.float32)
-            parts.append(Detections(boxes, found.confidences, found.class_ids))
-            truncated.append(_truncated(boxes, tile, size))
-        return _merged(parts, np.concatenate(truncated))
+        grid = self.grid((image_bgr.shape[1], image_bgr.shape[0]))
+        tiles = tile_boxes((image_bgr.shape[1], image_bgr.shape[0]), grid, overlap=self._overlap)
+        whole = self._detector.detect(image_bgr)
+        return with_tiles(whole, image_bgr, tiles if grid != (1, 1) else (), self._detector.detect)
 
 
-def _truncated(boxes: Boxes, tile: tuple[int, int, int, int], size: tuple[int, int]) -> npt.NDArray[np.bool_]:
+def with_tiles(
+    whole: Detections, image_bgr: Image, tiles: Iterable[Tile], detect: Callable[[Image], Detections]
+) -> Detections:
+    """What was found in the whole picture and what ``detect`` finds in each of its tiles, as one list, best first."""
+    size = (image_bgr.shape[1], image_bgr.shape[0])
+    parts, truncated = [whole], [np.zeros(len(whole), bool)]
+    for tile in tiles:
+        x1, y1, x2, y2 = tile
+        found = detect(np.ascontiguousarray(image_bgr[y1:y2, x1:x2]))
+        boxes = found.boxes_xyxy_px + np.array([x1, y1, x1, y1], np.float32)
+        parts.append(Detections(boxes, found.confidences, found.class_ids))
+        truncated.append(_truncated(boxes, tile, size))
+    return _merged(parts, np.concatenate(truncated))
+
+
+def _truncated(boxes: Boxes, tile: Tile, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
     # (N,) True for boxes that touch a border of the tile that is not one of the picture.
     x1, y1, x2, y2 = tile
     margin_x, margin_y = (max(1.0, _BORDER_SHARE * side) for side in (x2 - x1, y2 - y1))

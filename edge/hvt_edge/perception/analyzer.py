@@ -11,6 +11,7 @@ import numpy as np
 
 from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
@@ -62,7 +63,8 @@ class _Decoder(Protocol):
 class Analyzer:
     """Decodes the edge's own access units, detects on every n-th frame and tracks on each.
 
-    While the detector gives None the tracks are carried on. ``trust`` is told what it finds.
+    While the detector gives None the tracks are carried on. ``trust`` is told what it finds. ``search`` finds the
+    scale; without it that is as given.
     """
 
     def __init__(
@@ -74,12 +76,14 @@ class Analyzer:
         settings: AnalyzerSettings = AnalyzerSettings(),
         decoder: _Decoder | None = None,
         trust: ViewTrust | None = None,
+        search: ScaleSearch | None = None,
     ) -> None:
         self._detector = detector
         self._tracker = tracker
         self._view = view
         self._settings = settings
         self._trust = trust
+        self._search = search
         self._decoder = decoder or BaseDecoder()
         self._detected_index: int | None = None
         self.detected_ns: int | None = None
@@ -95,7 +99,8 @@ class Analyzer:
     @property
     def detect_every(self) -> int:
         """Source frames from one detection to the next, where there is time for it and each of them is coded."""
-        return self._settings.detect_every
+        every = self._settings.detect_every
+        return every if self._search is None else self._search.interval(every)
 
     @property
     def view_unlike(self) -> bool:
@@ -180,7 +185,7 @@ class Analyzer:
 
     def _due(self, index: int, *, coded: bool) -> bool:
         # Whether the detector is to run on this frame. By frame counts alone, never by a clock.
-        every, last = self._settings.detect_every, self._detected_index
+        every, last = self.detect_every, self._detected_index
         rested = last is None or index - last >= every
         since_coded = 0 if self._coded_index is None else index - self._coded_index
         sparse = max(self._coded_gap, since_coded) > every
@@ -188,14 +193,18 @@ class Analyzer:
             return rested or sparse
         return rested and sparse and self._settings.candidates == "source"
 
+    def _found(self, image_bgr: Image) -> Detections | None:
+        whole = self._detector.detect(image_bgr)
+        return whole if whole is None or self._search is None else self._search.take(whole, image_bgr)
+
     def _detect(self, frame: Frame, base_bgr: Sequence[Image]) -> Detections | None:
         # ``base_bgr`` is the one decoded picture, where candidates are of that.
         if self._settings.candidates == "decoded":
             assert base_bgr, "detection on the decoded stream is due on coded frames only"
-            return self._detector.detect(base_bgr[0])
+            return self._found(base_bgr[0])
         if self._view.enlarges:
-            return self._detector.detect(frame.base_bgr)
-        found = self._detector.detect(frame.source_bgr)
+            return self._found(frame.base_bgr)
+        found = self._found(frame.source_bgr)
         if found is None:
             return None
         width, height = self._view.base_size

@@ -10,6 +10,7 @@ from typing import Literal, cast
 from hvt_common.inference.detect import Detector, FailingDetector, detect_every, open_detector, warm_up
 from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.retried import RetriedDetector
+from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.scores import (
     declared_class_names,
     default_confidence,
@@ -17,7 +18,7 @@ from hvt_common.inference.scores import (
     uncalibrated,
 )
 from hvt_common.inference.store import MOTION
-from hvt_common.inference.tiles import detect_whole, tiled
+from hvt_common.inference.tiles import detect_whole, searches_scale, tiled
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.values import Detections, Image, View
 from hvt_edge.config import EdgeConfig
@@ -85,7 +86,17 @@ def make_analyzer(
             candidates=cast('Literal["decoded", "source"]', config.candidates),
         ),
         trust=trust,
+        search=_scale_search(config, detector),
     )
+
+
+def _scale_search(config: EdgeConfig, detector: FailingDetector) -> ScaleSearch | None:
+    # What it promises are sums of probabilities.
+    if not searches_scale(config.tiles, pace=config.pace) or not is_calibrated(
+        config.detector, role="detector"
+    ):
+        return None
+    return ScaleSearch(_whole(detector), confidence=track_confidence(config))
 
 
 def make_shadow(
@@ -103,17 +114,18 @@ def make_shadow(
     """
     if not config.measures or config.detector == MOTION:
         return None
-    whole = (
-        detector.detect_whole
-        if isinstance(detector, RetriedDetector)
-        else partial(detect_whole, cast("Detector", detector))
-    )
     return ShadowGround(
-        whole,
+        _whole(detector),
         settings=ShadowSettings(confidence=track_confidence(config)),
         before=before,
         spent_ns=spent_ns,
     )
+
+
+def _whole(detector: FailingDetector) -> Callable[[Image], Detections | None]:
+    if isinstance(detector, RetriedDetector):
+        return detector.detect_whole
+    return partial(detect_whole, cast("Detector", detector))
 
 
 def track_confidence(config: EdgeConfig) -> float:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
@@ -85,6 +86,8 @@ class PipelineParts:
     """Of the detector, in this session's video."""
     guesses: Guesses | None = None
     """None where the detector's scores are no probabilities."""
+    search: ScaleSearch | None = None
+    """Of the detector, in this session's video; None where its scale is given."""
     patient: bool = False
     """Wait for a turn, however long: what is due is always detected, as lockstep needs it."""
 
@@ -285,12 +288,14 @@ class Pipeline:
     def _track(self, index: int, image: Image, *, hurry: bool) -> Tracks:
         parts, last = self._parts, self._detected_frame
         frames = None if last is None else index - last
-        due = frames is None or frames >= (_PUT_OFF if hurry else 1) * self._detect_every
+        every = self._detect_every if parts.search is None else parts.search.interval(self._detect_every)
+        due = frames is None or frames >= (_PUT_OFF if hurry else 1) * every
         if due and parts.turns.take(self._turn_key, within_s=self._turn_s):
             self._detected_frame = index
             self.detections_run += 1
             try:
                 found = parts.detector.detect(image) or Detections.none()
+                found = found if parts.search is None else parts.search.take(found, image)
             finally:
                 parts.turns.release()
             self.trust.take(found)

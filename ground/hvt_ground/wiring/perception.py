@@ -8,6 +8,9 @@ from typing import Literal, cast
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import FailingDetector, detect_every
 from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.retried import RetriedDetector
+from hvt_common.inference.scale_search import ScaleSearch
+from hvt_common.inference.tiles import searches_scale
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_ground.backlog.perception import BacklogPerception
@@ -53,6 +56,7 @@ def make_pipeline(
         turns=models.turns,
         trust=trust or make_trust(config),
         guesses=_guesses(models.facts, info),
+        search=_scale_search(config, models.facts, detector, info),
         # In lockstep the same input gives the same detections, however long they take.
         patient=info.pace == "lockstep",
     )
@@ -88,6 +92,16 @@ def make_backlog_perception(
 
 def _guesses(facts: ModelFacts, info: Info) -> Guesses | None:
     return Guesses(fps=info.fps) if facts.calibrated else None
+
+
+def _scale_search(
+    config: GroundConfig, facts: ModelFacts, detector: FailingDetector, info: Info
+) -> ScaleSearch | None:
+    # What it promises are sums of probabilities. The hint that little is found counts whole pictures.
+    if not facts.calibrated or not searches_scale(config.tiles, pace=info.pace):
+        return None
+    detect = detector.detect_whole if isinstance(detector, RetriedDetector) else detector.detect
+    return ScaleSearch(detect, confidence=facts.track_confidence)
 
 
 def _tracker(config: GroundConfig, facts: ModelFacts, info: Info) -> ByteTracker:

@@ -105,13 +105,13 @@ STREET = many(0.9, 0.8, 0.45, 0.2)
 def test_a_view_that_it_does_not_know_is_said_once_and_left_again(caplog):
     """Boxes that are right half the time would look like those that are right nine times in ten."""
     trust = ViewTrust("aerial-nano", hence="are drawn thin and unnamed")
-    for _ in range(44):
+    for _ in range(14):
         trust.take(WATER)
     assert not trust.unlike
     trust.take(WATER)
     assert trust.unlike
     (record,) = caplog.records
-    assert "its last 135 boxes have a mean confidence of 0.53" in record.getMessage()
+    assert "its last 45 boxes have a mean confidence of 0.53" in record.getMessage()
     for way in ("hvt-models fetch yolox-s", "--detector yolox-s", "hvt-study train"):
         assert way in record.getMessage()
     for _ in range(45):
@@ -121,6 +121,20 @@ def test_a_view_that_it_does_not_know_is_said_once_and_left_again(caplog):
         trust.take(WATER)
     assert trust.unlike
     assert len(caplog.records) == 1
+
+
+def test_another_scene_is_told_from_the_one_before_within_seconds():
+    """Boxes of water would pass for cars for a quarter of a minute after a street of a hundred of them."""
+    trust = ViewTrust("aerial-nano", hence="")
+    for _ in range(45):
+        trust.take(many(*[0.8] * 100))
+    for _ in range(15):
+        assert not trust.unlike
+        trust.take(WATER)
+    assert trust.unlike
+    for _ in range(10):
+        trust.take(many(*[0.8] * 100))
+    assert not trust.unlike
 
 
 @pytest.mark.parametrize("view", [STREET, many(), many(0.41)])

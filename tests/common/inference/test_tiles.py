@@ -9,7 +9,15 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector, warm_up
 from hvt_common.inference.nms import suppress
-from hvt_common.inference.tiles import MOST_RUNS, TiledDetector, auto_grid, parse_tiles, tile_boxes, tiled
+from hvt_common.inference.tiles import (
+    MOST_RUNS,
+    TiledDetector,
+    auto_grid,
+    parse_tiles,
+    searches_scale,
+    tile_boxes,
+    tiled,
+)
 from hvt_common.values import Detections, iou
 
 MODEL = "yolov5su_visdrone_640.onnx"
@@ -131,7 +139,7 @@ def test_auto_follows_sizes_alone_and_stays_within_its_runs():
 @pytest.mark.parametrize("text", ["", "2", "2x", "0x2", "2x2x2", "-1x2", "9x9", "Auto", "2 x 2", "1e1x2"])
 def test_nonsense_is_one_sentence(text):
     """A typo would be tiles of another kind, without a word."""
-    with pytest.raises(UserError, match="off, auto or CxR such as 2x2"):
+    with pytest.raises(UserError, match="off, auto, search or CxR such as 2x2"):
         parse_tiles(text)
 
 
@@ -173,3 +181,17 @@ def test_on_real_small_objects_tiles_find_more(data):
         return float((iou(detector.detect(high).boxes_xyxy_px, truth).max(axis=0) > 0.5).mean())
 
     assert recall(tiled(whole, "auto")) > 3 * recall(whole) > 0.2
+
+
+@pytest.mark.parametrize(
+    ("tiles", "pace", "searches"),
+    [
+        ("auto", "realtime", True),
+        ("auto", "lockstep", False),
+        ("search", "lockstep", True),
+        ("off", "realtime", False),
+    ],
+)
+def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, searches):
+    """A study that is repeated would have other figures."""
+    assert searches_scale(tiles, pace=pace) is searches

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import RoiHeader, StillResult
 from hvt_common.runtime.clock import SteadyClock
@@ -28,7 +29,7 @@ from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from media.clips import framed, smooth_pictures
 from programs.processes import eventually
-from rigs.flight import CLASSES, SIZE, RedSquares, square_box
+from rigs.flight import CLASSES, SIZE, NothingSeen, RedSquares, square_box
 from rigs.still_stage import make_still_stage
 
 NOISE = (
@@ -48,10 +49,12 @@ UNITS = [
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 
 
-def make(*, detector=None, view: View = VIEW, **settings) -> Analyzer:
+def make(*, detector=None, view: View = VIEW, search: ScaleSearch | None = None, **settings) -> Analyzer:
     """The edge's analyzer."""
     tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15)
-    return Analyzer(detector or RedSquares(), tracker, view=view, settings=AnalyzerSettings(**settings))
+    return Analyzer(
+        detector or RedSquares(), tracker, view=view, settings=AnalyzerSettings(**settings), search=search
+    )
 
 
 def test_every_frame_is_decoded_and_each_nth_is_searched():
@@ -65,6 +68,17 @@ def test_every_frame_is_decoded_and_each_nth_is_searched():
         np.testing.assert_allclose(one.tracks.boxes_xyxy_px[0], square_box(one.frame.index), atol=6)
         error = one.base_bgr.astype(int) - one.frame.base_bgr
         assert 0 < np.abs(error).mean() < 6, "the decoded picture, not the camera's"
+
+
+@pytest.mark.parametrize("candidates", ["decoded", "source"])
+def test_small_objects_are_looked_at_enlarged_and_less_often(candidates):
+    """They got no still; five runs as often as one would take the whole processor."""
+    search = ScaleSearch(RedSquares().detect, confidence=0.25)
+    search.enlarged = True
+    analyzer = make(detector=NothingSeen(), search=search, detect_every=3, candidates=candidates)
+    seen = [analyzer.analyze(frame, unit) for frame, unit in zip(FRAMES, UNITS, strict=True)]
+    assert [one.frame.index for one in seen if one.detected] == [0, 9, 18, 21, 24, 27], "in vain at last"
+    np.testing.assert_allclose(seen[0].tracks.boxes_xyxy_px[0], square_box(0), atol=6)
 
 
 def test_what_nobody_uses_is_not_searched_and_goes_on_from_any_frame():

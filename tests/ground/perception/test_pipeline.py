@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.protocol.messages import AlsoShown, RoiHeader
 from hvt_common.values import Detections, View
 from hvt_common.video.base_crop import base_crop
@@ -16,7 +17,16 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import still_codec
 from hvt_ground.events import Notice, Overlay, Refinement
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
-from rigs.flight import CLASSES, Flight, RedSquares, SameAnswer, pipeline_of, square_box, tracks_at
+from rigs.flight import (
+    CLASSES,
+    Flight,
+    NothingSeen,
+    RedSquares,
+    SameAnswer,
+    pipeline_of,
+    square_box,
+    tracks_at,
+)
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +100,17 @@ def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures
         assert one.track_ids.tolist() == [1]
         np.testing.assert_allclose(one.boxes_base_px[0], square_box(one.frame_index), atol=6)
         assert (one.classes, one.refined.tolist()) == (("car",), [False])
+
+
+def test_small_objects_are_looked_at_enlarged_and_less_often(pictures):
+    """They had no box; five runs as often as one would take the whole processor."""
+    search = ScaleSearch(RedSquares().detect, confidence=0.25)
+    search.enlarged = True
+    rig = Rig(detect_every=3, search=search, detector=NothingSeen())
+    for picture in pictures:
+        rig.pipeline.analyze(picture, hurry=False)
+    assert rig.pipeline.detections_run == 6, "frames 0, 9 and 18, and in vain: then every third again"
+    np.testing.assert_allclose(rig.of(Overlay)[0].boxes_base_px[0], square_box(0), atol=6)
 
 
 def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flight, pictures):

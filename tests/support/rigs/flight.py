@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
 from hvt_common.protocol.channels import MSGPACK_ENCODING
 from hvt_common.protocol.messages import (
@@ -93,6 +94,16 @@ class RedSquares:
         return Detections(box, np.array([0.9], np.float32), np.zeros(1, np.int32))
 
 
+class NothingSeen:
+    """A detector to which all is too small."""
+
+    class_names = CLASSES
+
+    def detect(self, _image_bgr: Image) -> Detections:
+        """Nothing."""
+        return Detections.none()
+
+
 @dataclass
 class SameAnswer:
     """Reads every object in a still as a bus, or as nothing; keeps which frames' pictures it was given."""
@@ -122,6 +133,7 @@ def pipeline_of(
     edge_classes: Sequence[str] = CLASSES,
     wants_base: bool = False,
     trust: ViewTrust | None = None,
+    search: ScaleSearch | None = None,
 ) -> Pipeline:
     """The perception pipeline of a session of this flight."""
     reader = reader or SameAnswer()
@@ -138,6 +150,7 @@ def pipeline_of(
         path=path,
         turns=Turns(),
         trust=trust or ViewTrust(MOTION, hence=""),
+        search=search,
     )
     view = View.fitted(SIZE, SIZE, fit="letterbox")
     return Pipeline(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)

@@ -1,0 +1,108 @@
+"""The scale at which a detector promises most objects, found in flight.
+
+Of cars of five pixels a network that learnt them at twenty says next to nothing, and of the same picture enlarged
+nearly all. So now and then one quarter of the picture is looked at enlarged too. Where that promises far more objects
+(the sum of calibrated confidences is the expected number of true ones), the whole is looked at so from then on, part
+by part, until it promises no more than the whole alone. docs/embedded-models.md has what that finds and costs.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.inference.tiles import Tile, tile_boxes, with_tiles
+from hvt_common.values import Detections, Image
+
+_log = logging.getLogger(__name__)
+_GRID: Final = (2, 2)
+_OVERLAP: Final = 0.05
+"""Of two neighbouring parts: what is looked at enlarged is small."""
+_MOST_SIDE: Final = 1280
+"""A larger picture is searched at the scale of its pixels already (`hvt_common.inference.tiles`)."""
+_FIRST, _EVERY = 3, 45
+"""The first so many pictures are probed, and every so manieth from there on."""
+_OTHER: Final = 2.0
+"""Twice or half as many promised as at the last probe: another scene, which is probed at once."""
+_MORE, _LEAST_MORE = 3.0, 8.0
+"""The part must promise so many times as much enlarged, and so many objects more."""
+_STILL_MORE: Final = 2.0
+_IN_VAIN: Final = 3
+"""So many pictures in a row that promise less than `_STILL_MORE` times as much end it."""
+_RARER: Final = 3
+"""Five runs in place of one are due so many times more rarely."""
+
+
+class ScaleSearch:
+    """Of one video, whose detector's scores are probabilities; for one thread.
+
+    ``detect`` runs the detector on a picture of any size, None while it fails. Boxes from ``confidence`` on count.
+    """
+
+    def __init__(self, detect: Callable[[Image], Detections | None], *, confidence: float) -> None:
+        self._detect = detect
+        self._confidence = confidence
+        self._pictures = self._probes = self._in_vain = 0
+        self._due, self._before = 1, 0.0
+        self.enlarged = False
+        """Each picture is looked at in parts, enlarged."""
+
+    def interval(self, frames: int) -> int:
+        """Frames from one detection to the next, where they are so many with one run for each."""
+        return frames * _RARER if self.enlarged else frames
+
+    def take(self, whole: Detections, image_bgr: Image) -> Detections:
+        """All that is found on the next picture, ``whole`` being what its one run has found."""
+        size = (image_bgr.shape[1], image_bgr.shape[0])
+        if max(size) > _MOST_SIDE:
+            return whole
+        self._pictures += 1
+        tiles = tile_boxes(size, _GRID, overlap=_OVERLAP)
+        if self.enlarged:
+            found = with_tiles(whole, image_bgr, tiles, self._detect_enlarged)
+            self._note_gain(self._promise(found), self._promise(whole))
+            return found
+        promised = self._promise(whole)
+        low, high = sorted((promised, self._before))
+        if self._pictures >= self._due or high > _OTHER * low + _LEAST_MORE:
+            self._before = promised
+            self._probe(whole, image_bgr, tiles[self._probes % len(tiles)])
+        return whole
+
+    def _probe(self, whole: Detections, image_bgr: Image, tile: Tile) -> None:
+        x1, y1, x2, y2 = tile
+        self._probes += 1
+        self._due = self._pictures + (1 if self._probes < _FIRST else _EVERY)
+        middles = (whole.boxes_xyxy_px[:, :2] + whole.boxes_xyxy_px[:, 2:]) / 2
+        here = self._promise(whole, ((middles >= (x1, y1)) & (middles < (x2, y2))).all(axis=1))
+        there = self._promise(self._detect_enlarged(image_bgr[y1:y2, x1:x2]))
+        if there < _MORE * here + _LEAST_MORE:
+            return
+        self.enlarged, self._in_vain = True, 0
+        _log.info(
+            "objects are small here: a quarter of the picture promises %.0f of them enlarged, %.0f as it is; each "
+            "picture is looked at in parts, enlarged, a third as often",
+            there,
+            here,
+        )
+
+    def _note_gain(self, found: float, whole: float) -> None:
+        self._in_vain = self._in_vain + 1 if found < _STILL_MORE * whole + _LEAST_MORE else 0
+        if self._in_vain == _IN_VAIN:
+            self.enlarged, self._before = False, whole
+            self._due = self._pictures + _EVERY
+
+    def _detect_enlarged(self, part_bgr: Image) -> Detections:
+        scale = _MOST_SIDE / max(part_bgr.shape[:2])
+        large = cv2.resize(part_bgr, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        found = self._detect(np.asarray(large, np.uint8)) or Detections.none()
+        return Detections(found.boxes_xyxy_px / np.float32(scale), found.confidences, found.class_ids)
+
+    def _promise(self, found: Detections, among: npt.NDArray[np.bool_] | None = None) -> float:
+        counted = found.confidences >= self._confidence
+        return float(found.confidences[counted if among is None else counted & among].sum())

@@ -1,0 +1,112 @@
+"""The scale is found: objects that are too small for the network are looked at enlarged, while that pays."""
+
+from __future__ import annotations
+
+import logging
+
+import cv2
+import numpy as np
+
+from hvt_common.inference.scale_search import ScaleSearch
+from hvt_common.values import Detections, Image
+
+SIZE = (640, 360)
+
+
+def picture(count: int, side_px: int) -> Image:
+    """White squares, as many in each quarter."""
+    image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    for number in range(count):
+        x, y = 20 + 24 * (number % 25), 20 + 40 * (number // 25)
+        image[y : y + side_px, x : x + side_px] = 255
+    return image
+
+
+class Squares:
+    """A network that sees squares of 10 pixels and more; it counts its runs."""
+
+    def __init__(self) -> None:
+        self.runs = 0
+
+    def detect(self, image: Image) -> Detections:
+        """As wide as the picture is, or enlarged."""
+        self.runs += 1
+        _, _, stats, _ = cv2.connectedComponentsWithStats((image[..., 0] > 127).astype(np.uint8))
+        boxes = np.array([(x, y, x + w, y + h) for x, y, w, h, _ in stats[1:] if min(w, h) >= 10], np.float32)
+        count = len(boxes)
+        return Detections(boxes.reshape(-1, 4), np.full(count, 0.8, np.float32), np.zeros(count, np.int32))
+
+
+def flown(pictures: list[Image], caplog) -> tuple[list[int], list[int], ScaleSearch]:
+    """How many objects each picture gave, the runs of each, and the search."""
+    caplog.set_level(logging.INFO)
+    network, found, runs = Squares(), [], []
+    search = ScaleSearch(network.detect, confidence=0.4)
+    for image in pictures:
+        before = network.runs
+        found.append(len(search.take(network.detect(image), image)))
+        runs.append(network.runs - before)
+    return found, runs, search
+
+
+def test_small_objects_are_looked_at_enlarged_from_the_first_second_on(caplog):
+    """Of a map-like view nothing but roofs and trees had a box."""
+    small = picture(200, 5)
+    found, runs, search = flown([small] * 4, caplog)
+    assert found == [0, 200, 200, 200]
+    assert runs == [2, 5, 5, 5], "one probe, then the whole and its four parts"
+    assert search.interval(5) == 15, "five runs as often as one would take the whole processor"
+    (record,) = caplog.records
+    assert "objects are small here" in record.getMessage()
+
+
+def test_boxes_lie_on_the_objects(caplog):
+    """What is found in an enlarged part would be drawn at the enlarged place."""
+    small, network = picture(200, 6), Squares()
+    search = ScaleSearch(network.detect, confidence=0.4)
+    search.take(Detections.none(), small)
+    boxes = search.take(Detections.none(), small).boxes_xyxy_px
+    right = {(20 + 24 * (n % 25), 20 + 40 * (n // 25)) for n in range(200)}
+    assert len(boxes) == 200
+    for x1, y1, x2, y2 in boxes:
+        assert min(abs(x1 - x) + abs(y1 - y) for x, y in right) < 2
+        assert 4 < x2 - x1 < 8
+        assert 4 < y2 - y1 < 8
+
+
+def test_objects_of_the_usual_size_cost_a_probe_now_and_then(caplog):
+    """Every flight would pay five runs for a few more boxes, half of them wrong."""
+    found, runs, search = flown([picture(200, 12)] * 100, caplog)
+    assert set(found) == {200}
+    assert not search.enlarged
+    assert sum(runs) <= 100 + 3 + 3
+    assert not caplog.records
+
+
+def test_it_follows_the_scene(caplog):
+    """After a cut the eye would stay at the scale of what was."""
+    near, far, empty = picture(200, 12), picture(200, 5), picture(0, 5)
+    found, _, search = flown([near] * 10 + [far] * 4, caplog)
+    assert found[-2:] == [200, 200]
+    assert search.enlarged
+    found, runs, search = flown([far] * 10 + [near] * 4 + [far] * 3, caplog)
+    assert found[10:14] == [200] * 4, "the objects are there at either scale"
+    assert runs[12:14] == [5, 1], "three pictures in vain"
+    assert found[-1] == 200
+    found, runs, search = flown([far] * 10 + [empty] * 10, caplog)
+    assert runs[-1] == 1
+    assert not search.enlarged
+
+
+def test_a_picture_that_is_searched_in_its_own_pixels_is_left_alone(caplog):
+    """Tiles of tiles would take ten times as long."""
+    large = cv2.resize(picture(200, 5), (1920, 1080), interpolation=cv2.INTER_NEAREST)
+    _, runs, _ = flown([np.asarray(large, np.uint8)] * 5, caplog)
+    assert runs == [1] * 5
+
+
+def test_a_detector_that_fails_in_between_promises_nothing():
+    """The flight would end with its model."""
+    search = ScaleSearch(lambda _: None, confidence=0.4)
+    assert len(search.take(Detections.none(), picture(200, 5))) == 0
+    assert not search.enlarged
