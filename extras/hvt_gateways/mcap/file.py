@@ -32,7 +32,7 @@ from hvt_gateways.decodable import DecodableRun
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, VideoSample
 from hvt_ground.sinks.line_file import check_there
 from hvt_ground.sinks.palette import Rgb, class_colour
-from hvt_ground.sinks.rerun.stills.pairs import event_text, still_picture
+from hvt_ground.sinks.rerun.stills import event_text, still_picture
 
 _CHUNK_BYTES = 32 * 1024
 """The most that a kill loses: a chunk is written once it is full."""

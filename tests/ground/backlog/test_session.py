@@ -43,7 +43,7 @@ from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.rerun.stills.gallery import SLOTS
+from hvt_ground.sinks.rerun.still_places import SLOTS
 from hvt_ground.sinks.timing import SessionTiming, timing_table
 from programs.rrd import Recording
 from programs.small_disk import small_disk

@@ -20,7 +20,7 @@ from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks.rerun.live_view import viewer_program
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.rerun.stills.gallery import SLOTS
+from hvt_ground.sinks.rerun.still_places import SLOTS
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs.rrd import Recording
 

@@ -2,5 +2,5 @@
 
 `recording_file` is one of the files of a session, `sdk` has what a process sets up before. Who reads a recording
 finds in `blueprint` where things are, in `overlays` how boxes are drawn, in `map_rows` what a pose's row says, and in
-`rrd_file` how a file that breaks off is mended; `stills` are a room of their own.
+`rrd_file` how a file that breaks off is mended, and in `stills` the words and the picture of a still.
 """

@@ -24,6 +24,7 @@ from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Re
 from hvt_ground.sinks.contract import is_stored
 from hvt_ground.sinks.palette import AMBER, GREY, VERMILLION, Rgb
 from hvt_ground.sinks.rerun import blueprint as names
+from hvt_ground.sinks.rerun.blueprint import session_chunk, static_chunks
 from hvt_ground.sinks.rerun.live_view import LiveRecording
 from hvt_ground.sinks.rerun.map_rows import MapRows
 from hvt_ground.sinks.rerun.overlays import (
@@ -38,8 +39,7 @@ from hvt_ground.sinks.rerun.overlays import (
 from hvt_ground.sinks.rerun.recording_file import RecordingFile
 from hvt_ground.sinks.rerun.rrd_file import RrdFile
 from hvt_ground.sinks.rerun.sdk import RecordingId
-from hvt_ground.sinks.rerun.static_data import session_chunk, static_chunks
-from hvt_ground.sinks.rerun.stills.rows import StillRows
+from hvt_ground.sinks.rerun.stills import StillRows
 from hvt_ground.sinks.rerun.tables import CodedIdentity, LogText, SizeLimit, TableRow
 
 log = logging.getLogger(__name__)

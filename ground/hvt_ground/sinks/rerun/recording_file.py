@@ -10,10 +10,10 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
+from hvt_ground.sinks.rerun.blueprint import class_chunk, legend_chunk
 from hvt_ground.sinks.rerun.live_view import LiveRecording
 from hvt_ground.sinks.rerun.overlays import Layer
 from hvt_ground.sinks.rerun.rrd_file import RrdFile
-from hvt_ground.sinks.rerun.static_data import class_chunk, legend_chunk
 from hvt_ground.sinks.rerun.tables import TABLE_BYTES, SizeLimit, Table, TableRow
 
 _CLASS_BYTES = 40

@@ -14,7 +14,7 @@ import rerun as rr
 from rerun.chunk import Chunk
 
 from hvt_ground.sinks.palette import Rgb
-from hvt_ground.sinks.rerun.stills.gallery import Placement
+from hvt_ground.sinks.rerun.still_places import Placement
 
 _LATEST_NS = 2**63 - 1
 FIXED_BYTES = 77_000

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from hvt_ground.sinks.rerun.stills.gallery import Gallery
+from hvt_ground.sinks.rerun.still_places import Gallery
 
 
 @given(events=st.lists(st.tuples(st.booleans(), st.integers(0, 60)), max_size=60))

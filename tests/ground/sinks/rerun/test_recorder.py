@@ -23,7 +23,7 @@ from hvt_ground.sinks.rerun import recorder as recorder_module
 from hvt_ground.sinks.rerun.live_view import LiveView, free_port, viewer_program
 from hvt_ground.sinks.rerun.overlays import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.rerun.stills.gallery import CANVAS, SLOTS, Gallery, frame_of, placed
+from hvt_ground.sinks.rerun.still_places import CANVAS, SLOTS, Gallery, frame_of, placed
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes, session
 from programs.rrd import Recording
 

@@ -14,8 +14,7 @@ import pytest
 from hvt_ground.events import Overlay, Refinement, VideoSample
 from hvt_ground.sinks.rerun.overlays import ORIGINS, REPORTED_MARK
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.rerun.stills.gallery import Placement
-from hvt_ground.sinks.rerun.stills.patches import FRESH_NS, PATCHES, Moved, Patches
+from hvt_ground.sinks.rerun.still_places import FRESH_NS, PATCHES, Moved, Patches, Placement
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames
 from programs.rrd import Recording
 
