@@ -182,7 +182,7 @@ class Pacer:
         self._started_ns: int | None = None
         """When the first keyframe went out since somebody is there."""
         self.ignored = 0
-        """Reports that were old, of another receiver, or named what was never sent."""
+        """Reports that were old, of another receiver or of none that takes video, or named what was never sent."""
 
     @property
     def rate_bps(self) -> int:
@@ -245,7 +245,7 @@ class Pacer:
         """Take in one report of this session."""
         feedback, now_ns = report.feedback, report.now_ns
         with self._lock:
-            if not report.primary:
+            if not report.primary or self._linked is False:  # who takes no video says nothing of its link
                 self.ignored += 1
                 return
             if report.first:
@@ -296,7 +296,7 @@ class Pacer:
         with self._lock:
             before, self._linked, self._reports = self._linked, there, reports
             if there and not before:
-                self._started_ns = None
+                self._started_ns, self._progress_ns = None, now_ns
             if before and not there:
                 self._flight.clear()
                 if self._reported_ns is not None:
