@@ -45,7 +45,9 @@ def requested_host(header: str) -> str:
         valid = parts.port != 0  # which raises for what is no number
     except ValueError:
         return ""
-    return parts.hostname or "" if valid and parts.netloc == header and "@" not in header else ""
+    # What stands before or after brackets is dropped by the parser: it may be all of another site's name.
+    plain = parts.netloc == header and re.fullmatch(r"(?:\[[^][]*\]|[^][@]*)(?::\d*)?", header) is not None
+    return parts.hostname or "" if valid and plain else ""
 
 
 def host_and_port(address: str, *, name: str, example: str) -> tuple[str, int]:
