@@ -91,9 +91,9 @@ export class Boxes {
     return found && this.captured - found.captured < OLD_MS ? found : null;
   }
 
-  /** The newest list of this picture or of one before it, however old; null where there is none. */
-  newest() {
-    for (let frame = this.frame; frame > this.frame - LOOK_BACK && frame >= 0; frame--) {
+  /** The newest list of a picture or of one before it, however old; null where there is none. */
+  newest(last = this.frame) {
+    for (let frame = last; frame > last - LOOK_BACK && frame >= 0; frame--) {
       const found = this.overlays.get(frame);
       if (found) return found;
     }

@@ -362,7 +362,7 @@ async function pick(box, track) {
     return;
   }
   const [about, data] = unpacked(await reply.arrayBuffer());
-  tell(words.answeredStill(track, about.place), data);
+  tell(words.answeredStill(track, about.place, boxes.newest(about.frame)?.captured ?? null), data);
 }
 
 /** @param {string} said @param {Uint8Array | null} picture */

@@ -226,8 +226,12 @@ const place = (track) => (track ? `${trackName(track)} ${track.id}` : "this plac
 /** @param {string} edge @param {TrackFacts | null} track */
 export const askingStill = (edge, track) => `asking ${edge} for ${place(track)}`;
 
-/** @param {TrackFacts | null} track @param {number[]} box x, y, width and height in the camera's picture */
-export const answeredStill = (track, [, , width, height]) => `${place(track)}, ${width}×${height} pixels of the camera`;
+/**
+ * @param {TrackFacts | null} track @param {number[]} box x, y, width and height in the camera's picture
+ * @param {number | null} captured null: not known
+ */
+export const answeredStill = (track, [, , width, height], captured) =>
+  `${place(track)}${captured === null ? "" : ` at ${clock(captured)}`}, ${width}×${height} pixels of the camera`;
 
 /** @param {number} status */
 export const refusedWords = (status) => `the ground refused (${status})`;

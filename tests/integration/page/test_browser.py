@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import time
@@ -137,7 +138,7 @@ def test_a_click_brings_a_still_of_that_place(page):
     image = page.locator("#answer-picture")
     image.wait_for(state="visible")
     eventually(lambda: image.evaluate("one => one.naturalWidth") > 10, within_s=10, what="the still is shown")
-    assert "pixels of the camera" in page.inner_text("#answer-text")
+    assert re.search(r" at \d\d:\d\d:\d\d, .* pixels of the camera", page.inner_text("#answer-text"))
     strip = page.locator("#stills img")
     eventually(strip.count, within_s=20, what="the strip shows stills")
     eventually(
