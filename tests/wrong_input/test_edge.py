@@ -257,6 +257,16 @@ def test_an_input_of_a_disk_that_is_not_mounted_yet_is_tried_again(edge, flag, f
     assert file in edge(flag, file)
 
 
+@pytest.mark.parametrize("flag", ["--summary", "--record-base", "--truth"])
+@pytest.mark.parametrize("what", ["--source", "--detector", "--pose", "--zenoh-config"])
+def test_an_output_over_what_is_read(edge, here, flag, what):
+    """The only copy of a clip would be the summary of its first flight."""
+    Path("read").write_text("by the edge")
+    Path("out.mkv").hardlink_to("read")
+    assert f"{flag} out.mkv is read itself" in edge(flag, "out.mkv", what, "read")
+    assert Path("read").read_text() == "by the edge"
+
+
 def test_a_failed_start_leaves_an_old_summary_as_it_was(edge, here):
     """The result of yesterday would be gone."""
     Path("s.json").write_text("yesterday")

@@ -20,13 +20,15 @@ from hvt_edge.stills.outbox import Outbox
 
 
 def check_files(config: EdgeConfig) -> None:
-    """Raise `UserError` for a file or folder that could not be written."""
+    """Raise `UserError` for a file or folder that could not be written, or is one that is read."""
+    given = (config.source, config.pose, config.detector, config.labels, config.zenoh_config)
+    reads = [Path(one) for one in given if one is not None]
     for path, name in (
         (config.summary, "--summary"),
         (config.truth, "--truth"),
         (config.record_base, "--record-base"),
     ):
-        check_writable(path, name=name)
+        check_writable(path, name=name, reads=reads)
 
 
 def store_folder(config: EdgeConfig) -> Path:

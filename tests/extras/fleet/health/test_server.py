@@ -42,7 +42,16 @@ def answers(port: int) -> bool:
         (
             "127.0.0.1",
             ("127.0.0.1", "LOCALHOST:9", "[::1]:9", None),
-            ("evil.example", "127.evil.example:9", "127.0.0.1.evil.example", "192.0.2.7", "[", "[::1].evil.example", "", "a, b"),
+            (
+                "evil.example",
+                "127.evil.example:9",
+                "127.0.0.1.evil.example",
+                "192.0.2.7",
+                "[",
+                "[::1].evil.example",
+                "",
+                "a, b",
+            ),
         ),
         (
             "0.0.0.0",
