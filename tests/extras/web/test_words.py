@@ -218,6 +218,51 @@ def test_the_plot_draws_no_line_over_what_is_not_known():
     assert found == [["move", 140], ["line", 141], ["line", 142], ["move", 200], ["line", 201]]
 
 
+@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+def test_names_give_way_and_what_was_not_seen_in_this_picture_is_faint():
+    """On a crowded car park nobody could read a name, or see a car under one; old boxes would pass for new ones."""
+    found = ran(
+        f"""
+      let drawn = {{ boxes: [], names: [] }};
+      const known = {{ measureText: (text) => ({{ width: 6 * text.length }}),
+        strokeRect(...box) {{ drawn.boxes.push([...box, this.globalAlpha, this.strokeStyle]); }},
+        fillText(text, x, y) {{ drawn.names.push([text, x, y]); }},
+        clearRect() {{}}, fillRect() {{}}, setLineDash() {{}} }};
+      globalThis.window = {{ devicePixelRatio: 1 }};
+      globalThis.ResizeObserver = class {{ observe() {{}} }};
+      const {{ Boxes }} = await import({json.dumps((STATIC / "boxes.js").as_uri())});
+      const canvas = {{ clientWidth: 640, clientHeight: 360, getContext: () => known, addEventListener() {{}} }};
+      const boxes = new Boxes(canvas, () => {{}});
+      boxes.size = [640, 360];
+      const seen = (looked, tracks) => {{
+        boxes.add({{ frame: 1, captured: 1000, looked, tracks, colours: {{ car: "#56b4e9", van: "#f0ad1e" }} }});
+        drawn = {{ boxes: [], names: [] }};
+        boxes.show({{ frame: 1, captured: 1000 }});
+        return structuredClone({{ ...drawn, behind: boxes.behind() }});
+      }};
+      const track = (id, x, y, name = "car") => ({{ id, name, sureness: 0.9, box: [x, y, x + 30, y + 20] }});
+      const crowd = [...Array(60).keys()].map((id) => track(id, 10 + 36 * (id % 15), 60 + 24 * Math.floor(id / 15)));
+      const out = {{ crowd: seen(1000, crowd), old: seen(400, crowd.slice(0, 1)) }};
+      boxes.filter("van", false);
+      out.filtered = seen(1000, [track(1, 10, 50), track(2, 200, 50, "van")]);
+      boxes.toggle(false);
+      out.none = seen(1000, crowd);
+      console.log(JSON.stringify(out));
+    """
+    )
+    crowd, old = found["crowd"], found["old"]
+    assert len(crowd["boxes"]) == 60
+    assert 10 < len(crowd["names"]) < 60
+    middles = [(x + w / 2, y + h / 2) for x, y, w, h, _, _ in crowd["boxes"]]
+    for text, x, y in crowd["names"]:  # 12 px letters over 6 px a letter
+        left, top, right = x - 3, y - 12, x + 6 * len(text) + 3
+        assert not [one for one in middles if left < one[0] < right and top < one[1] < top + 16.2]
+    assert [one[4:] for one in old["boxes"]] == [[0.5, "#56b4e9"]]
+    assert old["behind"] == 600
+    assert [one[4:] for one in found["filtered"]["boxes"]] == [[1, "#56b4e9"]]
+    assert found["none"]["boxes"] == found["none"]["names"] == []
+
+
 def test_the_page_shows_no_word_of_the_code():
     """``base_good`` and ``queue_full`` mean nothing to who flies."""
     code = {word for word in STILL_WORDS if "_" in word} | {"cooldown", "superseded"}
