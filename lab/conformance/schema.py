@@ -37,6 +37,7 @@ from hvt_common.protocol.messages.fields import REFUSED_CHARACTERS, Kind, ListOf
 from hvt_common.protocol.messages.track_boxes import MOST_BOXES, MOST_CLASSES
 
 PATH = Path(__file__).resolve().parents[2] / "docs" / "wire.json"
+_PARTS = {8: "eighths", 10: "tenths", 100: "hundredths", 1000: "thousandths"}
 MESSAGES: tuple[type[Message], ...] = (
     BaseHeader,
     StillWire,
@@ -101,3 +102,41 @@ def _fields(message: type) -> Iterator[dict[str, Any]]:
         meta, kind = item.metadata, item.metadata["wire"]
         default = {"default": kind.encode(meta["default"])} if meta["optional"] else {}
         yield {"name": item.name, **kind.schema(), **default}
+
+
+def described(kind: dict[str, Any]) -> str:  # noqa: C901, PLR0911 - one return for each kind
+    """A schema in a few words, as docs/wire-messages.md has it."""
+    match kind:
+        case {"type": "int", "words": words}:
+            return "int: " + ", ".join(f"{number} {word}" for number, word in enumerate(words))
+        case {"type": "int", "low": low, "high": high, "per": per}:
+            return f"int {low}…{high}, {_PARTS[per]}"
+        case {"type": "int", "low": low, "high": high}:
+            return _range(low, high)
+        case {"type": "float", "low": low, "high": high}:
+            return f"float {low:g}…{high:g}"
+        case {"type": "str" | "bin" as name, "most_bytes": most}:
+            return f"{name} ≤ {most} B"
+        case {"type": "word", "words": words, "most_bytes": most}:
+            return (
+                ", ".join(f"{number} {word}" for number, word in enumerate(words)) + f"; else str ≤ {most} B"
+            )
+        case {"type": "scalar", "most_bytes": most}:
+            return f"int, finite float or str ≤ {most} B"
+        case {"type": "array", "least": least, "most": most, "of": of}:
+            return (
+                f"array of {most}: {described(of)}" if least == most else f"array ≤ {most} of {described(of)}"
+            )
+        case {"type": "map", "most": most, "key_bytes": key_bytes, "of": of}:
+            return f"map ≤ {most}: str ≤ {key_bytes} B to {described(of)}"
+        case {"type": "nested", "of": name}:
+            return str(name)
+    return str(kind["type"])
+
+
+def _range(low: int, high: int) -> str:
+    # Whole numbers of so many bits by the name that the page explains: ``u32`` is 0…(2^32 - 1).
+    bits = high.bit_length()
+    if bits >= 32 and high == 2**bits - 1 and low in (0, -1, -high):
+        return f"u{bits}" if low == 0 else f"u{bits} or −1" if low == -1 else f"±u{bits}"  # noqa: RUF001
+    return f"int {low}…{high}"

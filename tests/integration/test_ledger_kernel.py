@@ -19,7 +19,9 @@ import pytest
 
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
-from hvt_common.transport.session import Inbox, LinkSettings, declare_publisher, open_session, subscribe
+from hvt_common.transport.inbox import Inbox
+from hvt_common.transport.session import declare_publisher, open_session, subscribe
+from hvt_common.transport.zenoh_config import LinkSettings
 
 # Time that passes is keep-alives that are counted.
 pytestmark = [pytest.mark.integration, pytest.mark.realtime]

@@ -21,22 +21,9 @@ import zenoh
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, EdgeKeys
 from hvt_common.runtime.failures import Awaited, Failures
-from hvt_common.transport.inbox import Inbox, Received, ReceivedQueue
+from hvt_common.transport.inbox import Received, ReceivedQueue
 from hvt_common.transport.link_doctor import link_doctor
-from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings, configure, without_build_paths
-
-__all__ = [
-    "DEFAULT_ENDPOINT",
-    "Inbox",
-    "LinkSettings",
-    "Received",
-    "declare_publisher",
-    "open_session",
-    "query",
-    "query_later",
-    "serve",
-    "subscribe",
-]
+from hvt_common.transport.zenoh_config import LinkSettings, configure, without_build_paths
 
 _log = logging.getLogger(__name__)
 

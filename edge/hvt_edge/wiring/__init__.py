@@ -15,26 +15,3 @@ from hvt_edge.wiring.video import (
     qualify_encoder,
     say_size,
 )
-
-__all__ = [
-    "Beginning",
-    "Stages",
-    "as_the_camera_is",
-    "base_size",
-    "build_stages",
-    "check_codecs",
-    "check_files",
-    "check_store",
-    "default_size",
-    "first_decimation",
-    "make_detector",
-    "make_encoder",
-    "make_link_settings",
-    "open_for_flight",
-    "qualify_encoder",
-    "say_size",
-    "store_folder",
-    "track_confidence",
-    "try_scene",
-    "warm_up_for",
-]

@@ -5,15 +5,3 @@ from hvt_ground.wiring.files import check_outputs, make_record_folder, output_pa
 from hvt_ground.wiring.link import make_link_settings
 from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline
 from hvt_ground.wiring.sessions import OpenSink, SessionFactory
-
-__all__ = [
-    "Models",
-    "OpenSink",
-    "SessionFactory",
-    "check_outputs",
-    "make_backlog_perception",
-    "make_link_settings",
-    "make_pipeline",
-    "make_record_folder",
-    "output_path",
-]

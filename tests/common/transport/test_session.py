@@ -23,17 +23,15 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.protocol.ledger import STANDARD_ENCODINGS
 from hvt_common.protocol.messages import BaseHeader, Command, ControlAnswer, ControlRequest, Flags
+from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.transport.session import (
-    Inbox,
-    LinkSettings,
-    Received,
     declare_publisher,
     open_session,
     query,
     serve,
     subscribe,
 )
-from hvt_common.transport.zenoh_config import configure
+from hvt_common.transport.zenoh_config import LinkSettings, configure
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "wire.md"
 KEYS = EdgeKeys("uav-1")
@@ -352,7 +350,9 @@ def test_what_another_machine_has_is_one_sentence(endpoint, lacks):
 LISTENER = """
     import signal, sys, time
     signal.signal(signal.SIGINT, signal.default_int_handler)  # who starts in the background may ignore it
-    from hvt_common.transport.session import *
+    from hvt_common.transport.inbox import Inbox
+    from hvt_common.transport.session import open_session, subscribe
+    from hvt_common.transport.zenoh_config import LinkSettings
     from hvt_common.protocol.channels import *
     with open_session(LinkSettings("ground", listen=(sys.argv[1],))) as session:
         inbox = Inbox(capacity=8)
@@ -362,7 +362,8 @@ LISTENER = """
 """
 STUCK_SENDER = """
     import sys, threading, time
-    from hvt_common.transport.session import *
+    from hvt_common.transport.session import declare_publisher, open_session
+    from hvt_common.transport.zenoh_config import LinkSettings
     from hvt_common.protocol.channels import *
     with open_session(LinkSettings("edge", connect=(sys.argv[1],))) as session:
         publisher = declare_publisher(session, Channel.BASE, keys=EdgeKeys("uav-1"))

@@ -10,7 +10,8 @@ import zenoh
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, GroupKeys
-from hvt_common.transport.session import LinkSettings, open_session
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_ground.link.group import GroundGroup, member_name, owner_of
 from programs.fleet_keys import Fleet
 from programs.processes import eventually, free_ports

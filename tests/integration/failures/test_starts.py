@@ -20,8 +20,8 @@ from hvt_common.config import load
 from hvt_common.errors import FlightError, NotYetError, UserError, exit_with_sentence
 from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.runtime.reporting import check_writable
-from hvt_common.transport.session import LinkSettings, open_session
-from hvt_common.transport.zenoh_config import configure
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_edge.config import EdgeConfig
 from hvt_edge.loop.pose import open_pose
 from hvt_edge.source.live import LiveSource, Shot, SignalLost

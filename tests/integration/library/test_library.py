@@ -137,7 +137,8 @@ def test_an_edge_that_never_got_a_frame_ends_quietly():
 ENDING = """
 import gc, sys, threading, time
 import {library}
-from hvt_common.transport.session import LinkSettings, open_session
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings
 
 heard = threading.Event()
 

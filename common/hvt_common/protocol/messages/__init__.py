@@ -5,6 +5,7 @@ Who makes vectors of them reaches into `envelope`, `fields`, `exp_golomb`, `rang
 
 from __future__ import annotations
 
+from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
 from hvt_common.protocol.messages.backlog import (
     MAX_ACKNOWLEDGED_RANGES,
     MAX_BACKLOG_BYTES,
@@ -34,7 +35,6 @@ from hvt_common.protocol.messages.dialogue import (
     TrackNow,
 )
 from hvt_common.protocol.messages.envelope import (
-    MAX_PAYLOAD_BYTES,
     MOST_UNKNOWN_FIELDS,
     READ_VERSIONS,
     SPOKEN_VERSIONS,
@@ -66,62 +66,3 @@ from hvt_common.protocol.messages.stream import (
     StillWire,
 )
 from hvt_common.protocol.messages.track_step import TrackStep, TrackStepDecoder, TrackStepEncoder
-
-__all__ = [
-    "BASE_CODEC",
-    "MAX_ACKNOWLEDGED_RANGES",
-    "MAX_ALSO",
-    "MAX_BACKLOG_BYTES",
-    "MAX_MISSING_STILLS",
-    "MAX_PAYLOAD_BYTES",
-    "MAX_STILL_CODECS",
-    "MAX_STILL_RESULTS",
-    "MAX_TRACKS_NOW",
-    "MOST_FAILED_PARTS",
-    "MOST_UNKNOWN_FIELDS",
-    "READ_VERSIONS",
-    "SPOKEN_VERSIONS",
-    "WIRE_VERSION",
-    "AcknowledgedRange",
-    "AlsoShown",
-    "BacklogHeader",
-    "BacklogKind",
-    "BacklogStill",
-    "BacklogUnit",
-    "BaseHeader",
-    "CaptureTimes",
-    "Command",
-    "ControlAnswer",
-    "ControlRequest",
-    "CorruptError",
-    "FailedPart",
-    "Feedback",
-    "Flags",
-    "Health",
-    "Info",
-    "InfoRequest",
-    "Message",
-    "ObjectKey",
-    "PackedMessage",
-    "PoseDecoder",
-    "PoseEncoder",
-    "PoseReport",
-    "RoiHeader",
-    "Status",
-    "StillResult",
-    "StillWire",
-    "TrackNow",
-    "TrackStep",
-    "TrackStepDecoder",
-    "TrackStepEncoder",
-    "UnknownVersionError",
-    "WireError",
-    "fitted_class_names",
-    "fitted_text",
-    "kinds",
-    "pack_backlog_still",
-    "pack_backlog_units",
-    "parse_backlog_still",
-    "parse_backlog_units",
-    "wire_version",
-]

@@ -15,7 +15,8 @@ from typing import Any, ClassVar, TypeVar
 
 import msgpack
 
-from hvt_common.protocol.messages.envelope import MAX_PAYLOAD_BYTES, Message, from_values, kinds, unpacked
+from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
+from hvt_common.protocol.messages.envelope import Message, from_values, kinds, unpacked
 from hvt_common.protocol.messages.fields import (
     I63,
     U32,

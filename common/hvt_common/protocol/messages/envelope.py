@@ -22,24 +22,6 @@ import msgpack
 from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
 from hvt_common.protocol.messages.fields import Kind, WireError
 
-__all__ = [
-    "DEEPEST",
-    "MAX_PAYLOAD_BYTES",
-    "MOST_UNKNOWN_FIELDS",
-    "READ_VERSIONS",
-    "SPOKEN_VERSIONS",
-    "WIRE_VERSION",
-    "CorruptError",
-    "Message",
-    "Nested",
-    "PackedMessage",
-    "UnknownVersionError",
-    "from_values",
-    "kinds",
-    "unpacked",
-    "wire_version",
-]
-
 WIRE_VERSION = 5
 """That of every message that is sent."""
 SPOKEN_VERSIONS = (5,)

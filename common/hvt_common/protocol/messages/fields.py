@@ -41,7 +41,7 @@ class Kind(ABC):
             raw = self._encode(value)
             self.decode(raw)  # what we send is held to the same rules as what we receive
         except (WireError, TypeError, ValueError, OverflowError, AttributeError) as error:
-            raise ValueError(f"{value!r} cannot be sent as {self.describe()}: {error}") from error
+            raise ValueError(f"{value!r} cannot be sent: {error}") from error
         return raw
 
     @abstractmethod
@@ -51,10 +51,6 @@ class Kind(ABC):
     @abstractmethod
     def schema(self) -> dict[str, Any]:
         """Type and bounds as docs/wire.json holds them."""
-
-    def describe(self) -> str:
-        """Type and bounds in a few words, as docs/wire-messages.md prints them."""
-        return described(self.schema())
 
     def _encode(self, value: Any) -> Any:
         return value
@@ -357,44 +353,3 @@ def _check_size(raw: Any, wanted: type[Sized], name: str, most: int) -> None:
         raise WireError(f"{type(raw).__name__} in place of a {name}")
     if len(raw) > most:
         raise WireError(f"{name} of {len(raw)} where at most {most} are allowed")
-
-
-_PARTS = {8: "eighths", 10: "tenths", 100: "hundredths", 1000: "thousandths"}
-
-
-def described(kind: dict[str, Any]) -> str:  # noqa: C901, PLR0911 - one return for each kind
-    """A schema in a few words."""
-    match kind:
-        case {"type": "int", "words": words}:
-            return "int: " + ", ".join(f"{number} {word}" for number, word in enumerate(words))
-        case {"type": "int", "low": low, "high": high, "per": per}:
-            return f"int {low}…{high}, {_PARTS[per]}"
-        case {"type": "int", "low": low, "high": high}:
-            return _range(low, high)
-        case {"type": "float", "low": low, "high": high}:
-            return f"float {low:g}…{high:g}"
-        case {"type": "str" | "bin" as name, "most_bytes": most}:
-            return f"{name} ≤ {most} B"
-        case {"type": "word", "words": words, "most_bytes": most}:
-            return (
-                ", ".join(f"{number} {word}" for number, word in enumerate(words)) + f"; else str ≤ {most} B"
-            )
-        case {"type": "scalar", "most_bytes": most}:
-            return f"int, finite float or str ≤ {most} B"
-        case {"type": "array", "least": least, "most": most, "of": of}:
-            return (
-                f"array of {most}: {described(of)}" if least == most else f"array ≤ {most} of {described(of)}"
-            )
-        case {"type": "map", "most": most, "key_bytes": key_bytes, "of": of}:
-            return f"map ≤ {most}: str ≤ {key_bytes} B to {described(of)}"
-        case {"type": "nested", "of": name}:
-            return str(name)
-    return str(kind["type"])
-
-
-def _range(low: int, high: int) -> str:
-    # Whole numbers of so many bits by the name that the page explains: ``u32`` is 0…(2^32 - 1).
-    bits = high.bit_length()
-    if bits >= 32 and high == 2**bits - 1 and low in (0, -1, -high):
-        return f"u{bits}" if low == 0 else f"u{bits} or −1" if low == -1 else f"±u{bits}"  # noqa: RUF001
-    return f"int {low}…{high}"

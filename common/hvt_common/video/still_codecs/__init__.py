@@ -15,18 +15,3 @@ from hvt_common.video.still_codecs.contract import (
 from hvt_common.video.still_codecs.jpeg import JpegCodec
 from hvt_common.video.still_codecs.registry import still_codec, still_codec_names
 from hvt_common.video.still_codecs.search import best_fitting, psnr_y_db, smallest_reaching
-
-__all__ = [
-    "NO_PARAMETERS",
-    "BaseMissingError",
-    "CodedCrop",
-    "JpegCodec",
-    "Parameters",
-    "StillCodec",
-    "StillError",
-    "best_fitting",
-    "psnr_y_db",
-    "smallest_reaching",
-    "still_codec",
-    "still_codec_names",
-]
