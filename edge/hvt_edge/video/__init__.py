@@ -2,5 +2,5 @@
 
 `encoders` has others in place of x265; `passthrough` is the stage without one. `frame_skip` says
 which frames, `regions` where finer, `rate_model` and `share` at which rate, `preset` with how much time;
-`reconfigure` changes all that with a keyframe. `local_copy` is ``--record-base``.
+`reconfigure` changes all that with a keyframe.
 """

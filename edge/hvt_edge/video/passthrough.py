@@ -19,8 +19,7 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.video.encoders.camera_rates import LeastLink
 from hvt_edge.video.encoders.passthrough import unit_of
 from hvt_edge.video.frame_decision import Action, FrameDecision
-from hvt_edge.video.local_copy import LocalCopy
-from hvt_edge.video.stage import BaseStage
+from hvt_edge.video.stage import BaseStage, LocalCopy
 
 _PART = "passthrough"
 _PATIENCE_NS = SECOND_NS // 2

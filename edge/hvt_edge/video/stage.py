@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,7 +21,6 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.frame_decision import Action, FrameDecision, FrameInputs, decide
 from hvt_edge.video.frame_skip import FrameSkip
-from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.regions import TrackRegions
 
 _PART, _SIZE_PART = "encoder", "video"
@@ -30,6 +30,14 @@ _CODING_MEMORY = 4
 _COARSER = (2, 4, 8)
 """By how much a picture is made coarser whose unit is too large. x265 cannot code more coarsely than at quantiser 51;
 what it has to code can have less detail."""
+
+
+class LocalCopy(Protocol):
+    """``--record-base``: keeps every access unit at the edge."""
+
+    def write(self, unit: AccessUnit) -> None:
+        """Hand over an access unit; returns at once."""
+        ...
 
 
 @dataclass(eq=False)

@@ -33,7 +33,6 @@ from hvt_edge.source.demo import write_truth_of
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.video.frame_skip import LimitedFrameSkip
-from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.passthrough import PassthroughStage, VideoStage
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
@@ -48,7 +47,7 @@ from hvt_edge.wiring.link import (
 )
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.stills import make_chooser, make_method, make_on_demand, make_still_maker
-from hvt_edge.wiring.storing import make_backlog
+from hvt_edge.wiring.storing import make_backlog, open_local_copy
 from hvt_edge.wiring.trial import Beginning
 from hvt_edge.wiring.video import (
     encoder_opener,
@@ -123,7 +122,9 @@ def build_stages(
     write_truth_of(source, config.truth, fps=config.nominal_fps)
     local_copy = None
     if config.record_base:
-        local_copy = stack.enter_context(LocalCopy(config.record_base, failures=failures, wait=lockstep))
+        local_copy = stack.enter_context(
+            open_local_copy(config.record_base, failures=failures, wait=lockstep)
+        )
     in_flight, outbox = BaseInFlight(), Outbox(reports=not lockstep)
     transmitter = Transmitter(
         link,

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import cast
 
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.disk import Store
@@ -17,6 +20,9 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.stills.outbox import Outbox
+from hvt_edge.video.stage import LocalCopy
+
+_COPIES = "hvt.edge_copies"
 
 
 def check_files(config: EdgeConfig) -> None:
@@ -29,6 +35,15 @@ def check_files(config: EdgeConfig) -> None:
         (config.record_base, "--record-base"),
     ):
         check_writable(path, name=name, reads=reads)
+
+
+def open_local_copy(path: Path, *, failures: Failures, wait: bool) -> AbstractContextManager[LocalCopy]:
+    """What keeps the base stream in a file, of an extra; ``wait``: it blocks where the card is slower (lockstep)."""
+    entry = the_one(_COPIES, "base", what="local copy", built_in=False)
+    if entry is None:
+        raise UserError("--record-base is of an extra that is not installed: pip install 'hvt[edge]'")
+    made = loaded(entry, lambda copy: copy(path, failures=failures, wait=wait), what="local copy")
+    return cast("AbstractContextManager[LocalCopy]", made)
 
 
 def store_folder(config: EdgeConfig) -> Path:

@@ -10,6 +10,7 @@ from pathlib import Path
 import av
 import pytest
 
+from hvt_archive.local_copy import LocalCopy
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.failures import Failures
@@ -21,7 +22,6 @@ from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.source.opening import open_source
 from hvt_edge.video.frame_decision import Action, FrameDecision
-from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.passthrough import PassthroughStage, UnitInputs, decide_unit
 from media.clips import START_NS, hard_pictures, smooth_pictures
 from media.hevc_camera import SIZE, write_clip

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from hvt_archive.local_copy import LocalCopy
 from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
@@ -22,7 +23,6 @@ from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
-from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder, encoder_context

@@ -15,11 +15,11 @@ import av
 import numpy as np
 import pytest
 
+from hvt_archive.local_copy import LocalCopy
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
 from programs.processes import eventually
