@@ -18,7 +18,7 @@ from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.values import AccessUnit, Frame, View
-from hvt_edge.link.publisher import ZenohLink
+from hvt_edge.link.publisher import Answers, ZenohLink
 from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 
@@ -42,16 +42,18 @@ class PlayedEdge:
             ZenohLink(settings, edge_id=edge_id, failures=Failures(clock), clock=clock)
         )
         self.link.listen(
-            info=lambda at_ns: replace(info, received_ns=at_ns, answered_ns=clock()).pack(),
-            control=lambda _request: ControlAnswer(
-                session_id=session_id,
-                accepted=False,
-                reason="it is played",
-                still_request=-1,
-                frame_index=-1,
-                tracks=(),
-            ),
-            on_feedback=lambda _feedback: None,
+            Answers(
+                info=lambda at_ns: replace(info, received_ns=at_ns, answered_ns=clock()).pack(),
+                control=lambda _request: ControlAnswer(
+                    session_id=session_id,
+                    accepted=False,
+                    reason="it is played",
+                    still_request=-1,
+                    frame_index=-1,
+                    tracks=(),
+                ),
+                on_feedback=lambda _feedback: None,
+            )
         )
 
     def send(self, unit: AccessUnit, index: int) -> None:

@@ -150,13 +150,7 @@ class Edge:
             heartbeat = Heartbeat(self._state_maker(stages, link, source.view), clock=world.clock)
             self._heartbeat = heartbeat
             status = self._status_reporter(stages, heartbeat)
-            link.listen(
-                info=stages.info.info,
-                control=stages.commands.answer,
-                on_feedback=stages.link_control.on_feedback,
-                on_info_request=stages.still_readers.on_request,
-                reply=stages.transmitter.reply,
-            )
+            link.listen(stages.answers)
             self._on_started()
             notify_systemd("READY=1")
             if not source.live:

@@ -36,6 +36,20 @@ _NEEDED = (Channel.BASE, Channel.ROI, Channel.STATUS)
 """Channels that a ground subscribes to in any case; one that only shows the video may leave out the others."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answers:
+    """The ends that a ground reaches: they run in the link's callbacks, and must be quick."""
+
+    info: Callable[[int], bytes]
+    """The session's facts for a question that came at this time, by the clock of the headers."""
+    control: Callable[[ControlRequest], ControlAnswer]
+    on_feedback: Callable[[Feedback], None]
+    on_info_request: Callable[[InfoRequest], None] = lambda _request: None
+    """Called before ``info`` answers."""
+    reply: Callable[[Channel, bytes], bytes] = lambda _channel, payload: payload
+    """Gives the payload back as it leaves (`Transmitter.reply`)."""
+
+
 class EdgeLink(Outlet, Protocol):
     """The link as an edge uses it: `ZenohLink`, or a study's."""
 
@@ -57,15 +71,7 @@ class EdgeLink(Outlet, Protocol):
         """Whether somebody subscribes to this channel."""
         ...
 
-    def listen(
-        self,
-        *,
-        info: Callable[[int], bytes],
-        control: Callable[[ControlRequest], ControlAnswer],
-        on_feedback: Callable[[Feedback], None],
-        on_info_request: Callable[[InfoRequest], None] = lambda _request: None,
-        reply: Callable[[Channel, bytes], bytes] = lambda _channel, payload: payload,
-    ) -> None:
+    def listen(self, answers: Answers) -> None:
         """Answer grounds from now on: all that answers them is there."""
         ...
 
@@ -120,26 +126,10 @@ class ZenohLink:
         except zenoh.ZError as error:
             _log.debug("%s was not sent: %s", channel, error)
 
-    def listen(
-        self,
-        *,
-        info: Callable[[int], bytes],
-        control: Callable[[ControlRequest], ControlAnswer],
-        on_feedback: Callable[[Feedback], None],
-        on_info_request: Callable[[InfoRequest], None] = lambda _request: None,
-        reply: Callable[[Channel, bytes], bytes] = lambda _channel, payload: payload,
-    ) -> None:
+    def listen(self, answers: Answers) -> None:
         """Answer grounds from now on; see `EdgeListener`."""
         listener = EdgeListener(
-            self._session,
-            self._keys,
-            info=info,
-            control=control,
-            on_feedback=on_feedback,
-            on_info_request=on_info_request,
-            reply=reply,
-            failures=self._failures,
-            clock=self._clock,
+            self._session, self._keys, answers, failures=self._failures, clock=self._clock
         )
         self._listener = self._stack.enter_context(listener)
 
@@ -154,19 +144,13 @@ class ZenohLink:
 class EdgeListener:
     """Queryables info and control; a subscriber of feedback; last the alive token, by which grounds find the edge.
 
-    ``info(received_ns)``, ``on_info_request(request)`` before it, ``control(request)`` and ``on_feedback(feedback)``
-    run in Zenoh's callbacks and must be quick; ``reply(channel, payload)`` gives the payload back as it leaves
-    (`Transmitter.reply`); ``clock`` is that of the headers.
+    ``clock`` is that of the headers.
     """
 
     session: zenoh.Session
     keys: EdgeKeys
+    answers: Answers
     _: KW_ONLY
-    info: Callable[[int], bytes]
-    control: Callable[[ControlRequest], ControlAnswer]
-    on_feedback: Callable[[Feedback], None]
-    on_info_request: Callable[[InfoRequest], None]
-    reply: Callable[[Channel, bytes], bytes]
     failures: Failures
     clock: Callable[[], int]
 
@@ -193,10 +177,10 @@ class EdgeListener:
     def _on_info(self, query: bytes) -> bytes | None:
         if query:
             try:
-                self.on_info_request(InfoRequest.parse(query))
+                self.answers.on_info_request(InfoRequest.parse(query))
             except WireError as error:  # who asks so is answered all the same
                 self._skip("info", error)
-        return self._answered(Channel.INFO, lambda: self.info(self.clock()))
+        return self._answered(Channel.INFO, lambda: self.answers.info(self.clock()))
 
     def _on_control(self, query: bytes) -> bytes | None:
         self._watch(Channel.CONTROL)
@@ -205,12 +189,12 @@ class EdgeListener:
         except WireError as error:
             self._skip("control", error)
             return None
-        return self._answered(Channel.CONTROL, lambda: self.control(request).pack())
+        return self._answered(Channel.CONTROL, lambda: self.answers.control(request).pack())
 
     def _answered(self, channel: Channel, answer: Callable[[], bytes]) -> bytes | None:
         # None where that fails: an error in Zenoh's thread would be nobody's.
         try:
-            data = self.reply(channel, answer())
+            data = self.answers.reply(channel, answer())
         except Exception as error:  # noqa: BLE001 - see above
             self.failures.failed(channel, f"a ground got no answer ({type(error).__name__}: {error})")
             return None
@@ -224,7 +208,7 @@ class EdgeListener:
         except WireError as error:
             self._skip("feedback", error)
             return
-        self.on_feedback(feedback)
+        self.answers.on_feedback(feedback)
 
     def _watch(self, channel: Channel) -> None:
         if self._flood.note(channel, now_ns=self.clock()) is not None:

@@ -21,7 +21,7 @@ from hvt_edge.control.commands import Commands
 from hvt_edge.control.link_control import LinkControl
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
-from hvt_edge.link.publisher import EdgeLink
+from hvt_edge.link.publisher import Answers, EdgeLink
 from hvt_edge.link.stills import StillReaders
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
@@ -67,13 +67,11 @@ class Stages:
     stills: StillStage
     transmitter: Transmitter
     link_control: LinkControl
-    commands: Commands
+    answers: Answers
     reconfiguration: EncoderReconfiguration
     operating: Operating
     keyframes: Keyframes
     backlog: BacklogStage | None
-    info: InfoReporter
-    still_readers: StillReaders
     pose: PoseStage | None
 
 
@@ -285,17 +283,22 @@ def build_stages(
         clock=clock,
         loop_clock=loop_clock,
     )
+    answers = Answers(
+        info=info.info,
+        control=commands.answer,
+        on_feedback=link_control.on_feedback,
+        on_info_request=still_readers.on_request,
+        reply=transmitter.reply,
+    )
     return Stages(
         base,
         stills,
         transmitter,
         link_control,
-        commands,
+        answers,
         reconfiguration,
         operating,
         keyframes,
         backlog,
-        info,
-        still_readers,
         pose,
     )

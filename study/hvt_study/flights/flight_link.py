@@ -13,6 +13,7 @@ from hvt_common.protocol.messages import BaseHeader, CaptureTimes, RoiHeader, St
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.transport.inbox import Received
 from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.link.publisher import Answers
 from hvt_edge.perception.shadow import Detected
 from hvt_study.serial_link import SerialLink
 
@@ -93,9 +94,9 @@ class FlightOutlet:
         """Of every channel."""
         return True
 
-    def listen(self, *, info: Callable[[int], bytes], **_: Any) -> None:
+    def listen(self, answers: Answers) -> None:
         """The edge is ready."""
-        self._on_listen(info(START_NS))
+        self._on_listen(answers.info(START_NS))
 
     def put(
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""

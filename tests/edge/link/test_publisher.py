@@ -31,11 +31,12 @@ def test_a_ground_of_another_version_commands_nothing(caplog, monkeypatch):
     listener = publisher.EdgeListener(
         session,
         EdgeKeys("uav-1"),
-        info=lambda _received_ns: b"info",
-        control=lambda _request: ANSWER,
-        on_feedback=reports.append,
-        on_info_request=requests.append,
-        reply=lambda _channel, payload: payload,
+        publisher.Answers(
+            info=lambda _received_ns: b"info",
+            control=lambda _request: ANSWER,
+            on_feedback=reports.append,
+            on_info_request=requests.append,
+        ),
         failures=MagicMock(),
         clock=lambda: 7,
     )
