@@ -45,7 +45,7 @@ class ModelStore(Protocol):
 
 
 def library_part(name: str) -> Any | None:
-    """A part of the model library: ``heads``, ``store``, ``ensemble`` or `MOTION`; None where it is not installed."""
+    """A part of the model library, as the entry points name it; None where it is not installed."""
     found = installed(_GROUP).get(name)
     return None if found is None else loaded(found[0], lambda part: part, what="model library")
 

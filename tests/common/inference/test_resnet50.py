@@ -20,7 +20,7 @@ from onnx import helper, numpy_helper
 from hvt_common.inference.class_names import IMAGENET_NAMES, kind_of
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
 from hvt_common.inference.labels import first_synonym, read_labels
-from hvt_common.inference.runtimes.openvino_model import find_openvino
+from hvt_common.inference.runtimes.model import find_openvino
 from hvt_common.values import Image
 from hvt_models.command import main
 from hvt_models.manifest import builtin_manifest

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +25,13 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.ir_file import ir_metadata, is_ir
 from hvt_common.inference.runtimes.onnx_file import check_onnx_file, onnx_version, opset_versions
-from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
-from hvt_common.inference.runtimes.providers import ONNXRUNTIME_PROVIDERS, ProviderChoice, choose_provider
+from hvt_common.inference.runtimes.providers import (
+    ONNXRUNTIME_PROVIDERS,
+    OpenVinoCpu,
+    ProviderChoice,
+    choose_provider,
+)
+from hvt_common.inference.store import library_part, needed_part
 
 if TYPE_CHECKING:
     import onnxruntime as ort
@@ -210,6 +215,16 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
     return model
 
 
+def find_openvino() -> OpenVinoCpu | None:
+    """The OpenVINO that is installed, if the model library is too: one of its parts runs it. Looking takes 0.2 s."""
+    part = library_part("openvino")
+    return None if part is None else cast("OpenVinoCpu | None", part.find())
+
+
+def _on_openvino(path: Path, settings: ModelSettings, *, bf16: bool) -> Any:
+    return needed_part("openvino", f"model {path}")(path, threads=settings.threads, bf16=bf16)
+
+
 def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
     # An OpenVINO model, in float32 where the reference is requested.
     if settings.provider not in ("auto", "cpu", "openvino"):
@@ -223,7 +238,7 @@ def _open_ir(path: Path, settings: ModelSettings) -> OnnxModel:
             f"model {path} is OpenVINO's, which is not installed here: pip install 'hvt[openvino]'"
         )
     bf16 = found.bf16 and settings.provider != "cpu"
-    openvino = OpenVinoRunner(path, threads=settings.threads, bf16=bf16)
+    openvino = _on_openvino(path, settings, bf16=bf16)
     inputs, outputs = (tuple(Port(*port) for port in ports) for ports in openvino.ports)
     why = f"OpenVINO {found.version} in {'bf16' if bf16 else 'float32'}: the file is OpenVINO's"
     choice = ProviderChoice("openvino", why, explicit=True)
@@ -266,7 +281,7 @@ def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxMo
         described = _session(path, settings, ("CPUExecutionProvider",), optimised=False)
         found = find_openvino()
         bf16 = found is not None and found.bf16
-        openvino = OpenVinoRunner(path, threads=settings.threads, bf16=bf16)
+        openvino = _on_openvino(path, settings, bf16=bf16)
         return _described(path, described, openvino, choice)
     names = ONNXRUNTIME_PROVIDERS[choice.provider]
     session = _session(path, settings, names)

@@ -18,7 +18,6 @@ from hvt_common.inference.classify import OnnxClassifier, open_classifier
 from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.runtimes import model as runtime
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
-from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
 from hvt_common.inference.runtimes.providers import PROVIDERS, OpenVinoCpu, choose_provider
 from hvt_common.values import Detections
 from hvt_edge.config import EdgeConfig
@@ -26,6 +25,7 @@ from hvt_edge.wiring import make_detector
 from hvt_ground.config import GroundConfig
 from hvt_ground.wiring import Models
 from hvt_models.command import main
+from hvt_models.openvino import OpenVinoRunner, find_openvino
 from media.onnx_models import colour_classifier, colour_detector, constant_model, save
 
 CPU = ("AzureExecutionProvider", "CPUExecutionProvider")

@@ -62,6 +62,8 @@ class OpenVinoRunner:
             raise UserError(f"model {path} cannot be read by openvino: {_reason(error)}") from error
         self._requests: OrderedDict[tuple[int, ...], Any] = OrderedDict()
 
+    find = staticmethod(find_openvino)
+
     @property
     def ports(self) -> tuple[list[_Port], list[_Port]]:
         """Inputs and outputs as the file declares them: name, shape with None where free, dtype."""
