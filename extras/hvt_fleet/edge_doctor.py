@@ -18,7 +18,6 @@ from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.host_names import check_port
 from hvt_common.runtime.reporting import Finding
-from hvt_common.transport.duplicate_edge import refuse_duplicate_edge
 from hvt_common.transport.session import declare_publisher
 from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
@@ -41,6 +40,7 @@ from hvt_edge.wiring import (
 )
 from hvt_edge.world import World
 from hvt_fleet.checkup import check_clock, check_folder, print_findings, run_checks
+from hvt_fleet.link.duplicate_edge import refuse_duplicate_edge
 from hvt_fleet.link.reach import check_link
 
 _DESCRIPTION = (

@@ -1,5 +1,4 @@
 """HVT over Zenoh: `session` opens it as `zenoh_config` says, `inbox` queues what arrives, `flood` notices too much.
 
-`link_doctor` is the door for who explains why there is no link, `duplicate_edge` refuses a second edge of one id,
-`rights` are those of a key.
+`link_doctor` is the door for who explains why there is no link, `rights` are those of a key.
 """

@@ -55,6 +55,9 @@ class LinkDoctor:
         Unix time.
         """
 
+    def check_id(self, settings: LinkSettings, keys: EdgeKeys) -> None:
+        """Raise `UserError` where another edge with these keys lives on the link. May take some seconds."""
+
     def why_no_link(self, config: zenoh.Config) -> list[str]:  # noqa: ARG002
         """One sentence for each endpoint that it connects to. Blocks for some seconds an endpoint."""
         return []

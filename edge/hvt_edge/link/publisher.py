@@ -20,7 +20,6 @@ from hvt_common.protocol.messages import (
     WireError,
 )
 from hvt_common.runtime.failures import Failures
-from hvt_common.transport.duplicate_edge import refuse_duplicate_edge
 from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import declare_publisher, open_session, serve
@@ -88,14 +87,15 @@ class ZenohLink:
         self._failures = failures
         self._keys = EdgeKeys(edge_id)
         self._clock = clock
-        refuse_duplicate_edge(settings, self._keys)
+        doctor = link_doctor()
+        doctor.check_id(settings, self._keys)
         self._listener: EdgeListener | None = None
         self._stack = ExitStack()
         self._session = self._stack.enter_context(open_session(settings, failures=failures))
         self._publishers = {
             channel: declare_publisher(self._session, channel, keys=self._keys) for channel in _PUBLISHED
         }
-        watch = link_doctor().watch(self._session, settings, served=lambda _ground: self.has_ground())
+        watch = doctor.watch(self._session, settings, served=lambda _ground: self.has_ground())
         self._watch = self._stack.enter_context(watch)
 
     @property

@@ -22,6 +22,7 @@ from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.link_doctor import LinkDoctor, LinkWatch
 from hvt_common.transport.zenoh_config import LinkSettings, connect_endpoints
 from hvt_fleet.link.certificate import TlsFiles, check_own_keys
+from hvt_fleet.link.duplicate_edge import refuse_duplicate_edge
 from hvt_fleet.link.probe import why_no_link
 from hvt_fleet.link.strangers import Strangers, listening_ports
 
@@ -258,6 +259,10 @@ class Doctor(LinkDoctor):
     ) -> None:
         """See `check_own_keys`."""
         check_own_keys(config, listen=listen, name=name, now_s=now_s)
+
+    def check_id(self, settings: LinkSettings, keys: EdgeKeys) -> None:
+        """See `refuse_duplicate_edge`."""
+        refuse_duplicate_edge(settings, keys)
 
     def why_no_link(self, config: zenoh.Config) -> list[str]:
         """See `visit`."""

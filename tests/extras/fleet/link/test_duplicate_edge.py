@@ -11,9 +11,9 @@ import pytest
 import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
-from hvt_common.transport.duplicate_edge import living_edge
 from hvt_common.transport.session import open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_fleet.link.duplicate_edge import living_edge
 from rigs.flight import Flight
 
 KEYS = EdgeKeys("uav-1")
