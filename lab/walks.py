@@ -28,8 +28,8 @@ from hvt_ground.extras import checked, config_class
 _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("hvt_common", "hvt_edge", "hvt_ground")
 _CODECS = "hvt_common/video/still_codecs"
-_LEAST_FRAMES, _LEAST_STILLS = 100, 12
-_MOST_S = 240.0
+_LEAST_FRAMES, _LEAST_STILLS = 60, 6
+_MOST_S = 100.0
 
 # Functions: name and bound of their walk, the largest of each taken together.
 _WALKS = {

@@ -46,7 +46,7 @@ from hvt_edge.wiring.link import (
     make_split,
 )
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
-from hvt_edge.wiring.stills import make_chooser, make_method, make_on_demand, make_still_maker
+from hvt_edge.wiring.stills import make_method, make_stills
 from hvt_edge.wiring.storing import make_backlog, open_local_copy
 from hvt_edge.wiring.trial import Beginning
 from hvt_edge.wiring.video import (
@@ -145,7 +145,15 @@ def build_stages(
         presets=presets,
     )
     still_readers = StillReaders(clock)
-    maker = make_still_maker(config, readable=still_readers.read)
+    chooser, on_demand = make_stills(
+        config,
+        outbox=outbox,
+        transmitter=transmitter,
+        view=view,
+        class_names=class_names,
+        readable=still_readers.read,
+        observe=reconfiguration.observe,
+    )
     info = InfoReporter(
         config,
         session_id=session_id,
@@ -153,7 +161,7 @@ def build_stages(
         view=view,
         class_names=fitted_class_names(class_names),
         channels=channels_of(config, live=source.live),
-        still_codecs=lambda: maker.codec_names,
+        still_codecs=lambda: chooser.maker.codec_names,
         clock=clock,
     )
     backlog = make_backlog(
@@ -171,7 +179,7 @@ def build_stages(
     )
     if backlog is not None:
         stack.enter_context(backlog)
-    still_sender = StillSender(outbox, maker=maker, transmitter=transmitter, backlog=backlog)
+    still_sender = StillSender(outbox, maker=chooser.maker, transmitter=transmitter, backlog=backlog)
     stack.callback(lambda: still_sender.close(clock()))
     link_control = LinkControl(
         has_ground=link.has_ground,
@@ -235,25 +243,6 @@ def build_stages(
             open_again=None if lockstep else reconfiguration.open_again,
             failures=failures,
         )
-    on_demand = make_on_demand(
-        config,
-        outbox=outbox,
-        maker=maker,
-        view=view,
-        class_names=class_names,
-        line=transmitter,
-    )
-    chooser = make_chooser(
-        config,
-        outbox=outbox,
-        maker=maker,
-        view=view,
-        class_names=class_names,
-        most_bytes=transmitter.most_still_bytes(),
-        on_outcome=transmitter.outcome,
-        observe=reconfiguration.observe,
-        on_demand=on_demand,
-    )
     levers = make_levers(config, operating, view)
     trust = None if levers is None else ViewTrust(config.detector, hence="auto gives its tracks no credit")
     stills = StillStage(

@@ -11,10 +11,11 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import View
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.config import EdgeConfig
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.candidates import Candidate, TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.on_demand import OnDemand, RequestedLine
+from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.base import Method, Step
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
@@ -76,65 +77,22 @@ def make_suppression(config: EdgeConfig) -> Suppression:
     return Suppression.for_cooldown(config.cooldown, min_gain=config.min_gain)
 
 
-def make_chooser(
+def make_stills(
     config: EdgeConfig,
     *,
     outbox: Outbox,
-    maker: StillMaker,
+    transmitter: Transmitter,
     view: View,
     class_names: tuple[str, ...],
-    most_bytes: int,
-    on_outcome: Callable[[str, str], None],
+    readable: Callable[[str], bool],
     observe: Callable[[Sequence[Candidate], Step], None],
-    on_demand: OnDemand,
-) -> Chooser:
-    """Method, suppression, gate and maker; ``most_bytes`` is the largest payload the budget ever admits."""
-    return Chooser(
-        make_method(config, view),
-        suppression=make_suppression(config),
-        outbox=outbox,
-        maker=maker,
-        memory=TrackMemory(padding=config.padding),
-        view=view,
-        class_names=class_names,
-        settings=ChooserSettings(
-            fps=config.nominal_fps,
-            most_bytes=most_bytes,
-            gate=Gate(psnr_y_db=config.gate),
-            share=config.group_stills,
-            from_source=config.candidates == "source",
-        ),
-        on_outcome=on_outcome,
-        observe=observe,
-        on_demand=on_demand,
-    )
+) -> tuple[Chooser, OnDemand]:
+    """Who chooses stills, with method, rules and maker; and the ring of source frames, who serves requested ones.
 
-
-def make_on_demand(
-    config: EdgeConfig,
-    *,
-    outbox: Outbox,
-    maker: StillMaker,
-    view: View,
-    class_names: tuple[str, ...],
-    line: RequestedLine,
-) -> OnDemand:
-    """The ring of source frames, and who serves stills from it."""
-    ring = FrameRing(RingSettings(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS)))
-    return OnDemand(
-        ring,
-        outbox=outbox,
-        maker=maker,
-        view=view,
-        class_names=class_names,
-        line=line,
-    )
-
-
-def make_still_maker(config: EdgeConfig, *, readable: Callable[[str], bool]) -> StillMaker:
-    """Codec, quality and fallback of stills; see `StillMaker.readable`."""
+    ``readable``: see `StillMaker`; ``observe``: see `Chooser`.
+    """
     codec = still_codec(config.still_codec)
-    return StillMaker(
+    maker = StillMaker(
         codec=codec,
         fallback=still_codec(config.fallback_codec) if codec.needs_base else None,
         quality_pct=config.jpeg_quality,
@@ -144,3 +102,31 @@ def make_still_maker(config: EdgeConfig, *, readable: Callable[[str], bool]) -> 
         least_bytes=_LEAST_STILL_BYTES if codec.needs_base else 0,
         readable=readable,
     )
+    on_demand = OnDemand(
+        FrameRing(RingSettings(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS))),
+        outbox=outbox,
+        maker=maker,
+        view=view,
+        class_names=class_names,
+        line=transmitter,
+    )
+    chooser = Chooser(
+        make_method(config, view),
+        suppression=make_suppression(config),
+        outbox=outbox,
+        maker=maker,
+        memory=TrackMemory(padding=config.padding),
+        view=view,
+        class_names=class_names,
+        settings=ChooserSettings(
+            fps=config.nominal_fps,
+            most_bytes=transmitter.most_still_bytes(),
+            gate=Gate(psnr_y_db=config.gate),
+            share=config.group_stills,
+            from_source=config.candidates == "source",
+        ),
+        on_outcome=transmitter.outcome,
+        observe=observe,
+        on_demand=on_demand,
+    )
+    return chooser, on_demand
