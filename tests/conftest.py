@@ -7,17 +7,21 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from hvt_common.runtime import plug_ins
 from hvt_common.runtime.process import STOP_SIGNALS
+from hvt_common.video.still_codecs import still_codec
 from media.pictures import write_scene
+from media.third_party import install
 from programs.golden import once
 from programs.processes import free_ports
 from rigs.drawn_flight import DrawnFlight, fly_into_all_sinks
+from rigs.watched_flight import WatchedFlight, fly_watched
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -94,6 +98,12 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> DrawnFlight:
 
 
 @pytest.fixture(scope="session")
+def watched(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> WatchedFlight:
+    """A flight that Prometheus, a probe and a collector of logs look at, that tests of several files read."""
+    return once(tmp_path_factory, "watched", lambda folder: fly_watched(folder, long_scene))
+
+
+@pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of pictures that lasts 30 s at 10 a second; the drawn demo would take seconds to begin."""
     return once(tmp_path_factory, "scene", lambda folder: write_scene(folder, frames=300))
@@ -106,6 +116,27 @@ def long_scene(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number in range(3000):
         (folder / f"{number:06d}.jpg").symlink_to(pictures[number % len(pictures)])
     return folder
+
+
+@pytest.fixture
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Installs a third party's package for one test and this process; the arguments are those of `install`."""
+
+    def forget() -> None:
+        plug_ins.installed.cache_clear()
+        still_codec.cache_clear()
+
+    def put(parts: dict[str, str], **options: str) -> None:
+        folder = str(install(tmp_path / "site", parts, **options))
+        if folder not in sys.path:
+            monkeypatch.syspath_prepend(folder)
+        forget()
+
+    yield put
+    monkeypatch.undo()
+    forget()
+    for name in [name for name in sys.modules if name.startswith("acme_")]:
+        del sys.modules[name]
 
 
 @pytest.fixture

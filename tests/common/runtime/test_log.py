@@ -9,14 +9,9 @@ from datetime import datetime
 
 import pytest
 
-from programs.processes import Link
-
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
 
 JSON = ("--log-format", "json")
-SMALL = (
-    *("--fps", "5", "--size", "320x192", "--detector", "motion", "--edge-id", "uav-1", "--max-frames", "15"),
-)
 
 
 def lines(said: str) -> list[dict]:
@@ -24,15 +19,11 @@ def lines(said: str) -> list[dict]:
     return [json.loads(line) for line in said.splitlines()]
 
 
-def test_a_flight_is_told_in_objects_on_both_sides(tmp_path, scene):
+def test_a_flight_is_told_in_objects_on_both_sides(watched):
     """A collector of logs would have to guess at what people read."""
-    with Link(tmp_path) as link:
-        ground = link.ground("--detector", "motion", "--classifier", "none", "--once", *JSON)
-        edge = link.edge("--source", str(scene), *SMALL, *JSON)
-        summary = edge.finish()
-        ground.finish()
-    flown, received = lines(edge.said), lines(ground.said)
-    assert edge.told == ground.told == "", "the table is for people"
+    flown, received = lines(watched.logs["edge"]), lines(watched.logs["ground"])
+    summary = watched.edge
+    assert set(watched.tables.values()) == {""}, "the table is for people"
     assert {(one["program"], one["edge"], one["session"]) for one in flown} == {
         ("hvt-edge", "uav-1", summary["session"])
     }
@@ -40,7 +31,7 @@ def test_a_flight_is_told_in_objects_on_both_sides(tmp_path, scene):
     assert any("a ground listens" in one["message"] for one in flown if one["logger"] == "hvt.status")
     assert flown[-1]["summary"] == summary
     assert received[-1]["summary"][0]["session"] == summary["session"]
-    assert {one["level"] for one in flown} == {"info"}
+    assert {one["level"] for one in flown} <= {"info", "warning"}, "a busy machine is told of"
 
 
 EDGES = """

@@ -5,17 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-import subprocess
-import sys
 import threading
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from prometheus_client.parser import text_string_to_metric_families
 
 from hvt_common.inference.detect import Detector
 from hvt_common.values import Detections, Frame, Image
@@ -25,43 +20,9 @@ from hvt_edge.source.contract import Source
 from hvt_edge.world import World
 from programs.processes import Link, eventually, free_ports
 from programs.rtsp_camera import RtspCamera
+from rigs.watched_flight import SMALL, STORE_BYTES, asked, series, state, status
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
-
-SMALL = ("--fps", "5", "--size", "320x192", "--detector", "motion", "--edge-id", "uav-1")
-
-
-def asked(address: str, path: str) -> tuple[int, str]:
-    """Status and text; 0 while nobody answers."""
-    try:
-        with urllib.request.urlopen(f"http://{address}{path}", timeout=10) as answer:
-            return answer.status, answer.read().decode()
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read().decode()
-    except OSError:
-        return 0, ""
-
-
-def state(address: str) -> dict:
-    """The newest; empty while there is none."""
-    code, text = asked(address, "/state.json")
-    return json.loads(text) if code == 200 else {}
-
-
-def series(address: str) -> dict[str, float]:
-    """Values by name; of several with one name the sum."""
-    found: dict[str, float] = {}
-    for family in text_string_to_metric_families(asked(address, "/metrics")[1]):
-        for one in family.samples:
-            found[one.name] = found.get(one.name, 0) + one.value
-    return found
-
-
-def status(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """``hvt-edge status``."""
-    command = [sys.executable, "-m", "hvt_edge.cli", "status", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
 @pytest.fixture
@@ -70,55 +31,38 @@ def address() -> str:
     return f"127.0.0.1:{free_ports(1)[0]}"
 
 
-def test_an_edge_says_how_it_is_from_its_start_to_its_flight(tmp_path, address, long_scene):
+def test_an_edge_says_how_it_is_from_its_start_to_its_flight(watched):
     """A team would learn of an edge only what reaches the ground."""
-    with Link(tmp_path) as link:
-        store = ("--store", "20MB", "--store-folder", str(tmp_path / "store"))
-        edge = link.edge("--source", str(long_scene), "--wait", "60", "--metrics", address, *SMALL, *store)
-        eventually(lambda: state(address), within_s=60, what="it answers")
-        waits = state(address)
-        assert (waits["state"], waits["frames"]["account"]["came"]) == ("waiting", 0)
-        unknown = (
-            "total_bps",
-            "budget_share",
-            "encode_ms",
-            "perception_ms",
-            "boxes_age_s",
-            "source_silent_s",
-        )
-        assert {waits[name] for name in unknown} == {None}, "what is unknown is not 0"
-        assert waits["link"]["round_trip_ms"] is waits["link"]["reported_s"] is None
-        assert asked(address, "/healthz") == (200, "ok; it waits for a ground\n")
-        assert asked(address, "/readyz") == (503, "it waits for a ground\n")
-        link.ground("--detector", "motion", "--classifier", "none")
-        eventually(
-            lambda: (state(address).get("link") or {}).get("round_trip_ms"), within_s=60, what="it flies"
-        )
-        eventually(lambda: state(address)["frames"]["encoded"] > 10, within_s=60, what="frames")
-        now, found = state(address), series(address)
-        assert (now["state"], now["link"]["ground"], now["edge"]) == ("running", True, "uav-1")
-        assert 0 < now["budget_share"] <= 1
-        assert now["total_bps"] >= now["base_bps"] > 0
-        assert now["operating"]["base_size"] == [320, 192]
-        assert now["operating"]["budget_bps"] == found["hvt_budget_bits_per_second"] == 800_000
-        assert now["backlog"]["limit_bytes"] == found["hvt_edge_store_limit_bytes"] == 20_000_000
-        assert now["backlog"]["disk_free_bytes"] > 0
-        assert found["hvt_edge_frames_encoded_total"] > 10
-        assert found["hvt_edge_sent_bits_per_second"] > 0
-        assert "hvt_edge_temperature_celsius" not in found or found["hvt_edge_temperature_celsius"] > 0
-        assert asked(address, "/healthz") == asked(address, "/readyz") == (200, "ok\n")
-        said = status("--at", address)
-        assert said.returncode == 0, said.stderr
-        assert "uav-1" in said.stdout
-        assert "a ground listens" in said.stdout
-        assert json.loads(status("--at", address, "--json").stdout)["session"] == now["session"]
-        nobody = status("--at", f"127.0.0.1:{free_ports(1)[0]}")
-        assert (nobody.returncode, "no edge answers at" in nobody.stderr) == (1, True)
-        busy = link.edge("--source", str(long_scene), "--metrics", address, name="busy")
-        busy.until(f"--metrics {address} cannot be listened on")
-        busy.kill()
-        edge.stop()
-        assert edge.summary()["session"] == now["session"]
+    waits = watched.waiting.state
+    assert (waits["state"], waits["frames"]["account"]["came"]) == ("waiting", 0)
+    unknown = ("total_bps", "budget_share", "encode_ms", "perception_ms", "boxes_age_s", "source_silent_s")
+    assert {waits[name] for name in unknown} == {None}, "what is unknown is not 0"
+    assert waits["link"]["round_trip_ms"] is waits["link"]["reported_s"] is None
+    assert watched.waiting.healthz == (200, "ok; it waits for a ground\n")
+    assert watched.waiting.readyz == (503, "it waits for a ground\n")
+    now, found = watched.flying.state, series(watched.flying.metrics)
+    assert (now["state"], now["link"]["ground"], now["edge"]) == ("running", True, "uav-1")
+    assert 0 < now["budget_share"] <= 1
+    assert now["total_bps"] >= now["base_bps"] > 0
+    assert now["operating"]["base_size"] == [320, 192]
+    assert now["operating"]["budget_bps"] == found["hvt_budget_bits_per_second"] == 800_000
+    assert now["backlog"]["limit_bytes"] == found["hvt_edge_store_limit_bytes"] == STORE_BYTES
+    assert now["backlog"]["disk_free_bytes"] > 0
+    assert found["hvt_edge_frames_encoded_total"] > 10
+    assert found["hvt_edge_sent_bits_per_second"] > 0
+    assert "hvt_edge_temperature_celsius" not in found or found["hvt_edge_temperature_celsius"] > 0
+    assert watched.flying.healthz == watched.flying.readyz == (200, "ok\n")
+    code, said, _ = watched.status
+    assert code == 0
+    assert "uav-1" in said
+    assert "a ground listens" in said
+    assert json.loads(watched.status_json[1])["session"] == now["session"] == watched.edge["session"]
+
+
+def test_where_no_edge_answers_is_a_sentence():
+    """A traceback would say that the command is broken."""
+    code, _, said = status("--at", f"127.0.0.1:{free_ports(1)[0]}")
+    assert (code, "no edge answers at" in said) == (1, True)
 
 
 @pytest.mark.nightly
@@ -255,9 +199,9 @@ def test_a_machine_too_slow_to_detect_says_how_old_its_boxes_are(address, free_p
         eventually(lambda: state(address).get("detection_slow"), within_s=60, what="it is said")
         assert state(address)["boxes_age_s"] > 1
         assert state(address)["tracks"] >= 1
-        assert series(address)["hvt_edge_boxes_age_seconds"] > 1
+        assert series(asked(address, "/metrics")[1])["hvt_edge_boxes_age_seconds"] > 1
         eventually(
-            lambda: "s old" in " ".join(status("--at", address).stdout.replace("│", " ").split()),
+            lambda: "s old" in " ".join(status("--at", address)[1].replace("│", " ").split()),
             within_s=60,
             what="`hvt-edge status` says it",
         )
