@@ -7,10 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hvt_common.runtime.plug_ins import installed
-from hvt_common.video.still_codecs import still_codec
 from hvt_edge.config import EdgeConfig
-from media.third_party import PIXELS, install
+from media.third_party import PIXELS
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -349,16 +347,9 @@ def test_an_open_door(edge, endpoint):
     assert "--insecure" in sentence
 
 
-def test_a_still_codec_that_does_not_work_here(edge, tmp_path, monkeypatch):
+def test_a_still_codec_that_does_not_work_here(edge, packages):
     """The first still of the flight would find out that its library is another build."""
     broken = PIXELS.replace("step = 65 -", 'raise RuntimeError("another build")\n        step = 65 -')
-    monkeypatch.syspath_prepend(str(install(tmp_path / "site", {"acme-pixels": "PixelCodec"}, source=broken)))
-    installed.cache_clear()
-    still_codec.cache_clear()
-    try:
-        assert "--still-codec acme-pixels does not work here (another build)" in edge(
-            "--still-codec", "acme-pixels"
-        )
-    finally:
-        installed.cache_clear()
-        still_codec.cache_clear()
+    packages({"acme-pixels": "PixelCodec"}, source=broken)
+    said = edge("--still-codec", "acme-pixels")
+    assert "--still-codec acme-pixels does not work here (another build)" in said

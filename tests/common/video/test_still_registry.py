@@ -15,25 +15,6 @@ from media.crops import textured
 from media.third_party import install
 
 
-@pytest.fixture
-def installed(tmp_path, monkeypatch):
-    """Installs packages for one test."""
-
-    def put(codecs: dict[str, str], **options) -> None:
-        monkeypatch.syspath_prepend(str(install(tmp_path, codecs, **options)))
-        forget()
-
-    def forget() -> None:
-        plug_ins.installed.cache_clear()
-        still_codec.cache_clear()
-
-    yield put
-    monkeypatch.undo()
-    forget()
-    for name in [name for name in sys.modules if name.startswith("acme_")]:
-        del sys.modules[name]
-
-
 def test_codecs_are_found_by_their_word_on_the_wire():
     """A still would be coded as one thing and announced as another."""
     names = still_codec_names()
@@ -105,10 +86,10 @@ def test_asking_for_names_loads_no_codec():
 
 
 @pytest.mark.parametrize("target", ["PixelCodec", "PixelCodec()"])
-def test_a_third_party_codec_codes_and_decodes(installed, target):
+def test_a_third_party_codec_codes_and_decodes(packages, target):
     """JPEG AI, or whatever comes next, could not be used without changing HVT."""
     source = (install.__globals__["PIXELS"]) + "\ninstance = PixelCodec()\n"
-    installed({"acme-pixels": "instance" if target.endswith(")") else target}, source=source)
+    packages({"acme-pixels": "instance" if target.endswith(")") else target}, source=source)
     assert still_codec_names()[-1] == "acme-pixels"
     codec, crop = still_codec("acme-pixels"), textured(40, 30)
     coded = codec.encode(crop, quality_pct=100)
@@ -135,9 +116,9 @@ def test_a_third_party_codec_codes_and_decodes(installed, target):
         ),
     ],
 )
-def test_a_broken_plug_in_is_named_and_hinders_nobody(installed, source, says):
+def test_a_broken_plug_in_is_named_and_hinders_nobody(packages, source, says):
     """One bad package would ground every drone that has it installed, whatever codec it flies."""
-    installed({"acme": "C"}, module="acme_broken", source=source)
+    packages({"acme": "C"}, module="acme_broken", source=source)
     assert "acme" in still_codec_names()
     assert still_codec("jpeg").name == "jpeg"
     with pytest.raises(UserError, match=f"'acme' of package acme_broken .*{says}"):
@@ -145,32 +126,26 @@ def test_a_broken_plug_in_is_named_and_hinders_nobody(installed, source, says):
 
 
 @pytest.mark.parametrize("source", ["raise RuntimeError('no licence')", "class C: name = 'webp'"])
-def test_another_webp_hinders_nobody(installed, source):
+def test_another_webp_hinders_nobody(packages, source):
     """Every ground with that package would end at its start, which asks for the names, or say that it reads webp."""
-    installed({"webp": "C"}, module="acme_webp", source=source)
+    packages({"webp": "C"}, module="acme_webp", source=source)
     assert "webp" not in still_codec_names()
     with pytest.raises(UserError, match="still codec 'webp' comes from both package"):
         still_codec("webp")
 
 
-def test_a_name_that_is_taken_is_refused(installed):
+def test_a_name_that_is_taken_is_refused(packages):
     """An installed package would change what `jpeg` means, on one side of the link."""
-    installed({"jpeg": "PixelCodec"})
+    packages({"jpeg": "PixelCodec"})
     with pytest.raises(UserError, match=r"'jpeg' is built in, and package acme_codecs .* brings another"):
         still_codec("jpeg")
     assert still_codec_names().count("jpeg") == 1
     assert still_codec("residual").name == "residual"
 
 
-def test_two_packages_of_one_name_are_refused(installed, tmp_path):
+def test_two_packages_of_one_name_are_refused(packages):
     """Which of the two codes the stills would depend on the order of the path."""
-    installed({"acme-pixels": "PixelCodec"})
-    (tmp_path / "second").mkdir()
-    install(tmp_path / "second", {"acme-pixels": "PixelCodec"}, module="acme_other")
-    sys.path.insert(0, str(tmp_path / "second"))
-    try:
-        plug_ins.installed.cache_clear()
-        with pytest.raises(UserError, match="comes from both package acme_"):
-            still_codec("acme-pixels")
-    finally:
-        sys.path.remove(str(tmp_path / "second"))
+    for module in ("acme_codecs", "acme_other"):
+        packages({"acme-pixels": "PixelCodec"}, module=module)
+    with pytest.raises(UserError, match="comes from both package acme_"):
+        still_codec("acme-pixels")

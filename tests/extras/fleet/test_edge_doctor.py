@@ -31,6 +31,14 @@ def examined(capsys, *words: str) -> tuple[int, dict[str, dict[str, str]]]:
     return code, {row["check"]: row for row in json.loads(capsys.readouterr().out)}
 
 
+def with_keys(folder: Path) -> tuple[Fleet, tuple[str, ...]]:
+    """A fleet of one edge, and the settings with which an edge takes its keys."""
+    fleet = Fleet(folder)
+    fleet.keys("add-ground", "base")
+    fleet.keys("add-edge", "uav-1")
+    return fleet, ("--zenoh-config", str(fleet.file("uav-1")), "--connect", "tls/127.0.0.1:7447")
+
+
 def test_all_is_well_where_a_ground_listens(tmp_path, capsys, scene):
     """The engineer would look for a fault that is not there."""
     with Link(tmp_path) as link:
@@ -82,41 +90,21 @@ def test_the_cameras_password_is_not_printed(free_port, capsys):
 
 def test_keys_of_another_edge_are_found_out(tmp_path, capsys):
     """Its ground would drop all that it sends, and say nothing."""
-    fleet = Fleet(tmp_path / "own")
-    fleet.keys("add-ground", "base")
-    fleet.keys("add-edge", "uav-1")
-    words = (
-        "--zenoh-config",
-        str(fleet.file("uav-1")),
-        "--edge-id",
-        "uav-2",
-        "--connect",
-        "tls/127.0.0.1:7447",
-    )
+    _, words = with_keys(tmp_path / "own")
     capsys.readouterr()  # what making the keys said
-    code, found = examined(capsys, "--source", small_scene(tmp_path), *CHEAP, *words)
+    code, found = examined(capsys, "--source", small_scene(tmp_path), *CHEAP, *words, "--edge-id", "uav-2")
     assert code == 2
     assert "the certificate of 'uav-1'" in found["link"]["found"] + found["link"]["todo"]
 
 
 def test_a_certificate_that_ends_is_found_out(tmp_path, capsys):
     """The drone would stand on the ground on some morning."""
-    fleet = Fleet(tmp_path / "own")
-    fleet.keys("add-ground", "base")
-    fleet.keys("add-edge", "uav-1")
-    words = (
-        "--zenoh-config",
-        str(fleet.file("uav-1")),
-        "--edge-id",
-        "uav-1",
-        "--connect",
-        "tls/127.0.0.1:7447",
-    )
+    fleet, words = with_keys(tmp_path / "own")
     now, scene = dt.datetime.now(dt.UTC), small_scene(tmp_path)
     for made, state, said in ((now - dt.timedelta(days=4000), "wrong", "expired on"), (now, "warning", "")):
         fleet.reissue("uav-1", now=made)
         capsys.readouterr()
-        code, found = examined(capsys, "--source", scene, *CHEAP, *words)
+        code, found = examined(capsys, "--source", scene, *CHEAP, *words, "--edge-id", "uav-1")
         assert (code, found["link"]["state"]) == (2 if state == "wrong" else 0, state)
         assert said in found["link"]["found"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
+from functools import partial
 
 import cv2
 import numpy as np
@@ -13,10 +13,9 @@ from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector, warm_up
 from hvt_common.inference.scores import uncalibrated
 from hvt_common.inference.tiles import tiled
-from hvt_common.runtime import plug_ins
 from hvt_models.command import main as models
 from hvt_study.cli import main as study
-from media.third_party import BLOBS, install
+from media.third_party import BLOBS
 
 MADE = """
 import numpy as np
@@ -31,20 +30,9 @@ GOOD = "Detections(np.array([[-5, 2, 900, 9], [3, 3, 8, 8]], 'f4'), np.array([0.
 
 
 @pytest.fixture
-def installed(tmp_path, monkeypatch):
-    """Installs packages for one test."""
-
-    def put(parts: dict[str, str], **options) -> None:
-        folder = install(tmp_path / "site", parts, group="hvt.detectors", **options)
-        if str(folder) not in sys.path:
-            monkeypatch.syspath_prepend(str(folder))
-        plug_ins.installed.cache_clear()
-
-    yield put
-    monkeypatch.undo()
-    plug_ins.installed.cache_clear()
-    for name in [name for name in sys.modules if name.startswith("acme_")]:
-        del sys.modules[name]
+def installed(packages):
+    """Installs packages of detectors for one test."""
+    return partial(packages, group="hvt.detectors")
 
 
 def picture() -> np.ndarray:

@@ -3,40 +3,31 @@
 from __future__ import annotations
 
 import math
-import sys
 
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.runtime import plug_ins
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.encoders.hardware import HardwareEncoder
 from hvt_edge.video.encoders.registry import HARDWARE, HardwareRow, check_encoder, encoder_names, open_encoder
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures
-from media.third_party import ENCODERS, install
+from media.third_party import ENCODERS
 
 SIZE = (320, 192)
 SETTINGS = EncoderSettings(size=SIZE, fps=15.0, bitrate_bps=200_000, preset="ultrafast")
 
 
 @pytest.fixture
-def installed(tmp_path, monkeypatch):
+def installed(packages):
     """Installs encoders for one test, by their class."""
 
     def put(*classes: str, module: str = "acme_encoders", **names: str) -> None:
         parts = {f"acme-{one.lower()}": one for one in classes} | names
-        folder = install(tmp_path / "site", parts, module=module, source=ENCODERS, group="hvt.encoders")
-        if str(folder) not in sys.path:
-            monkeypatch.syspath_prepend(str(folder))
-        plug_ins.installed.cache_clear()
+        packages(parts, module=module, source=ENCODERS, group="hvt.encoders")
 
-    yield put
-    monkeypatch.undo()
-    plug_ins.installed.cache_clear()
-    for name in [name for name in sys.modules if name.startswith("acme_")]:
-        del sys.modules[name]
+    return put
 
 
 def test_another_encoder_makes_the_base_stream(installed):
