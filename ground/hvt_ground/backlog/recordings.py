@@ -1,13 +1,14 @@
 """Objects of an edge's earlier sessions go into recordings of their own, one for each session.
 
-So many files at most, and of those so many open at a time, whatever an edge says that it stored: one that is started
-over and over, or somebody in its name, would fill the disk with them.
+So many files a day at most, and of those so many open at a time, whatever an edge says that it stored: one that is
+started over and over, or somebody in its name, would fill the disk with them.
 """
 
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
+import time
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +21,9 @@ from hvt_ground.sinks import QueuedSink
 
 MOST_OPEN = 4
 MOST_FILES = 32
+_DAY_S = 86_400.0
+_MOST_REMEMBERED = 256
+"""Files that the summary names."""
 _OPEN_S = 0.5
 
 
@@ -57,8 +61,8 @@ class BacklogRecordings:
 
     Where more than ``most`` are open, the one that nothing came for the longest is closed. One that is in use is not:
     should all be, one more is open for the time being. When more comes of a session whose recording is closed, it
-    gets another file; at most ``most_files`` are made in all. Whoever has one made waits up to ``open_s`` for its
-    file, and for as long nobody else does.
+    gets another file; at most ``most_files`` are made in a day. Whoever has one made waits up to ``open_s`` for its
+    file, and for as long nobody else does. ``clock`` is seconds without steps.
     """
 
     def __init__(
@@ -68,20 +72,23 @@ class BacklogRecordings:
         most: int = MOST_OPEN,
         most_files: int = MOST_FILES,
         open_s: float = _OPEN_S,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._open_one = open_one
         self._most = most
         self._open_s = open_s
-        self._left = most_files
+        self._most_files = most_files
+        self._clock = clock
+        self._made_s: deque[float] = deque(maxlen=most_files)
         self._lock = threading.Lock()
         self._open: OrderedDict[int, BacklogRecording] = OrderedDict()
         self._closed = False
-        self._sinks: list[QueuedSink[Event]] = []
+        self._sinks: deque[QueuedSink[Event]] = deque(maxlen=_MOST_REMEMBERED)
 
     @property
     def paths(self) -> list[Path]:
-        """All files, in the order of opening."""
-        return [path for sink in self._sinks for path in sink.files]
+        """The last files, in the order of opening."""
+        return [path for sink in tuple(self._sinks) for path in sink.files]
 
     @property
     def open_sessions(self) -> list[int]:
@@ -92,7 +99,7 @@ class BacklogRecordings:
     def takes(self, session_id: int) -> bool:
         """Whether there is a recording for this session, or may be one."""
         with self._lock:
-            return not self._closed and (self._left > 0 or session_id in self._open)
+            return not self._closed and (session_id in self._open or self._may_make())
 
     def acquire(self, info: Info) -> SessionBacklog | None:
         """The backlog of that session's recording, which stays open until `release`.
@@ -103,10 +110,10 @@ class BacklogRecordings:
         with self._lock:
             recording = self._open.get(info.session_id)
             if recording is None:
-                if self._closed or self._left <= 0:
+                if self._closed or not self._may_make():
                     return None
                 self._close_surplus()
-                self._left -= 1
+                self._made_s.append(self._clock())
                 recording = self._open[info.session_id] = self._open_one(info)
                 self._sinks.append(recording.sink)
                 wait_s = self._open_s
@@ -131,6 +138,9 @@ class BacklogRecordings:
             self._closed = True
             while self._open:
                 self._open.popitem()[1].close()
+
+    def _may_make(self) -> bool:
+        return len(self._made_s) < self._most_files or self._clock() - self._made_s[0] >= _DAY_S
 
     def _close_surplus(self) -> None:
         unused = [session_id for session_id, recording in self._open.items() if not recording.users]

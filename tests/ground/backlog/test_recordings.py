@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import threading
 import time
+from dataclasses import replace
 
 from hvt_common.inference.few_found import ViewTrust
+from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_ground.backlog.perception import BacklogPerception
@@ -18,6 +20,40 @@ from programs.processes import eventually
 from rigs.flight import Flight, RedSquares, SameAnswer
 
 
+def perception(info: Info) -> BacklogPerception:
+    """That of a session."""
+    return BacklogPerception(
+        info,
+        take_models=lambda: (RedSquares(), None),
+        tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
+        reader_of=lambda _detector, _classifier: SameAnswer(),
+        detect_every=3,
+        trust=ViewTrust("motion", hence=""),
+    )
+
+
+def test_a_ground_that_runs_for_months_takes_former_sessions_every_day(tmp_path):
+    """After the thirty-second flight with an outage all that drones have stored would be refused for ever."""
+    now_s, made = 0.0, []
+
+    def open_one(info) -> BacklogRecording:
+        path = tmp_path / f"{info.session_id}.csv"
+        made.append(QueuedSink("recording", lambda: LineFile(path, ("a",)), failures=Failures(time.time_ns)))
+        return BacklogRecording(info, sink=made[-1], perception=perception(info))
+
+    recordings = BacklogRecordings(open_one, most_files=2, open_s=20.0, clock=lambda: now_s)
+    first, second, third = (replace(Flight(1).info(), session_id=number) for number in (1, 2, 3))
+    assert None not in (recordings.acquire(first), recordings.acquire(second))
+    assert not recordings.takes(3), "whoever invents sessions does not fill the disk"
+    assert recordings.acquire(third) is None
+    now_s = 86_400.0
+    assert recordings.takes(3)
+    assert recordings.acquire(third) is not None
+    recordings.close()
+    for one in made:
+        one.join(time.monotonic() + 20)
+
+
 def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):
     """The live picture would stand still until the disk has made a file for what was stored long ago."""
     info = Flight(1).info()
@@ -27,19 +63,9 @@ def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):
     sinks: list[QueuedSink] = []
 
     def open_one(info) -> BacklogRecording:
-        failures = Failures(time.time_ns)
-        perception = BacklogPerception(
-            info,
-            take_models=lambda: (RedSquares(), None),
-            tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
-            reader_of=lambda _detector, _classifier: SameAnswer(),
-            detect_every=3,
-            trust=ViewTrust("motion", hence=""),
-        )
-        sink = QueuedSink("recording", lambda: LineFile(pipe, ("a",)), failures=failures)
-        sinks.append(sink)
+        sinks.append(QueuedSink("recording", lambda: LineFile(pipe, ("a",)), failures=Failures(time.time_ns)))
         opened.set()
-        return BacklogRecording(info, sink=sink, perception=perception)
+        return BacklogRecording(info, sink=sinks[-1], perception=perception(info))
 
     recordings = BacklogRecordings(open_one, open_s=60.0)
     acquired: list[SessionBacklog | None] = []
