@@ -99,7 +99,7 @@ class BacklogStage:
         self._probed_ns = 0
         self.frames = 0
         """Stored, to be sent later; those included that went out too, to find out whether the link is back."""
-        self.folder, self.max_bytes = store.path, store.max_bytes
+        self.max_bytes = store.max_bytes
         self.breaks = 0
         """How often the messages in flight have been taken for lost."""
         self._worker = StoreWorker(

@@ -9,9 +9,11 @@ alone, and it is tried again: video needs neither. Chunks leave in a thread of t
 from __future__ import annotations
 
 import logging
+import shutil
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from queue import SimpleQueue
 
 from hvt_common.protocol.messages import BacklogKind, pack_backlog_still
@@ -34,6 +36,8 @@ _IDLE_S = 0.25
 _CLOSE_S = 5.0
 _LAST_CHUNK_S = 1.0
 """The last chunk has so long to go out."""
+_MEASURED_NS, _OLD_NS = SECOND_NS, 5 * SECOND_NS
+"""How often a disk is asked for its free space, and how long its answer counts."""
 _TRICKLE_SHARE = 1 / 40
 """Share of the total while live stills are always pending: an admitted chunk must not wait for ever."""
 
@@ -65,6 +69,8 @@ class StoreNumbers:
     given_up: int = 0
     unacknowledged_bytes: int = 0
     """Sent, and not in any report of a ground yet."""
+    disk_free_bytes: int | None = None
+    """Of the disk that the store lies on; None where it does not answer."""
 
     @property
     def empty(self) -> bool:
@@ -107,6 +113,8 @@ class StoreWorker:
         self._sending = ChunkThread(send, on_done=self.intake.signal)
         self._sent_stills = self._sent_ns = self._trickle_ns = 0
         self._slow = False
+        self._free: tuple[int, int | None] | None = None
+        """When the disk's free bytes were measured, and how many."""
         self._too_large = 0
         self._retry, self._sending_retry = RetryPause(), RetryPause()
         self.failed = False
@@ -146,7 +154,7 @@ class StoreWorker:
     @property
     def numbers(self) -> StoreNumbers:
         """The contents and the counts of the store."""
-        store = self._store
+        store, free = self._store, self._free
         return StoreNumbers(
             stills=store.stills,
             segments=store.segments + store.open_segments,
@@ -160,6 +168,7 @@ class StoreWorker:
             unreadable=store.damaged,
             given_up=self._backfill.given_up,
             unacknowledged_bytes=self._backfill.unacknowledged_bytes,
+            disk_free_bytes=free[1] if free is not None and self._clock() - free[0] < _OLD_NS else None,
         )
 
     def send_no_more(self) -> None:
@@ -193,6 +202,9 @@ class StoreWorker:
             self._error = error
 
     def _turn(self) -> None:
+        # Here alone: a disk that hangs would hold up the frame loop, and live video with it.
+        if self._free is None or self._clock() - self._free[0] >= _MEASURED_NS:
+            self._free = self._clock(), _free_bytes(self._store.path)
         busy = self._store.stills or self._store.segments
         news, item = self.intake.take(_BUSY_S if busy else _IDLE_S)
         self._attempt_sending(lambda: self._note(news))
@@ -274,6 +286,18 @@ class StoreWorker:
         self._sent_stills += entry.kind is BacklogKind.STILL
         self._sent_ns += entry.span_ns
         self._on_sent(entry)
+
+
+def _free_bytes(folder: Path) -> int | None:
+    # Where it will be, before it is made.
+    for path in (folder.absolute(), *folder.absolute().parents):
+        try:
+            return shutil.disk_usage(path).free
+        except FileNotFoundError:
+            continue
+        except OSError:
+            break
+    return None
 
 
 class ChunkThread:

@@ -7,7 +7,6 @@ they have in common, so that none of them says what another does not. What is no
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, asdict, dataclass
@@ -146,7 +145,7 @@ class BacklogState:
     disk_bytes: int
     limit_bytes: int
     disk_free_bytes: int | None
-    """Of the disk that it lies on."""
+    """Of the disk that it lies on; None where that does not answer."""
     frames_stored: int
     """By this session."""
     sent_stills: int
@@ -365,25 +364,13 @@ def _backlog(backlog: BacklogStage) -> BacklogState:
         video_s=numbers.video_s,
         disk_bytes=numbers.disk_bytes,
         limit_bytes=backlog.max_bytes,
-        disk_free_bytes=_free_bytes(backlog.folder),
+        disk_free_bytes=numbers.disk_free_bytes,
         frames_stored=backlog.frames,
         sent_stills=numbers.sent_stills,
         sent_video_s=numbers.sent_video_s,
         evicted_stills=numbers.evicted_stills,
         evicted_segments=numbers.evicted_segments,
     )
-
-
-def _free_bytes(folder: Path) -> int | None:
-    # Where it will be, before it is made.
-    for path in (folder.absolute(), *folder.absolute().parents):
-        try:
-            return shutil.disk_usage(path).free
-        except FileNotFoundError:
-            continue
-        except OSError:
-            break
-    return None
 
 
 class Heartbeat:

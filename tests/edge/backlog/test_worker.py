@@ -97,6 +97,28 @@ def test_a_disk_that_hangs_costs_what_waits_and_says_so(tmp_path, caplog):
     eventually(lambda: not len(worker.intake), within_s=10, what="the thread has gone on")
 
 
+def test_the_free_space_of_a_disk_that_hangs_is_unknown_and_holds_up_nobody(tmp_path, monkeypatch):
+    link, hangs, on = Link(), threading.Event(), threading.Event()
+    measure, asked_by = shutil.disk_usage, set()
+
+    def disk_usage(path):
+        asked_by.add(threading.current_thread().name)
+        if hangs.is_set():
+            on.wait(timeout=20)
+        return measure(path)
+
+    monkeypatch.setattr(shutil, "disk_usage", disk_usage)
+    worker = worker_of(tmp_path / "not made yet", link)
+    eventually(lambda: worker.numbers.disk_free_bytes, within_s=10, what="the free space is known")
+    hangs.set()
+    link.now_ns += 6 * S
+    assert worker.numbers.disk_free_bytes is None
+    on.set()
+    eventually(lambda: worker.numbers.disk_free_bytes, within_s=10, what="the free space is known")
+    worker.close()
+    assert asked_by == {"hvt-store"}
+
+
 def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
     """The segment would never end, and never be sent: the outage's video would wait for the next one."""
     disk, link = threading.Event(), Link()
