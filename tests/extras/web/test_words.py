@@ -285,7 +285,7 @@ EVENTS = {
     "the pose is stale: nothing is placed on the ground until there is a new one",
     "there is a pose again",
     "… lines were left out here: the edge gave rise to too many",
-    "still … is asked for again: …",
+    "still … is asked for again: the picture it builds on did not come",
     "still … cannot be decoded: …",
 }
 """Every text of an event that the ground makes; it passes on what an edge says of its settings in flight."""

@@ -156,9 +156,11 @@ class StillStage:
         try:
             base = self._history.picture(header.frame_index)
             image = decode_still(still, base=base, view=self._view)
-        except BaseMissingError as error:
+        except BaseMissingError:
             self.dropped["base_missing"] += 1
-            self._notice(now, f"still {header.sequence} is asked for again: {error}")
+            self._notice(
+                now, f"still {header.sequence} is asked for again: the picture it builds on did not come"
+            )
             self._answer(header, header.track_id, None, again=True)
             return None
         except StillError as error:
