@@ -29,8 +29,10 @@ class KeyframeSettings:
     patience_ns: int = 3 * SECOND_NS // 5
     scheduled_patience_ns: int = 2 * SECOND_NS
     rest_ns: int = 3 * SECOND_NS // 10
-    """After a keyframe, requests are taken as answered by it for so long: they crossed it on the way. With the
-    second request of a ground (0.3 s after the first) and the patience it stays under a second."""
+    """After a keyframe, requests are taken as answered by it for so long at most: they crossed it on the way. With
+    the second request of a ground (0.3 s after the first) and the patience it stays under a second."""
+    coding_ns: int = SECOND_NS // 10
+    """A keyframe is coded and put on the line for so long: with the round trip, a request crosses it for as long."""
     burst: int = 6
     """Requests in a row: losses come in bursts."""
     refill_ns: int = 7 * SECOND_NS // 10
@@ -58,6 +60,8 @@ class Keyframes:
         """Requests are paid for up to this time: `_cost_ns` each."""
         self._keyframe_ns = 0
         """The cost of a keyframe, as time of the budget."""
+        self._crosses_ns = self.settings.rest_ns
+        """After a keyframe, a request of so long may be from before it came."""
         self._losses: dict[int, int] = {}
         """Losses by receiver, as of its last report."""
         self._lossy = False
@@ -93,7 +97,7 @@ class Keyframes:
             )
         with self._lock:
             last_ns = self._last_ns
-            fresh = last_ns is not None and now_ns - last_ns < self.settings.rest_ns
+            fresh = last_ns is not None and now_ns - last_ns < self._crosses_ns
             pending = self._requested_ns is not None or self._due_ns is not None
             if not fresh and not pending and last_ns is not None:
                 refusal = self._pay(now_ns, last_ns=last_ns)
@@ -120,6 +124,10 @@ class Keyframes:
                 del self._losses[next(iter(self._losses))]
             self._losses[receiver_id] = count
             self._lossy = True
+
+    def note_round_trip(self, round_trip_ns: int) -> None:
+        """The link's round trip; a request that comes later than that after a keyframe says that it was lost."""
+        self._crosses_ns = min(self.settings.rest_ns, round_trip_ns + self.settings.coding_ns)
 
     # The frame loop
 

@@ -159,6 +159,23 @@ def test_recovery_after_losses_is_never_refused():
             assert not plan.due(now_ns + 100 * MS)
 
 
+def test_a_keyframe_that_was_lost_itself_is_followed_by_another_as_soon_as_the_link_can_say_so():
+    """On a lossy link the second request counted as one that crossed the keyframe, and the screen stayed dark."""
+    plan = Keyframes(KeyframeSettings(interval_ns=0))
+    plan.done(0)
+    assert plan.request(210 * MS) is None
+    assert not plan.due(210 * MS), "as long as nothing is known of the link"
+    plan.note_round_trip(70 * MS)
+    assert plan.request(150 * MS) is None
+    assert not plan.due(150 * MS), "it may have crossed"
+    assert plan.request(210 * MS) is None
+    assert plan.due(210 * MS)
+    plan.done(2_000 * MS)
+    plan.note_round_trip(1_200 * MS)
+    assert plan.request(2_310 * MS) is None
+    assert plan.due(2_310 * MS), "over a satellite no later than before"
+
+
 def test_a_reported_loss_is_a_reason_once():
     """One old loss would be a ticket to as many keyframes as somebody cares to ask for."""
     plan = Keyframes(KeyframeSettings(interval_ns=0, burst=1))

@@ -136,6 +136,7 @@ class LinkControl:
         self.keyframes.report_losses(feedback.receiver_id, feedback.lost + feedback.corrupt)
         if self.pacer is not None:
             self.pacer.on_report(report)
+            self.keyframes.note_round_trip(self.pacer.round_trip_ns)
         if report.primary:
             self.in_flight.on_report(feedback.base_sequence)
             self.outbox.on_report(
