@@ -30,6 +30,8 @@ def _list(name: str) -> tuple[str, ...]:
 COCO_NAMES = _list("coco.txt")
 VISDRONE_NAMES = _list("visdrone.txt")
 IMAGENET_NAMES = _list("imagenet.txt")
+VEHICLE_KINDS = frozenset({"car", "truck", "bus"})
+"""Kinds that a network confuses before any others; a van is a car."""
 _NOTHING = frozenset({"other", "background", "nothing"})
 _IMAGENET_SHARE = 0.9
 _GROUP_OF_KIND = {

@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.inference.class_names import VEHICLE_KINDS, kind_of
 from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.scale_search import ScaleSearch
@@ -159,6 +160,7 @@ class Pipeline:
         self.doubted = 0
         """Of the tracks that are shown, those that stills doubt."""
         self.trust = parts.trust
+        self.tilt = parts.refiner.tilt
         self.steps_used = 0
         """Reports of the edge's tracks that were taken in."""
 
@@ -301,12 +303,21 @@ class Pipeline:
             self.trust.take(found)
             own = parts.tracker.update(found, frame_index=index, image_bgr=image)
             self.objects_detected = int((own.seen_frames == index).sum())
+            self.tilt.take(self._vehicles(own), height_px=image.shape[0])
         else:
             own = parts.tracker.predict(frame_index=index, image_bgr=image)
         before, affine = self._now.picture_index, parts.tracker.camera_step
         if before >= 0 and affine is not None:  # the tracker has followed it: it is not estimated twice
             parts.path.add(affine, start=before, end=index)
         return own
+
+    def _vehicles(self, own: Tracks) -> Boxes:
+        # Those that the detector has just seen.
+        names = self._parts.vocabulary.names
+        vehicles = np.array(
+            [kind_of(names[class_id]) in VEHICLE_KINDS for class_id in own.class_ids], np.bool_
+        )
+        return own.boxes_xyxy_px[vehicles & (own.seen_frames == own.frame_index)]
 
     def _own_at(self, frame_index: int) -> Tracks:
         # Our tracker's list at a frame: as it was, or moved on from the newest frame.

@@ -113,6 +113,15 @@ def test_small_objects_are_looked_at_enlarged_and_less_often(pictures):
     np.testing.assert_allclose(rig.of(Overlay)[0].boxes_base_px[0], square_box(0), atol=6)
 
 
+def test_the_vehicles_that_are_seen_tell_the_tilt(pictures):
+    """Of kinds aslant every second one is wrong; those of tracks that are only carried on tell nothing."""
+    rig, taken = Rig(detect_every=3), []
+    rig.pipeline.tilt.take = lambda boxes, *, height_px: taken.append((len(boxes), height_px))
+    for picture in pictures:
+        rig.pipeline.analyze(picture, hurry=False)
+    assert taken == [(1, 192)] * 10
+
+
 def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flight, pictures):
     """A box that is a guess would be drawn and named like one that is right nine times in ten."""
     trust = ViewTrust("motion", hence="")  # which measures nothing by itself

@@ -20,11 +20,13 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.inference.class_names import VEHICLE_KINDS, kind_of
 from hvt_common.values import Tracks
 from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.match import Matcher, Outcome, StillSeen, TrackMatch
 from hvt_ground.perception.stills.posterior import ClassEstimate, TrackPosterior
 from hvt_ground.perception.stills.vocabulary import Vocabulary
+from hvt_ground.perception.view_tilt import ViewTilt
 
 Mode = Literal["replace", "fuse"]
 
@@ -79,6 +81,8 @@ class Refiner:
         """Distinct tracks of the ground that a still has refined."""
         self.class_changes = 0
         """Stills after which the class shown was another than before."""
+        self.tilt = ViewTilt()
+        """Of the view: aslant no kind of vehicle is sure."""
         self._mode = mode
         self._vocabulary = vocabulary
         self._calibrated = calibrated
@@ -287,7 +291,9 @@ class Refiner:
         )
 
     def _is_sure(self, reading: ClassEstimate) -> bool:
-        return self._calibrated and reading.sure and reading.class_id != self._vocabulary.nothing
+        if not self._calibrated or not reading.sure or reading.class_id == self._vocabulary.nothing:
+            return False
+        return not (self.tilt.aslant and kind_of(self._vocabulary.names[reading.class_id]) in VEHICLE_KINDS)
 
     def _touch(self, track_id: int, class_posterior: TrackPosterior, frame_index: int) -> None:
         class_posterior.last_frame = max(class_posterior.last_frame, frame_index)

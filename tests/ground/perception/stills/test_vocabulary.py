@@ -108,7 +108,7 @@ def test_a_class_that_the_classifier_cannot_say_is_left_alone():
     assert (shown.classes, shown.doubted.tolist()) == (("dog",), [False])
 
 
-def flown(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, mode="fuse"):
+def flown(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, mode="fuse", aslant=False):
     """What is shown of a track after these stills."""
     from hvt_ground.perception.history import History
 
@@ -125,6 +125,7 @@ def flown(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, m
     history = History(track_frames=10)
     history.add_tracks(tracks)
     refiner = Refiner(mode, fps=15, vocabulary=words, calibrated=calibrated)
+    refiner.tilt.aslant = aslant
     for sequence, posterior in enumerate(posteriors):
         still = seen(sequence, 0, posterior, (10, 10, 50, 40), edge=1, side_px=side_px)
         refiner.offer(still, now_frame=0)
@@ -167,6 +168,15 @@ def test_a_check_mark_needs_a_calibrated_probability_on_enough_pixels():
     shown = flown(words, *unsure, base=0, confidence=0.8)
     assert shown.confidences[0] > 0.99
     assert shown.sure.tolist() == [False], "five answers of .8 on one object are not one of .99"
+
+
+def test_seen_aslant_no_kind_of_vehicle_has_a_check_mark():
+    """Of kinds aslant every second one is wrong."""
+    words = Vocabulary(AERIAL, AERIAL)
+    (car,), (walker,) = votes(words, {"car": 0.97}), votes(words, {"pedestrian": 0.97})
+    assert flown(words, car, base=0, confidence=0.8, aslant=True).sure.tolist() == [False]
+    person = AERIAL.index("pedestrian")
+    assert flown(words, walker, base=person, confidence=0.8, aslant=True).sure.tolist() == [True]
 
 
 def test_a_toss_up_leaves_the_class_as_it_is():
