@@ -6,8 +6,7 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any
 
 from hvt_common.config import (
     AUTO,
@@ -61,9 +60,6 @@ TRACKS_BPS = 8_000
 """The share of ``--send-tracks`` in the budget: about that for 45 boxes three times a second."""
 
 
-_REFRESH_GONE = (
-    "is no longer accepted: give --fps auto, which shows more for the same bits, or --roi-depth 0.1"
-)
 _SOURCE, _LINK, _SENT = Group("source"), Group("budget and link"), Group("what to send")
 _MODELS, _FILES = Group("models"), Group("files")
 _SOURCE_RARE, _LINK_RARE, _SENT_RARE, _MODELS_RARE, _FILES_RARE = (
@@ -74,16 +70,6 @@ _SOURCE_RARE, _LINK_RARE, _SENT_RARE, _MODELS_RARE, _FILES_RARE = (
 @dataclass(frozen=True, slots=True)
 class EdgeConfig:
     """The settings of ``hvt-edge``. See ``--help-all`` for each."""
-
-    GONE: ClassVar[Mapping[str, str]] = MappingProxyType(
-        {
-            "lend": "is no longer accepted: give --borrow-unused",
-            "pulse": _REFRESH_GONE,
-            "pulse-depth": _REFRESH_GONE,
-            "rolling": _REFRESH_GONE,
-            "rolling-depth": _REFRESH_GONE,
-        }
-    )
 
     source: str | None = _SOURCE.option(
         TEXT, None, "clip.mp4, folder/, rtsp://…, /dev/video0, demo or demo:codes,4k"

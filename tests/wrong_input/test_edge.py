@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import pytest
 
-from hvt_edge.config import EdgeConfig
 from media.third_party import PIXELS
 
 pytestmark = pytest.mark.timeout(60)
@@ -208,18 +206,6 @@ def test_a_flag_that_does_not_exist(edge, words):
     sentence = edge(*words)
     assert words[0] in sentence
     assert "--help" in sentence
-
-
-@pytest.mark.parametrize(("name", "instead"), sorted(EdgeConfig.GONE.items()))
-def test_a_setting_of_an_earlier_version(edge, here, name, instead):
-    """A script that worked would end with a list of flags to search."""
-    assert f"--{name} {instead}" in edge(f"--{name}", "1")
-    Path("old.toml").write_text(f"{name} = 1\n", encoding="utf-8")
-    assert f"{name} in old.toml {instead}" in edge("--config", "old.toml")
-    new = [word for word in instead.split() if word.startswith("--")]
-    assert new
-    known = {"--" + field.name.replace("_", "-") for field in dataclasses.fields(EdgeConfig)}
-    assert set(new) <= known
 
 
 def test_a_flag_without_its_value(edge):

@@ -32,13 +32,6 @@ def test_an_unknown_name_gets_the_choice():
         still_codec("gif")
 
 
-@pytest.mark.parametrize("name", ["jpeg-lite", "avif-lite", "hevc-intra"])
-def test_a_removed_codec_names_its_successor(name):
-    """A settings file of an earlier version would not say what to write instead."""
-    with pytest.raises(UserError, match=f"still codec '{name}' is no longer part of HVT: use h264-intra"):
-        still_codec(name)
-
-
 @pytest.mark.parametrize(("name", "package"), [("webp", "edge"), ("avif", "edge"), ("jxl", "jxl")])
 def test_without_the_extra_a_codec_names_what_to_install(name, package, monkeypatch):
     """It would be a codec that nobody knows."""

@@ -39,8 +39,6 @@ _BUILT_IN: Mapping[str, str] = MappingProxyType(
 _BROUGHT_BY = {"webp": "edge", "avif": "edge", "jxl": "jxl"}
 """Codecs of the extra that comes with HVT, and the package to install for each. They need a library that may be
 missing; ``lacking`` of the class says which."""
-_REMOVED = ("jpeg-lite", "avif-lite", "hevc-intra")
-"""Codecs of earlier versions; h264-intra takes their place."""
 
 
 def still_codec_names() -> tuple[str, ...]:
@@ -65,8 +63,6 @@ def still_codec(name: str) -> StillCodec:
         raise UserError(
             f"still codec {name!r} is of an extra that is not installed: pip install 'hvt[{_BROUGHT_BY[name]}]'"
         )
-    if name in _REMOVED:
-        raise UserError(f"still codec {name!r} is no longer part of HVT: use h264-intra")
     raise UserError(f"still codec {name!r} is not known: choose one of {', '.join(still_codec_names())}")
 
 
