@@ -33,16 +33,16 @@ _MOST_S = 100.0
 
 # Functions: name and bound of their walk, the largest of each taken together.
 _WALKS = {
-    ("RealtimePace.step",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 36),
-    ("StillStage.analyze",): ("a frame's objects at the edge", 26),
-    ("StillStage.send",): ("a still at the edge, from choosing to put", 44),
+    ("RealtimePace.step",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 35),
+    ("StillStage.analyze",): ("a frame's objects at the edge", 25),
+    ("StillStage.send",): ("a still at the edge, from choosing to put", 41),
     ("command.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
         "a command, from hvt-ground set-budget to the encoder",
         37,
     ),
-    ("EdgeSessions.handle",): ("a message at the ground, received", 72),
+    ("EdgeSessions.handle",): ("a message at the ground, received", 68),
     ("GroundSession._analyze",): ("a frame at the ground, analyzed", 34),
-    ("Recorder.log",): ("an event at the ground, recorded", 18),
+    ("Recorder.log",): ("an event at the ground, recorded", 13),
 }
 _MEASURED = {one for functions in _WALKS for one in functions}
 _GOES = "Transmitter.still"
