@@ -135,10 +135,9 @@ class Ground:
             if config.group is not None:
                 shown = "".join([one.shown_to_others for one in services][:1])
                 group = stack.enter_context(GroundGroup(session, config.group, page=shown))
+            log = next((one.message_log for one in services if one.message_log is not None), None)
             link = stack.enter_context(
-                GroundLink(
-                    session, edges=config.edges, clock=self._clock, group=group, log=factory.message_log
-                )
+                GroundLink(session, edges=config.edges, clock=self._clock, group=group, log=log)
             )
             watch = stack.enter_context(link_doctor().watch(session, settings, served=link.is_known))
             self._on_started()

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hvt_common.config import BYTES, DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
+from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
@@ -18,8 +18,6 @@ from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import Limit, parse_limit
 
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
-LEAST_LOG_BYTES = 20_000_000
-"""Twice the largest message that there is, and room for a flight between."""
 
 
 _LIMIT = SettingType("LIMIT", parse_limit)
@@ -126,12 +124,6 @@ class GroundConfig:
     stills: Path | None = _FILES.option(
         PATH, None, "also write each still as a picture, with a table of them: a folder that is there"
     )
-    log: Path | None = _FILES.option(
-        PATH, None, "also keep every message as it came, for hvt-ground replay: FILE.hvtlog"
-    )
-    log_size: int = _FILES_RARE.option(
-        BYTES, 4_000_000_000, "how large the log may become: then its older half makes room"
-    )
     timing: Path | None = _FILES_RARE.option(
         PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
     )
@@ -171,10 +163,6 @@ def check(config: GroundConfig, *, files: Iterable[tuple[str, Path]] = ()) -> Gr
     _check_files(config, files)
     if config.group is not None:
         GroupKeys(config.group)
-    if config.log_size < LEAST_LOG_BYTES:
-        raise UserError(
-            f"--log-size {config.log_size} bytes is not accepted: give at least {LEAST_LOG_BYTES // 10**6}MB"
-        )
     if config.view and config.serve:
         raise UserError("--view and --serve are both given: choose the viewer here or the one in a browser")
     if config.labels is not None and config.classifier in (None, DETECTOR, NONE):
@@ -202,7 +190,6 @@ def _check_files(config: GroundConfig, more: Iterable[tuple[str, Path]]) -> None
         ("--record", config.record, ".rrd"),
         ("--tracks", config.tracks, ".csv"),
         ("--timing", config.timing, None),
-        ("--log", config.log, None),
         ("--summary", config.summary, None),
         *((name, path, None) for name, path in more),
     ):

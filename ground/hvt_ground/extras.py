@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no reco
     from hvt_common.protocol.messages import Info
     from hvt_common.runtime.failures import Failures
     from hvt_common.runtime.reporting import Finding
+    from hvt_common.transport.inbox import Received
     from hvt_ground.control import EdgeClient
     from hvt_ground.events import Event, Refinement
     from hvt_ground.poses import Locator
@@ -37,6 +38,8 @@ _BROUGHT_BY = {
     "ts": "ground",
     "keep": "ground",
     "keep-video": "ground",
+    "log": "ground",
+    "log-size": "ground",
     "web": "web",
     "web-proxy": "web",
 }
@@ -84,6 +87,9 @@ class Service:
     """Where somebody can watch."""
     shown_to_others: str = ""
     """Such a link that other machines reach, without secrets."""
+
+    message_log: Callable[[Received], None] | None = None
+    """Takes every message as it came, in any thread; set by `begin` where it wants them."""
 
     def begin(self, client: EdgeClient) -> None:
         """Nothing can be refused any more, the folder of ``--record`` is there, and ``client`` reaches the edges."""

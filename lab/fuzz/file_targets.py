@@ -7,10 +7,10 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+from hvt_archive.replay.message_log import MessageLog, read_log
 from hvt_common.errors import UserError
 from hvt_common.transport.inbox import Received
 from hvt_geo.pose.files import read_poses
-from hvt_ground.sinks.message_log import MessageLog, read_log
 from lab.fuzz.contract import Target, scratch
 from rigs import messages
 

@@ -53,6 +53,8 @@ def test_extras_bring_what_the_core_has_not():
         "cot_types",
         "keep",
         "keep_video",
+        "log",
+        "log_size",
         "mcap",
         "terrain",
         "ts",

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from hvt_archive.replay.message_log import MessageLog
 from hvt_common.redaction import redacted
 from hvt_common.transport.inbox import Received
-from hvt_ground.sinks.message_log import MessageLog
 from media.onnx_models import colour_classifier, colour_detector
 
 pytestmark = pytest.mark.timeout(60)

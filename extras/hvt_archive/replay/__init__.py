@@ -1,1 +1,1 @@
-"""Receives again a ground's stored messages: `command` plays a file of ``hvt-ground --log``."""
+"""Receives again a ground's stored messages: `message_log` writes and reads them, `command` plays a file."""

@@ -21,6 +21,7 @@ from rich.progress import Progress
 
 from hvt_archive.reading.recorded import read_recordings
 from hvt_archive.replay.from_recording import messages_of
+from hvt_archive.replay.message_log import read_log
 from hvt_common.config import load
 from hvt_common.errors import Parser, UserError
 from hvt_common.protocol.channels import Channel, check_edge_pattern, matches, parse_key
@@ -38,7 +39,6 @@ from hvt_ground.session.edge_port import InfoAnswer
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
-from hvt_ground.sinks.message_log import read_log
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.wiring import SessionFactory, check_outputs, make_record_folder
 

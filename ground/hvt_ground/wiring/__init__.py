@@ -1,4 +1,4 @@
-"""From settings to objects: the parts of each session of an edge, as one tree."""
+"""From settings to objects: the parts of each session of an edge, as one tree; `files` names what they write."""
 
 from hvt_ground.perception.models import Models
 from hvt_ground.wiring.files import check_outputs, make_record_folder, output_path

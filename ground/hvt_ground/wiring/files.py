@@ -27,7 +27,6 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
         extra.check_outputs(config, reads=reads)
     check_writable(config.summary, name="--summary", reads=reads)
     check_writable(config.timing, name="--timing", reads=reads)
-    check_writable(config.log, name="--log", reads=reads)
     for path, suffix, name in (
         (config.tracks, ".csv", "--tracks"),
         (config.record, ".rrd", "--record"),

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hvt_common.protocol.messages import Info
-from hvt_common.transport.inbox import Received
 from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.recordings import BacklogRecording
 from hvt_ground.config import GroundConfig
@@ -26,7 +25,6 @@ from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
 from hvt_ground.sinks.line_file import has_nothing
-from hvt_ground.sinks.message_log import MessageLog
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.still_files import StillFiles, picture_of
@@ -84,12 +82,6 @@ class SessionFactory:
         if config.timing is not None:
             names = partial(free_path, [config.timing], number=2, may_exist=config.timing)
             self._timing = outputs.open("timing table", partial(self._opened, timing_table, names))
-        self.message_log: Callable[[Received], None] | None = None
-        """Takes all that comes from edges."""
-        if config.log is not None:
-            names = partial(free_path, [config.log], number=2, may_exist=config.log)
-            make_log = partial(MessageLog, most_bytes=config.log_size)
-            self.message_log = outputs.open("message log", partial(self._opened, make_log, names)).log
 
     def open_session(self, info: Info, reports: ReceiverReports) -> GroundSession:
         """A session with its perception and its sinks."""

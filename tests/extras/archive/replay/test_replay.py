@@ -13,6 +13,7 @@ import hvt_ground.cli
 from hvt_archive.reading.recorded import read_recordings
 from hvt_archive.replay.command import messages_in
 from hvt_archive.replay.from_recording import messages_of
+from hvt_archive.replay.message_log import MessageLog, read_log
 from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (
     READ_VERSIONS,
@@ -27,7 +28,6 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
-from hvt_ground.sinks.message_log import MessageLog, read_log
 from rigs.drawn_flight import FRAMES
 
 pytestmark = pytest.mark.integration

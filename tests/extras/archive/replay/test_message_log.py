@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hvt_archive.replay.message_log import MessageLog, read_log
 from hvt_common.errors import UserError
 from hvt_common.transport.inbox import Received
-from hvt_ground.sinks.message_log import MessageLog, read_log
 from programs.small_disk import small_disk
 from rigs.messages import INFO
 

@@ -1,0 +1,101 @@
+"""The settings of the log of messages, and how the ground comes to write it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hvt_common.config import BYTES, PATH, Group
+from hvt_common.errors import UserError
+from hvt_ground.config import GroundConfig
+from hvt_ground.extras import Extra, Service
+
+if TYPE_CHECKING:  # ``--help`` is to open no log
+    from hvt_archive.replay.message_log import MessageLog
+    from hvt_common.runtime.failures import Failures
+    from hvt_common.transport.inbox import Received
+    from hvt_ground.control import EdgeClient
+    from hvt_ground.sinks import QueuedSink
+
+LEAST_LOG_BYTES = 20_000_000
+"""Twice the largest message that there is, and room for a flight between."""
+_LOG = Group("log of messages")
+_END_S = 8.0
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """The settings of ``hvt-ground`` for it."""
+
+    log: Path | None = _LOG.option(
+        PATH, None, "also keep every message as it came, for hvt-ground replay: FILE.hvtlog"
+    )
+    log_size: int = replace(_LOG, rare=True).option(
+        BYTES, 4_000_000_000, "how large the log may become: then its older half makes room"
+    )
+
+
+class LogExtra(Extra):
+    """One log for all edges."""
+
+    options = LogOptions
+
+    def check(self, config: GroundConfig) -> None:
+        """Refuse a log without room for its messages."""
+        if isinstance(config, LogOptions) and config.log_size < LEAST_LOG_BYTES:
+            raise UserError(
+                f"--log-size {config.log_size} bytes is not accepted: give at least {LEAST_LOG_BYTES // 10**6}MB"
+            )
+
+    def writes(self, config: GroundConfig) -> Iterable[tuple[str, Path]]:
+        """The file that is named."""
+        if isinstance(config, LogOptions) and config.log is not None:
+            yield "--log", config.log
+
+    def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
+        """Refuse a file that cannot be written."""
+        from hvt_common.runtime.reporting import check_writable  # noqa: PLC0415
+
+        for name, path in self.writes(config):
+            check_writable(path, name=name, reads=reads)
+
+    def serve(self, config: GroundConfig, *, clock: Callable[[], int], failures: Failures) -> Service | None:  # noqa: ARG002
+        """Log all that comes."""
+        if not isinstance(config, LogOptions) or config.log is None:
+            return None
+        return _Logging(config.log, most_bytes=config.log_size, failures=failures)
+
+
+class _Logging(Service):
+    def __init__(self, path: Path, *, most_bytes: int, failures: Failures) -> None:
+        self._path, self._most_bytes, self._failures = path, most_bytes, failures
+        self._taken: set[Path] = set()
+        self._sink: QueuedSink[Received] | None = None
+
+    def begin(self, client: EdgeClient) -> None:  # noqa: ARG002 - no edge is asked
+        from hvt_ground.sinks import QueuedSink  # noqa: PLC0415
+
+        self._sink = QueuedSink("message log", self._open, failures=self._failures)
+        self.message_log = self._sink.log
+
+    def __exit__(self, *_: object) -> None:
+        if self._sink is not None:
+            self._sink.close()
+            self._sink.join(time.monotonic() + _END_S)
+
+    def _open(self) -> MessageLog:
+        # One that failed stays as it is: the next has a number in its name.
+        from hvt_archive.replay.message_log import MessageLog  # noqa: PLC0415
+        from hvt_ground.wiring.files import free_path  # noqa: PLC0415
+
+        path = free_path([self._path], self._taken, number=2, may_exist=self._path)
+        try:
+            return MessageLog(path, most_bytes=self._most_bytes)
+        except BaseException:
+            self._taken.discard(path)
+            if path != self._path:
+                path.unlink(missing_ok=True)
+            raise
