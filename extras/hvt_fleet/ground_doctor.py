@@ -20,7 +20,6 @@ from hvt_fleet.link.reach import check_link
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import all_extras, checked, config_class
 from hvt_ground.perception.models import Models
-from hvt_ground.wiring import make_link_settings
 
 _DESCRIPTION = (
     "Check what a ground with these settings needs; takes the settings of hvt-ground. --json is for programs."
@@ -42,7 +41,7 @@ def run(argv: Sequence[str]) -> int:
         "ports": lambda: _ports(config),
         **dict(one for extra in all_extras() for one in extra.checks(config).items()),
         "clock": check_clock,
-        "link": lambda: check_link(make_link_settings(config), _edges, other="edge"),
+        "link": lambda: check_link(config.link, _edges, other="edge"),
     }
     return print_findings("hvt-ground doctor", run_checks(checks), as_json=len(words) < len(argv))
 

@@ -60,13 +60,12 @@ class WebExtra(Extra):
         with needs_extra("'hvt[web]'"):
             from hvt_web.server import WebPage  # noqa: PLC0415
         from hvt_common.transport.zenoh_config import key_pair  # noqa: PLC0415
-        from hvt_ground.wiring import make_link_settings  # noqa: PLC0415
 
         return WebPage(
             config.web,
             clock=clock,
             failures=failures,
-            keys=key_pair(make_link_settings(config)),
+            keys=key_pair(config.link),
             proxy=config.web_proxy,
             recorded=config.record is not None,
         )

@@ -40,7 +40,6 @@ from hvt_ground.wiring import (
     OpenSink,
     SessionFactory,
     check_outputs,
-    make_link_settings,
     make_record_folder,
 )
 
@@ -111,7 +110,7 @@ class Ground:
                     failures=models.failures,
                 )
                 stack.enter_context(server)
-            settings = make_link_settings(config)
+            settings = config.link
             offered = (one.serve(config, clock=self._clock, failures=models.failures) for one in all_extras())
             services = [stack.enter_context(one) for one in offered if one is not None]
             outputs = Outputs(models.failures)

@@ -14,7 +14,7 @@ from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, parts_of
 from hvt_common.protocol.channels import GroupKeys
 from hvt_common.runtime.log import LOG_FORMATS
-from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
+from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_common.units import Limit, parse_limit
 
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
@@ -146,6 +146,18 @@ class GroundConfig:
         if self.record is None or (self.record.suffix == ".rrd" and not self.record.is_dir()):
             return None
         return self.record
+
+    @property
+    def link(self) -> LinkSettings:
+        """The ground's end of the link."""
+        return LinkSettings(
+            role="ground",
+            listen=self.listen,
+            connect=self.connect,
+            zenoh_config=self.zenoh_config,
+            insecure=self.insecure,
+            links=2 if self.links == 2 else 1,
+        )
 
     @property
     def patience_s(self) -> float:

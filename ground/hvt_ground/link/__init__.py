@@ -1,6 +1,5 @@
 """Messages of the link, put in order and counted; pure but for `group`.
 
-`receiver` takes all of one edge, `reassemble` makes its video decodable, `statistics` says what is missing,
-`sequence_window` remembers numbers. `group` shares edges among grounds,
-and `capture_clock` has capture times by this ground's clock.
+`receiver` takes all of one edge, `reassemble` makes its video decodable, `statistics` says what is missing
+and when pictures were captured, `sequence_window` remembers numbers. `group` shares edges among grounds.
 """

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
+from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import (
     MAX_MISSING_STILLS,
@@ -28,9 +29,11 @@ from hvt_common.runtime.statistics import LatencyStats
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, MessageTiming, Traffic
-from hvt_ground.link.capture_clock import CaptureClock
 
 _MS = 1_000_000
+_LONGEST_TRIP_NS = 60 * SECOND_NS
+_EARLY_NS = 5 * SECOND_NS
+"""More than half the round trip of any link that carries video."""
 REPORT_LINE_BYTES = 180
 """Line bytes of a report without results."""
 _SHARE = 0.03
@@ -160,6 +163,39 @@ class ReceptionStatistics:
     def _forget(self, now_ns: int) -> None:
         while self._sizes and (self._sizes[0][0] <= now_ns - _RATE_OVER_NS or len(self._sizes) > 4096):
             self._size_bytes -= self._sizes.popleft()[1]
+
+
+class CaptureClock:
+    """The times of one camera by this ground's clock.
+
+    A camera's clock may be years off, and an edge may say what it likes. A picture that came before it was captured,
+    or a minute after, counts from its arrival, and so do those after it, as long as that can be.
+    """
+
+    def __init__(self, edge_clock: ClockOffset) -> None:
+        self._edge_clock = edge_clock
+        self._own_offset_ns: int | None = None
+
+    def note(self, capture_ns: int, *, received_ns: int) -> None:
+        """Take the time of something that has just come."""
+        if -_EARLY_NS <= received_ns - self._edge_clock.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:
+            self._own_offset_ns = None
+        elif self.is_sound or not 0 <= received_ns - self.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:
+            self._own_offset_ns = capture_ns - received_ns
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the offset is that of the edge's clock, and not one from the arrival."""
+        return self._own_offset_ns is None
+
+    @property
+    def offset_ns(self) -> int:
+        """The camera's clock minus ours."""
+        return self._edge_clock.offset_ns if self._own_offset_ns is None else self._own_offset_ns
+
+    def to_local_ns(self, capture_ns: int) -> int:
+        """A time of the camera as our clock would have shown it."""
+        return capture_ns - self.offset_ns
 
 
 class SessionAccount:

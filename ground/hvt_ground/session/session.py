@@ -35,11 +35,10 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
-from hvt_ground.link.capture_clock import CaptureClock
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.receiver import BasePacket
 from hvt_ground.link.sequence_window import StillSequenceWindow
-from hvt_ground.link.statistics import ReceptionStatistics, SessionAccount
+from hvt_ground.link.statistics import CaptureClock, ReceptionStatistics, SessionAccount
 from hvt_ground.perception.models import NotOpenError
 from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
@@ -131,11 +130,14 @@ class GroundSession:
         self.edge_failing: Mapping[str, int] = {}
         """Since when each part of the edge fails, by its clock: a report has the newest try."""
         self._log = SessionLog(self._emit, clock=clock)
-        self._last_step = self._last_index = -1
+        self._last_step = -1
+        self.newest_index = -1
+        """Frame index of the newest access unit; -1 before the first."""
         self._stepped_ns = self._status_ns = self._base_ns = 0
         """When the newest report of tracks came, the newest status, and the newest access unit."""
         self._first_capture_ns: int | None = None
-        self._last_capture_ns = 0
+        self.newest_capture_ns = 0
+        """Its capture time, the edge's clock; 0 before the first."""
         self._results: tuple[StillResult, ...] = ()
         self._still_window, self._results_lock = StillSequenceWindow(), threading.Lock()
         if worker_of is None:
@@ -182,7 +184,7 @@ class GroundSession:
         self.frames_received += 1
         if self._first_capture_ns is None:
             self._first_capture_ns = header.capture_ns
-        self._last_index, self._last_capture_ns = header.frame_index, header.capture_ns
+        self.newest_index, self.newest_capture_ns = header.frame_index, header.capture_ns
         self._base_ns = self._clock()
         if not decode:
             return True
@@ -241,7 +243,7 @@ class GroundSession:
         if pose is not None:
             self._pose_clock.note(pose.capture_ns, received_ns=item.received_ns)
             self.worker.pose(partial(self.poses.use, pose), pose.capture_ns)
-            self._emit(PoseUpdate(max(0, self._last_index), pose.capture_ns, pose, self.info.view))
+            self._emit(PoseUpdate(max(0, self.newest_index), pose.capture_ns, pose, self.info.view))
             self._note_stale(pose.capture_ns)
 
     def status(self, status: Status, item: Received) -> None:
@@ -259,7 +261,7 @@ class GroundSession:
             for one in status.failed
             if not one.working
         }
-        self._note_stale(self._last_capture_ns)
+        self._note_stale(self.newest_capture_ns)
         before, now = ([one for one, _ in lever_decisions(says)] for says in (self.levers, status.levers))
         self.levers = status.levers or self.levers
         if status.levers and now != before:  # numbers alone change each second: they are in the state
@@ -297,7 +299,7 @@ class GroundSession:
 
     def note(self, level: Level, text: str, *, last: bool = False) -> None:
         """Put a line into the recording's log, unless there is a flood of them (`SessionLog`)."""
-        self._log.note(level, text, at=(max(0, self._last_index), self._last_capture_ns), last=last)
+        self._log.note(level, text, at=(max(0, self.newest_index), self.newest_capture_ns), last=last)
 
     def close(self) -> None:
         """Finish what is queued (for a second or two) and close the sinks, each whatever the others do.
@@ -341,21 +343,11 @@ class GroundSession:
         return self._pipeline or NothingPerceived()
 
     @property
-    def newest_index(self) -> int:
-        """Frame index of the newest access unit; -1 before the first."""
-        return self._last_index
-
-    @property
-    def newest_capture_ns(self) -> int:
-        """The capture time of the newest access unit, the edge's clock; 0 before the first."""
-        return self._last_capture_ns
-
-    @property
     def newest_captured_ns(self) -> int | None:
         """The capture time of the newest picture, this ground's clock; None before the first."""
         if self._first_capture_ns is None:
             return None
-        return self._capture_clock.to_local_ns(self._last_capture_ns)
+        return self._capture_clock.to_local_ns(self.newest_capture_ns)
 
     @property
     def knows_delay(self) -> bool:
@@ -397,7 +389,7 @@ class GroundSession:
         """From the first frame received to the last by their capture, with one frame's length."""
         if self._first_capture_ns is None:
             return 0.0
-        span_ns = max(0, self._last_capture_ns - self._first_capture_ns)
+        span_ns = max(0, self.newest_capture_ns - self._first_capture_ns)
         return span_ns / SECOND_NS + 1 / self.info.fps
 
     @property

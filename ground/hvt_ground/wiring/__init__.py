@@ -2,6 +2,5 @@
 
 from hvt_ground.perception.models import Models
 from hvt_ground.wiring.files import check_outputs, make_record_folder, output_path
-from hvt_ground.wiring.link import make_link_settings
 from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline
 from hvt_ground.wiring.sessions import OpenSink, SessionFactory

@@ -29,7 +29,7 @@ from hvt_geo.terrain import Terrain
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.config import check
 from hvt_ground.extras import config_class
-from hvt_ground.link.capture_clock import CaptureClock
+from hvt_ground.link.statistics import CaptureClock
 from hvt_ground.poses import Locator
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.sinks import Outputs
