@@ -17,7 +17,7 @@ from hvt_web.video.pictures import RUNGS, THUMBNAIL, Made, Rung
 
 _MOST_QUEUED = 400
 _MOST_QUEUED_BYTES = 4 * 2**20
-"""Of a viewer; above, it loses pictures up to the next keyframe."""
+"""Of a viewer; above, it loses pictures up to the next keyframe. What it was given to begin with does not count."""
 _MOST_TEXTS = 2000
 _MOST_TEXT_BYTES = 4 * 2**20
 """Text is not dropped: a viewer with so much of it unread is given up."""
@@ -58,6 +58,8 @@ class Viewer:
         self._queue: deque[tuple[str | bytes, bool]] = deque()
         self._bytes = 0
         self._texts = self._text_bytes = 0
+        self._begun = self._begun_bytes = 0
+        """What it was given to begin with, until it has taken all there is."""
         self._waits_for_keyframe = False
         self._there = asyncio.Event()
 
@@ -71,12 +73,22 @@ class Viewer:
         self._text_bytes += len(message)
         self._add(message, video=False)
 
+    def begin_video(self, fragments: Sequence[bytes]) -> None:
+        """Queue all fragments from a keyframe on; where there are none it waits for the next keyframe."""
+        self._waits_for_keyframe = not fragments
+        if self.hopeless:
+            return
+        self._begun += len(fragments)
+        self._begun_bytes += sum(map(len, fragments))
+        for one in fragments:
+            self._add(one, video=True)
+
     def put_video(self, message: str | bytes, *, begins: bool) -> None:
         """Queue a message of the live picture; ``begins``: it can be used without those before it."""
         if self.hopeless or (self._waits_for_keyframe and not begins):
             self.lost += 1
             return
-        if len(self._queue) - self._texts >= _MOST_QUEUED or self._bytes >= _MOST_QUEUED_BYTES:
+        if self._full:
             self._drop_video()
             if not begins:
                 self.lost += 1
@@ -84,6 +96,13 @@ class Viewer:
                 return
         self._waits_for_keyframe = False
         self._add(message, video=True)
+
+    def put_picture(self, message: bytes) -> None:
+        """Queue a thumbnail, which is no part of the live picture."""
+        if self.hopeless or self._full:
+            self.lost += 1
+        else:
+            self._add(message, video=True)
 
     def give_up(self, reason: str) -> None:
         """It is closed, and told the reason: it takes nothing, or has to make room."""
@@ -111,10 +130,17 @@ class Viewer:
             raise ConnectionError("the viewer takes nothing")
         message, video = self._queue.popleft()
         self._bytes -= len(message)
+        if not self._queue:
+            self._begun = self._begun_bytes = 0
         if not video:
             self._texts -= 1
             self._text_bytes -= len(message)
         return message
+
+    @property
+    def _full(self) -> bool:
+        pending = len(self._queue) - self._texts - self._begun
+        return pending >= _MOST_QUEUED or self._bytes - self._begun_bytes >= _MOST_QUEUED_BYTES
 
     def _add(self, message: str | bytes, *, video: bool) -> None:
         self._queue.append((message, video))
@@ -124,6 +150,7 @@ class Viewer:
     def _drop_video(self) -> None:
         others = [one for one in self._queue if not one[1]]
         self.lost += len(self._queue) - len(others)
+        self._begun = self._begun_bytes = 0
         self._queue = deque(others)
         self._bytes = sum(len(message) for message, _ in others)
 
@@ -213,7 +240,7 @@ class Hub:
             edge.thumbnail = packed("thumbnail", item, **about)
             for viewer in self.viewers:
                 if viewer.wall:
-                    viewer.put_video(edge.thumbnail, begins=True)
+                    viewer.put_picture(edge.thumbnail)
             return
         if isinstance(item, Start):
             stream = edge.streams[rung] = self._new_stream()
@@ -312,7 +339,7 @@ class Hub:
         # Those of all edges: of a silent one no other would come.
         for edge in self.edges.values() if viewer.wall else ():
             if edge.thumbnail is not None:
-                viewer.put_video(edge.thumbnail, begins=True)
+                viewer.put_picture(edge.thumbnail)
 
     def _new_stream(self) -> _Stream:
         self._streams += 1
@@ -329,8 +356,7 @@ class Hub:
             return
         for one in stream.start:
             viewer.put(one)
-        for index, fragment in enumerate(stream.fragments):
-            viewer.put_video(fragment, begins=index == 0)
+        viewer.begin_video(stream.fragments)
 
     def _fragment(self, edge: EdgePage, rung: Rung, item: Fragment, about: dict[str, Any]) -> None:
         stream = edge.streams.get(rung)

@@ -29,8 +29,9 @@ RUNGS: tuple[Rung, ...] = ("hevc", "h264", "jpeg")
 THUMBNAIL: Rung = "thumbnail"
 
 _MOST_GOP_BYTES = 16 * 2**20
-_MOST_GOP_UNITS = 1800
-"""Limit of the pictures since the last keyframe, which a new viewer needs."""
+MOST_GOP_UNITS = 1800
+"""Limit of the pictures since the last keyframe, which a new viewer needs. Where there are more he waits for the next
+keyframe; who looks already goes on."""
 _JPEG_EVERY_NS = 500_000_000
 _THUMBNAIL_EVERY_NS = 1_000_000_000
 _THUMBNAIL_WIDTH_PX = 320
@@ -63,7 +64,10 @@ class Pictures:
     def __init__(self, info: Info) -> None:
         self._info = info
         self._gop: list[VideoSample] = []
+        """All since the last keyframe; empty where they are too many."""
         self._gop_bytes = 0
+        self._whole = False
+        """Nothing is missing since the last keyframe."""
         self._decoder: BaseDecoder | None = None
         """None while nobody needs decoded pictures."""
         self._h264: _H264 | None = None
@@ -86,11 +90,11 @@ class Pictures:
         if not self._remember(sample):
             return
         if "hevc" in wanted:
-            yield from self._copy()
+            yield from self._copy(sample)
         if not set(wanted) - {"hevc"}:
             self._decoder = None
             return
-        picture = self._decode()
+        picture = self._decode(sample)
         if picture is None or hurry:
             return
         yield from self._coded(picture, sample, wanted=wanted, now_ns=now_ns)
@@ -99,23 +103,26 @@ class Pictures:
         """Samples are missing: the next that is of use is a keyframe."""
         self._gop.clear()
         self._gop_bytes = 0
+        self._whole = False
         self._copied = self._decoder = None
 
     def _remember(self, sample: VideoSample) -> bool:
         if sample.keyframe:
             self._gop.clear()
+            self._gop_bytes, self._whole = 0, True
+        elif len(self._gop) >= MOST_GOP_UNITS or self._gop_bytes >= _MOST_GOP_BYTES:
+            self._gop.clear()
             self._gop_bytes = 0
-        elif not self._gop or len(self._gop) >= _MOST_GOP_UNITS or self._gop_bytes >= _MOST_GOP_BYTES:
-            if self._gop:
-                self.gap()
-            return False
-        self._gop.append(sample)
-        self._gop_bytes += len(sample.data)
-        return True
+        if sample.keyframe or self._gop:
+            self._gop.append(sample)
+            self._gop_bytes += len(sample.data)
+        return self._whole
 
-    def _copy(self) -> Iterator[Made]:
-        new = self._gop[-1:]
+    def _copy(self, sample: VideoSample) -> Iterator[Made]:
+        new = [sample]
         if self._copied is None:
+            if not self._gop:
+                return
             self._copied = Muxer("hevc", size=self._info.base_size, fps=self._info.fps)
             new = self._gop
         for one in new:
@@ -123,10 +130,12 @@ class Pictures:
                 "hevc", self._copied, one.data, keyframe=one.keyframe, capture_ns=one.capture_ns
             )
 
-    def _decode(self) -> av.VideoFrame | None:
+    def _decode(self, sample: VideoSample) -> av.VideoFrame | None:
         # The newest picture; who begins in between decodes all since the keyframe first.
-        new = self._gop[-1:]
+        new = [sample]
         if self._decoder is None:
+            if not self._gop:
+                return None
             self._decoder = BaseDecoder(size=self._info.base_size)
             new = self._gop
         picture = None

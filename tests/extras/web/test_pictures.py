@@ -75,6 +75,19 @@ def test_who_begins_to_look_in_the_middle_sees_the_picture_of_now(samples, rung,
     )
 
 
+def test_who_looks_goes_on_however_rare_keyframes_are(samples, monkeypatch):
+    """With keyframes on demand alone the page would stand still for good after two minutes."""
+    monkeypatch.setattr("hvt_web.video.pictures.MOST_GOP_UNITS", 10)
+    for rung in ("hevc", "h264"):
+        assert [place(one) for one in shown(fed(pictures(), samples, {rung}))] == pytest.approx(
+            [index * STEP_PX for index in range(60)], abs=2
+        )
+    made = pictures()
+    fed(made, samples[:30], set())
+    assert fed(made, samples[30:], {"hevc", "h264", "jpeg"}) == []  # their keyframe is no longer kept
+    assert fed(made, samples[:3], {"hevc"}, number=2)
+
+
 def test_keyframes_of_the_coded_stream_come_every_two_seconds(samples):
     """Who joins would decode everything since the first one looked."""
     came = [one.item for one in fed(pictures(), samples, {"h264"}) if isinstance(one.item, Fragment)]

@@ -56,6 +56,28 @@ def test_who_joins_between_keyframes_begins_at_the_last_one(hub):
     assert kinds(viewer)[1:] == ["start", "init", *(f"fragment {number}" for number in range(20, 26))]
 
 
+def test_who_joins_long_after_a_keyframe_begins_there_too(hub):
+    """On a thin link keyframes come once a minute: a second viewer would see black until then."""
+    edge = flown(hub, frames=900, keyframe_every=2000)
+    viewer = Viewer()
+    hub.join(viewer)
+    hub.watch(viewer, "uav-1", "h264")
+    hub.made(edge, fragment(900), frame_index=900, captured_ms=0)
+    assert kinds(viewer)[4:] == [f"fragment {number}" for number in range(901)]
+    assert viewer.lost == 0
+
+
+def test_who_joins_where_the_keyframe_is_no_longer_kept_waits_for_the_next(hub):
+    """He would be shown a broken picture."""
+    edge = flown(hub, frames=2003, keyframe_every=4000)
+    viewer = Viewer()
+    hub.join(viewer)
+    hub.watch(viewer, "uav-1", "h264")
+    for number in range(2003, 2006):
+        hub.made(edge, fragment(number, keyframe=number == 2004), frame_index=number, captured_ms=0)
+    assert kinds(viewer)[4:] == ["fragment 2004", "fragment 2005"]
+
+
 def test_a_slow_viewer_goes_on_at_a_keyframe_and_loses_no_words(hub):
     """It would see a broken picture, or fill the memory of the ground."""
     edge = flown(hub, frames=1, keyframe_every=10)
@@ -77,6 +99,20 @@ def test_a_slow_viewer_goes_on_at_a_keyframe_and_loses_no_words(hub):
     assert len(frames) < 450
     assert frames[0] % 100 == 0
     assert frames == list(range(frames[0], 1005))
+
+
+def test_a_thumbnail_is_no_keyframe(hub):
+    """Who is slow would be shown a broken picture each time the wall is."""
+    edge = flown(hub, frames=1, keyframe_every=1000)
+    slow = Viewer()
+    hub.join(slow)
+    hub.show_wall(slow, shown=True)
+    hub.watch(slow, "uav-1", "h264")
+    for number in range(1, 1000):
+        hub.made(edge, fragment(number), frame_index=number, captured_ms=0)
+        if number % 10 == 0:
+            hub.made(edge, Made("thumbnail", b"jpeg"), frame_index=number, captured_ms=0)
+    assert not [one for one in kinds(slow) if one.startswith("fragment")]
 
 
 def test_nothing_is_made_for_nobody(hub):
