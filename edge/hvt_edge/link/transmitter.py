@@ -71,6 +71,7 @@ class Transmitter:
 
     ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep. A ``pacer`` counts all that
     goes out, and holds stills while the link is busy. ``in_flight`` holds access units until they are reported.
+    ``clock`` is the time of the windows where it passes while a still is coded; None in lockstep.
     """
 
     outlet: Outlet
@@ -83,6 +84,7 @@ class Transmitter:
     wait_until: Callable[[int], None]
     pacer: Pacer | None = None
     in_flight: BaseInFlight | None = None
+    clock: Callable[[], int] | None = None
 
     def __post_init__(self) -> None:
         self._keys = EdgeKeys(self.edge_id)
@@ -212,7 +214,8 @@ class Transmitter:
 
         ``requested`` by a ground: `requested_allowance_bytes` admitted it.
 
-        Where another thread has taken the allowance since, it waits until there is one again, as everything does.
+        It goes when it is coded, which is later than ``now_ns``. Where another thread has taken the allowance since,
+        it waits until there is one again, as everything does.
         Its outcome is noted with its bytes: ``sent``, or ``dropped`` once the run has ended.
         """
         still, encoding = envelope.still, envelope.encoding
@@ -222,7 +225,7 @@ class Transmitter:
                 return
             self.ledger.record_outcome("sent", copy or still.reason)
             self.still_sequence = max(self.still_sequence, still.sequence)
-            at_ns = self._still_at_ns(envelope, now_ns)
+            at_ns = self._still_at_ns(envelope, max(now_ns, now_ns if self.clock is None else self.clock()))
             attachment = self._header_at(envelope, at_ns).pack(still.data)
             line_bytes = self._count(
                 Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=encoding

@@ -134,6 +134,7 @@ def build_stages(
         wait_until=loop_clock.wait_until,
         pacer=pacer,
         in_flight=None if lockstep else in_flight,
+        clock=None if lockstep else loop_clock,
     )
     reconfiguration = EncoderReconfiguration(
         operating,

@@ -310,6 +310,16 @@ def test_a_still_of_just_the_room_takes_just_the_room(  # noqa: PLR0917 - hypoth
         assert len(header.class_name.encode()) > 60 or header.class_name == class_name
 
 
+def test_a_still_is_stamped_and_counted_when_it_goes_not_when_its_coding_began():
+    """Windows on the line would be fuller than those of the account, and every still seem to take long on its way."""
+    rig = Rig()
+    rig.sender.clock = lambda: NOW_NS + 400_000_000
+    rig.sender.still(rig.sender.envelope(still()), now_ns=NOW_NS)
+    header = RoiHeader.parse(rig.out.puts[0][2], rig.out.puts[0][1])
+    assert header.send_ns == NOW_NS + 400_000_000
+    assert not rig.budget.fits(99_900, now_ns=NOW_NS + SECOND_NS + 200_000_000)
+
+
 def test_before_there_is_a_still_the_room_is_that_of_a_usual_one():
     """The method would plan with room that no still has, or leave room unused."""
     rig = Rig()
