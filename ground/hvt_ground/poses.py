@@ -18,6 +18,8 @@ STALE_S: Final = 10.0
 """A pose this old is none."""
 _MOST_POSES: Final = 64
 """A minute of them: pictures are not shown later than that."""
+_ANEW_AFTER: Final = 5
+"""What comes so often and is never newer begins anew: the newest may be forged, or the edge's clock set back."""
 _DRIFT: Final = 0.5
 """Standard deviation of a change of motion, as a share of the motion in as long a time."""
 
@@ -29,11 +31,16 @@ class PoseTrail:
         self._most = most
         self._poses: list[Pose] = []
         self._times: list[int] = []
+        self._refused = 0
 
     def add(self, pose: Pose) -> bool:
         """Take a pose; False for one that is not newer than the last."""
         if self._poses and pose.capture_ns <= self._poses[-1].capture_ns:
-            return False
+            self._refused += 1
+            if self._refused < _ANEW_AFTER:
+                return False
+            self._poses, self._times = [], []
+        self._refused = 0
         self._poses.append(pose)
         self._times.append(pose.capture_ns)
         if len(self._poses) > self._most:
@@ -43,7 +50,8 @@ class PoseTrail:
     @property
     def newest(self) -> Pose | None:
         """The last one that came."""
-        return self._poses[-1] if self._poses else None
+        poses = self._poses
+        return poses[-1] if poses else None
 
     def age_s(self, capture_ns: int) -> float | None:
         """The age of the newest pose at this moment; None without one."""

@@ -68,6 +68,17 @@ def test_ten_seconds_old_is_no_pose():
     assert trail.age_s(12 * SECOND_NS) == 12
 
 
+def test_one_pose_of_the_future_does_not_hold_for_the_rest_of_the_flight():
+    """The map would show one place, as if it were of now, until that time is there."""
+    trail = PoseTrail()
+    trail.add(pose(0))
+    trail.add(pose(1e6))
+    taken = [trail.add(pose(second)) for second in range(1, 20)]
+    assert taken == 4 * [False] + 15 * [True]
+    assert trail.newest == pose(19)
+    assert trail.at(19 * SECOND_NS) is not None
+
+
 def test_an_old_one_is_left_out_and_memory_is_bounded():
     """A repeated message would turn time back, and a long flight fill the memory."""
     trail = PoseTrail(most=10)

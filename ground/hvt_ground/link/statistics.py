@@ -261,8 +261,8 @@ class SessionAccount:
         )
 
     def traffic_due(self, header: BaseHeader) -> bool:
-        """Whether to call `traffic`: twice a second of the stream."""
-        return header.send_ns >= self._next_traffic_ns
+        """Whether to call `traffic`: twice a second of the stream, and where its time was set back."""
+        return not 0 < self._next_traffic_ns - header.send_ns <= SECOND_NS // 2
 
     def traffic(self, header: BaseHeader, *, tracks: int, tracks_refined: int) -> None:
         """Give out how full the link was and how old the picture is."""

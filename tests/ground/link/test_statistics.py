@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import pytest
 
+from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader
-from hvt_ground.link.statistics import REPORT_LINE_BYTES, ReceptionStatistics
+from hvt_ground.link.statistics import REPORT_LINE_BYTES, CaptureClock, ReceptionStatistics, SessionAccount
 from rigs.footprint import footprint_bytes
+from rigs.messages import INFO
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -183,3 +186,17 @@ def test_a_still_may_come_while_a_report_is_made():
     for came in now.threads:
         came.join()
     assert reception_statistics.take(S).still_sequence == 100 + 2 * (len(now.threads) - 1)
+
+
+def test_a_time_of_the_future_does_not_stop_the_measurement():
+    """One forged frame would leave the numbers of the link as they were for the rest of the flight."""
+    account = SessionAccount(
+        INFO, clock=lambda: 0, clock_offset=CaptureClock(ClockOffset()), emit=lambda _event: None
+    )
+    due = []
+    for at_ns in (0, 100 * MS, 500 * MS, 10**6 * S, 600 * MS, 900 * MS, 1100 * MS):
+        one = replace(header(0), capture_ns=at_ns)
+        due.append(account.traffic_due(one))
+        if due[-1]:
+            account.traffic(one, tracks=0, tracks_refined=0)
+    assert due == [True, False, True, True, True, False, True]

@@ -38,7 +38,7 @@ class MapRows:
     def overlay(self, overlay: Overlay) -> Iterable[TableRow]:
         """The places of tracks, at most once a second."""
         places = overlay.places
-        if places is None or overlay.capture_ns < self._next_ns:
+        if places is None or 0 < self._next_ns - overlay.capture_ns <= _EVERY_NS:
             return []
         self._next_ns = overlay.capture_ns + _EVERY_NS
         known = np.flatnonzero(np.isfinite(places.places_deg).all(axis=1))
