@@ -20,6 +20,7 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
 from hvt_common.video.hevc import YuvPicture
+from hvt_edge.config import EdgeConfig, check
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
@@ -27,6 +28,7 @@ from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from hvt_edge.wiring.perception import make_analyzer
 from media.clips import framed, smooth_pictures
 from programs.processes import eventually
 from rigs.flight import CLASSES, SIZE, NothingSeen, RedSquares, square_box
@@ -79,6 +81,18 @@ def test_small_objects_are_looked_at_enlarged_and_less_often(candidates):
     seen = [analyzer.analyze(frame, unit) for frame, unit in zip(FRAMES, UNITS, strict=True)]
     assert [one.frame.index for one in seen if one.detected] == [0, 9, 18, 21, 24, 27], "in vain at last"
     np.testing.assert_allclose(seen[0].tracks.boxes_xyxy_px[0], square_box(0), atol=6)
+
+
+@pytest.mark.parametrize(
+    ("tiles", "pace", "runs"),
+    [("auto", "realtime", 2), ("auto", "lockstep", 1), ("search", "lockstep", 2), ("off", "realtime", 1)],
+)
+def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, runs):
+    """Objects of a few pixels would get no still, or a study that is repeated other figures."""
+    config = check(EdgeConfig(source="demo", candidates="source", tiles=tiles, pace=pace))
+    network = NothingSeen()
+    make_analyzer(config, detector=network, view=VIEW).analyze(FRAMES[0], UNITS[0])
+    assert network.runs == runs
 
 
 def test_what_nobody_uses_is_not_searched_and_goes_on_from_any_frame():

@@ -16,7 +16,7 @@ from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.turns import Turns
 from hvt_ground.wiring import Models
 from hvt_ground.wiring.perception import make_pipeline
-from rigs.flight import Flight
+from rigs.flight import Flight, NothingSeen
 
 
 def flown(fps: dict[str, float], *, detect_s: float, lasts_s: float) -> Counter[str]:
@@ -123,3 +123,17 @@ def test_lockstep_takes_turns_with_all_others():
         pipeline = make_pipeline(config, models, info=info, emit=lambda _: None)
         pipeline.analyze(DecodedFrame(0, 0, 0, np.zeros((192, 320, 3), np.uint8)), hurry=False)
     assert waits == [pytest.approx(0.5 / 15), None]
+
+
+@pytest.mark.parametrize(
+    ("tiles", "pace", "runs"),
+    [("auto", "realtime", 2), ("auto", "lockstep", 1), ("search", "lockstep", 2), ("off", "realtime", 1)],
+)
+def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, runs):
+    """Objects of a few pixels would have no box, or a study that is repeated other figures."""
+    models, network = Models(check(GroundConfig(classifier="none"))), NothingSeen()
+    models.take = lambda: (network, None)
+    config, info = check(GroundConfig(classifier="none", tiles=tiles)), replace(Flight(1).info(), pace=pace)
+    pipeline = make_pipeline(config, models, info=info, emit=lambda _: None)
+    pipeline.analyze(DecodedFrame(0, 0, 0, np.zeros((192, 320, 3), np.uint8)), hurry=False)
+    assert network.runs == runs
