@@ -21,12 +21,12 @@ from hvt_common.config import load
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.link.publisher import EdgeListener
+from hvt_fleet import commands
 from hvt_ground.app import Ground
-from hvt_ground.control import command
 from hvt_ground.extras import checked, config_class
 
 _ROOT = Path(__file__).resolve().parent.parent
-_PACKAGES = ("hvt_common", "hvt_edge", "hvt_ground")
+_PACKAGES = ("hvt_common", "hvt_edge", "hvt_ground", "hvt_fleet")
 _CODECS = "hvt_common/video/still_codecs"
 _LEAST_FRAMES, _LEAST_STILLS = 60, 6
 _MOST_S = 100.0
@@ -36,13 +36,13 @@ _WALKS = {
     ("RealtimePace.step",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 35),
     ("StillStage.analyze",): ("a frame's objects at the edge", 25),
     ("StillStage.send",): ("a still at the edge, from choosing to put", 41),
-    ("command.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
+    ("commands.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
         "a command, from hvt-ground set-budget to the encoder",
-        37,
+        39,
     ),
-    ("EdgeSessions.handle",): ("a message at the ground, received", 68),
+    ("EdgeSessions.handle",): ("a message at the ground, received", 67),
     ("GroundSession._analyze",): ("a frame at the ground, analyzed", 34),
-    ("Recorder.log",): ("an event at the ground, recorded", 13),
+    ("Recorder.log",): ("an event at the ground, recorded", 12),
 }
 _MEASURED = {one for functions in _WALKS for one in functions}
 _GOES = "Transmitter.still"
@@ -112,7 +112,7 @@ def fly(walks: Walks) -> None:
         ground = threading.Thread(target=Ground(checked(ground_config), stop=stop).run)
         edge = threading.Thread(target=Edge(edge_config, stop=landed).run)
         words = ["set-budget", "300kbps", "--connect", endpoint]
-        commander = threading.Thread(target=command.run, args=[words])
+        commander = threading.Thread(target=commands.run, args=[words])
         for one in (ground, edge):
             one.start()
         _wait_for(walks, "RealtimePace.step", _LEAST_FRAMES)

@@ -28,7 +28,10 @@ Other commands, each with --help:
   hvt-ground keys                        make keys, and say who may do what"""
 _EXTRA_COMMANDS = "hvt.ground_commands"
 """Entry points of commands that extras bring: each takes the words that follow, and returns the exit code."""
-_BROUGHT = ("doctor", "export", "keys", "recordings", "replay", "status")
+_BROUGHT = (
+    *("doctor", "edges", "export", "keyframe", "keys", "recordings", "replay"),
+    *("set-budget", "set-method", "status", "still", "tracks"),
+)
 """Commands of the extras that come with HVT."""
 
 
@@ -50,10 +53,6 @@ def _run(argv: Sequence[str] | None) -> int:
             with needs_extra("'hvt[ground]'"):
                 run = entry.load()
             return int(run(words[1:]))
-        from hvt_ground.control import command as control  # noqa: PLC0415
-
-        if words[0] in control.COMMANDS:
-            return control.run(words)
         if words[0] in _BROUGHT:
             raise UserError(
                 f"hvt-ground {words[0]} is of an extra that is not installed: pip install 'hvt[ground]'"

@@ -64,7 +64,9 @@ def test_extras_bring_what_the_core_has_not():
     assert not set(settings) & set(GroundConfig.__annotations__)
 
 
-@pytest.mark.parametrize("command", ["doctor", "export", "keys", "recordings", "replay", "status"])
+@pytest.mark.parametrize(
+    "command", ["doctor", "export", "keys", "recordings", "replay", "set-budget", "status"]
+)
 def test_a_command_of_an_extra_that_is_absent(command, monkeypatch, capsys):
     """It would be an unrecognised argument of the ground."""
     monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})

@@ -367,7 +367,7 @@ MORE_ANSWERS = {
         "the budget had no room for it",
     },
     "edge/hvt_edge/stills/requested_coding.py": {"the video already shows it as well as the source does"},
-    "ground/hvt_ground/control/api.py": {
+    "ground/hvt_ground/control.py": {
         "edge … does not answer: is it flying, and does this link reach it?…",
         "the edge is not there any more: it has ended, or its link is down",
         "the budget or the link is full",
@@ -383,7 +383,7 @@ def test_every_answer_to_a_command_is_read():
         for path in ROOT.joinpath("edge").rglob("*.py")
         for text in given(path, {"RefusedError", "NothingCloser"})
     }
-    found |= set(given(ROOT / "ground/hvt_ground/control/api.py", {"RefusedError", "UserError"}))
+    found |= set(given(ROOT / "ground/hvt_ground/control.py", {"RefusedError", "UserError"}))
     assert found == ANSWERS
     for name, said in MORE_ANSWERS.items():
         assert said <= set(sentences(ROOT / name)), name

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from hvt_common.config import with_joined_values
 from hvt_common.errors import Parser, UserError
 from hvt_common.runtime.reporting import say
 from hvt_common.units import bitrate_text, parse_bitrate, parse_duration_s
-from hvt_ground.control.api import EdgeClient, RemoteEdge, RequestedStill, check_suffix
+from hvt_ground.control import EdgeClient, RemoteEdge, RequestedStill, check_suffix
 
 _TIMEOUT_S = 15.0
 
@@ -28,6 +29,10 @@ def run(argv: Sequence[str]) -> int:
             return 0
         do(edges[arguments.edge or _only_one(edges)])
     return 0
+
+
+def _named(name: str, words: Sequence[str]) -> int:
+    return run([name, *words])
 
 
 def _only_one(edges: EdgeClient) -> str:
@@ -183,3 +188,7 @@ def _still_flags(parser: argparse.ArgumentParser) -> None:
         metavar="TIME",
         help=f"how long to wait for it [{_TIMEOUT_S:g}s]",
     )
+
+
+still, tracks, keyframe, set_budget, set_method, edges = (partial(_named, name) for name in COMMANDS)
+"""Each is a command of ``hvt-ground``."""

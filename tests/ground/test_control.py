@@ -18,9 +18,9 @@ from hvt_common.protocol.messages import ControlAnswer, ControlRequest, RoiHeade
 from hvt_common.transport.session import declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_common.video.still_codecs import JpegCodec
+from hvt_fleet.commands import run
 from hvt_ground.cli import main
 from hvt_ground.control import EdgeClient, RefusedError, RequestedStill
-from hvt_ground.control.command import run
 from rigs import messages
 
 KEYS = EdgeKeys("uav-1")
