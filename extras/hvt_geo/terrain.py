@@ -5,12 +5,15 @@ from __future__ import annotations
 import logging
 import math
 import threading
+import time
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.geodesy import metres_per_degree, turned_deg
+from hvt_common.runtime.failures import RetryPause
 from hvt_common.values import Pose
 from hvt_geo.elevation import TILE_M, ElevationModel, ModelError, Tile
 from hvt_geo.surface import LEAST_DEPRESSION_DEG, Points, Rays
@@ -28,13 +31,18 @@ class Terrain:
 
     The camera's height above the sea is ``altitude_m``; of a pose that says only a height above the ground, that is
     taken to be above the ground below the first pose. Where the model has no ground below the camera the log says so
-    once, with ``flight``, the name of whose it is.
+    once, with ``flight``, the name of whose it is. Where the model cannot be read, what is in memory counts, and it
+    is read again after a pause. ``clock`` is nanoseconds without steps.
     """
 
-    def __init__(self, model: ElevationModel, flight: str) -> None:
+    def __init__(
+        self, model: ElevationModel, flight: str, *, clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
         self._model = model
         self._flight = flight
+        self._clock = clock
         self._lock = threading.Lock()
+        self._retry = RetryPause()
         self._tile: Tile | None = None
         self._middle = (math.inf, math.inf)
         self._base_m: float | None = None
@@ -112,16 +120,19 @@ class Terrain:
             north_m, east_m = metres_per_degree(pose.latitude_deg)
             east_deg = turned_deg(pose.longitude_deg - self._middle[1]) if self._tile else math.inf
             off_m = math.hypot((pose.latitude_deg - self._middle[0]) * north_m, east_deg * east_m)
-            if self._tile is None or not off_m <= TILE_M - _REACH_M:
-                self._middle = (pose.latitude_deg, pose.longitude_deg)
+            outside = self._tile is None or not off_m <= TILE_M - _REACH_M
+            if outside and self._retry.due(self._clock()):
+                middle = (pose.latitude_deg, pose.longitude_deg)
                 try:
-                    self._tile = self._model.around(*self._middle)
+                    self._tile, self._middle = self._model.around(*middle), middle
                 except ModelError as error:
-                    self._tile, failure = Tile.empty(), error
+                    failure = error
+                    self._retry.failed(self._clock())
             tile = self._tile
         if failure is not None:
-            self._note(f"cannot be read, and nothing of {self._flight} is placed: {failure}")
-        return tile
+            nothing = "nothing" if tile is None else "nothing far from where it was"
+            self._note(f"cannot be read, and {nothing} of {self._flight} is placed: {failure}")
+        return tile or Tile.empty()
 
     def _note(self, what: str) -> None:
         # Say once why nothing is placed: who watches the map waits for it.

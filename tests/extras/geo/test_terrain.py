@@ -347,6 +347,20 @@ def test_a_model_that_goes_in_flight_ends_no_flight(tmp_path, caplog):
     assert f"--terrain {path} cannot be read, and nothing of uav-1 is placed: " in notice.message
 
 
+def test_a_model_that_comes_back_in_flight_is_read_again(tmp_path):
+    """A share that is away for a second would take the map for as long as the aircraft circles."""
+    path, now_ns = model(tmp_path, lambda north, east: 500.0), 0
+    terrain = Terrain(ElevationModel(path), "uav-1", clock=lambda: now_ns)
+    away = path.rename(tmp_path / "away")
+    assert not terrain.usable(POSE)
+    away.rename(path)
+    assert not terrain.usable(POSE)  # not with every frame
+    now_ns += 2_000_000_000
+    assert terrain.usable(POSE)
+    path.unlink()
+    assert terrain.usable(replace(POSE, latitude_deg=47.0 + 6000 / NORTH_M)), "what is in memory is forgotten"
+
+
 def test_each_flight_has_a_ground_below_its_own_first_pose(tmp_path):
     """The second drone's heights would count from where the first one took off."""
     locator_of = GeoExtra().locators(model(tmp_path, lambda north, east: 500 + 0.5 * north))
