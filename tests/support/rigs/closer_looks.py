@@ -18,6 +18,7 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import psnr_y_db, still_codec
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.link.publisher import Answers
 from hvt_edge.source.contract import Source
 from hvt_edge.world import World
 from media.clips import START_NS
@@ -110,10 +111,10 @@ class LookFlight(World):
         del channel
         return True
 
-    def listen(self, *, control: Callable[[ControlRequest], ControlAnswer], info: Any, **_: Any) -> None:
+    def listen(self, answers: Answers) -> None:
         """The edge is ready."""
-        self._control = control
-        self.info = Info.parse(info(START_NS))
+        self._control = answers.control
+        self.info = Info.parse(answers.info(START_NS))
 
     def put(
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
