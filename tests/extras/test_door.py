@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -13,9 +14,12 @@ from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.store import library_part
+from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.health import health_server
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_edge.wiring.storing import open_local_copy
 from hvt_ground.cli import main
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.extras import all_extras, config_class, locators
@@ -99,6 +103,16 @@ def test_a_link_without_its_doctor_is_a_link(monkeypatch, free_port):
     settings = LinkSettings(role="edge", connect=(f"tls/127.0.0.1:{free_port}",), name="uav-1")
     with open_session(settings) as session, link_doctor().watch(session, settings, served=bool) as watch:
         assert (watch.trouble, watch.may_command("uav-1")) == ("", True)
+
+
+def test_an_option_whose_part_is_of_an_extra_that_is_absent(monkeypatch, tmp_path):
+    """An edge would fly without its copy, or be watched by nobody, and say nothing of it."""
+    monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})
+    failures = Failures(time.time_ns)
+    with pytest.raises(UserError, match=r"--record-base is of an extra .*: pip install 'hvt\[edge\]'"):
+        open_local_copy(tmp_path / "a.mkv", failures=failures, wait=False)
+    with pytest.raises(UserError, match=r"--metrics is of an extra .*: pip install 'hvt\[metrics\]'"):
+        health_server("edge", "127.0.0.1:1", lambda: None, clock=time.time_ns, stuck_s=1, failures=failures)
 
 
 def test_the_names_of_heads_are_those_that_the_library_reads():
