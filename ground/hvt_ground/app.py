@@ -132,7 +132,7 @@ class Ground:
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             group = None
             if config.group is not None:
-                shown = "".join([one.shown_to_others for one in services][:1])
+                shown = next((one.shown_to_others for one in services if one.shown_to_others), "")
                 group = stack.enter_context(GroundGroup(session, config.group, page=shown))
             log = next((one.message_log for one in services if one.message_log is not None), None)
             link = stack.enter_context(

@@ -12,8 +12,10 @@ from typing import Any
 import pytest
 
 from hvt_common.errors import FlightError
+from hvt_common.protocol.channels import GroupKeys
 from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig, check
+from hvt_ground.extras import Extra, Service
 from programs.outsider import joined
 from programs.processes import eventually
 
@@ -78,6 +80,41 @@ def test_once_without_a_time_to_wait_it_waits(free_port: int, tmp_path: Path) ->
     assert not run.over
     run.stop.set()
     eventually(lambda: run.over, within_s=20, what="the ground has ended")
+
+
+class Brings(Extra):
+    """An extra with one service."""
+
+    def __init__(self, shown: str = "") -> None:
+        self._shown = shown
+
+    def serve(self, *_: Any, **__: Any) -> Service:
+        """One that others see there, or nowhere."""
+        service = Service()
+        service.shown_to_others = self._shown
+        return service
+
+
+def test_a_group_learns_of_the_page_whatever_else_is_served(
+    free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With an index of recordings, too, an edge that another member serves would have no link to its page."""
+    extras = (Brings(), Brings("https://base-a.example/"), Brings())
+    monkeypatch.setattr("hvt_ground.app.all_extras", lambda: extras)
+    run = Run(config(free_port, tmp_path, group="north"))
+    try:
+        with joined(f"tcp/127.0.0.1:{free_port}") as outsider:
+            pages: list[bytes] = []
+
+            def answered() -> bool:
+                answers = outsider.get(GroupKeys("north").everything, timeout=5.0)
+                pages[:] = [one.ok.payload.to_bytes() for one in answers if one.ok is not None]
+                return bool(pages)
+
+            eventually(answered, within_s=20, what="a member answers")
+            assert pages == [b"https://base-a.example/"]
+    finally:
+        run.stop.set()
 
 
 class Failing(threading.Event):

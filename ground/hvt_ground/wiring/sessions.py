@@ -46,8 +46,8 @@ _LOCKSTEP_WAIT_S = 10.0
 class SessionFactory:
     """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
-    All that they write to is of ``outputs``; ``view`` is a viewer, None shows nothing there; ``services`` are of
-    extras; ``index`` learns of the recordings, and ``program`` opens a sink of another program.
+    All that they write to is of ``outputs``; ``view`` is a viewer, None shows nothing there; ``services`` of extras
+    bring sinks and learn of the recordings, and ``program`` opens a sink of another program.
     """
 
     def __init__(
