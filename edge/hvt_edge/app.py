@@ -112,16 +112,18 @@ class Edge:
             say_size(config, source.view)
             headroom = qualify_encoder(config, source, clock=world.clock, stop=self._stop)
             background = (lambda call: call()) if self._lockstep else with_lower_priority
-            opened = background(
-                lambda: open_for_flight(
-                    config,
-                    lambda: world.open_detector(config),
-                    lambda detector: world.warm_up(config, detector, source),
+            # Not kept beside the one that is opened in its place once it has failed: it holds 100 MB.
+            ready = [
+                background(
+                    lambda: open_for_flight(
+                        config,
+                        lambda: world.open_detector(config),
+                        lambda detector: world.warm_up(config, detector, source),
+                    )
                 )
-            )
-            detector: FailingDetector = opened
+            ]
+            detector: FailingDetector = ready[0]
             if not self._lockstep:  # whose result would be of something else
-                ready = [opened]
                 detector = RetriedDetector(
                     lambda: ready.pop() if ready else world.open_detector(config),
                     self._failures,

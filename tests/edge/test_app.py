@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -11,7 +12,7 @@ import pytest
 
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import BaseHeader
-from hvt_common.values import Frame
+from hvt_common.values import Detections, Frame, Image
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.report.status import table
@@ -140,3 +141,52 @@ def test_video_alone_opens_no_detector(tmp_path, pace, settings, opened):
     assert world.opened == opened
     assert summary["frames"] > 0
     assert not summary.get("failed")
+
+
+class FragileDetector(Detector):
+    """Its first fails in flight; the next says whether that one is gone."""
+
+    class_names = ("car",)
+
+    def __init__(self, first: weakref.ref[FragileDetector] | None) -> None:
+        self.first, self.runs = first, 0
+        self.alone: bool | None = None
+
+    def detect(self, image_bgr: Image) -> Detections:
+        """See there."""
+        self.runs += 1
+        if self.first is None and self.runs > 2:
+            raise RuntimeError("it stumbles")
+        self.alone = self.first is not None and self.first() is None
+        return Detections.none()
+
+
+class FragileWorld(World):
+    """With such detectors."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first: weakref.ref[FragileDetector] | None = None
+        self.second: FragileDetector | None = None
+
+    def open_detector(self, config: EdgeConfig) -> Detector:
+        """See there."""
+        opened = FragileDetector(self.first)
+        if self.first is None:
+            self.first = weakref.ref(opened)
+        else:
+            self.second = opened
+        return opened
+
+
+def test_a_detector_that_failed_does_not_stay_beside_its_successor(tmp_path):
+    """The edge would hold two networks from the first failure on, 100 MB more, and a small board end it."""
+    write_scene(tmp_path, frames=25)
+    config = EdgeConfig(
+        source=str(tmp_path), source_fps=10.0, fps=10, size="320x192", preset="ultrafast", method="M2",
+        connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0, detect_every=1,
+    )  # fmt: skip
+    world = FragileWorld()
+    Edge(check(config), stop=threading.Event(), world=world).run()
+    assert world.second is not None, "it was opened again"
+    assert world.second.alone
