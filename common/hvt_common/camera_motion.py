@@ -28,6 +28,12 @@ _LEAST_INLIERS: Final = 12
 _LEAST_INLIER_SHARE: Final = 0.3
 # No camera zooms or rolls this far between two frames: such an estimate is wrong.
 _SCALE_RANGE: Final = (0.5, 2.0)
+_STILL_SHIFT: Final = 0.03
+"""Of the picture's sides together: what came into view since is no larger."""
+_STILL_CHANGED: Final = 0.006
+_CHANGED_LEVELS: Final = 16
+_BLUR_PX: Final = 5
+"""Of the reduced picture; noise and the coding of a base stream are not motion."""
 
 
 class CameraMotion:
@@ -42,6 +48,26 @@ class CameraMotion:
             raise ValueError(f"camera motion scale is {scale}, must be above 0 and at most 1")
         self._scale = scale
         self._previous: _Gray | None = None
+        self.mark()
+
+    def mark(self) -> None:
+        """`still` compares with the newest image from now on."""
+        self._marked, self._since = self._previous, np.eye(3)
+
+    def still(self) -> bool:
+        """Whether the newest image shows what the marked one did, but for a small motion of the camera. 0.2 ms."""
+        then, now = self._marked, self._previous
+        if then is None or now is None or then.shape != now.shape:
+            return False
+        height, width = now.shape
+        corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float64)
+        shift = np.abs(corners @ self._since[:2].T - corners[:, :2]).max(axis=0) / (width, height)
+        if shift.sum() > _STILL_SHIFT:
+            return False
+        moved = cv2.warpAffine(then, self._since[:2], (width, height), borderMode=cv2.BORDER_REPLICATE)
+        blurred = (cv2.blur(one, (_BLUR_PX, _BLUR_PX)) for one in (moved, now))
+        changed = np.count_nonzero(cv2.absdiff(*blurred) > _CHANGED_LEVELS)
+        return changed <= _STILL_CHANGED * now.size
 
     def step(self, image_bgr: Image) -> Affine:
         """The map from the image of the last call to this one, (2, 3) float64 in pixels of the full image.
@@ -59,11 +85,13 @@ class CameraMotion:
         estimate = _by_flow(previous, current)
         if estimate is None or not _plausible(estimate):
             return _identity()
+        self._since = np.vstack((estimate, [0.0, 0.0, 1.0])) @ self._since
         return _at_full_size(estimate, full_size=full_size, small_size=small_size)
 
     def reset(self) -> None:
         """Forget the last image: the next call gives the identity."""
         self._previous = None
+        self.mark()
 
 
 def _by_flow(previous: _Gray, current: _Gray) -> Affine | None:

@@ -209,7 +209,7 @@ class Edge:
                 if now_ns >= next_status_ns:
                     next_status_ns = now_ns + SECOND_NS
                     give_back_holes()
-                    stages.stills.note_load(self._counts.captured, self._counts.unanalyzed, now_ns=now_ns)
+                    stages.stills.note_load(self._counts.cpu.now.taken, now_ns=now_ns)
                     status.send("running")
                     self._reached |= link.has_subscriber(Channel.BASE)
                     if heartbeat.state is not None:

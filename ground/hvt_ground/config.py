@@ -82,7 +82,7 @@ class GroundConfig:
         integer(1, 1000, unit=" frames"),
         None,
         "detect on every n-th frame, less when behind",
-        shown_default="5; with few frames a second less",
+        shown_default="5; with few frames a second less; one a second in real time while the picture stands still",
     )
     confidence: float | None = _MODELS.option(
         number(0.01, 1),

@@ -168,3 +168,41 @@ def test_ids_survive_a_shaking_camera(ground: np.ndarray, every: int) -> None:
     shaken = follow(ground, camera_motion="off", every=every)
     kept = sum(len(set(ids) & set(range(1, 7))) for ids in shaken) / (6 * len(shaken))
     assert kept < 0.5
+
+
+def seen_since(ground: np.ndarray, cameras: list[np.ndarray], *, car_px: int | None = None) -> bool:
+    """Whether the last picture is still, after the first was looked at; a car comes so far into it."""
+    motion, rng = CameraMotion(scale=None), np.random.default_rng(1)
+    for index, camera in enumerate(cameras):
+        image = shot(ground, camera, rng)
+        if index == len(cameras) - 1 and car_px is not None:
+            image[200:230, car_px : car_px + 60] = (20, 20, 220)
+        motion.step(image)
+        if index == 0:
+            motion.mark()
+    return motion.still()
+
+
+def test_a_hovering_camera_is_still_and_one_that_flies_on_is_not(ground: np.ndarray) -> None:
+    """The detector would look at a standing scene as often as at one that changes, or miss what comes into view."""
+    hovering = [view(500 + 2 * np.sin(step), 300, 1.0, 0.2 * step) for step in range(6)]
+    assert seen_since(ground, hovering)
+    assert not seen_since(ground, [view(500 + 8 * step, 300, 1.0, 0.0) for step in range(6)])
+
+
+def test_what_moves_in_a_standing_picture_is_noticed(ground: np.ndarray) -> None:
+    """A car would drive through it between two looks."""
+    standing = [view(500, 300, 1.0, 0.0)] * 4
+    assert seen_since(ground, standing)
+    assert not seen_since(ground, standing, car_px=300)
+
+
+def test_before_a_look_and_after_another_size_nothing_is_still(ground: np.ndarray) -> None:
+    """The first pictures of a camera, or of another mode of it, would be passed over."""
+    motion = CameraMotion(scale=None)
+    assert not motion.still()
+    motion.step(np.zeros((360, 640, 3), np.uint8))
+    motion.mark()
+    assert motion.still()
+    motion.step(np.zeros((480, 640, 3), np.uint8))
+    assert not motion.still()

@@ -147,6 +147,12 @@ def detect_every(given: int | None, *, fps: float) -> int:
     return given or min(5, max(1, round(fps / 3)))
 
 
+def detect_still_every(given: int | None, *, fps: float, lockstep: bool) -> int:
+    """The same while the picture is still (`ByteTracker.still`): one a second, but as given, and in lockstep."""
+    every = detect_every(given, fps=fps)
+    return every if given or lockstep else max(every, round(fps))
+
+
 def warm_up(detector: FailingDetector, size: tuple[int, int]) -> None:
     """Run a network once at the (width, height) it will get: a runtime may compile for it, which takes 0.2 s.
 

@@ -151,6 +151,15 @@ class ByteTracker:
         if self._camera is not None:
             self._camera.reset()
 
+    @property
+    def still(self) -> bool:
+        """Whether the newest frame shows what the last update saw, and that left nothing to be confirmed.
+
+        False where the camera is not followed.
+        """
+        confirmed = not (self._table.phase == UNCONFIRMED).any()
+        return self._camera is not None and confirmed and self._camera.still()
+
     def update(self, detections: Detections, *, frame_index: int, image_bgr: Image | None = None) -> Tracks:
         """The tracks at a frame that a detector has searched; boxes in base pixels.
 
@@ -166,6 +175,8 @@ class ByteTracker:
         self._widen_for(seen)
         match, free = self._match(seen, frame_index, growth=self._growth(frame_index))
         self._updated_index = frame_index
+        if self._camera is not None:
+            self._camera.mark()
         self._correct(seen, match, frame_index, gap=gap)
         retained = self._retire(match, frame_index)
         self._start(seen.take(free), frame_index, confirmed=first)

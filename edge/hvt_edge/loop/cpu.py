@@ -22,6 +22,8 @@ class Cores:
     """By this process, had it left out nothing."""
     free: float = 0.0
     """Left by others."""
+    taken: float = 0.0
+    """By this process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,17 +53,16 @@ class CpuMeter:
         self._last = here
         wall_s, own_s = here.wall_s - last.wall_s, here.own_s - last.own_s
         others = max(0.0, here.busy_s - last.busy_s - own_s) / wall_s
-        self.now = Cores(needed=own_s / wall_s * scale, free=max(0.0, processors() - others))
+        taken = own_s / wall_s
+        self.now = Cores(needed=taken * scale, free=max(0.0, processors() - others), taken=taken)
         if short:
             self._short = [*self._short[-_MOST_SHORT:], self.now]
 
     @property
     def short(self) -> Cores:
         """The mean of the times in which something was left out."""
-        count = max(1, len(self._short))
-        return Cores(
-            sum(one.needed for one in self._short) / count, sum(one.free for one in self._short) / count
-        )
+        rows = [(one.needed, one.free, one.taken) for one in self._short] or [(0.0, 0.0, 0.0)]
+        return Cores(*(sum(column) / len(rows) for column in zip(*rows, strict=True)))
 
 
 def processors() -> int:

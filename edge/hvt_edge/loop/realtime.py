@@ -26,35 +26,6 @@ _MOST_LINK_LATE_NS = 10 * SECOND_NS
 _LINK_BOUND_NS = SECOND_NS // 100
 _BEHIND_SHARE = 0.5
 """Share of the time between two frames: beyond it the loop is late."""
-_FIRST_REST_NS = SECOND_NS // 8
-_LONGEST_REST_NS = SECOND_NS // 2
-"""If video goes on losing frames whatever perception does, boxes are still made twice a second."""
-_STEADY_NS = 5 * SECOND_NS
-
-
-class PerceptionRest:
-    """Has perception rest after each frame that video lost, twice as long while it goes on losing some.
-
-    Pure: time is an argument.
-    """
-
-    def __init__(self) -> None:
-        self._lost = 0
-        self._lost_ns: int | None = None
-        self._rest_ns = 0
-        self._taken_ns: int | None = None
-
-    def lets(self, lost: int, *, now_ns: int) -> bool:
-        """Whether perception may take the frame of now; ``lost``: so many frames video has lost until now."""
-        if lost > self._lost:
-            steady = self._lost_ns is None or now_ns - self._lost_ns > _STEADY_NS
-            self._rest_ns = _FIRST_REST_NS if steady else min(_LONGEST_REST_NS, 2 * self._rest_ns)
-            self._lost, self._lost_ns = lost, now_ns
-        rests = self._lost_ns is not None and now_ns - self._lost_ns < self._rest_ns
-        if rests and self._taken_ns is not None and now_ns - self._taken_ns < _LONGEST_REST_NS:
-            return False
-        self._taken_ns = now_ns
-        return True
 
 
 @dataclass(eq=False)
@@ -84,7 +55,6 @@ class RealtimePace:
 
     def __post_init__(self) -> None:
         self._missed: int | None = None
-        self._rest = PerceptionRest()
         self._must_code_ns = 0
         self._sent_ns = self._link_late_ns = 0
         """When the last frame was sent; how late a clip is because the link took its time, not yet made up."""
@@ -142,8 +112,9 @@ class RealtimePace:
         # Video goes first: perception gets no frame while the loop is late, and fewer for a while after it lost one.
         # Where nobody uses it, it takes no time.
         used = self.stills.is_used(frame.capture_ns)
-        rests = behind or not self._rest.lets(self.counts.dropped_cpu, now_ns=self._sent_ns)
-        taken_up = self._worker.take(frame, unit, late=rests and used)
+        cpu_budget, lost = self.stills.cpu_budget, self.counts.dropped_cpu
+        rests = used and not cpu_budget.admits_frame(frame.capture_ns, lost=lost, late=behind)
+        taken_up = self._worker.take(frame, unit, late=rests)
         self.counts.unanalyzed += used and not taken_up
 
     def __enter__(self) -> Self:

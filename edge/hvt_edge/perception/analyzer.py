@@ -16,6 +16,7 @@ from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
+from hvt_edge.perception.cpu_budget import CpuBudget
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,8 @@ class AnalyzerSettings:
     detect_every: int = 5
     """Source frames from one detection to the next; see `Analyzer.analyze` for streams that code fewer."""
     candidates: Literal["decoded", "source"] = "decoded"
+    detect_still_every: int = 0
+    """The same while the picture is still; no fewer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +67,8 @@ class Analyzer:
     """Decodes the edge's own access units, detects on every n-th frame and tracks on each.
 
     While the detector gives None the tracks are carried on. ``trust`` is told what it finds. ``search`` finds the
-    scale; without it that is as given.
+    scale; without it that is as given. A detection that is due waits until ``cpu_budget`` admits it; decoding and
+    tracking never do.
     """
 
     def __init__(
@@ -77,6 +81,7 @@ class Analyzer:
         decoder: _Decoder | None = None,
         trust: ViewTrust | None = None,
         search: ScaleSearch | None = None,
+        cpu_budget: CpuBudget | None = None,
     ) -> None:
         self._detector = detector
         self._tracker = tracker
@@ -84,6 +89,7 @@ class Analyzer:
         self._settings = settings
         self._trust = trust
         self._search = search
+        self.cpu_budget = cpu_budget or CpuBudget()
         self._decoder = decoder or BaseDecoder()
         self._detected_index: int | None = None
         self.detected_ns: int | None = None
@@ -123,21 +129,19 @@ class Analyzer:
         unit: AccessUnit | None,
         *,
         skipped: Sequence[AccessUnit] = (),
-        hurry: bool = False,
     ) -> AnalyzedFrame:
         """Take in the next source frame; ``unit`` is None where it is not coded.
 
         Detection is due ``detect_every`` frames after the last one. With candidates of the decoded stream that can
         only be a coded frame. With candidates of the source it waits for a coded frame too, as long as those are no
         further apart than ``detect_every``; where they are, detection runs at its own pace and at each coded frame
-        besides, so that stills are always chosen by what that very picture shows. With ``hurry`` detection waits
-        for a later frame; decoding never does. ``skipped`` are the units since the frame before, of frames that were
-        not analyzed: they are decoded and no more.
+        besides, so that stills are always chosen by what that very picture shows. ``skipped`` are the units since
+        the frame before, of frames that were not analyzed: they are decoded and no more.
         """
         began_ns = time.perf_counter_ns()
         for one in skipped:
             self._decode(one.frame_index, one)
-        analyzed = self._analyze(frame, unit, hurry=hurry)
+        analyzed = self._analyze(frame, unit)
         self.spent_ns += time.perf_counter_ns() - began_ns
         self.frames += 1
         self._track_ids.add(analyzed.tracks.ids.tolist())
@@ -158,16 +162,22 @@ class Analyzer:
         tracks = Tracks.none(frame.index)
         return AnalyzedFrame(frame, picture, tracks, detected=False, tracked=False)
 
-    def _analyze(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool) -> AnalyzedFrame:
+    def _analyze(self, frame: Frame, unit: AccessUnit | None) -> AnalyzedFrame:
         picture = None if unit is None else self._decode(frame.index, unit)
         bgr = [picture.bgr()] if picture is not None and self._settings.candidates == "decoded" else []
         pixels = bgr[0] if bgr else None
         if self._settings.candidates == "source":
             pixels = frame.base_bgr
-        due = not hurry and self._due(frame.index, coded=unit is not None)
-        detections = self._detect(frame, bgr) if due else None
+        due = self._due(frame.index, coded=unit is not None) and self.cpu_budget.admits_detection(
+            frame.capture_ns
+        )
+        detections = None
+        if due:
+            with self.cpu_budget.spending("detect"):
+                detections = self._detect(frame, bgr)
         if detections is None:
-            tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
+            with self.cpu_budget.spending("track"):
+                tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
             return AnalyzedFrame(frame, picture, tracks, detected=False, _bgr=bgr)
         if self._trust is not None:
             self._trust.take(detections)
@@ -187,6 +197,8 @@ class Analyzer:
         # Whether the detector is to run on this frame. By frame counts alone, never by a clock.
         every, last = self.detect_every, self._detected_index
         rested = last is None or index - last >= every
+        if rested and last is not None and index - last < self._settings.detect_still_every:
+            rested = not self._tracker.still
         since_coded = 0 if self._coded_index is None else index - self._coded_index
         sparse = max(self._coded_gap, since_coded) > every
         if coded:

@@ -69,10 +69,6 @@ class LeverSettings:
     pause_ns: int = 20 * SECOND_NS
     """How long stills pause before some are tried again; twice as long after each vain try, up to 8 times."""
     most_pauses: int = 8
-    load_samples: int = 8
-    """Seconds over which the machine is judged."""
-    least_analyzed: float = 0.03
-    """The share of frames that perception must have time for: two pictures in five seconds."""
 
     def net_gain(self, gain: float, *, total_bps: int) -> float:
         """The gain of tracks, less the gain of video by the same bits."""
@@ -102,7 +98,6 @@ class LeverControl:
         self._pauses = 1
         self._too_slow = self._unlike = False
         operating.pull(Levers(tracks=False))
-        self._loads: deque[tuple[int, int]] = deque(maxlen=settings.load_samples)
 
     def take_shadow(self, measured: Measured) -> None:
         """Take a measurement of the shadow ground."""
@@ -116,20 +111,13 @@ class LeverControl:
         """A ground has inspected a still; ``changed``: it now names the object otherwise than the edge does."""
         self._changed.append(changed)
 
-    def take_load(self, captured: int, unanalyzed: int, *, now_ns: int) -> None:
-        """Take the counts of frames so far: captured, and not analyzed for want of time. From any thread.
+    def take_load(self, *, too_slow: bool, now_ns: int) -> None:
+        """``too_slow``: the detector does not come to look. From any thread.
 
-        It decides too where the machine is too slow, because perception may never come to it.
+        It decides then too, because perception may never come to it.
         """
-        self._loads.append((captured, unanalyzed))
-        came = captured - self._loads[0][0]
-        skipped = unanalyzed - self._loads[0][1]
-        self._too_slow = (
-            len(self._loads) == self._loads.maxlen
-            and came > 0
-            and came - skipped < self._settings.least_analyzed * came
-        )
-        if self._too_slow:
+        self._too_slow = too_slow
+        if too_slow:
             self.decide(now_ns)
 
     def forget(self) -> None:

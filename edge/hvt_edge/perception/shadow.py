@@ -37,6 +37,7 @@ from hvt_common.tracking.recall import EDGE_ONLY_CONFIDENCE, Recall
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
 from hvt_edge.perception.analyzer import AnalyzedFrame
+from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.perception.levers import Measured
 from hvt_edge.perception.scene_change import SceneChange
 
@@ -129,12 +130,10 @@ class ShadowSettings:
     confidence: float
     """From where a detection starts a track, at the edge and at the ground."""
     rest_ns: int = SECOND_NS
-    """Capture time from one comparison to the next, at least. On a slow machine more: see ``most_share``."""
+    """Capture time from one comparison to the next, at least."""
     quick_rest_ns: int = SECOND_NS // 3
     quick_comparisons: float = 2.5
     """At first so few comparisons are made in quick order, because nothing is known."""
-    most_share: float = 0.15
-    """Share of a processor core for comparisons; in lockstep, where no clock may decide, only ``rest_ns`` counts."""
     memory_s: float = 8.0
     """Time constant with which former comparisons fade."""
     match_iou: float = 0.3
@@ -247,10 +246,9 @@ UNMEASURED = Shadow()
 
 
 class ShadowGround:
-    """Looks now and then; deterministic where ``spent_ns`` is not given.
+    """Looks now and then, where ``cpu_budget`` admits it.
 
     ``detect`` is the detector on a whole picture, as the ground runs it; None of it while it does not work.
-    ``spent_ns`` is a clock in nanoseconds by which the cost of a comparison is measured; None in lockstep.
     It goes on from what was measured of the scene ``before``.
     """
 
@@ -259,12 +257,12 @@ class ShadowGround:
         detect: Callable[[Image], Detections | None],
         *,
         settings: ShadowSettings,
-        spent_ns: Callable[[], int] | None = None,
+        cpu_budget: CpuBudget | None = None,
         before: Shadow = UNMEASURED,
     ) -> None:
         self._detect = detect
         self._settings = settings
-        self._spent_ns = spent_ns
+        self._cpu_budget = cpu_budget or CpuBudget()
         self._next_ns = 0
         self._last_ns: int | None = None
         self._shown_ids = np.empty(0, np.int64)
@@ -303,16 +301,17 @@ class ShadowGround:
             self._next_ns = capture_ns + self._settings.quick_rest_ns
             self._last_ns = capture_ns  # what was measured before is no older
             return False
-        began_ns = self._spent_ns() if self._spent_ns else 0
+        if not self._cpu_budget.admits_comparison(capture_ns):
+            return False
         base_bgr = seen.base_bgr
         assert base_bgr is not None, "checked"
-        found = self._detect(base_bgr)
-        took_ns = self._spent_ns() - began_ns if self._spent_ns else 0
+        with self._cpu_budget.spending("compare"):
+            found = self._detect(base_bgr)
         settings = self._settings
         rest_ns = (
             settings.rest_ns if self.now.comparisons >= settings.quick_comparisons else settings.quick_rest_ns
         )
-        self._next_ns = capture_ns + max(rest_ns, round(took_ns / settings.most_share))
+        self._next_ns = capture_ns + rest_ns
         if found is None:
             return False
         one = self._compared(seen, found)

@@ -33,7 +33,7 @@ from hvt_edge.loop.cpu import Cores
 from hvt_edge.operating import Levers, LoopClock, Operating
 from hvt_edge.stills.stage import StillStage
 
-_LEAST_OLD_S = 1.0
+_LEAST_OLD_S = 1.5
 """Boxes that are younger are not called old."""
 _ZONES = "sys/class/thermal/thermal_zone*/temp"
 _WIRELESS = "proc/net/wireless"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import KW_ONLY, dataclass
 
 from hvt_common.inference.class_names import same_kind
@@ -15,6 +15,7 @@ from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import Levers
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
+from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.perception.levers import LeverControl
 from hvt_edge.perception.shadow import Detected, ShadowGround
 from hvt_edge.stills.crop_job import CropJob
@@ -62,6 +63,11 @@ class StillStage:
         return self._latest_tracks
 
     @property
+    def cpu_budget(self) -> CpuBudget:
+        """What of perception runs, for want of processor."""
+        return self.analyzer.cpu_budget
+
+    @property
     def pending(self) -> int:
         """Number of pending stills of the method."""
         return len(self.outbox)
@@ -81,8 +87,6 @@ class StillStage:
         frame: Frame,
         unit: AccessUnit | None,
         skipped: Sequence[AccessUnit] = (),
-        *,
-        hurry: bool = False,
     ) -> AnalyzedFrame:
         """Decode, detect and track one frame; ``unit`` is None for one that is not part of the base stream.
 
@@ -91,8 +95,8 @@ class StillStage:
         """
         if not self.is_used(frame.capture_ns):
             return self.analyzer.pass_over(frame, unit, skipped=skipped)
-        analyzed = self.analyzer.analyze(frame, unit, skipped=skipped, hurry=hurry)
-        if self.shadow is not None and not hurry:
+        analyzed = self.analyzer.analyze(frame, unit, skipped=skipped)
+        if self.shadow is not None:
             self.shadow.compare(analyzed)
         return analyzed
 
@@ -109,6 +113,10 @@ class StillStage:
         ``now_ns`` is the time that windows go by. With ``held`` none is sent, because a keyframe is to come; None
         asks the plan.
         """
+        with self.cpu_budget.spending("choose") if analyzed.detected else nullcontext():
+            return self._send(analyzed, now_ns=now_ns, held=held)
+
+    def _send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None) -> set[int]:
         self._latest_tracks = analyzed.tracks
         levers = self._decided(now_ns)
         if self.reporter is not None and analyzed.detected and levers.tracks:
@@ -170,10 +178,11 @@ class StillStage:
                     entropy_nats=result.entropy_nats,
                 )
 
-    def note_load(self, captured: int, unanalyzed: int, *, now_ns: int) -> None:
-        """Take the counts of frames so far: captured, and never analyzed; about once a second."""
+    def note_load(self, cores: float, *, now_ns: int) -> None:
+        """Take how many cores the process takes; about once a second."""
+        self.cpu_budget.measure(cores, now_ns=now_ns)
         if self.levers is not None:
-            self.levers.take_load(captured, unanalyzed, now_ns=now_ns)
+            self.levers.take_load(too_slow=self.cpu_budget.too_slow, now_ns=now_ns)
 
     def _decided(self, now_ns: int) -> Levers:
         if self.levers is None:

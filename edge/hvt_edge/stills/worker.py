@@ -24,8 +24,6 @@ from hvt_edge.stills.stage import StillStage
 _log = logging.getLogger(__name__)
 
 _PART, _REQUESTED_PART = "stills", "requested stills"
-_BEHIND_FRAMES = 3
-"""With more frames queued than this, detection is put off; decoding never is."""
 _LEAST_FRAMES = 2
 MAX_QUEUE_BYTES = 24 * 2**20
 """Of frames that are queued: 4 of 1280x720, 2 of 1920x1080 and more."""
@@ -152,9 +150,9 @@ class StillWorker:
             try:
                 if (item := self._next()) is None:
                     return
-                behind = self._frames.qsize() >= _BEHIND_FRAMES
+                self.stage.cpu_budget.queued = self._frames.qsize()
                 self.stage.on_results(self.results(), detected=self.detected())
-                analyzed = self.stage.analyze(*item, hurry=behind)
+                analyzed = self.stage.analyze(*item)
                 self.stage.send(analyzed, now_ns=self.clock())
                 self.failures.works(_PART)
             except Exception as error:  # noqa: BLE001 - it ends stills for a while, never the flight

@@ -7,7 +7,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Literal, cast
 
-from hvt_common.inference.detect import Detector, FailingDetector, detect_every, open_detector, warm_up
+from hvt_common.inference.detect import (
+    Detector,
+    FailingDetector,
+    detect_every,
+    detect_still_every,
+    open_detector,
+    warm_up,
+)
 from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.retried import RetriedDetector
 from hvt_common.inference.scale_search import ScaleSearch
@@ -23,6 +30,7 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_con
 from hvt_common.values import Detections, Image, View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
+from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.perception.shadow import UNMEASURED, Shadow, ShadowGround, ShadowSettings
 from hvt_edge.stills.policy.registry import method
 
@@ -71,9 +79,15 @@ def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
 
 
 def make_analyzer(
-    config: EdgeConfig, *, detector: FailingDetector, view: View, trust: ViewTrust | None = None
+    config: EdgeConfig,
+    *,
+    detector: FailingDetector,
+    view: View,
+    trust: ViewTrust | None = None,
+    cpu_budget: CpuBudget | None = None,
 ) -> Analyzer:
-    """Decoder, detector and tracker of the edge's own stream."""
+    """Decoder, detector and tracker of the edge's own stream; without ``cpu_budget`` of a trial, unlimited."""
+    steady = cpu_budget is None or config.pace == "lockstep"
     settings = TrackerSettings.starting_at(
         track_confidence(config), camera_motion=cast('Literal["off", "flow"]', config.camera_motion)
     )
@@ -84,9 +98,13 @@ def make_analyzer(
         settings=AnalyzerSettings(
             detect_every=detect_every(config.detect_every, fps=config.nominal_fps),
             candidates=cast('Literal["decoded", "source"]', config.candidates),
+            detect_still_every=detect_still_every(
+                config.detect_every, fps=config.nominal_fps, lockstep=steady
+            ),
         ),
         trust=trust,
         search=_scale_search(config, detector),
+        cpu_budget=cpu_budget,
     )
 
 
@@ -104,11 +122,11 @@ def make_shadow(
     detector: FailingDetector,
     *,
     before: Shadow = UNMEASURED,
-    spent_ns: Callable[[], int] | None = None,
+    cpu_budget: CpuBudget | None = None,
 ) -> ShadowGround | None:
     """The shadow ground, which measures how much of the source the base shows; None where nothing depends on it.
 
-    It goes on from what was measured ``before``, and looks less often where that takes long by ``spent_ns``.
+    It goes on from what was measured ``before``.
 
     `MOTION` remembers the pictures of one stream, and those of the base are another.
     """
@@ -118,7 +136,7 @@ def make_shadow(
         _whole(detector),
         settings=ShadowSettings(confidence=track_confidence(config)),
         before=before,
-        spent_ns=spent_ns,
+        cpu_budget=cpu_budget,
     )
 
 

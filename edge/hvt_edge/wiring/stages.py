@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -25,8 +24,10 @@ from hvt_edge.link.publisher import Answers, EdgeLink
 from hvt_edge.link.stills import StillReaders
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.loop.cpu import processors
 from hvt_edge.loop.pose import PoseSource, PoseStage
 from hvt_edge.operating import LoopClock, Operating, base_rate_bps
+from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.report.status import InfoReporter
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
@@ -246,8 +247,9 @@ def build_stages(
         )
     levers = make_levers(config, operating, view)
     trust = None if levers is None else ViewTrust(config.detector, hence="auto gives its tracks no credit")
+    cpu_budget = CpuBudget() if lockstep else CpuBudget(fps=config.nominal_fps, processors=processors())
     stills = StillStage(
-        make_analyzer(config, detector=detector, view=view, trust=trust),
+        make_analyzer(config, detector=detector, view=view, trust=trust, cpu_budget=cpu_budget),
         chooser,
         outbox=outbox,
         sender=still_sender,
@@ -255,9 +257,7 @@ def build_stages(
         keyframes=keyframes,
         tracks_used=config.tracks_used,
         reporter=TrackReporter(transmitter, session_id=session_id) if config.send_tracks else None,
-        shadow=make_shadow(
-            config, detector, before=beginning.shadow, spent_ns=None if lockstep else time.thread_time_ns
-        ),
+        shadow=make_shadow(config, detector, before=beginning.shadow, cpu_budget=cpu_budget),
         levers=levers,
     )
     commands = Commands(

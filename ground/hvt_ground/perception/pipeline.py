@@ -108,7 +108,8 @@ class NothingPerceived:
 class Pipeline:
     """One session's perception. Used by one thread; ``emit`` takes the events.
 
-    Detections are at least ``detect_every`` frames apart; ``wants_base``: the reader uses the base frame of a
+    Detections are at least ``detect_every`` frames apart, while the picture is still ``detect_still_every``;
+    ``wants_base``: the reader uses the base frame of a
     still.
     """
 
@@ -119,11 +120,12 @@ class Pipeline:
         view: View,
         fps: float,
         detect_every: int,
+        detect_still_every: int = 0,
         emit: Callable[[Event], None],
         wants_base: bool = False,
     ) -> None:
         self._parts = parts
-        self._detect_every = detect_every
+        self._detect_every, self._detect_still_every = detect_every, detect_still_every
         self._base_size = view.base_size
         self._frame_ns = SECOND_NS / fps
         self._turn_s = None if parts.patient else _TURN_SHARE / fps
@@ -292,6 +294,8 @@ class Pipeline:
         frames = None if last is None else index - last
         every = self._detect_every if parts.search is None else parts.search.interval(self._detect_every)
         due = frames is None or frames >= (_PUT_OFF if hurry else 1) * every
+        if due and frames is not None and frames < self._detect_still_every:
+            due = not parts.tracker.still
         if due and parts.turns.take(self._turn_key, within_s=self._turn_s):
             self._detected_frame = index
             self.detections_run += 1

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Literal, cast
 
 from hvt_common.inference.classify import Classifier
-from hvt_common.inference.detect import FailingDetector, detect_every
+from hvt_common.inference.detect import FailingDetector, detect_every, detect_still_every
 from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.retried import RetriedDetector
 from hvt_common.inference.scale_search import ScaleSearch
@@ -65,6 +65,9 @@ def make_pipeline(
         view=info.view,
         fps=info.fps,
         detect_every=detect_every(config.detect_every, fps=info.fps),
+        detect_still_every=detect_still_every(
+            config.detect_every, fps=info.fps, lockstep=info.pace == "lockstep"
+        ),
         emit=emit,
         wants_base=isinstance(reader, Redetection),
     )

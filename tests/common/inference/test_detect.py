@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
-from hvt_common.inference.detect import OnnxDetector, detect_every, open_detector
+from hvt_common.inference.detect import OnnxDetector, detect_every, detect_still_every, open_detector
 from hvt_common.inference.heads.decode import YoloxCells
 from hvt_common.inference.heads.trial import anchor_count
 from hvt_common.inference.letterbox import Letterbox, Letterboxer, as_bgr
@@ -495,6 +495,13 @@ def test_the_detector_runs_three_times_a_second_where_frames_are_few(fps: float,
     """At 2 frames a second every fifth would be one look in 2.5 s: what moves is never in one place twice."""
     assert detect_every(None, fps=fps) == every
     assert detect_every(7, fps=fps) == 7
+
+
+@pytest.mark.parametrize(("given", "lockstep", "every"), [(None, False, 15), (None, True, 5), (7, False, 7)])
+def test_a_still_picture_is_looked_at_once_a_second(given, lockstep, every) -> None:
+    """Half of the processor would go into what stands still; or a study's numbers would depend on it."""
+    assert detect_still_every(given, fps=15, lockstep=lockstep) == every
+    assert detect_still_every(given, fps=0.5, lockstep=lockstep) == (given or 1)
 
 
 def test_a_scale_of_nothing_is_refused(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating import LoopClock
+from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.video.frame_decision import Action, FrameDecision
 from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.stage import BaseStage
@@ -40,7 +41,7 @@ class Nowhere:
 class Unmoved:
     """Perception that finds nothing."""
 
-    latest_tracks, pending, any_requested = None, 0, False
+    latest_tracks, pending, any_requested, cpu_budget = None, 0, False, CpuBudget()
 
     def capture(self, frame):
         """Nobody asks for a still of it."""
@@ -49,7 +50,7 @@ class Unmoved:
         """Somebody looks at what comes of it."""
         return True
 
-    def analyze(self, frame, unit, skipped=(), *, hurry=False):
+    def analyze(self, frame, unit, skipped=()):
         """Nothing."""
         return frame.index
 

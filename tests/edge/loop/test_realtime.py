@@ -22,6 +22,7 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.realtime import RealtimePace
+from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.stills.worker import SkippedUnits
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.stage import BaseStage
@@ -54,7 +55,7 @@ class BlockedStills:
         self.frames: list[int] = []
         self.decoded = 0
         self.detected: list[int] = []
-        self.used = True
+        self.used, self.cpu_budget = True, CpuBudget()
 
     def capture(self, frame):
         """Nobody asks for a still of it."""
@@ -63,7 +64,7 @@ class BlockedStills:
         """Somebody looks at what comes of it."""
         return self.used
 
-    def analyze(self, frame, unit, skipped=(), *, hurry):
+    def analyze(self, frame, unit, skipped=()):
         """As `Analyzer.analyze` does: all units, in their order."""
         for one in (*skipped, unit):
             self.decoded += self.decoder.decode(one.data) is not None

@@ -130,12 +130,22 @@ def test_in_a_hurry_detection_is_put_off_and_made_up_for():
     """A slow detector would fall behind more and more; or a busy second would leave it blind for another."""
     analyzer = make(detect_every=5)
     hurried = {5, 6, 7, 15}
-    seen = [
-        analyzer.analyze(frame, unit, hurry=frame.index in hurried)
-        for frame, unit in zip(FRAMES, UNITS, strict=True)
-    ]
+    seen = []
+    for frame, unit in zip(FRAMES, UNITS, strict=True):
+        analyzer.cpu_budget.queued = 3 * (frame.index in hurried)
+        seen.append(analyzer.analyze(frame, unit))
     assert [one.frame.index for one in seen if one.detected] == [0, 8, 13, 18, 23, 28]
     assert all(one.base_bgr.shape == (192, 320, 3) for one in seen)
+
+
+def test_a_standing_picture_is_searched_less_often_until_something_moves():
+    """A hovering drone's processor would go into what it has seen; or a car drive through between two looks."""
+    tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
+    settings = AnalyzerSettings(detect_every=5, detect_still_every=15, candidates="source")
+    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, settings=settings)
+    standing = [replace(FRAMES[0], index=index) for index in range(20)]
+    seen = [analyzer.analyze(frame, unit) for frame, unit in zip(standing + FRAMES[20:], UNITS, strict=True)]
+    assert [one.frame.index for one in seen if one.detected] == [0, 15, 21, 26]
 
 
 def test_candidates_of_the_source_lie_in_base_pixels():
@@ -180,14 +190,12 @@ def test_what_a_cropped_base_does_not_show_is_no_candidate():
 def sparse(analyzer: Analyzer, *, every: int, hurried: frozenset[int] = frozenset()) -> list:
     """All frames, of which only each n-th is coded, as with ``--fps auto``."""
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
-    return [
-        analyzer.analyze(
-            replace(frame, source_bgr=frame.base_bgr),
-            encoder.encode(frame) if frame.index % every == 0 else None,
-            hurry=frame.index in hurried,
-        )
-        for frame in FRAMES
-    ]
+    seen = []
+    for frame in FRAMES:
+        unit = encoder.encode(frame) if frame.index % every == 0 else None
+        analyzer.cpu_budget.queued = 3 * (frame.index in hurried)
+        seen.append(analyzer.analyze(replace(frame, source_bgr=frame.base_bgr), unit))
+    return seen
 
 
 @pytest.mark.parametrize(

@@ -132,9 +132,7 @@ def test_stills_of_a_source_much_finer_than_the_base_never_pause():
     rig = Rig(finer=True)
     assert rig.answers(60)
     assert rig.operating.now.levers.says.endswith("stills show details, 0 of 40 renamed something")
-    rig.control.take_load(0, 0, now_ns=0)
-    for second in range(1, 10):
-        rig.control.take_load(15 * second, 15 * second, now_ns=second * SECOND_NS)
+    rig.control.take_load(too_slow=True, now_ns=SECOND_NS)
     assert not rig.second().stills, "but on a machine that is too slow"
 
 
@@ -168,14 +166,12 @@ def test_a_machine_that_is_too_slow_sends_video_alone_and_says_so():
     """Perception that never comes to a frame would leave the last levers for ever."""
     rig = Rig()
     rig.tracks(0.1)
-    for second in range(SETTINGS.load_samples + 1):
-        rig.control.take_load(15 * second, 15 * second, now_ns=second * SECOND_NS)
+    rig.control.take_load(too_slow=True, now_ns=SECOND_NS)
     levers = rig.operating.now.levers
     assert not levers.tracks
     assert not levers.stills
     assert "too slow" in levers.says
-    for second in range(20, 20 + SETTINGS.load_samples):
-        rig.control.take_load(15 * second, 15 * 20, now_ns=second * SECOND_NS)
+    rig.control.take_load(too_slow=False, now_ns=2 * SECOND_NS)
     assert rig.tracks(0.1), "it has time again"
 
 

@@ -283,21 +283,6 @@ def test_another_scene_forgets_and_a_moving_camera_does_not():
     assert (shadow.scene_changes, shadow.now.comparisons) == (1, 0)
 
 
-def test_no_more_than_its_share_of_the_processor():
-    """On a slow machine the measurement would take the time of what it measures."""
-    clock = [0]
-
-    def detect(_image: np.ndarray) -> Detections:
-        clock[0] += 600_000_000
-        return found(0)
-
-    shadow = ShadowGround(detect, settings=SETTINGS, spent_ns=lambda: clock[0])
-    frames = 20 * FPS
-    comparisons = sum(shadow.compare(seen(index, {0: 0.9})) for index in range(0, frames, 5))
-    assert clock[0] <= 0.15 * frames * PERIOD_NS + 600_000_000
-    assert comparisons >= 4
-
-
 def test_a_thin_base_hides_what_a_rich_one_shows():
     """On real x265, the real detector and the drawn scene: else the levers would follow noise."""
     detector = open_detector(EMBEDDED_DETECTOR, threads=2, confidence=0.1)

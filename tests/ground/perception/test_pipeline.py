@@ -172,6 +172,15 @@ def test_in_a_hurry_detection_waits_but_the_track_goes_on(pictures):
     assert all(len(one.track_ids) == 1 for one in rig.of(Overlay)[8:])
 
 
+def test_a_standing_picture_is_searched_less_often(pictures):
+    """Half of a small ground's processor would go into what it has seen, and its boxes come late for it."""
+    rig = Rig(detect_every=2, detect_still_every=10)
+    for index in range(30):
+        rig.pipeline.analyze(replace(pictures[0], frame_index=index), hurry=False)
+    assert rig.pipeline.detections_run == 3
+    assert all(len(one.track_ids) == 1 for one in rig.of(Overlay))
+
+
 def test_on_a_machine_that_is_always_behind_something_is_detected_now_and_then(pictures):
     """Whatever comes into view would never have a box."""
     rig = Rig(detect_every=2)

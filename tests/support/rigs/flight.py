@@ -134,6 +134,7 @@ def pipeline_of(
     detector=None,
     reader=None,
     detect_every: int = 1,
+    detect_still_every: int = 0,
     edge_classes: Sequence[str] = CLASSES,
     wants_base: bool = False,
     trust: ViewTrust | None = None,
@@ -146,7 +147,9 @@ def pipeline_of(
     vocabulary = Vocabulary(names, reader.class_names)
     parts = PipelineParts(
         detector=detector or RedSquares(),
-        tracker=ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
+        tracker=ByteTracker(
+            TrackerSettings.starting_at(0.25, camera_motion="flow" if detect_still_every else "off"), fps=15
+        ),
         reader=reader,
         refiner=Refiner("replace", fps=15, vocabulary=vocabulary),
         vocabulary=vocabulary,
@@ -157,7 +160,15 @@ def pipeline_of(
         search=search,
     )
     view = View.fitted(SIZE, SIZE, fit="letterbox")
-    return Pipeline(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)
+    return Pipeline(
+        parts,
+        view=view,
+        fps=15,
+        detect_every=detect_every,
+        detect_still_every=detect_still_every,
+        emit=emit,
+        wants_base=wants_base,
+    )
 
 
 class Flight:

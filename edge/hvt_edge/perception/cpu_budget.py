@@ -1,0 +1,177 @@
+"""What of perception runs, for want of processor: one decides, by what each part was measured to take.
+
+Capture, coding and sending have no turn here: they go before all else. Perception has a budget of its own, a share of
+the processors (`most_cores`), and no more than video leaves of them. It is given out in the order of `share_out`.
+No measure of a second shows what stands in a frame's way, so a frame that video loses says more: each halves the
+budget, which comes back in a while. Stills are chosen at looks, and are as rare as these.
+
+Time is an argument, but for the processor time that a part takes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from hvt_common.units import SECOND_NS
+
+Part = Literal["track", "detect", "compare", "choose"]
+"""Tracking through one frame; the detector on the source; the detector on the base, for the shadow ground; stills."""
+
+LONGEST_DETECT_S: Final = 5.0
+"""Where a look comes later than that, the machine is too slow for the detector."""
+_LONGEST_TRACK_S: Final = 0.5
+"""Boxes come twice a second, however little there is."""
+_MOST_TRACKING: Final = 0.5
+_MOST_DETECTING: Final = 0.85
+"""Shares of what the parts before have left."""
+_LEAST_CORES: Final = 0.4
+_SHARE: Final = 0.3
+"""With fewer looks than three a second nothing is tracked from a camera that moves: with 1.5 a third is (car10)."""
+_LEAST_LEFT: Final = 1 / 16
+"""Of the budget, however many frames are lost."""
+_BACK_S: Final = 5.0
+"""In so long the budget doubles again."""
+_LOSS_NS: Final = SECOND_NS // 4
+"""Frames lost within that are one loss."""
+_MOST_QUEUED: Final = 3
+"""With more frames behind the one in hand nothing is searched: they would wait as long again."""
+_NEWEST: Final = 0.3
+"""Weight of the newest cost."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Least seconds from one turn of a part to its next; 0: whenever it likes."""
+
+    track_s: float = 0.0
+    detect_s: float = 0.0
+    compare_s: float = 0.0
+
+
+def most_cores(processors: float) -> float:
+    """Cores, of so many, that perception may take."""
+    return max(_LEAST_CORES, _SHARE * processors)
+
+
+def share_out(cores: float, costs: Mapping[Part, float], *, fps: float) -> Plan:
+    """The plan for so many cores, where one turn of each part takes so many seconds of one.
+
+    | order | part | gets | at least |
+    |---|---|---|---|
+    | 1 | track | each frame, for half of the cores at most | twice a second |
+    | 2 | detect, with its stills | .85 of what is left | each 5 s |
+    | 3 | compare | the rest | never |
+    """
+    track, detect, compare, choose = (
+        costs.get(part, 0.0) for part in ("track", "detect", "compare", "choose")
+    )
+    track_s = _every_s(track, _MOST_TRACKING * cores, longest_s=_LONGEST_TRACK_S)
+    left = max(0.0, cores - track * min(fps, 1 / track_s if track_s else fps))
+    detect_s = _every_s(detect + choose, _MOST_DETECTING * left, longest_s=LONGEST_DETECT_S)
+    compare_s = _every_s(compare, (1 - _MOST_DETECTING) * left, longest_s=math.inf)
+    return Plan(track_s if track_s * fps > 1 else 0.0, detect_s, compare_s)
+
+
+def _every_s(cost_s: float, cores: float, *, longest_s: float) -> float:
+    if not cost_s:
+        return 0.0
+    return min(longest_s, cost_s / cores) if cores else longest_s
+
+
+class CpuBudget:
+    """Gives turns, and takes what they took. With endless ``processors``, as in lockstep, each gets all it asks for.
+
+    The frame loop gives frames and measures, the thread of perception takes the other turns: a value has one writer.
+    """
+
+    def __init__(
+        self,
+        *,
+        fps: float = math.inf,
+        processors: float = math.inf,
+        spent_ns: Callable[[], int] = time.thread_time_ns,
+    ) -> None:
+        self._fps, self._processors = fps, processors
+        self._cores = most_cores(processors)
+        self._spent_ns = spent_ns
+        self._costs: dict[Part, float] = {}
+        self._had_ns: dict[Part, int] = {}
+        self._perceived_ns = 0
+        self._measured: tuple[int, int] | None = None
+        """When, and perception's processor time until then."""
+        self._lost, self._lost_ns, self._left = 0, 0, 1.0
+        self._first_ns: int | None = None
+        self._newest_ns = 0
+        self.queued = 0
+        """Frames behind the one in hand."""
+
+    @property
+    def plan(self) -> Plan:
+        """The plan now."""
+        if math.isinf(self._processors):
+            return Plan()
+        return share_out(self._cores * self._left, self._costs, fps=self._fps)
+
+    @property
+    def too_slow(self) -> bool:
+        """Whether the detector has not come to look for so long that its boxes tell nothing."""
+        if self._first_ns is None:
+            return False
+        return (
+            self._newest_ns - self._had_ns.get("detect", self._first_ns) > (LONGEST_DETECT_S + 1) * SECOND_NS
+        )
+
+    def admits_frame(self, at_ns: int, *, lost: int, late: bool) -> bool:
+        """Whether perception gets the frame of that capture time; ``lost``: so many video has lost until now.
+
+        None while the loop is ``late`` itself.
+        """
+        self._first_ns = at_ns if self._first_ns is None else self._first_ns
+        if at_ns > self._newest_ns:
+            grown = (at_ns - self._newest_ns) / SECOND_NS / _BACK_S if self._newest_ns else 0.0
+            self._left = min(1.0, self._left * 2**grown)
+            self._newest_ns = at_ns
+        if lost > self._lost and at_ns - self._lost_ns >= _LOSS_NS:
+            self._left, self._lost_ns = max(_LEAST_LEFT, self._left / 2), at_ns
+        self._lost = lost
+        return not late and self._take("track", self.plan.track_s, at_ns)
+
+    def admits_detection(self, at_ns: int) -> bool:
+        """Whether the detector searches the source of that frame, where that is due."""
+        return self.queued < _MOST_QUEUED and self._take("detect", self.plan.detect_s, at_ns)
+
+    def admits_comparison(self, at_ns: int) -> bool:
+        """Whether it searches the base of that frame besides."""
+        return self.queued < _MOST_QUEUED and self._take("compare", self.plan.compare_s, at_ns)
+
+    def _take(self, part: Part, every_s: float, at_ns: int) -> bool:
+        # Frames come when they come: the nearest to the plan is meant, not the first beyond.
+        had_ns, early_s = self._had_ns.get(part), 0.5 / self._fps
+        if had_ns is not None and at_ns - had_ns < (every_s - early_s) * SECOND_NS:
+            return False
+        self._had_ns[part] = at_ns
+        return True
+
+    @contextmanager
+    def spending(self, part: Part) -> Iterator[None]:
+        """Measure a turn of this part, by the processor time of the calling thread."""
+        began_ns = self._spent_ns()
+        yield
+        took_ns = self._spent_ns() - began_ns
+        self._perceived_ns += took_ns
+        before_s = self._costs.get(part, took_ns / SECOND_NS)
+        self._costs[part] = before_s + _NEWEST * (took_ns / SECOND_NS - before_s)
+
+    def measure(self, cores: float, *, now_ns: int) -> None:
+        """Take how many cores this process took since the last measure, about a second ago."""
+        before, self._measured = self._measured, (now_ns, self._perceived_ns)
+        if before is None or now_ns <= before[0]:
+            return
+        perceived = (self._perceived_ns - before[1]) / (now_ns - before[0])
+        others = max(0.0, cores - perceived)
+        self._cores = min(most_cores(self._processors), max(0.0, self._processors - others))
