@@ -36,6 +36,8 @@ _RATES = (
     *("base_bytes", "roi_bytes", "backlog_bytes", "meta_bytes", "overhead_bytes"),
     *("total_bps", "base_bps", "roi_bps"),
 )
+_MOST_MS, _MOST_AGE_MS, _MOST_CORES = 60_000.0, 2**32 - 1, 4096.0
+"""The largest numbers that a report can say."""
 _LEVERS_REST = 10
 _LATE_NS = 2 * SECOND_NS
 """A report that has waited so long for what video leaves goes before the next frame: grounds live by it too."""
@@ -169,12 +171,14 @@ class StatusReporter:
                 tracks=state.tracks,
                 base_queue=0,  # the base stream has no queue: frames are dropped before they are encoded
                 still_queue=state.stills_pending,
-                encode_ms=(state.encode_ms or 0.0) if measured else 0.0,
-                detect_ms=(state.perception_ms or 0.0) if measured else 0.0,
-                feedback_age_ms=round(1000 * reported_s) if measured and reported_s is not None else -1,
+                encode_ms=min(state.encode_ms or 0.0, _MOST_MS) if measured else 0.0,
+                detect_ms=min(state.perception_ms or 0.0, _MOST_MS) if measured else 0.0,
+                feedback_age_ms=min(round(1000 * reported_s), _MOST_AGE_MS)
+                if measured and reported_s is not None
+                else -1,
                 frames_dropped_cpu=frames.account.groups.get("processor", 0),
                 frames_unanalyzed=frames.unanalyzed,
-                cores_needed=(state.cores_needed or 0.0) if measured else 0.0,
+                cores_needed=min(state.cores_needed or 0.0, _MOST_CORES) if measured else 0.0,
                 cores_free=(state.cores_free or 0.0) if measured else 0.0,
             ),
             failed=tuple(

@@ -114,7 +114,7 @@ class Health:
     """Access units that wait to be sent."""
     still_queue: int = wire_field(Int(0, U32))
     encode_ms: float = wire_field(Scaled(0, 60_000, 10))
-    """Mean since the last status."""
+    """Means since the start, at most a minute."""
     detect_ms: float = wire_field(Scaled(0, 60_000, 10))
     feedback_age_ms: int = wire_field(Int(-1, U32))
     """Since the last feedback from any ground; -1 for none yet."""

@@ -1,0 +1,54 @@
+"""The once-a-second report."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from hvt_common.protocol.frame_account import FrameAccount
+from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import Status
+from hvt_common.runtime.failures import Failures
+from hvt_edge.report.status import StatusReporter
+
+DAY_S = 86_400
+
+
+def test_numbers_that_a_report_cannot_say_end_no_flight():
+    """A camera that no ground has heard for 50 days would end, and so would one whose first detection hangs."""
+    sent: list[bytes] = []
+    state: Any = SimpleNamespace(
+        state="running",
+        duration_s=60.0 * DAY_S,
+        lockstep=False,
+        levers=SimpleNamespace(tracks=True, stills=True, says=""),
+        link=SimpleNamespace(reported_s=50.0 * DAY_S),
+        frames=SimpleNamespace(
+            account=FrameAccount.of_counts((), coded_fps=0.0, auto_fps=False), encoded=1, unanalyzed=0
+        ),
+        keyframes=1,
+        tracks=0,
+        stills_pending=0,
+        encode_ms=70_000.0,
+        perception_ms=70_000.0,
+        cores_needed=5000.0,
+        cores_free=1.0,
+    )
+    fields: dict[str, Any] = {
+        "heartbeat": SimpleNamespace(beat=lambda _phase: state),
+        "operating": SimpleNamespace(now=SimpleNamespace(started_ns=0)),
+        "transmitter": SimpleNamespace(
+            base_sequence=0,
+            still_sequence=-1,
+            status=lambda make, **_: sent.append(make(10**18).pack()) is None,
+        ),
+    }
+    StatusReporter(
+        **fields,
+        session_id=7,
+        ledger=Ledger(window_ns=10**9),
+        failures=Failures(lambda: 0),
+        loop_clock=lambda: 0,
+    ).send("running")
+    health = Status.parse(sent[0]).health
+    assert (health.encode_ms, health.detect_ms, health.feedback_age_ms) == (60_000, 60_000, 2**32 - 1)
