@@ -255,6 +255,11 @@ class BacklogStage:
         """The store's numbers, for status and summary."""
         return self._worker.numbers
 
+    @property
+    def disk_free_bytes(self) -> int | None:
+        """Of the disk that the store lies on; None where it does not answer."""
+        return self._worker.disk_free_bytes
+
     def send_no_more(self) -> None:
         """Before the last report to the ground, which says how much there was."""
         self._worker.send_no_more()

@@ -69,8 +69,6 @@ class StoreNumbers:
     given_up: int = 0
     unacknowledged_bytes: int = 0
     """Sent, and not in any report of a ground yet."""
-    disk_free_bytes: int | None = None
-    """Of the disk that the store lies on; None where it does not answer."""
 
     @property
     def empty(self) -> bool:
@@ -154,7 +152,7 @@ class StoreWorker:
     @property
     def numbers(self) -> StoreNumbers:
         """The contents and the counts of the store."""
-        store, free = self._store, self._free
+        store = self._store
         return StoreNumbers(
             stills=store.stills,
             segments=store.segments + store.open_segments,
@@ -168,8 +166,13 @@ class StoreWorker:
             unreadable=store.damaged,
             given_up=self._backfill.given_up,
             unacknowledged_bytes=self._backfill.unacknowledged_bytes,
-            disk_free_bytes=free[1] if free is not None and self._clock() - free[0] < _OLD_NS else None,
         )
+
+    @property
+    def disk_free_bytes(self) -> int | None:
+        """Of the disk that the store lies on; None where it does not answer."""
+        free = self._free
+        return free[1] if free is not None and self._clock() - free[0] < _OLD_NS else None
 
     def send_no_more(self) -> None:
         """Send nothing from now on, so that an account can be closed; new objects are still stored."""

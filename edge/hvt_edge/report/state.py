@@ -364,7 +364,7 @@ def _backlog(backlog: BacklogStage) -> BacklogState:
         video_s=numbers.video_s,
         disk_bytes=numbers.disk_bytes,
         limit_bytes=backlog.max_bytes,
-        disk_free_bytes=numbers.disk_free_bytes,
+        disk_free_bytes=backlog.disk_free_bytes,
         frames_stored=backlog.frames,
         sent_stills=numbers.sent_stills,
         sent_video_s=numbers.sent_video_s,
