@@ -33,8 +33,8 @@ _MOST_S = 100.0
 
 # Functions: name and bound of their walk, the largest of each taken together.
 _WALKS = {
-    ("RealtimePace.step",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 35),
-    ("StillStage.analyze",): ("a frame's objects at the edge", 25),
+    ("RealtimePace.step",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 36),
+    ("StillStage.analyze",): ("a frame's objects at the edge", 26),
     ("StillStage.send",): ("a still at the edge, from choosing to put", 41),
     ("commands.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
         "a command, from hvt-ground set-budget to the encoder",
