@@ -64,7 +64,8 @@ def _models(config: GroundConfig) -> Finding:
 
 
 def _recordings(config: GroundConfig) -> Finding:
-    named = {"--summary": config.summary, "--timing": config.timing}
+    of_extras = (one for extra in all_extras() for one in extra.writes(config))
+    named = {"--summary": config.summary, "--timing": config.timing, **dict(of_extras)}
     if config.tracks is not None and config.tracks.suffix == ".csv" and not config.tracks.is_dir():
         named["--tracks"] = config.tracks
     folder = config.record_folder or Path()

@@ -3,7 +3,7 @@
 A request only crops (`OnDemand.request`, in the link's callback). Coding and sending have a thread of their own
 (`hvt_edge.stills.worker`), so that no detection stands before them, within the budget as every other still.
 `code_requested` says how: at the source's pixels, and better than the base. For its bytes frames of the video are
-left out (`hvt_edge.link.loan`), whatever share of the budget stills have. While one is pending, no other is sent.
+left out (`hvt_edge.link.budget`), whatever share of the budget stills have. While one is pending, no other is sent.
 """
 
 from __future__ import annotations

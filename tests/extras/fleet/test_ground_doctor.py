@@ -55,13 +55,15 @@ def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
     assert found["link"]["state"] == "warning", "edges may come later"
 
 
-def test_reports_to_others_are_checked_where_there_are_any(tmp_path, capsys, monkeypatch):
-    """A certificate that is missing would be found at the airfield."""
+def test_what_extras_send_and_write_is_checked(tmp_path, capsys, monkeypatch):
+    """A certificate or a folder that is missing would be found at the airfield."""
     monkeypatch.delenv("PYTAK_TLS_CLIENT_CERT", raising=False)
     link = ("--detector", "motion", "--classifier", "none", "--record", str(tmp_path))
     link += ("--connect", f"tcp/127.0.0.1:{free_ports(1)[0]}")
     _, found = examined(capsys, *link, "--cot", "udp://239.2.3.1:6969")
     assert found["reports"]["state"] == "ok"
-    code, found = examined(capsys, *link, "--cot", "tls://127.0.0.1:8089")
+    log = tmp_path / "gone" / "flight.hvtlog"
+    code, found = examined(capsys, *link, "--cot", "tls://127.0.0.1:8089", "--log", str(log))
+    assert found["recordings"]["found"] == f"--log {log} is in a folder that does not exist"
     assert (code, found["reports"]["state"]) == (2, "wrong")
     assert "PYTAK_TLS_CLIENT_CERT" in found["reports"]["found"] + found["reports"]["todo"]
