@@ -60,7 +60,9 @@ def test_the_picture_goes_on_without_boxes_and_they_come_back(tmp_path: Path, ca
     detector = fragile(colour_detector(tmp_path / "d.onnx", "yolox"), bright=220)
     classifier = fragile(colour_classifier(tmp_path / "c.onnx"), bright=1_000)
     config = check(
-        GroundConfig(detector=str(detector), classifier=str(classifier), confidence=0.3, provider="cpu")
+        GroundConfig(
+            detector=str(detector), classifier=str(classifier), confidence=0.3, provider="cpu", detect_every=5
+        )
     )
     models, events, flight = Models(config), list[Event](), Flight(1)
     pipeline = make_pipeline(config, models, info=flight.info(), emit=events.append)
