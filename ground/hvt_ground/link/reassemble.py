@@ -144,6 +144,13 @@ class Reassembler:
         self._held[header.sequence] = unit
         return self._release(now_ns)
 
+    def overdue(self, *, now_ns: int) -> list[Arrival]:
+        """What has waited long enough behind a hole, settled though nothing more comes.
+
+        Until it counts as received the edge holds its next frames, and with them what would end the wait.
+        """
+        return self._release(now_ns)
+
     def corrupt(self) -> None:
         """Count a message of the base stream that could not be read or whose CRC was wrong."""
         self.counters.corrupt += 1

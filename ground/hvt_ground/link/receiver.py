@@ -103,6 +103,8 @@ class Receiver:
         self._versions = versions
         self._clock = clock
         self._reassembler: Reassembler = Reassembler()
+        self._base_item: Received | None = None
+        """The newest message of the base stream."""
         self._other: int | None = None
         """The session of a second edge of this id that was noted last."""
         self._other_said_ns: int | None = None
@@ -142,6 +144,7 @@ class Receiver:
             match message:
                 case BaseHeader():
                     self._captures.note(message)
+                    self._base_item = item
                     arrivals = self._reassembler.accept(message, item.payload, now_ns=at_ns)
                     return [_base_packet(arrival, item) for arrival in arrivals]
                 case RoiHeader():
@@ -153,6 +156,14 @@ class Receiver:
                 self._reassembler.corrupt()
             self.skip(str(row), error)
         return []
+
+    def take_overdue(self, *, pending: bool) -> list[BasePacket]:
+        """Access units that have waited long enough behind a hole; ``pending``: messages wait to be received."""
+        item = self._base_item
+        if item is None:
+            return []
+        at_ns = self._uptime.at(self._clock(), pending=pending)
+        return [_base_packet(arrival, item) for arrival in self._reassembler.overdue(now_ns=at_ns)]
 
     def take_keyframe_request(self, *, pending: bool) -> bool:
         """Whether to request a keyframe now, which is noted; ``pending``: messages wait to be received."""

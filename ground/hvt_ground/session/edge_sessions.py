@@ -152,6 +152,8 @@ class EdgeSessions:
 
     def housekeep(self, *, pending: bool) -> None:
         """Do what is due by now; raises whatever goes wrong with it."""
+        for packet in self._receiver.take_overdue(pending=pending):
+            self._route(packet)
         session, now_ns = self.session, time.monotonic_ns()
         if self._pause.due(now_ns) and self._receiver.take_keyframe_request(pending=pending):
             self.port.request_keyframe()

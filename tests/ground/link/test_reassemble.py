@@ -162,6 +162,15 @@ def test_a_hole_is_given_up_after_its_wait_even_if_nothing_more_comes(running):
     assert running.core.counters.lost == 1
 
 
+def test_what_waits_behind_a_hole_is_settled_though_nothing_more_comes(running):
+    """The edge would hear of nothing that came, hold its frames, and with them the keyframe: dark for 1.7 s."""
+    assert running.send(5) == []
+    assert running.core.overdue(now_ns=running.now_ns + 99_000_000) == []
+    settled = running.core.overdue(now_ns=running.now_ns + 100_000_000)
+    assert [(one.verdict, one.header.sequence) for one in settled] == [("skip", 5)]
+    assert running.wants()
+
+
 def test_a_keyframe_does_not_wait_behind_a_hole(running):
     """After a loss the picture would come back later than the link allows."""
     running.send(5, after_ns=MS)
