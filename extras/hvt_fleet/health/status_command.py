@@ -16,6 +16,7 @@ from rich.live import Live
 from rich.table import Table
 
 from hvt_common.errors import FlightError, Parser
+from hvt_common.runtime.host_names import host_and_port
 from hvt_common.runtime.reporting import say
 
 _PATIENCE_S = 5.0
@@ -34,9 +35,10 @@ class StatusCommand:
     table: Callable[[dict[str, Any]], Table]
 
     def run(self, argv: Sequence[str]) -> int:
-        """Print it once, or each second; `FlightError` where none answers."""
+        """Print it once, or each second; `FlightError` where none answers, `UserError` where none can."""
         arguments = self._parser().parse_args(argv)
         address: str = arguments.at
+        host_and_port(address, name="--at", example=self.address)
         if not arguments.watch:
             state, table = self._requested(address)
             if arguments.json:

@@ -10,6 +10,8 @@ from contextlib import suppress
 
 import pytest
 
+import hvt_edge.cli
+import hvt_ground.cli
 from hvt_common.runtime.failures import Failures
 from hvt_fleet.health.server import Answer, HealthServer
 from programs.processes import eventually, free_ports
@@ -67,3 +69,11 @@ def test_state_is_told_under_names_of_this_machine_alone(served_at, names, stran
         eventually(lambda: answers(port), within_s=30, what="it serves")
         assert {one: asked(port, one) for one in names} == dict.fromkeys(names, 200)
         assert {one: asked(port, one) for one in strangers} == dict.fromkeys(strangers, 403)
+
+
+@pytest.mark.parametrize(("main", "port"), [(hvt_edge.cli.main, 9465), (hvt_ground.cli.main, 9464)])
+def test_status_at_what_is_no_address(main, port, capsys):
+    """A script would wait for a program to come where none can be."""
+    assert main(["status", "--at", "here:99999"]) == 2
+    said = f"--at 'here:99999' is not accepted: give HOST:PORT, such as 127.0.0.1:{port}\n"
+    assert capsys.readouterr().err.partition(": ")[2] == said
