@@ -168,8 +168,8 @@ class Analyzer:
         pixels = bgr[0] if bgr else None
         if self._settings.candidates == "source":
             pixels = frame.base_bgr
-        due = self._due(frame.index, coded=unit is not None) and self.cpu_budget.admits_detection(
-            frame.capture_ns
+        due = self.cpu_budget.admits_detection(
+            frame.capture_ns, due=self._due(frame.index, coded=unit is not None)
         )
         detections = None
         if due:

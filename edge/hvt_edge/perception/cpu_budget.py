@@ -105,7 +105,8 @@ class CpuBudget:
         self._measured: tuple[int, int] | None = None
         """When, and perception's processor time until then."""
         self._lost, self._lost_ns, self._left = 0, 0, 1.0
-        self._first_ns: int | None = None
+        self._waits_ns: int | None = None
+        """Of the frames since the detector was last not due, or came to look: the first."""
         self._newest_ns = 0
         self.queued = 0
         """Frames behind the one in hand."""
@@ -120,18 +121,15 @@ class CpuBudget:
     @property
     def too_slow(self) -> bool:
         """Whether the detector has not come to look for so long that its boxes tell nothing."""
-        if self._first_ns is None:
-            return False
-        return (
-            self._newest_ns - self._had_ns.get("detect", self._first_ns) > (LONGEST_DETECT_S + 1) * SECOND_NS
-        )
+        waits_ns = self._waits_ns
+        return waits_ns is not None and self._newest_ns - waits_ns > (LONGEST_DETECT_S + 1) * SECOND_NS
 
     def admits_frame(self, at_ns: int, *, lost: int, late: bool) -> bool:
         """Whether perception gets the frame of that capture time; ``lost``: so many video has lost until now.
 
         None while the loop is ``late`` itself.
         """
-        self._first_ns = at_ns if self._first_ns is None else self._first_ns
+        self._waits_ns = at_ns if self._waits_ns is None else self._waits_ns
         if at_ns > self._newest_ns:
             grown = (at_ns - self._newest_ns) / SECOND_NS / _BACK_S if self._newest_ns else 0.0
             self._left = min(1.0, self._left * 2**grown)
@@ -141,9 +139,12 @@ class CpuBudget:
         self._lost = lost
         return not late and self._take("track", self.plan.track_s, at_ns)
 
-    def admits_detection(self, at_ns: int) -> bool:
-        """Whether the detector searches the source of that frame, where that is due."""
-        return self.queued < _MOST_QUEUED and self._take("detect", self.plan.detect_s, at_ns)
+    def admits_detection(self, at_ns: int, *, due: bool = True) -> bool:
+        """Whether the detector searches the source of that frame, where that is ``due``."""
+        admitted = due and self.queued < _MOST_QUEUED and self._take("detect", self.plan.detect_s, at_ns)
+        if admitted or not due:
+            self._waits_ns = None
+        return admitted
 
     def admits_comparison(self, at_ns: int) -> bool:
         """Whether it searches the base of that frame besides."""

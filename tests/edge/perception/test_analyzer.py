@@ -138,6 +138,15 @@ def test_in_a_hurry_detection_is_put_off_and_made_up_for():
     assert all(one.base_bgr.shape == (192, 320, 3) for one in seen)
 
 
+def test_a_detector_that_is_to_look_rarely_is_not_called_too_slow():
+    """With --detect-every 100 auto would send nothing but video, and blame the machine."""
+    analyzer = make(detect_every=100)
+    for frame, unit in zip(FRAMES, UNITS, strict=True):
+        analyzer.cpu_budget.admits_frame(frame.index * SECOND_NS, lost=0, late=False)
+        assert not analyzer.cpu_budget.too_slow
+        analyzer.analyze(frame, unit)
+
+
 def test_a_standing_picture_is_searched_less_often_until_something_moves():
     """A hovering drone's processor would go into what it has seen; or a car drive through between two looks."""
     tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)

@@ -128,6 +128,15 @@ def test_a_machine_that_does_not_come_to_look_is_too_slow():
     assert not rig.budget.too_slow
 
 
+def test_a_machine_is_not_too_slow_for_frames_that_are_far_apart():
+    """With --fps 0.1, or after a camera was away, auto would send nothing but video, and blame the machine."""
+    budget = CpuBudget(fps=0.1, processors=8)
+    for at_ns in (0, 10 * SECOND_NS, 20 * SECOND_NS):
+        assert budget.admits_frame(at_ns, lost=0, late=False)
+        assert not budget.too_slow, "it has only come"
+        assert budget.admits_detection(at_ns)
+
+
 def test_with_frames_that_wait_nothing_is_searched():
     """They would wait as long again, and boxes be seconds old."""
     budget = CpuBudget()
