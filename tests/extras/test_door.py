@@ -66,6 +66,8 @@ def test_extras_bring_what_the_core_has_not():
         "web_proxy",
     ]
     assert not set(settings) & set(GroundConfig.__annotations__)
+    named = vars(config_class(()))["GONE"]
+    assert sorted(named) == sorted(one.replace("_", "-") for one in settings), "a core knows what it lacks"
 
 
 @pytest.mark.parametrize(
