@@ -48,6 +48,7 @@ class FewFoundHint:
         self._lock = threading.Lock()
         self._open = detector != MOTION
         self._runs = self._with_something = self._with_motion = 0
+        self._also = False
         motion = library_part(MOTION) if self._open and detector != EMBEDDED_DETECTOR else None
         self._motion = None if motion is None else motion()
 
@@ -60,7 +61,8 @@ class FewFoundHint:
             return
         with self._lock:
             self._runs += 1
-            self._with_something += self._has(found)
+            self._with_something += self._has(found) or self._also
+            self._also = False
             if self._motion is not None and not self._with_something:
                 self._with_motion += bool(len(self._motion.detect(image_bgr)))
             if self._runs < _RUNS or not self._open:
@@ -72,6 +74,11 @@ class FewFoundHint:
                 self._say_other_model()
         elif not self._with_something:
             self._say_what_does(image_bgr, detect)
+
+    def take_also(self, found: Detections | None) -> None:
+        """What another run has found on that picture, as on a part of it that was enlarged."""
+        with self._lock:
+            self._also |= self._has(found)
 
     def _has(self, found: Detections | None) -> bool:
         return found is not None and bool((found.confidences >= self._confidence).any())

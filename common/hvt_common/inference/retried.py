@@ -42,7 +42,10 @@ class RetriedDetector(Retried[Detector]):
 
     def detect_whole(self, image_bgr: Image) -> Detections | None:
         """Like `hvt_common.inference.tiles.detect_whole`; None while it fails."""
-        return self.run(lambda model: detect_whole(model, image_bgr))
+        found = self.run(lambda model: detect_whole(model, image_bgr))
+        if self._hint is not None:
+            self._hint.take_also(found)
+        return found
 
 
 class RetriedClassifier(Retried[Classifier]):

@@ -100,7 +100,7 @@ def _guesses(facts: ModelFacts, info: Info) -> Guesses | None:
 def _scale_search(
     config: GroundConfig, facts: ModelFacts, detector: FailingDetector, info: Info
 ) -> ScaleSearch | None:
-    # What it promises are sums of probabilities. The hint that little is found counts whole pictures.
+    # What it promises are sums of probabilities. The hint that little is found counts pictures, not their parts.
     if not facts.calibrated or not searches_scale(config.tiles, pace=info.pace):
         return None
     detect = detector.detect_whole if isinstance(detector, RetriedDetector) else detector.detect

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from hvt_common.inference.few_found import FewFoundHint, ViewTrust
+from hvt_common.inference.retried import RetriedDetector
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import Detections
 
 STILL = np.full((120, 160, 3), 90, np.uint8)
@@ -40,6 +44,21 @@ def test_a_view_that_it_knows_or_a_flight_that_is_young(caplog):
     looks = [found(0.9), *[Detections.none()] * 8]
     assert said(caplog, "aerial-nano", looks * 20) == []
     assert said(caplog, "aerial-nano", [Detections.none()] * 44) == []
+
+
+@pytest.mark.parametrize("detector", ["aerial-nano", "boat.onnx"])
+def test_what_is_found_enlarged_is_found(caplog, detector):
+    """Who sees two hundred small objects would be told that nothing is found, and sent to another model."""
+    finds = SimpleNamespace(
+        detect=lambda image: found(0.9) if image.shape[0] > STILL.shape[0] else Detections.none()
+    )
+    hint = FewFoundHint(detector, confidence=0.25)
+    retried = RetriedDetector(lambda: finds, Failures(lambda: 0), hint=hint)
+    large = np.repeat(STILL, 2, axis=0)
+    for index in range(100):
+        retried.detect(moving(index % 60))
+        retried.detect_whole(large)
+    assert not caplog.records
 
 
 @pytest.mark.parametrize("detector", ["motion", "boat.onnx", "yolox-s", "acme-blobs:x"])
