@@ -66,7 +66,7 @@ class CameraMotion:
             return False
         moved = cv2.warpAffine(then, self._since[:2], (width, height), borderMode=cv2.BORDER_REPLICATE)
         blurred = (cv2.blur(one, (_BLUR_PX, _BLUR_PX)) for one in (moved, now))
-        changed = np.count_nonzero(cv2.absdiff(*blurred) > _CHANGED_LEVELS)
+        changed = int(np.count_nonzero(cv2.absdiff(*blurred) > _CHANGED_LEVELS))
         return changed <= _STILL_CHANGED * now.size
 
     def step(self, image_bgr: Image) -> Affine:

@@ -79,7 +79,8 @@ class ScaleSearch:
         self._probes += 1
         self._due = self._pictures + (1 if self._probes < _FIRST else _EVERY)
         middles = (whole.boxes_xyxy_px[:, :2] + whole.boxes_xyxy_px[:, 2:]) / 2
-        here = self._promise(whole, ((middles >= (x1, y1)) & (middles < (x2, y2))).all(axis=1))
+        inside = (middles >= (x1, y1)) & (middles < (x2, y2))
+        here = self._promise(whole, inside[:, 0] & inside[:, 1])
         there = self._promise(self._detect_enlarged(image_bgr[y1:y2, x1:x2]))
         if there < _MORE * here + _LEAST_MORE:
             return

@@ -321,7 +321,8 @@ class Pipeline:
         vehicles = np.array(
             [kind_of(names[class_id]) in VEHICLE_KINDS for class_id in own.class_ids], np.bool_
         )
-        return own.boxes_xyxy_px[vehicles & (own.seen_frames == own.frame_index)]
+        seen: Boxes = own.boxes_xyxy_px[vehicles & (own.seen_frames == own.frame_index)]
+        return seen
 
     def _own_at(self, frame_index: int) -> Tracks:
         # Our tracker's list at a frame: as it was, or moved on from the newest frame.
