@@ -100,6 +100,20 @@ def check_not_read(path: Path, reads: Iterable[Path], *, name: str) -> None:
             raise UserError(f"{name} {path} is {one} itself, which is read: name another file")
 
 
+def check_apart(files: Iterable[tuple[str, Path | None]]) -> None:
+    """Raise `UserError` where two of the (name, path), which are to be written, are one file.
+
+    None is no file, and a device takes anything.
+    """
+    names: dict[str, str] = {}
+    for name, path in files:
+        if path is None or (path.exists() and not path.is_file()):
+            continue
+        other = names.setdefault(os.path.realpath(path), name)
+        if other != name:
+            raise UserError(f"{other} and {name} both name {path}: give each a file of its own")
+
+
 def exit_with_sentence(
     run: Callable[[Sequence[str] | None], int], *, program: str, argv: Sequence[str] | None
 ) -> int:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
-from hvt_common.errors import NotYetError, UserError
+from hvt_common.errors import NotYetError, UserError, check_apart
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, parts_of
@@ -193,22 +192,10 @@ def check(config: GroundConfig, *, files: Iterable[tuple[str, Path]] = ()) -> Gr
 
 
 def _check_files(config: GroundConfig, more: Iterable[tuple[str, Path]]) -> None:
-    # Two files must not be one. Files in a folder have names of their own, and a device takes anything.
+    # Two files must not be one. Files in a folder have names of their own.
     if config.stills is not None and not config.stills.is_dir():
         kind = UserError if config.stills.exists() else NotYetError
         raise kind(f"--stills {config.stills} is no folder: create it, or name one that is there")
-    files: dict[str, str] = {}
-    for name, path, suffix in (
-        ("--record", config.record, ".rrd"),
-        ("--tracks", config.tracks, ".csv"),
-        ("--timing", config.timing, None),
-        ("--summary", config.summary, None),
-        *((name, path, None) for name, path in more),
-    ):
-        if path is None or (suffix is not None and path.suffix != suffix):
-            continue
-        if path.exists() and not path.is_file():
-            continue
-        other = files.setdefault(os.path.realpath(path), name)
-        if other != name:
-            raise UserError(f"{other} and {name} both name {path}: give each a file of its own")
+    in_folders = (("--record", config.record, ".rrd"), ("--tracks", config.tracks, ".csv"))
+    files = [(name, path) for name, path, suffix in in_folders if path is not None and path.suffix == suffix]
+    check_apart([*files, ("--timing", config.timing), ("--summary", config.summary), *more])

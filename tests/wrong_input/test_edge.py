@@ -251,6 +251,12 @@ def test_an_output_over_what_is_read(edge, here, flag, what):
     assert Path("read").read_text() == "by the edge"
 
 
+def test_two_outputs_of_one_file(edge, here):
+    """The video of a flight would be gone under its summary."""
+    said = edge("--record-base", "one.mkv", "--summary", "./one.mkv")
+    assert "--summary and --record-base both name one.mkv: give each a file of its own" in said
+
+
 def test_a_failed_start_leaves_an_old_summary_as_it_was(edge, here):
     """The result of yesterday would be gone."""
     Path("s.json").write_text("yesterday")

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import cast
 
-from hvt_common.errors import NotYetError, UserError
+from hvt_common.errors import NotYetError, UserError, check_apart
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.runtime.reporting import check_writable
@@ -26,15 +26,17 @@ _COPIES = "hvt.edge_copies"
 
 
 def check_files(config: EdgeConfig) -> None:
-    """Raise `UserError` for a file or folder that could not be written, or is one that is read."""
+    """Raise `UserError` for a file or folder that could not be written, is one that is read, or another's."""
     given = (config.source, config.pose, config.detector, config.labels, config.zenoh_config)
     reads = [Path(one) for one in given if one is not None]
-    for path, name in (
-        (config.summary, "--summary"),
-        (config.truth, "--truth"),
-        (config.record_base, "--record-base"),
-    ):
+    files = (
+        ("--summary", config.summary),
+        ("--truth", config.truth),
+        ("--record-base", config.record_base),
+    )
+    for name, path in files:
         check_writable(path, name=name, reads=reads)
+    check_apart(files)
 
 
 def open_local_copy(path: Path, *, failures: Failures, wait: bool) -> AbstractContextManager[LocalCopy]:
