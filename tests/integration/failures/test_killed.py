@@ -60,11 +60,12 @@ class Flight:
         return {one.file: one for one in read_index(self.folder / "flights")}
 
     def before(self, *, doomed: bool) -> list[Path]:
-        """The killed ground's files of the first process, or of the second."""
+        """The killed ground's files of the first process, or of the second, as they flew."""
+        rows, session = self.rows, self.edges["uav-1"]["session"]
         return [
             one
             for one in self.left
-            if (self.rows[one.name].session == self.edges["uav-1"]["session"]) != doomed
+            if not rows[one.name].backlog and (rows[one.name].session == session) != doomed
         ]
 
 
@@ -99,8 +100,14 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight
         old = files()
         steady = link.edge(*edge, "--edge-id", "uav-1", name="uav-1")
         flown(len(old) + 2)
+
+        def closed() -> bool:
+            whole = [one for one in read_index(flights) if one.whole]
+            before, files = {one.name for one in old}, {one.file for one in whole}
+            return before <= files and any(one.file not in before and not one.backlog for one in whole)
+
         eventually(
-            lambda: {one.name for one in old} < {one.file for one in read_index(flights) if one.whole},
+            closed,
             within_s=SOON_S,
             what="what the killed edge flew is closed, and some of what came then",
         )
