@@ -204,6 +204,15 @@ def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path,
     assert sum("all else goes on" in one.getMessage() for one in caplog.records) == 1
 
 
+def test_what_waits_behind_a_hole_is_received_though_nothing_more_comes(flight, tmp_path):
+    """The edge would hear of nothing that came, and hold the keyframe that would end the wait."""
+    rig = Rig(flight, Consumer(tmp_path))
+    rig.put(0, 1, 3)
+    session = rig.sessions.session
+    eventually(lambda: session.frames_received == 3, within_s=10, what="the one behind the hole is received")
+    assert rig.thread.close(timeout_s=60)
+
+
 def test_a_flight_that_has_ended_holds_no_place(tmp_path):
     """A ground that runs for years would refuse every drone after the sixty-fourth."""
     rig = Rig(Flight(1), Consumer(tmp_path))
