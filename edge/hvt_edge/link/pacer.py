@@ -245,7 +245,9 @@ class Pacer:
         """Take in one report of this session."""
         feedback, now_ns = report.feedback, report.now_ns
         with self._lock:
-            if not report.primary or self._linked is False:  # who takes no video says nothing of its link
+            # Who takes no video says nothing of its link, also where somebody else does who reports nothing.
+            video = self._linked is not False and (self._reports or feedback.base_sequence >= 0)
+            if not (report.primary and video):
                 self.ignored += 1
                 return
             if report.first:

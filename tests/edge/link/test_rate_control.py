@@ -526,12 +526,13 @@ def test_nobody_reports_and_nothing_is_held_back():
     assert pacer.rate_bps == 800_000
 
 
-def test_who_takes_stills_alone_and_reports_says_nothing_of_the_link():
-    """Nothing of the video would ever be named, and frames that nobody asked for would be the link's fault."""
+@pytest.mark.parametrize("viewer", [False, True])
+def test_who_takes_stills_alone_and_reports_says_nothing_of_the_link(viewer):
+    """Nothing of the video would ever be named, and frames would be held back for it, a silent viewer's too."""
     pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
     for number in range(150):
         now_ns = number * 66 * MS
-        pacer.link(False, now_ns=now_ns)
+        pacer.link(viewer, reports=False, now_ns=now_ns)
         pacer.on_report(counted(report(number, base=-1), now_ns=now_ns, first=number == 0))
         assert pacer.admits_base(now_ns)
         pacer.sent_base(number, 5_000, now_ns=now_ns)
