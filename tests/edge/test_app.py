@@ -148,8 +148,8 @@ class FragileDetector(Detector):
 
     class_names = ("car",)
 
-    def __init__(self, first: weakref.ref[FragileDetector] | None) -> None:
-        self.first, self.runs = first, 0
+    def __init__(self, first: weakref.ref[FragileDetector] | None, stop: threading.Event) -> None:
+        self.first, self.runs, self._stop = first, 0, stop
         self.alone: bool | None = None
 
     def detect(self, image_bgr: Image) -> Detections:
@@ -157,21 +157,24 @@ class FragileDetector(Detector):
         self.runs += 1
         if self.first is None and self.runs > 2:
             raise RuntimeError("it stumbles")
-        self.alone = self.first is not None and self.first() is None
+        if self.first is not None:
+            self.alone = self.first() is None
+            self._stop.set()
         return Detections.none()
 
 
 class FragileWorld(World):
-    """With such detectors."""
+    """With such detectors; the flight ends when the second has looked."""
 
     def __init__(self) -> None:
         super().__init__()
+        self.stop = threading.Event()
         self.first: weakref.ref[FragileDetector] | None = None
         self.second: FragileDetector | None = None
 
     def open_detector(self, config: EdgeConfig) -> Detector:
         """See there."""
-        opened = FragileDetector(self.first)
+        opened = FragileDetector(self.first, self.stop)
         if self.first is None:
             self.first = weakref.ref(opened)
         else:
@@ -181,12 +184,12 @@ class FragileWorld(World):
 
 def test_a_detector_that_failed_does_not_stay_beside_its_successor(tmp_path):
     """The edge would hold two networks from the first failure on, 100 MB more, and a small board end it."""
-    write_scene(tmp_path, frames=25)
+    write_scene(tmp_path, frames=200)
     config = EdgeConfig(
         source=str(tmp_path), source_fps=10.0, fps=10, size="320x192", preset="ultrafast", method="M2",
         connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0, detect_every=1,
     )  # fmt: skip
     world = FragileWorld()
-    Edge(check(config), stop=threading.Event(), world=world).run()
+    Edge(check(config), stop=world.stop, world=world).run()
     assert world.second is not None, "it was opened again"
     assert world.second.alone
