@@ -50,6 +50,19 @@ def test_a_watcher_that_stays_after_the_ground_has_left_is_served(tmp_path):
         rig.backlog.close()
 
 
+def test_reports_tell_how_soon_a_keyframe_is_known_to_be_lost(tmp_path):
+    """The screen would stay dark for as long as on a satellite link."""
+    rig = Rig(tmp_path / "store", adapt=True)
+    try:
+        rig.play(0, 30, reports=True)
+        rig.keyframes.done(rig.now_ns)
+        soon_ns = rig.now_ns + SECOND_NS // 4
+        assert rig.keyframes.request(soon_ns) is None
+        assert rig.keyframes.due(soon_ns)
+    finally:
+        rig.backlog.close()
+
+
 def test_a_report_that_cannot_be_used_lowers_the_rate_and_video_goes_on(tmp_path, caplog):
     """An error in a thread of the link is nobody's: the edge would wait for ever for what never arrives."""
     inbox = Faulty()
