@@ -29,8 +29,8 @@ _LONGEST_TRACK_S: Final = 0.5
 _MOST_TRACKING: Final = 0.5
 _MOST_DETECTING: Final = 0.85
 """Shares of what the parts before have left."""
-_LEAST_CORES: Final = 0.4
-_SHARE: Final = 0.3
+_LEAST_CORES: Final = 0.5
+_SHARE: Final = 0.5
 """With fewer looks than three a second nothing is tracked from a camera that moves: with 1.5 a third is (car10)."""
 _LEAST_LEFT: Final = 1 / 16
 """Of the budget, however many frames are lost."""
