@@ -15,7 +15,7 @@ from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from rigs.flight import Flight, Port, pipeline_of
 
-TO_THE_PICTURE, TO_THE_TRACKS = 10, 11
+TO_THE_PICTURE, TO_THE_TRACKS = 10, 12
 """Files of the ground that a frame enters at most in the receiving thread, and in that of the worker."""
 
 

@@ -35,8 +35,8 @@ def ground_of(link: Link) -> Running:
     ("name", "more", "pace"),
     [
         pytest.param("camera.hevc", "", "lockstep", marks=pytest.mark.nightly),
-        ("camera.ts", "aud=1:repeat-headers=1", "realtime"),
-        pytest.param("camera.mp4", "", "realtime", marks=pytest.mark.nightly),
+        ("camera.ts", "aud=1:repeat-headers=1", "lockstep"),
+        pytest.param("camera.mp4", "", "realtime", marks=pytest.mark.realtime),
         pytest.param("camera.mkv", "open-gop=1", "lockstep", marks=pytest.mark.nightly),
     ],
 )
