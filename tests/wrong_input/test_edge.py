@@ -251,6 +251,15 @@ def test_an_output_over_what_is_read(edge, here, flag, what):
     assert Path("read").read_text() == "by the edge"
 
 
+@pytest.mark.parametrize("name", ["0.png", "2.JPG", "../pictures/1.png"])
+def test_an_output_among_the_pictures_of_the_source(edge, pictures, name):
+    """A picture of the flight would be its summary, or the next flight show one that is none."""
+    before = [(one.name, one.read_bytes()) for one in sorted(Path(pictures).iterdir())]
+    said = edge("--summary", f"{pictures}/{name}")
+    assert f"--summary {pictures}/{name} would be a picture of --source pictures" in said
+    assert [(one.name, one.read_bytes()) for one in sorted(Path(pictures).iterdir())] == before
+
+
 def test_two_outputs_of_one_file(edge, here):
     """The video of a flight would be gone under its summary."""
     said = edge("--record-base", "one.mkv", "--summary", "./one.mkv")

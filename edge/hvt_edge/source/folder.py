@@ -29,10 +29,13 @@ _ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"}
 
 def sequence_files(folder: Path) -> list[Path]:
     """The images of a folder in natural order (img2 before img10); hidden files and subfolders are not looked at."""
-    files = [
-        file for file in folder.iterdir() if file.suffix.lower() in _ENDINGS and not file.name.startswith(".")
-    ]
+    files = [file for file in folder.iterdir() if names_picture(file)]
     return sorted((file for file in files if file.is_file()), key=lambda file: _natural(file.name))
+
+
+def names_picture(file: Path) -> bool:
+    """Whether a file of this name, in the folder of a sequence, is one of its images."""
+    return file.suffix.lower() in _ENDINGS and not file.name.startswith(".")
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

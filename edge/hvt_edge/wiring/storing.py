@@ -19,6 +19,7 @@ from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import EdgeConfig
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.source.folder import names_picture
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.video.stage import LocalCopy
 
@@ -34,7 +35,12 @@ def check_files(config: EdgeConfig) -> None:
         ("--truth", config.truth),
         ("--record-base", config.record_base),
     )
+    pictures = Path(config.source or "").resolve()
     for name, path in files:
+        if path is not None and names_picture(path) and path.resolve().parent == pictures:
+            raise UserError(
+                f"{name} {path} would be a picture of --source {config.source}: name another file"
+            )
         check_writable(path, name=name, reads=reads)
     check_apart(files)
 
