@@ -183,8 +183,9 @@ class BacklogStage:
         if (
             self.state is State.LIVE
         ):  # else these were to show whether the link is back, and are stored already
-            for unit in units:
-                self._worker.offer(unit)
+            whole = True
+            for unit in units:  # behind one that the disk does not take, what builds on it is of no use
+                whole = (whole or unit.keyframe) and self._worker.offer(unit)
 
     # The end of the run
 

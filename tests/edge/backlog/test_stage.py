@@ -9,8 +9,11 @@ import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Flags, RoiHeader, parse_backlog_still
+from hvt_common.values import AccessUnit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.backlog.entry import worth
+from hvt_edge.backlog.intake import IntakeStill
+from hvt_edge.backlog.worker import StoreWorker
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.wiring.storing import make_backlog
 from media.clips import START_NS
@@ -36,6 +39,20 @@ def test_what_is_coded_in_an_outage_is_kept_and_all_else_is_sent(tmp_path):
     assert {unit.frame_index: unit.data for unit in kept}.items() <= rig.coded.items()
     first_kept = next(unit for unit in kept if unit.frame_index == 30)
     assert first_kept.keyframe, "the stretch of the outage can be shown by itself"
+
+
+def test_what_was_in_flight_is_kept_without_a_hole(tmp_path, monkeypatch):
+    """A slow disk would take the frames behind one that it refused, and the ground show garbage."""
+    rig, offered, offer = Rig(tmp_path / "store"), [], StoreWorker.offer
+
+    def slow(worker: StoreWorker, item: AccessUnit | IntakeStill) -> bool:
+        offered.append(item)
+        return len(offered) != 11 and offer(worker, item)
+
+    monkeypatch.setattr(StoreWorker, "offer", slow)
+    rig.play(0, 20, linked=True)
+    rig.play(20, 30, linked=False)
+    assert [unit.frame_index for unit in rig.kept()] == [*range(10), *range(20, 30)]
 
 
 def test_the_picture_after_an_outage_can_be_shown_at_once(tmp_path):

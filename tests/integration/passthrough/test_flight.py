@@ -61,7 +61,7 @@ def test_the_recording_holds_the_cameras_own_units(link, name, more, pace):
     assert pictures_of(link.folder / "copy.mkv") == slices
 
 
-@pytest.mark.nightly
+@pytest.mark.realtime
 def test_a_closer_look_and_a_keyframe_are_refused_with_their_reasons(link):
     """Bits would go to a still of the pixels that the video has; whoever joins would ask for a keyframe for ever."""
     clip = write_clip(link.folder / "camera.mp4", smooth_pictures(200, size=SIZE), keyint=30)
