@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import json
 import socket
 import time
 from contextlib import suppress
+from http.server import HTTPServer
+from socketserver import ThreadingMixIn
 
 import pytest
 
@@ -69,6 +72,34 @@ def test_state_is_told_under_names_of_this_machine_alone(served_at, names, stran
         eventually(lambda: answers(port), within_s=30, what="it serves")
         assert {one: asked(port, one) for one in names} == dict.fromkeys(names, 200)
         assert {one: asked(port, one) for one in strangers} == dict.fromkeys(strangers, 403)
+
+
+def test_threads_and_descriptors_that_are_used_up_for_a_while(monkeypatch):
+    """The port would answer nobody for the rest of the flight, or take a core from video."""
+    (port,) = free_ports(1)
+    started, taken = ThreadingMixIn.process_request, HTTPServer.get_request
+    refused, full = [], []
+
+    def start(server, request, address):
+        if len(refused) < 20:
+            refused.append(address)
+            raise RuntimeError("can't start new thread")
+        started(server, request, address)
+
+    def take(server):
+        if len(refused) == 20 and len(full) < 4:
+            full.append(time.monotonic())
+            raise OSError(errno.EMFILE, "too many open files")
+        return taken(server)
+
+    monkeypatch.setattr(ThreadingMixIn, "process_request", start)
+    monkeypatch.setattr(HTTPServer, "get_request", take)
+    with HealthServer(f"127.0.0.1:{port}", STATE, name="--metrics", failures=Failures(time.time_ns)):
+        eventually(lambda: answers(port), within_s=30, what="it serves")
+        while len(refused) < 20:
+            answers(port)
+        assert [asked(port, None) for _ in range(20)] == [200] * 20
+    assert full[-1] - full[0] >= 3 * 0.2, "it rests"
 
 
 @pytest.mark.parametrize(("main", "port"), [(hvt_edge.cli.main, 9465), (hvt_ground.cli.main, 9464)])
