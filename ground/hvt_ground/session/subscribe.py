@@ -56,6 +56,8 @@ class GroundLink:
         self._log = log
         self._alive: set[str] = set()
         """Edges that show their token, also those that others serve; with a group."""
+        self._unplaced: set[str] = set()
+        """Edges that show their token and found no place; the first `MAX_EDGES` of them."""
         self._subscribers: dict[str, list[zenoh.Subscriber[None]]] = {}
         """Subscriptions by edge, with a group."""
         self._leaving: set[str] = set()
@@ -165,13 +167,19 @@ class GroundLink:
         with self._lock:
             port = self._ports.get(edge)
             if port is None:
-                if len(self._ports) >= MAX_EDGES and not (alive and self._make_space()):
+                waits = edge in self._unplaced
+                if len(self._ports) >= MAX_EDGES and not ((alive or waits) and self._make_space()):
                     self.foreign += 1
+                    if alive and len(self._unplaced) < MAX_EDGES:
+                        self._unplaced.add(edge)
                     self._say_refused(edge)
                     return None
                 port = self._ports[edge] = EdgePort(
                     self._session, edge, clock=self._clock, log=self._log, still_codecs=self._still_codecs
                 )
+                if waits:  # its token came once, and does not come again
+                    self._unplaced.discard(edge)
+                    port.present.set()
             return port
 
     def _make_space(self) -> bool:
@@ -200,6 +208,8 @@ class GroundLink:
         if self._group is not None:
             self._note_shared(key, there=there)
             return
+        if not there and (parsed := parse_key(key)) is not None:
+            self._unplaced.discard(parsed[0])
         try:
             port = self._port(key, alive=there)
         except Exception as error:  # noqa: BLE001 - for the edge's thread

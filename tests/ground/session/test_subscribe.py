@@ -102,7 +102,14 @@ def test_edges_that_are_there_or_fly_keep_their_place(link):
     ghost.used.set()
     with outsider.liveliness().declare_token("hvt/late/alive"):
         eventually(lambda: ground.foreign == 1, within_s=20, what="it is refused")
-    assert "late" not in served(ground)
+        assert "late" not in served(ground)
+        ghost.used.clear()
+        outsider.put("hvt/late/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        eventually(
+            lambda: "late" in served(ground), within_s=20, what="a flight has ended, so there is a place"
+        )
+        (late,) = [port for port in ground.ports() if port.edge == "late"]
+        assert late.present.is_set()
     for token in tokens:
         token.undeclare()
 
