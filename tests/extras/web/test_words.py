@@ -286,7 +286,7 @@ EVENTS = {
     "there is a pose again",
     "… lines were left out here: the edge gave rise to too many",
     "still … is asked for again: the picture it builds on did not come",
-    "still … cannot be decoded: …",
+    "still … is damaged: it is not shown",
 }
 """Every text of an event that the ground makes; it passes on what an edge says of its settings in flight."""
 REFUSALS = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +21,8 @@ from hvt_ground.perception.stills.decode import Box, DecodedStill, ReceivedStill
 from hvt_ground.perception.stills.match import StillSeen
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary, Vote
+
+_log = logging.getLogger(__name__)
 
 SAME_DB, OTHER_DB = 38.0, 26.0
 """Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
@@ -166,7 +169,8 @@ class StillStage:
         except StillError as error:
             self.dropped["undecodable"] += 1
             self._spoilt.append(now.frame_index)
-            self._notice(now, f"still {header.sequence} cannot be decoded: {error}")
+            _log.info("still %d cannot be decoded: %s", header.sequence, error)
+            self._notice(now, f"still {header.sequence} is damaged: it is not shown")
             for track_id, _ in _shown(header):
                 self._answer(header, track_id, None)
             return None
