@@ -39,7 +39,8 @@ def run(argv: Sequence[str]) -> int:
         return 0
     name: str = arguments.name
     if arguments.command == "renew":
-        authority.issue(name, hosts=arguments.host or _hosts_of(before, name))
+        known = _hosts_of(before, name)  # first of all: a machine that nobody knows may be the CA
+        authority.issue(name, hosts=arguments.host or known)
         say(f"{name}: copy {name}.pem and {name}.key from {folder} to the machine")
         return 0
     after = _changed(before, arguments)

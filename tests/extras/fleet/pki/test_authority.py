@@ -210,6 +210,7 @@ def test_zenoh_reads_every_file_also_of_a_fleet_of_one(tmp_path: Path) -> None:
     ("arguments", "says"),
     [
         (["add-edge", "ca"], "'ca' is reserved"),
+        (["renew", "ca", "--host", "h"], "'ca' is not in this fleet"),
         (["add-edge", "base"], "'base' is the name of a ground"),
         (["add-ground", "uav-1"], "'uav-1' is the name of a edge"),
         (["add-router", "base", "--host", "h"], "'base' is the name of a ground"),
