@@ -14,7 +14,20 @@ TRACK_COMPONENTS = frozenset(
     {"centers", "half_sizes", "track_id", "class_before", "class_ids", "confidence_pct", "origin"}
 )
 """The rest is of the layer, once: how it is drawn."""
+_CLASSES = ("class_before", "class_ids")
+_IDS = 2**16
+"""Numbers of classes in a file; another ground may have given the same ones to other classes."""
 _HUNDRED = 100
+
+
+def of_file(row: Timed, component: str, *, number: int) -> Timed:
+    """A row of the file of this number, with numbers of classes that no other file has."""
+    frame, capture_ns, value = row
+    if component.rpartition(":")[2] in _CLASSES:
+        value = [one + number * _IDS for one in value]
+    elif component.endswith("context"):
+        value = [[one | {"class_id": one["class_id"] + number * _IDS} for one in value[0]]]
+    return frame, capture_ns, value
 
 
 @dataclass(frozen=True, slots=True)

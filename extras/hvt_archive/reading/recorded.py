@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from rerun.chunk import Chunk, RrdReader
 
-from hvt_archive.reading.drawn_layer import TRACK_COMPONENTS, DrawnLayer
+from hvt_archive.reading.drawn_layer import TRACK_COMPONENTS, DrawnLayer, of_file
 from hvt_archive.reading.spool import Mapped, Spool, SpooledRows, Timed
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireError
@@ -124,7 +124,8 @@ def read_recordings(paths: Sequence[Path], *, locator: Locator = NOWHERE) -> Rec
         UserError: a file is no recording of hvt-ground, or they are of several sessions.
     """
     spool = Spool()
-    files = sorted((_opened(path, spool) for path in paths), key=lambda one: one.first)
+    opened = (_opened(path, spool, number) for number, path in enumerate(paths))
+    files = sorted(opened, key=lambda one: one.first)
     names = {one.name for one in files}
     rows: _Rows = {}
     for file in files:
@@ -217,9 +218,9 @@ def _hashes(rows: Iterable[Timed]) -> set[int]:
     return {hash(value) for _, _, value in rows}
 
 
-def _opened(path: Path, spool: Spool) -> _File:
+def _opened(path: Path, spool: Spool, number: int) -> _File:
     try:
-        return _read(path, spool)
+        return _read(path, spool, number)
     except (OSError, RuntimeError, ValueError, LookupError) as error:
         refused = f"{path} is no recording ({error}): give .rrd files of hvt-ground"
     with tempfile.TemporaryDirectory() as folder:
@@ -227,14 +228,14 @@ def _opened(path: Path, spool: Spool) -> _File:
         try:
             if not copy_whole_messages(path, whole):
                 raise UserError(refused)
-            file = _read(whole, spool)
+            file = _read(whole, spool, number)
         except (OSError, RuntimeError, ValueError, LookupError):
             raise UserError(refused) from None
     _log.warning("%s breaks off: what comes before is exported", path)
     return file
 
 
-def _read(path: Path, spool: Spool) -> _File:
+def _read(path: Path, spool: Spool, number: int) -> _File:
     rows: _Rows = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that there is no footer
@@ -243,7 +244,8 @@ def _read(path: Path, spool: Spool) -> _File:
     ours = False
     for chunk in reader.stream():
         ours |= chunk.entity_path.startswith("/base/")
-        for component, found in _rows(chunk):
+        for component, of_chunk in _rows(chunk):
+            found = [of_file(row, component, number=number) for row in of_chunk]
             entity = chunk.entity_path
             blobs = component in (_SAMPLE, _PICTURE)
             if blobs or (entity in _LAYERS and not component.endswith("context")):

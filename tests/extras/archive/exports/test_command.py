@@ -223,15 +223,16 @@ def test_what_is_doubted_has_no_name_in_any_picture(events, tmp_path):
 
 
 def test_a_ground_that_was_started_again_leaves_no_ghosts(events, tmp_path):
-    """Boxes of the first recording would stand in the second, beside their own."""
+    """Boxes of the first recording would stand in the second, beside their own, or bear the names of its classes."""
     halves = (0, 30), (30, 60)
+    boats = ("boat",) * TRACKS
     for number, (begin, end) in enumerate(halves):
         settings = RecorderSettings(tmp_path / f"{number}.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
         with Recorder(settings) as recorder:
             for event in events:
                 if begin <= event.frame_index < end and not isinstance(event, Refinement):
                     shift = (
-                        replace(event, track_ids=event.track_ids + 50)
+                        replace(event, track_ids=event.track_ids + 50, base_classes=boats, classes=boats)
                         if number and isinstance(event, Overlay)
                         else event
                     )
@@ -243,6 +244,7 @@ def test_a_ground_that_was_started_again_leaves_no_ghosts(events, tmp_path):
     )
     by_frame: dict[int, list[int]] = {}
     for row in lines(out):
+        assert [row[name] == "boat" for name in ("base_class", "class")] == [int(row["id"]) > 50] * 2
         by_frame.setdefault(int(row["frame_index"]), []).append(int(row["id"]))
     assert {len(ids) for ids in by_frame.values()} == {TRACKS}
     # The second begins at its first keyframe.
