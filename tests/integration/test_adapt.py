@@ -35,7 +35,9 @@ def flown(folder: Path, scene: Path, *arguments: str) -> dict[str, Any]:
 def test_the_base_stream_adapts_to_a_link_thinner_than_the_budget(tmp_path, scene):
     """The picture would be seconds late, and move in jerks."""
     summary = flown(tmp_path / "adapted", scene, "--adapt", "--max-frames", "240")
-    assert summary["budget_base_bps"] < 0.6 * 650_000  # x265 was opened anew, far below what the budget gives
+    # x265 was opened anew, below what the budget gives; how far depends on the moment of the end: 130 to 390 kbps.
+    assert summary["keyframes"] > 1
+    assert summary["budget_base_bps"] < 0.8 * 650_000
     assert summary["total_bps"] < 1.2 * 250_000  # of 800,000: nothing more stands in queues
     assert summary["frames"] > 0.6 * 240  # of the rest each would have been late
 
