@@ -22,6 +22,8 @@ def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
         UserError: it cannot be written, or is to be ``new`` and somebody has made one meanwhile.
     """
     part = _part_of(path)
+    if path.exists() and not path.is_file():  # moved over /dev/null, every program would fill the file
+        raise UserError(f"{path} is there and no file: name a file with --out")
     try:
         yield part
         if new and not claim_name(path):

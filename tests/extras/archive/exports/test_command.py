@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 from dataclasses import replace
 from fractions import Fraction
@@ -381,3 +382,11 @@ def test_a_name_that_nobody_gave_is_never_taken_from_another_export(tmp_path):
         out.write_text("first")
     assert out.read_text() == "first"
     assert [one.name for one in tmp_path.iterdir()] == ["flight.csv"]
+
+
+def test_a_device_or_pipe_is_not_replaced_by_a_file(recording, tmp_path, capsys):
+    """Root's ``--out /dev/null`` would take it from every program of the machine."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    assert f"{pipe} is there and no file" in refused(capsys, recording, "--to", "csv", "--out", pipe)
+    assert pipe.is_fifo()
