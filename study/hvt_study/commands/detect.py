@@ -24,6 +24,7 @@ from hvt_common.inference.tiles import tiled
 from hvt_common.units import parse_size
 from hvt_common.values import Detections, Image, View
 from hvt_edge.source.resample import Resizer
+from hvt_study.commands.arguments import make_out
 from hvt_study.commands.progress import RunProgress
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
 from hvt_study.datasets.labels import NO_ID, inside_frame
@@ -111,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
     reads = [*arguments.pictures, *(one.path for one in pictures)]
     for written in ("detections.csv", "score.json", "false-alarms.png", "misses.png"):
         check_not_read(arguments.out / written, reads, name="--out")
-    arguments.out.mkdir(parents=True, exist_ok=True)
+        make_out(arguments.out, name=written)
     paths, frames, skipped = [], [], 0
     with (arguments.out / "detections.csv").open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)

@@ -219,6 +219,11 @@ def test_what_cannot_be_is_said_before_anything_is_written(
     (tmp_path / "bad.json").write_text("[]")
     assert "is not COCO's JSON" in sentence(capsys, tmp_path / "bad.json", "--out", out)
     assert not out.exists()
+    out.write_text("")
+    named = (folder, "--classes", CLASSES)
+    assert f"--out {out} cannot be made (File exists)" in sentence(capsys, *named, "--out", out)
+    (tmp_path / "there" / "score.json").mkdir(parents=True)
+    assert "score.json is a folder" in sentence(capsys, *named, "--out", tmp_path / "there")
 
 
 def test_calibration_error_of_known_confidences() -> None:
