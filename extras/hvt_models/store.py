@@ -199,6 +199,9 @@ class Store:
                 f"model file {names} has SHA-256 {one_text}, but {','.join(pinned)} is pinned for {name}"
             )
         with self._lock(name):
+            parts = [self._part(self.folder / name, pin) for pin in pins]
+            for source, part in zip(brought, parts, strict=True):
+                _copy_file(source, part)  # before the pin changes: the disk may have no room for it
             if pinned != found:
                 first, *more = pins
                 self._note(
@@ -210,9 +213,7 @@ class Store:
                     )
                 )
             files = self._files(name)
-            for source, (path, pin) in zip(brought, files.items(), strict=True):
-                part = self._part(path, pin)
-                _copy_file(source, part)
+            for part, path in zip(parts, files, strict=True):
                 _put_in_place(part, path)
             for suffix in (".onnx", ".xml", ".bin"):  # of the format that the name had before
                 if (old := self.folder / f"{name}{suffix}") not in files:
@@ -234,12 +235,15 @@ class Store:
         file = self.folder / _ADDED
         import tomli_w  # noqa: PLC0415 - as above
 
-        with self._lock("added-toml"):
+        with self._lock(_ADDED):  # which no model is called
             entries = {**self._added(), entry.name: entry}
             tables = {name: _table(one) for name, one in entries.items()}
             scratch = file.with_name(f"{_ADDED}.part")
-            scratch.write_text(tomli_w.dumps(tables), encoding="utf-8")
-            scratch.replace(file)
+            try:
+                scratch.write_text(tomli_w.dumps(tables), encoding="utf-8")
+                scratch.replace(file)
+            except OSError as error:
+                raise UserError(f"{file} cannot be written ({error.strerror})") from error
 
     def _part(self, path: Path, file: PinnedFile) -> Path:
         # The digest is in the name: what was fetched for one pin is never carried on for another.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import re
+import resource
 import subprocess
 import sys
 import threading
@@ -27,7 +28,7 @@ from hvt_models.command import main
 from hvt_models.heads import KINDS
 from hvt_models.inspect import inspect_model
 from hvt_models.manifest import builtin_manifest, parse_manifest
-from hvt_models.store import Store, cache_folder
+from hvt_models.store import Store, cache_folder, file_digest
 from media.onnx_models import colour_classifier, colour_detector, constant_model
 
 CONTENT = np.random.default_rng(7).bytes(300_000)
@@ -395,6 +396,26 @@ def test_a_file_brought_by_hand_is_taken_in_if_its_digest_is_right(
     assert main(["add", str(file), "--name", "mine"]) == 2
     assert main(["add", str(file), "--name", "mine", "--sha256", digest]) == 2
     assert (folder / "mine.onnx").read_bytes() != file.read_bytes()
+
+
+def test_a_full_disk_leaves_the_model_of_before(folder: Path, tmp_path: Path) -> None:
+    """Its new pin would stand beside the old file, which is then refused."""
+    store = Store(folder)
+    small, large = tmp_path / "small.onnx", tmp_path / "large.onnx"
+    small.write_bytes(b"1")
+    large.write_bytes(bytes(2**16))
+    store.add(small, name="mine", sha256=file_digest(small))
+    most, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2**15, hard))
+        with pytest.raises(UserError, match="cannot be copied"):
+            store.add(large, name="mine", sha256=file_digest(large))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1, hard))
+        with pytest.raises(UserError, match=r"added.toml cannot be written"):
+            store.add(small, name="other", sha256=file_digest(small))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
+    assert store.verified("mine").read_bytes() == b"1"
 
 
 def two_files(folder: Path, origin: Origin) -> Store:
