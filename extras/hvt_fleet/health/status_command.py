@@ -39,19 +39,20 @@ class StatusCommand:
         arguments = self._parser().parse_args(argv)
         address: str = arguments.at
         host_and_port(address, name="--at", example=self.address)
+        console = Console(highlight=False, markup=False)  # an address or a device may have brackets in it
         if not arguments.watch:
             state, table = self._requested(address)
             if arguments.json:
                 say(json.dumps(state))
             else:
-                Console(highlight=False).print(table)
+                console.print(table)
             return 0
         try:
             if arguments.json:
                 while True:
                     print(json.dumps(self._requested(address)[0]), flush=True)
                     time.sleep(1)
-            with Live(self._requested(address)[1], refresh_per_second=4) as live:
+            with Live(self._requested(address)[1], console=console, refresh_per_second=4) as live:
                 while True:
                     time.sleep(1)
                     live.update(self._requested(address)[1])

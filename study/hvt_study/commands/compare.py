@@ -115,7 +115,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def print_result(result: CompareResult) -> None:
     """One line a method and rate: named F1 of the whole clip, and of both halves beside it."""
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     table = Table(
         title=f"{result.clip}, {result.labels} labels",
         title_justify="left",
@@ -145,7 +145,7 @@ def print_result(result: CompareResult) -> None:
 
 def print_verdicts(found: Sequence[Verdict]) -> None:
     """What to fly at each rate, and how."""
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     for one in found:
         console.print(f"\n{one.sentence}", markup=False, soft_wrap=True)
         if one.command:

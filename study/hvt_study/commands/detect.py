@@ -222,7 +222,7 @@ def print_score(score: dict[str, Any]) -> None:
         cells = ("-" if value is None else f"{value:.3f}" for value in shares)
         boxes = "-" if one["boxes"] is None else str(one["boxes"])
         table.add_row(name, str(one["labels"]), boxes, *cells)
-    Console(highlight=False).print(table)
+    Console(highlight=False, markup=False).print(table)
     error = score["calibration_error"]
     if "recall_only" in score:
         print("one target is labelled, all else that is in view is not: recall alone can be said")

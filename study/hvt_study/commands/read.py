@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def print_result(result: ReadResult) -> None:
     """One line a method and rate."""
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     if not console.is_terminal:  # a file has room for every column
         console.width = max(console.width, _WIDTH)
     table = Table(

@@ -65,7 +65,7 @@ def _print(columns: Sequence[tuple[str, Score]]) -> None:
     table.add_row("objects on all frames", *(f"{one.objects}" for _, one in columns))
     for label, field in _ROWS:
         table.add_row(label, *(_shown(getattr(one, field)) for _, one in columns))
-    Console(highlight=False).print(table)
+    Console(highlight=False, markup=False).print(table)
 
 
 def _shown(share: float) -> str:

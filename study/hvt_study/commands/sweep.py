@@ -131,7 +131,7 @@ def _print(rows: Sequence[SweepRow], *, raw: int, frames: int) -> None:
         table.add_column(name, justify="right")
     for row in rows:
         table.add_row(row.policy, str(row.selected), f"{row.ratio:.4f}", f"{row.frame_coverage:.4f}")
-    Console(highlight=False).print(table)
+    Console(highlight=False, markup=False).print(table)
 
 
 def _write(rows: Sequence[SweepRow], folder: Path) -> None:

@@ -343,7 +343,7 @@ def _print(about: dict[str, Any]) -> None:
         cells = [one.get(field) for one in pair for field in fields]
         shown = ("-" if value is None else f"{value:.3f}" for value in cells)
         table.add_row(name, str(pair[1].get("labels", 0)), *shown)
-    Console(highlight=False).print(table)
+    Console(highlight=False, markup=False).print(table)
     error = about["after"].get("calibration_error")
     print(f"boxes are shown from confidence {about['after']['confidence']:g} on", end="")
     print("" if error is None else f"; expected calibration error {error:.3f}")

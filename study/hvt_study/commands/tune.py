@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print(found: Tuned, written: Path) -> None:
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     table = Table(title="held out: objects shown with their class, of all", title_justify="left", box=None)
     for head in ("sequence", "regime", "default", "tuned", "kbps", "kbps"):
         table.add_column(head, justify="left" if head in ("sequence", "regime") else "right")

@@ -15,6 +15,7 @@ from hvt_common.values import Image
 from hvt_scene import Scene
 from hvt_scene.truth import Truth
 from hvt_study.cli import main
+from hvt_study.commands.detect import print_score
 from hvt_study.metrics.operating_point import calibration_error
 
 CLASSES = "car,van,truck,bus,motor,pedestrian,other"
@@ -224,6 +225,15 @@ def test_what_cannot_be_is_said_before_anything_is_written(
     assert f"--out {out} cannot be made (File exists)" in sentence(capsys, *named, "--out", out)
     (tmp_path / "there" / "score.json").mkdir(parents=True)
     assert "score.json is a folder" in sentence(capsys, *named, "--out", tmp_path / "there")
+
+
+def test_a_name_with_brackets_is_shown_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    """The hour's score ended in a traceback, or under a name that no file has."""
+    figures = dict.fromkeys(("labels", "boxes", "precision", "recall", "f1", "ap50", "calibration_error"))
+    print_score({**figures, "detector": "[/a] [b].onnx", "confidence": 0.25, "by_class": {"[/c]": figures}})
+    said = capsys.readouterr().out
+    assert "[/a] [b].onnx at confidence 0.25" in said
+    assert "[/c]" in said
 
 
 def test_calibration_error_of_known_confidences() -> None:

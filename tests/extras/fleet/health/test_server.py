@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import errno
 import http.client
+import io
 import json
 import socket
 import time
+import urllib.request
 from contextlib import suppress
 from http.server import HTTPServer
 from socketserver import ThreadingMixIn
 
 import pytest
+from rich.table import Table
 
 import hvt_edge.cli
 import hvt_ground.cli
 from hvt_common.runtime.failures import Failures
 from hvt_fleet.health.server import Answer, HealthServer
+from hvt_fleet.health.status_command import StatusCommand
 from programs.processes import eventually, free_ports
 
 STATE = {"/state.json": lambda: Answer(json.dumps({"latitude_deg": 52.1}).encode())}
@@ -108,3 +112,18 @@ def test_status_at_what_is_no_address(main, port, capsys):
     assert main(["status", "--at", "here:99999"]) == 2
     said = f"--at 'here:99999' is not accepted: give HOST:PORT, such as 127.0.0.1:{port}\n"
     assert capsys.readouterr().err.partition(": ")[2] == said
+
+
+def test_status_says_brackets_as_they_are(monkeypatch, capsys):
+    """A part that fails with a device or an address in brackets ended it in a traceback, or lost them."""
+
+    def table(state):
+        made = Table(title="uav-1")
+        made.add_row(state["reason"])
+        return made
+
+    reason = "[/dev/video0] is busy, tcp/[fe80::1]:7447 too"
+    answer = json.dumps({"reason": reason}).encode()
+    monkeypatch.setattr(urllib.request, "urlopen", lambda *_, **__: io.BytesIO(answer))
+    assert StatusCommand("hvt-edge", "edge", "127.0.0.1:9465", table).run([]) == 0
+    assert reason in capsys.readouterr().out
