@@ -205,7 +205,7 @@ class _Replay:
 def messages_in(files: Sequence[Path]) -> _Messages:
     """The received messages: of logs that follow each other, or of the recordings of one session."""
     if any(one.suffix == ".rrd" for one in files):
-        return partial(iter, messages_of(read_recordings(files)))
+        return partial(messages_of, read_recordings(files))
     ordered = sorted(files, key=_first_ns)
     return lambda: chain.from_iterable(map(read_log, ordered))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import count
+from itertools import chain, count
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
@@ -22,10 +22,11 @@ _OF_EVERY_POSE = 0
 """Each report stands by itself, so that none is lost with another."""
 
 
-def messages_of(recorded: Recorded) -> list[Received]:
+def messages_of(recorded: Recorded) -> Iterator[Received]:
     """The messages in the order in which they were known, the session's first; times are capture times.
 
-    Stills are the JPEGs of the recording. Raises `UserError` where the recording does not say what session it is of.
+    Each is made when it is its turn. Stills are the JPEGs of the recording. Raises `UserError` where that does not
+    say what session it is of.
     """
     info = recorded.info
     if info is None:
@@ -42,7 +43,7 @@ def messages_of(recorded: Recorded) -> list[Received]:
         map(make.unit, recorded.video),
         (make.still(one, one.header) for one in recorded.stills if one.header is not None),
     )
-    return [first, *heapq.merge(*streams, key=lambda one: one.received_ns)]
+    return chain([first], heapq.merge(*streams, key=lambda one: one.received_ns))
 
 
 class _Messages:

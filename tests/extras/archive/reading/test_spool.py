@@ -6,12 +6,15 @@ import errno
 import gc
 import os
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hvt_archive.reading.recorded import read_recordings
 from hvt_archive.reading.spool import Mapped, Spool, SpooledRows
+from hvt_archive.replay.from_recording import messages_of
 from hvt_common.errors import UserError
 from hvt_ground.events import VideoSample
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -38,7 +41,7 @@ def test_rows_come_back_in_order_of_frames() -> None:
 
 
 def test_the_video_of_a_flight_does_not_come_into_memory(tmp_path: Path) -> None:
-    """An hour took 800 MB, and a day's flight could not be exported on the machine that had recorded it."""
+    """An hour took 800 MB, and a day's flight could not be exported or replayed on the machine that had it."""
     path = tmp_path / "flight.rrd"
     unit = coded(drawn_frames(1), kbps=300, keyint=1)[0][0]
     with Recorder(RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 4e5)) as recorder:
@@ -50,6 +53,8 @@ def test_the_video_of_a_flight_does_not_come_into_memory(tmp_path: Path) -> None
     tracemalloc.start()
     recorded = read_recordings([path])
     assert sum(isinstance(one, VideoSample) for one in recorded.all()) == 400
+    played = replace(recorded, info=SimpleNamespace(edge="uav-1", session_id=255, pack=lambda: b""))  # type: ignore[arg-type]
+    assert sum(1 for _ in messages_of(played)) == 401
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(recorded.video) == 400

@@ -89,7 +89,7 @@ def test_a_recording_holds_video_and_stills(drawn, tmp_path, capsys):
     folder = drawn.folder
     recorded = read_recordings([folder / "flight.rrd"])
     logged = [item for item in read_log(folder / "flight.hvtlog") if parse_key(item.key)]
-    again = messages_of(recorded)
+    again = list(messages_of(recorded))
 
     def of(messages, channel):
         return [one for one in messages if parse_key(one.key)[1] is channel]
