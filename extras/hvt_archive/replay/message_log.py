@@ -8,11 +8,14 @@ the next one has, which begins with the last answer of each edge.
 
 from __future__ import annotations
 
+import logging
+import os
 import struct
 import threading
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -23,6 +26,8 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, READ_VERSIONS, Info, WireError
 from hvt_common.transport.inbox import Received
 from hvt_ground.sinks.line_file import check_there
+
+_log = logging.getLogger(__name__)
 
 _MAGIC = b"HVTLOG\x00\x01"
 _HEAD = struct.Struct("<II")
@@ -138,10 +143,20 @@ def read_log(path: Path) -> Iterator[Received]:
         with path.open("rb") as file:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise UserError(f"{path} is no message log of hvt-ground --log")
+            end = file.tell()
             while (item := _read(file)) is not None:
+                end = file.tell()
                 yield item
+            if left := os.fstat(file.fileno()).st_size - end:
+                _say_broken(path, left)
     except OSError as error:
         raise UserError(f"message log {path} cannot be read: {error.strerror}") from None
+
+
+@cache
+def _say_broken(path: Path, left: int) -> None:
+    # Once: a replay reads its files several times.
+    _log.warning("message log %s breaks off %d bytes before its end: what comes before is read", path, left)
 
 
 def _read(file: BinaryIO) -> Received | None:

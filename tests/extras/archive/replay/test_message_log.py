@@ -51,13 +51,18 @@ def test_messages_come_back_as_they_came(log):
 
 
 @pytest.mark.parametrize("lost", [1, 3, 8, 200, 5000])
-def test_a_killed_ground_leaves_all_but_the_last_record(log, tmp_path, lost):
-    """A power cut would take the whole flight."""
+def test_a_killed_ground_leaves_all_but_the_last_record(log, tmp_path, lost, caplog):
+    """A power cut would take the whole flight; one that is damaged early would pass for a short one."""
+    assert list(read_log(log)) == MESSAGES
+    assert not caplog.messages
     cut_off = tmp_path / "cut.hvtlog"
     cut_off.write_bytes(log.read_bytes()[:-lost])
     found = list(read_log(cut_off))
     assert found == MESSAGES[: len(found)]
     assert len(found) >= len(MESSAGES) - 1 - lost // 600
+    assert list(read_log(cut_off)) == found
+    (said,) = caplog.messages
+    assert f"{cut_off} breaks off" in said
 
 
 @given(place=st.integers(8, 15_000), flipped=st.integers(1, 255))
