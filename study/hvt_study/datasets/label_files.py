@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import ast
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -294,6 +295,7 @@ def read_voc(path: Path) -> VocFile:
 
 def _number(text: str | None, *, missing: float = 0.0) -> float:
     try:
-        return float((text or "").replace(",", "."))
+        value = float((text or "").replace(",", "."))
     except ValueError:
         return missing
+    return value if math.isfinite(value) else missing

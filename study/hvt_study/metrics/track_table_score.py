@@ -77,7 +77,7 @@ def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
                 x, y, w, h = (float(line[name]) for name in ("x", "y", "w", "h"))
                 frame = int(line["frame_index"]) + 1 if "frame_index" in line else int(line["frame"])
                 rows[frame].append(([x, y, x + w, y + h], line[column]))
-    except (OSError, KeyError, ValueError, TypeError) as error:
+    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
         raise UserError(
             f"{path} is not a table of tracks as hvt-ground --tracks writes it ({error})"
         ) from None

@@ -449,6 +449,15 @@ def test_a_box_that_stands_there_twice_is_one(tmp_path: Path) -> None:
     assert "a.txt, line 2 stands there twice" in doubts_of([one])[0]
 
 
+@pytest.mark.parametrize("side", ["nan", "inf", "wide"])
+def test_a_size_that_is_no_number_is_not_known(tmp_path: Path, side: str) -> None:
+    """One label of thousands would end the training in a traceback."""
+    picture(tmp_path / "a.jpg")
+    text(tmp_path / "a.xml", voc().replace(f"<width>{SIZE[0]}<", f"<width>{side}<"))
+    ((_, labels),) = read(tmp_path)
+    assert labels.class_names == ("bus",)
+
+
 def test_an_object_without_a_class_is_left_out(tmp_path: Path) -> None:
     """It would be of a class without a name."""
     picture(tmp_path / "a.jpg")

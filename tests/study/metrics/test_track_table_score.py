@@ -124,6 +124,10 @@ def test_wrong_files_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixt
     junk.write_text("a,b\n1,2\n")
     with pytest.raises(UserError, match=r"junk\.csv"):
         read_tracks(junk)
+    endless = tmp_path / "endless.csv"  # a quotation mark that nothing closes
+    endless.write_text('frame,x,y,w,h,class\n1,1,2,3,4,"' + "car" * 50_000)
+    with pytest.raises(UserError, match=r"endless\.csv is not a table of tracks"):
+        read_tracks(endless)
     with pytest.raises(UserError, match=r"junk\.csv, line 1 is 'a,b'"):
         read_truth(junk, class_names=("car",))
     assert main(["score", str(junk), "--truth", str(junk)]) == 2
