@@ -88,6 +88,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Detect on all pictures; write detections.csv, and score.json and two sheets where there are labels."""
+    try:
+        return _detect(arguments)
+    except OSError as error:
+        raise UserError(f"--out {arguments.out} cannot be written ({error.strerror}): name another") from None
+
+
+def _detect(arguments: argparse.Namespace) -> int:
     size = parse_size(arguments.size, name="--size")
     confidence = arguments.confidence
     if confidence is None:

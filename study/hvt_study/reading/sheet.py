@@ -24,7 +24,7 @@ _PAPER = 246
 def write_sheet(path: Path, result: ReadResult) -> None:
     """Write a PNG of up to ten codes of the first scene at the lowest rate; nothing where nothing was flown.
 
-    First come codes that some methods showed and others did not.
+    First come codes that some methods showed and others did not. Raises `OSError` where it cannot be written.
     """
     flown = [row for row in result.rows if row.method != "source"]
     if not flown:
@@ -37,7 +37,7 @@ def write_sheet(path: Path, result: ReadResult) -> None:
         [_line([f"at {lowest:g} kbps", *(_title(*one) for one in columns)], high_px=_HEAD_PX)]
         + [_row(object_id, columns) for object_id in _chosen(columns)]
     )
-    cv2.imwrite(str(path), picture)
+    path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
 
 
 def _channels(row: ReadRow) -> tuple[Channel, ...]:

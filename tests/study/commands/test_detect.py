@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import resource
 from functools import cache
 from pathlib import Path
 
@@ -225,6 +226,20 @@ def test_what_cannot_be_is_said_before_anything_is_written(
     assert f"--out {out} cannot be made (File exists)" in sentence(capsys, *named, "--out", out)
     (tmp_path / "there" / "score.json").mkdir(parents=True)
     assert "score.json is a folder" in sentence(capsys, *named, "--out", tmp_path / "there")
+
+
+def test_a_full_disk_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An hour of detections ended in a traceback, or in a sheet that nobody missed."""
+    folder, out = draw(tmp_path / "set", moments=1), tmp_path / "out"
+    most, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for limit in (10, 20_000):  # of the table, and of the sheets
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+            said = sentence(capsys, folder, "--out", out)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
+        assert said == f"hvt-study: --out {out} cannot be written (File too large): name another"
+    assert json.loads((out / "score.json").read_text())["pictures"] == 1
 
 
 def test_a_name_with_brackets_is_shown_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:

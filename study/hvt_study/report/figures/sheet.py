@@ -30,7 +30,10 @@ class Finding:
 
 
 def write_sheet(path: Path, findings: Sequence[Finding]) -> None:
-    """Write a PNG of at most 40 crops; an earlier one is removed where there is nothing to show."""
+    """Write a PNG of at most 40 crops; an earlier one is removed where there is nothing to show.
+
+    Raises `OSError` where it cannot be written.
+    """
     worst = sorted(findings, key=lambda one: -one.weight)[: _COLUMNS * _ROWS]
     if not worst:
         path.unlink(missing_ok=True)
@@ -39,7 +42,7 @@ def write_sheet(path: Path, findings: Sequence[Finding]) -> None:
     blank = np.zeros_like(cells[0])
     cells += [blank] * (-len(cells) % _COLUMNS)
     rows = [np.hstack(cells[start : start + _COLUMNS]) for start in range(0, len(cells), _COLUMNS)]
-    cv2.imwrite(str(path), np.vstack(rows))
+    path.write_bytes(cv2.imencode(".png", np.vstack(rows))[1].tobytes())
 
 
 def _cell(finding: Finding) -> Image:
