@@ -40,8 +40,13 @@ def run(argv: Sequence[str]) -> int:
     name: str = arguments.name
     if arguments.command == "renew":
         known = _hosts_of(before, name)  # first of all: a machine that nobody knows may be the CA
-        authority.issue(name, hosts=arguments.host or known)
+        hosts = tuple(arguments.host) or known
+        authority.issue(name, hosts=hosts)
         say(f"{name}: copy {name}.pem and {name}.key from {folder} to the machine")
+        if hosts != known:  # the next renewal would go back to where it was
+            after = before.with_hosts(name, hosts)
+            after.write(folder)
+            _write_files(after, folder, given={})
         return 0
     after = _changed(before, arguments)
     if arguments.command == "remove":

@@ -109,6 +109,14 @@ class Roster:
         others = [one for one in self.routers if one.name != router.name]
         return replace(self, routers=tuple(sorted([*others, router], key=lambda one: one.name)))
 
+    def with_hosts(self, name: str, hosts: tuple[str, ...]) -> Roster:
+        """The same with this ground or router at other places; of an edge none are known."""
+        return replace(
+            self,
+            grounds=tuple(replace(one, hosts=hosts) if one.name == name else one for one in self.grounds),
+            routers=tuple(replace(one, hosts=hosts) if one.name == name else one for one in self.routers),
+        )
+
     def without(self, name: str) -> Roster:
         """The same without this machine; `UserError` where there is none of the name."""
         if name not in self.names:

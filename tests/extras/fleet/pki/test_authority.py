@@ -206,6 +206,15 @@ def test_zenoh_reads_every_file_also_of_a_fleet_of_one(tmp_path: Path) -> None:
             assert not _rights(fleet, name).knows("anybody")
 
 
+def test_a_renewed_ground_stays_where_it_moved_to(fleet: Fleet) -> None:
+    """The next renewal would name its old host: every edge would refuse it."""
+    fleet.keys("renew", "base", "--host", "new.example")
+    fleet.keys("renew", "base")
+    names = _certificate(fleet, "base").extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.DNSName) == ["base", "new.example"]
+    assert "tls/new.example:7447" in fleet.file("uav-1").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
