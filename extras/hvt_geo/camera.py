@@ -23,8 +23,15 @@ _FIELD_ERROR: Final = 0.02
 _BOX_ERROR: Final = (0.15, 0.25)
 """Standard deviation of the point where an object stands, of its box's width and height."""
 _LEAST_BOX_PX: Final = 1.0
+_MOST_LATITUDE_DEG: Final = 89.8
+"""22 km from a pole."""
 _SURE: Final = 2.0
 """A ray nearer to the horizon than so many standard deviations of the pitch tells no place."""
+
+
+def at_a_pole(pose: Pose) -> bool:
+    """Whether places around it have no degrees that a plane tells: they would lie beyond latitude 90."""
+    return abs(pose.latitude_deg) > _MOST_LATITUDE_DEG
 
 
 def ground_points(
@@ -63,9 +70,10 @@ def places_of_boxes(
     An object is taken to stand at the lower edge of its box where the camera looks along the ground, in the middle
     where it looks straight down, and between the two otherwise. The ellipse comes from the errors of the pose, of the
     field of view and of the box, by what each alone does to the place (error propagation, JCGM 100, 5.1). None where
-    the pose does not say height, direction or field of view; NaN for an object at or near the horizon.
+    the pose does not say height, direction or field of view, or is at a pole; NaN for an object at or near the
+    horizon.
     """
-    if pose.camera is None or pose.hfov_deg is None or not surface.usable(pose):
+    if pose.camera is None or pose.hfov_deg is None or at_a_pole(pose) or not surface.usable(pose):
         return None
     boxes = view.to_source(boxes_base_px).astype(np.float64)
     points = _standing(pose, boxes, focal_px=_focal_px(pose.hfov_deg, view), size=view.source_size)

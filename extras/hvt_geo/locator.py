@@ -9,7 +9,7 @@ import numpy as np
 
 from hvt_common.geodesy import moved
 from hvt_common.values import Boxes, Pose, View
-from hvt_geo.camera import ground_points, places_of_boxes
+from hvt_geo.camera import at_a_pole, ground_points, places_of_boxes
 from hvt_geo.surface import FLAT_GROUND, Surface
 from hvt_ground.events import Places
 from hvt_ground.poses import Footprint
@@ -32,7 +32,7 @@ class SurfaceLocator:
 
 def footprint(pose: Pose, view: View, *, surface: Surface = FLAT_GROUND) -> Footprint | None:
     """The footprint of a picture; None without height, direction or field of view, or with the centre in the sky."""
-    if pose.camera is None or pose.hfov_deg is None or not surface.usable(pose):
+    if pose.camera is None or pose.hfov_deg is None or at_a_pole(pose) or not surface.usable(pose):
         return None
     (wide, high), (x, y) = view.base_size, view.offset_px
     base = np.array(((wide / 2, high / 2), (0, 0), (wide, 0), (wide, high), (0, high)), np.float64)

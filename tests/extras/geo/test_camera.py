@@ -9,6 +9,7 @@ import pytest
 
 from hvt_common.values import Orientation, Pose, View
 from hvt_geo.camera import ground_points, places_of_boxes
+from hvt_geo.locator import footprint
 
 SIZE = (1000, 500)
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
@@ -64,6 +65,14 @@ def test_without_direction_height_or_field_nothing_is_placed(missing):
     """A place would be invented."""
     boxes = np.array([[490, 240, 510, 260]], np.float32)
     assert places_of_boxes(replace(DOWN, **{missing: None}), boxes, view=VIEW) is None
+
+
+@pytest.mark.parametrize("latitude", [90.0, 89.95, -90.0])
+def test_at_a_pole_nothing_is_placed(latitude):
+    """Latitudes of 90.004 went to tables and maps."""
+    boxes = np.array([[480, 240, 520, 260]], np.float32)
+    assert places_of_boxes(replace(DOWN, latitude_deg=latitude), boxes, view=VIEW) is None
+    assert footprint(replace(DOWN, latitude_deg=latitude), VIEW) is None
 
 
 def test_a_worse_attitude_widens_the_ellipse():
