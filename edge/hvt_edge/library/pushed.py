@@ -15,6 +15,7 @@ import numpy as np
 
 from hvt_common.config import load, settings_words
 from hvt_common.errors import UserError
+from hvt_common.runtime.failures import RetryPause
 from hvt_common.runtime.process import join_threads_at_exit
 from hvt_common.values import Fit, Image
 from hvt_edge.app import Edge
@@ -25,7 +26,7 @@ from hvt_edge.wiring import base_size
 from hvt_edge.world import World
 
 _NAME = "pushed frames"
-_PATIENCE_S = 5.0
+PATIENCE_S = 5.0
 """A program that pushes nothing for so long is said to be away, as a camera is."""
 
 join_threads_at_exit()
@@ -165,15 +166,17 @@ class _PushGrabber:
             self._opened = True
 
     def restart(self) -> None:
+        """Wait for the next frame: there is nothing to try again meanwhile."""
         with self._news:
+            self._news.wait_for(lambda: self._newest or self._ended)
             if self._newest is None:
                 raise SignalLost("no frame is pushed")
 
     def grab(self) -> Shot:
         with self._news:
-            self._news.wait_for(lambda: self._newest or self._ended, _PATIENCE_S)
+            self._news.wait_for(lambda: self._newest or self._ended, PATIENCE_S)
             if self._newest is None:
-                raise SignalLost(f"no frame was pushed for {_PATIENCE_S:g} s")
+                raise SignalLost(f"no frame was pushed for {PATIENCE_S:g} s")
             (frame_bgr, capture_ns), self._newest = self._newest, None
             replaced, self._replaced = self._replaced, 0
         return Shot(lambda: frame_bgr, camera_ns=capture_ns, missed=replaced)
@@ -194,6 +197,7 @@ class _PushedSource(LiveSource):
             failures=world.failures,
         )
         self._pushed = grabber
+        self._pause = RetryPause(0, 0)  # a program that pushes again is there at once
 
     def close(self) -> None:
         self._end()

@@ -15,6 +15,7 @@ import pytest
 import hvt_edge
 import hvt_ground
 from hvt_common.errors import FlightError, UserError
+from hvt_edge.library import pushed
 from hvt_edge.library.pushed import PushedEdge
 from hvt_ground.events import Overlay
 from hvt_ground.library.received import Picture, Received, _Events
@@ -125,6 +126,22 @@ def test_what_is_wrong_is_raised_where_the_program_can_see_it(tmp_path, monkeypa
     ground = hvt_ground.listen(listen="tcp/127.0.0.1:0nonsense")
     with pytest.raises(UserError, match="0nonsense"):
         next(ground)
+
+
+def test_a_program_that_pushes_again_after_a_pause_is_sent_at_once(monkeypatch):
+    """Its video would stay dark for up to eight seconds after it is there again, as after a camera that is gone."""
+    monkeypatch.setattr(pushed, "PATIENCE_S", 0.1)
+    frames = [np.full((96, 128, 3), 40 * index, np.uint8) for index in range(4)]
+    with hvt_edge.open(
+        connect="tcp/127.0.0.1:9", wait="0s", method="M0", store="0", preset="ultrafast", fps="10"
+    ) as edge:
+        push_all(edge, frames)
+        time.sleep(1.8)  # tries after .5 and 1.5 s have failed; the next would come after 3.5
+        push_all(edge, frames, rounds=5)
+        time.sleep(0.1)
+        edge.push(frames[0])
+        time.sleep(1.0)  # away again when it is closed
+    assert edge.summary["frames"] > 6
 
 
 def test_an_edge_that_never_got_a_frame_ends_quietly():
