@@ -24,6 +24,7 @@ from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_common.units import SECOND_NS
 from hvt_edge.link.transmitter import Outlet
 
 _log = logging.getLogger(__name__)
@@ -31,6 +32,7 @@ _log = logging.getLogger(__name__)
 _PUBLISHED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.POSE, Channel.BACKLOG, Channel.STATUS)
 _MOST_PER_S = 1000
 """Requests, or reports: a ground sends some ten a second."""
+_AGAIN_NS = 2 * SECOND_NS
 _NEEDED = (Channel.BASE, Channel.ROI, Channel.STATUS)
 """Channels that a ground subscribes to in any case; one that only shows the video may leave out the others."""
 
@@ -121,6 +123,8 @@ class ZenohLink:
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
         """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""
+        if channel is Channel.STATUS and self._listener is not None:  # about once a second
+            self._listener.declare_info_again(there=self.has_ground())
         try:
             self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
         except zenoh.ZError as error:
@@ -159,7 +163,10 @@ class EdgeListener:
         self.unusable = 0
         """Messages from grounds that were skipped: damaged, foreign or of another version."""
         self._version_said = False
-        serve(self.session, Channel.INFO, keys=self.keys, answer=self._on_info)
+        self._without_request_ns: int | None = None
+        """Since when a ground is there that has not asked for `Info`, or since it was declared anew."""
+        self._requested = False
+        self._info = serve(self.session, Channel.INFO, keys=self.keys, answer=self._on_info)
         serve(self.session, Channel.CONTROL, keys=self.keys, answer=self._on_control)
         self._feedback = self.session.declare_subscriber(self.keys.key(Channel.FEEDBACK), self._on_feedback)
         self._token = self.session.liveliness().declare_token(self.keys.key(Channel.ALIVE))
@@ -174,7 +181,25 @@ class EdgeListener:
     def __exit__(self, *_error: object) -> None:
         self.close()
 
+    def declare_info_again(self, *, there: bool) -> None:
+        """Declare `Info` anew while a ground is ``there`` that does not ask for it; call it about once a second.
+
+        A declaration comes once: where UDP has lost it, the ground could ask nobody, and show nothing of this flight.
+        """
+        now_ns = self.clock()
+        if not there:
+            self._requested, self._without_request_ns = False, None
+        elif self._requested:
+            self._without_request_ns = None
+        elif self._without_request_ns is None:
+            self._without_request_ns = now_ns
+        elif now_ns - self._without_request_ns >= _AGAIN_NS:
+            self._without_request_ns = now_ns
+            self._info.undeclare()  # type: ignore[no-untyped-call]
+            self._info = serve(self.session, Channel.INFO, keys=self.keys, answer=self._on_info)
+
     def _on_info(self, query: bytes) -> bytes | None:
+        self._requested = True
         if query:
             try:
                 self.answers.on_info_request(InfoRequest.parse(query))

@@ -10,6 +10,7 @@ import msgpack
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import WIRE_VERSION, Feedback, Message
+from hvt_common.units import SECOND_NS
 from hvt_edge.link import publisher
 from rigs.messages import ANSWER, FEEDBACK, INFO_REQUEST, REQUEST
 
@@ -54,3 +55,37 @@ def test_a_ground_of_another_version_commands_nothing(caplog, monkeypatch):
         f"a ground speaks wire version {WIRE_VERSION - 1}, edge uav-1 reads {WIRE_VERSION}: update a ground"
     )
     assert caplog.messages == [said]
+
+
+def test_a_ground_that_does_not_ask_is_told_again_whom_to_ask(monkeypatch):
+    """One datagram that UDP loses at the start would leave a ground without a picture for the whole flight."""
+    declared, now_s = [], [0.0]
+
+    def serve(_session: object, channel: Channel, **told: object) -> MagicMock:
+        declared.append((channel, told["answer"]))
+        return MagicMock()
+
+    monkeypatch.setattr(publisher, "serve", serve)
+    answers = publisher.Answers(
+        info=lambda _received_ns: b"info", control=lambda _request: ANSWER, on_feedback=lambda _feedback: None
+    )
+    listener = publisher.EdgeListener(
+        MagicMock(),
+        EdgeKeys("uav-1"),
+        answers,
+        failures=MagicMock(),
+        clock=lambda: round(now_s[0] * SECOND_NS),
+    )
+
+    def after(seconds: int, *, there: bool) -> int:
+        before = len(declared)
+        for _ in range(seconds):
+            now_s[0] += 1
+            listener.declare_info_again(there=there)
+        return [channel for channel, _ in declared[before:]].count(Channel.INFO)
+
+    assert after(10, there=False) == 0
+    assert after(7, there=True) == 3
+    assert declared[-1][1](b"") == b"info"
+    assert after(10, there=True) == 0, "it has asked"
+    assert (after(1, there=False), after(3, there=True)) == (0, 1), "another, or the same on another way"
