@@ -33,6 +33,7 @@ _PUBLISHED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.POSE, Channel.B
 _MOST_PER_S = 1000
 """Requests, or reports: a ground sends some ten a second."""
 _AGAIN_NS = 2 * SECOND_NS
+"""A ground asks within a fraction of it."""
 _NEEDED = (Channel.BASE, Channel.ROI, Channel.STATUS)
 """Channels that a ground subscribes to in any case; one that only shows the video may leave out the others."""
 
@@ -123,10 +124,10 @@ class ZenohLink:
         self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
         """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""
-        if channel is Channel.STATUS and self._listener is not None:  # about once a second
-            self._listener.declare_info_again(there=self.has_ground())
         try:
             self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
+            if channel is Channel.STATUS and self._listener is not None:  # about once a second
+                self._listener.declare_info_again(there=self.has_ground())
         except zenoh.ZError as error:
             _log.debug("%s was not sent: %s", channel, error)
 
