@@ -100,7 +100,7 @@ def _with_boxes(picture: Image, overlay: Overlay) -> Image:
     firm, words = overlay.firm, overlay.words
     for row, track_id in enumerate(overlay.track_ids.tolist()):
         x1, y1, x2, y2 = (round(value) for value in overlay.boxes_base_px[row].tolist())
-        colour = class_colour(overlay.classes[row])[::-1]
+        colour = class_colour(words[row])[::-1]
         cv2.rectangle(drawn, (x1, y1), (x2, y2), colour, 2 if firm[row] else 1)
         text = f"{track_id} {words[row]}"
         x, y = x1, y1 - 4 if y1 > 14 else y2 + 12

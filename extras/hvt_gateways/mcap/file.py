@@ -148,7 +148,7 @@ def _annotations(overlay: Overlay) -> ImageAnnotations:
     for row, track_id in enumerate(overlay.track_ids.tolist()):
         x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
         name, refined = overlay.classes[row], bool(overlay.refined[row])
-        colour = _colour(class_colour(name))
+        colour = _colour(class_colour(words[row]))
         facts = {
             "id": track_id,
             "class": name,

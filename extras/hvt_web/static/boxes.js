@@ -177,7 +177,7 @@ export class Boxes {
   /** @param {CanvasRenderingContext2D} context @param {Track} track @param {number} scale @param {number} ratio */
   drawBox(context, track, scale, ratio) {
     const [x, y, right, bottom] = track.box.map((value) => value * scale);
-    context.strokeStyle = this.colourOf(track.name);
+    context.strokeStyle = this.colourOf(trackName(track));
     context.lineWidth = (track.read ? 3 : 1.5) * ratio;
     context.setLineDash(track.doubted ? [4 * ratio, 4 * ratio] : []);
     if (track.doubted) context.lineWidth = ratio;
@@ -207,7 +207,7 @@ export class Boxes {
       taken.push([left, top, right, bottom]);
       context.fillStyle = "#000a";
       context.fillRect(left, top, width, height);
-      context.fillStyle = this.colourOf(track.name);
+      context.fillStyle = this.colourOf(trackName(track));
       context.fillText(words, left + letter * 0.25, top + letter);
       return;
     }

@@ -30,7 +30,7 @@ BUDGET_LINE = VERMILLION
 # The first pattern that is found in a class name decides. The names are those of VisDrone, UAVDT, COCO and the
 # vehicles of ImageNet, so that "van" of a detector and "minivan" of a classifier look alike.
 _FAMILIES: tuple[tuple[str, Rgb], ...] = (
-    (r"^(other|background|nothing)$", GREY),
+    (r"^(other|background|nothing|something)$", GREY),
     (r"pedestrian|people|person|rider", PINK),
     (r"tricycle|rickshaw", YELLOW),
     (r"motor|moped|scooter", (190, 160, 255)),

@@ -41,10 +41,10 @@ class MapRows:
         if places is None or 0 < self._next_ns - overlay.capture_ns <= _EVERY_NS:
             return []
         self._next_ns = overlay.capture_ns + _EVERY_NS
-        known = np.flatnonzero(np.isfinite(places.places_deg).all(axis=1))
+        known, words = np.flatnonzero(np.isfinite(places.places_deg).all(axis=1)), overlay.words
         points = MapPoints(
             places.places_deg[known],
-            tuple(packed(class_colour(overlay.classes[row])) for row in known.tolist()),
+            tuple(packed(class_colour(words[row])) for row in known.tolist()),
             tuple(overlay.track_ids[known].tolist()),
         )
         return [TableRow(names.MAP_TRACKS, "map points", points, _POINT_BYTES * len(known))]

@@ -28,6 +28,7 @@ from hvt_common.units import Limit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.session_files import SessionFiles
+from hvt_ground.sinks.palette import GREY
 from hvt_ground.sinks.rerun.joined import join_recordings
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
@@ -218,6 +219,10 @@ def test_what_is_doubted_has_no_name_in_any_picture(events, tmp_path):
         ]
     words = {text.text.split()[1] for one in drawn for text in one.texts}
     assert words == {"something"}
+    colours = {
+        (box.outline_color.r, box.outline_color.g, box.outline_color.b) for one in drawn for box in one.points
+    }
+    assert colours == {tuple(part / 255 for part in GREY)}, "nor the colour of a class"
     facts = [{fact.key: fact.value for fact in box.metadata} for one in drawn for box in one.points]
     assert {fact["doubted"] for fact in facts} == {"1"}
     assert {fact["class"] for fact in facts} <= {"car", "van", "truck", "bus"}
