@@ -117,11 +117,11 @@ def same_word(name: str, other: str) -> bool:
 
 
 def _names(detectors: Sequence[str], words: Sequence[str], nothing: str | None) -> tuple[str, ...]:
-    names = dict.fromkeys(detectors)
+    names = list(detectors)  # each in its place, though a name may occur twice
     if MOVING in names:
-        names |= dict.fromkeys(word for word in words if word)
+        names += [word for word in dict.fromkeys(words) if word and word not in names]
     if nothing is not None and not any(map(is_nothing, names)):
-        names[nothing] = None
+        names.append(nothing)
     return tuple(names)
 
 

@@ -15,6 +15,7 @@ from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.values import Posterior, Tracks
 from hvt_edge.perception.crop import PADDING
+from hvt_ground.perception.fusion.fuse import unified_names
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import LEAST_SIDE_PX, Vocabulary, check_common
 from rigs.stills import seen
@@ -44,6 +45,16 @@ def test_the_same_words_mean_the_same():
     np.testing.assert_allclose(vote.posterior.probabilities, answer.probabilities, rtol=1e-5)
     entropy = -sum(p * math.log(p) for p in answer.probabilities.tolist())
     assert vote.posterior.entropy_nats == pytest.approx(entropy, rel=1e-4)
+
+
+def test_a_name_that_a_model_has_twice_moves_no_other():
+    """Every truck would be called a bus, and the last class end the session, where two classes are called car."""
+    names, edge_ids = unified_names(("car", "car", "truck"), ("Truck", "bus"))
+    words = Vocabulary(names, ("car", "car", "truck"))
+    assert words.names == ("car", "car", "truck", "bus")
+    assert [words.names[place] for place in edge_ids] == ["truck", "bus"]
+    vote = words.vote(says(("car", "car", "truck"), truck=0.9), called="truck", side_px=30)
+    assert vote.posterior is not None and vote.posterior.probabilities.argmax() == 2
 
 
 def test_imagenet_tells_a_vehicle_from_a_person_and_no_more():
