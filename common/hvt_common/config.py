@@ -22,7 +22,7 @@ from typing import Any, NoReturn, Protocol, TypeVar, cast
 
 import tomli_w
 
-from hvt_common.errors import UserError, absent, check_not_read
+from hvt_common.errors import UserError, absent, check_not_read, named_path
 from hvt_common.redaction import Redaction
 from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse_share, parse_size
 
@@ -51,10 +51,7 @@ def _plain(text: str, *, name: str) -> str:
 
 
 def _path(text: str, *, name: str) -> Path:
-    try:
-        path = Path(_plain(text, name=name)).expanduser()
-    except RuntimeError:
-        raise UserError(f"{name} {text!r} begins with a user that this machine does not know") from None
+    path = named_path(_plain(text, name=name), name=name)
     _plain(str(path), name=name)  # a blank with a slash behind it is a blank
     return path
 

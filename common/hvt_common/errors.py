@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hvt_common.redaction import Redaction
 
@@ -24,6 +24,7 @@ _MAY_COME = frozenset(
         *(errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EBUSY, errno.EAGAIN),
     }
 )
+_NEVER_SEEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
 
 
 class UserError(Exception):
@@ -59,6 +60,26 @@ def absent(path: Path) -> type[UserError]:
         return UserError
 
 
+def named_path(text: str, *, name: str = "") -> Path:
+    """The path that somebody wrote; ``~`` is a user's folder. One that is not there is no error.
+
+    Raises `UserError` for a user that is not known, or where nobody may look, or the name is too long: there
+    `Path.exists` raises. `NotYetError` where the disk does not answer.
+    """
+    what = f"{name} {text!r}".lstrip()
+    try:
+        path = Path(text).expanduser()
+        path.stat()
+    except RuntimeError:
+        raise UserError(f"{what} begins with a user that this machine does not know") from None
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        kind = UserError if error.errno in _NEVER_SEEN else NotYetError
+        raise kind(f"{what} cannot be looked at ({error.strerror}): name another") from None
+    return path
+
+
 def listening_trouble(error: OSError) -> str:
     """Why an address and its port cannot be listened on, and the remedy: the end of a sentence."""
     if error.errno == errno.EADDRNOTAVAIL:
@@ -80,6 +101,10 @@ class FlightError(Exception):
 
 class Parser(argparse.ArgumentParser):
     """Explains wrong arguments in one sentence, without the usage above it."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.register("type", Path, named_path)
 
     def error(self, message: str) -> NoReturn:
         """Raise `UserError`."""

@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, named_path
 from hvt_models.manifest import (
     MAX_SIZE_BYTES,
     ModelEntry,
@@ -34,7 +34,7 @@ def cache_folder() -> Path:
     """The folder of models: ``HVT_MODELS``, else ``hvt/models`` in the platform's cache folder."""
     own = os.environ.get("HVT_MODELS")
     if own:
-        return Path(own).expanduser()
+        return named_path(own, name="HVT_MODELS")
     import platformdirs  # noqa: PLC0415 - a start that names no model needs none of these
 
     return Path(platformdirs.user_cache_path("hvt")) / "models"

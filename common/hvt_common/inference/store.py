@@ -13,7 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Protocol
 
-from hvt_common.errors import UserError, absent
+from hvt_common.errors import UserError, absent, named_path
 from hvt_common.runtime.plug_ins import installed, loaded
 
 EMBEDDED_DETECTOR = "aerial-nano"
@@ -135,7 +135,7 @@ def resolve_model(
 
 
 def _file(spec: str, *, role: str) -> Path:
-    path = Path(spec).expanduser()
+    path = named_path(spec, name=role)
     if not path.exists():
         raise absent(path)(
             f"{role} {spec} does not exist: give an ONNX file, or a name that 'hvt-models list' shows"

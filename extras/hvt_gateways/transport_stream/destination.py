@@ -17,7 +17,7 @@ from urllib.parse import SplitResult, parse_qs, urlsplit
 import av
 import av.error
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, named_path
 from hvt_common.runtime.host_names import is_group
 from hvt_common.runtime.reporting import check_writable
 from hvt_ground.sinks.line_file import check_there
@@ -63,7 +63,7 @@ class Address:
 def destination(text: str) -> Address | Path:
     """The destination in ``--ts``, a path if it is no URL. `UserError` if it can be neither."""
     if "://" not in text:
-        path = Path(text)
+        path = named_path(text, name="--ts")
         if path.suffix != ".ts" and not path.is_dir():
             raise UserError(f"--ts {text} is none of what it may be: {_ACCEPTED}")
         return path

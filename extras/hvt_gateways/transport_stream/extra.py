@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hvt_common.config import TEXT, Group
+from hvt_common.errors import named_path
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 
@@ -44,7 +45,7 @@ class TransportStreamExtra(Extra):
     def writes(self, config: GroundConfig) -> Iterable[tuple[str, Path]]:
         """The file that is named."""
         if isinstance(config, TransportStreamOptions) and config.ts is not None and "://" not in config.ts:
-            path = Path(config.ts)
+            path = named_path(config.ts, name="--ts")
             if path.suffix == ".ts":
                 yield "--ts", path
 

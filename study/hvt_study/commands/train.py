@@ -17,7 +17,7 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
-from hvt_common.errors import UserError, needs_extra
+from hvt_common.errors import UserError, named_path, needs_extra
 from hvt_common.inference.class_names import kind_of
 from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
@@ -188,7 +188,9 @@ def _checked(arguments: argparse.Namespace) -> tuple[_Size, Path]:
     if not arguments.out.parent.is_dir():
         raise UserError(f"--out {arguments.out} cannot be written: there is no folder {arguments.out.parent}")
     start = resolve_model(arguments.start, role="start")
-    labels = [Path(uri.partition(":")[2]).expanduser() for uri in (*arguments.data, *arguments.held_out)]
+    labels = [
+        named_path(uri.partition(":")[2], name="--data") for uri in (*arguments.data, *arguments.held_out)
+    ]
     for suffix in (".onnx", ".json", ".jsonl"):
         check_writable(arguments.out.with_suffix(suffix), name="--out", reads=[start, *labels])
     return size, start
@@ -197,7 +199,7 @@ def _checked(arguments: argparse.Namespace) -> tuple[_Size, Path]:
 def _labelled(uri: str, names: Sequence[str]) -> list[LabelledPicture]:
     """Pictures that somebody labelled; others are left out, and counted."""
     scheme, colon, text = uri.partition(":")
-    place = Path(text).expanduser()
+    place = named_path(text, name="--data")
     if not colon or scheme not in _SCHEMES:
         raise UserError(f"--data {uri} is not accepted: yolo:FOLDER or coco:FILE.json is")
     if scheme == "coco" and not place.is_file():

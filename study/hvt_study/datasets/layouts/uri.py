@@ -11,7 +11,7 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, named_path
 from hvt_study.datasets.class_map import of_kinds
 from hvt_study.datasets.layouts.clips import open_clips
 from hvt_study.datasets.layouts.demo import open_demo
@@ -96,7 +96,7 @@ def _laid_out(uri: str) -> _Found:
         raise UserError(f"dataset {uri!r} is unknown: accepted are {', '.join(DATASETS)}")
     opener, accepted = _LAYOUTS[scheme]
     text, options = split_options(uri, place, accepted=accepted)
-    path = Path(text).expanduser()
+    path = named_path(text, name=f"dataset {uri!r}: folder")
     files_too = scheme in ("clips", "still")
     if not text or not (path.is_dir() or (files_too and path.is_file())):
         state = "is not a folder" if text and path.exists() else "does not exist"

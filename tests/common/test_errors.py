@@ -1,0 +1,44 @@
+"""What people write is refused in a sentence, also where the system does not even let it be looked at."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from hvt_common.errors import NotYetError, Parser, UserError, named_path
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a" * 300, r"--out 'a+' cannot be looked at \(File name too long\)"),
+        ("{folder}/loop/x", r"cannot be looked at \(Too many levels of symbolic links\)"),
+        ("~nobody-of-that-name/x", "begins with a user that this machine does not know"),
+    ],
+)
+def test_a_path_that_nobody_can_look_at_is_refused(tmp_path, text, says):
+    """Each option that names a file would end with a traceback: `Path.exists` raises."""
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(UserError, match=says) as caught:
+        named_path(text.format(folder=tmp_path), name="--out")
+    assert not isinstance(caught.value, NotYetError)
+    assert named_path(str(tmp_path / "not there" / "x")) == tmp_path / "not there" / "x"
+
+
+@pytest.mark.parametrize(("number", "kind"), [(errno.EACCES, UserError), (errno.ESTALE, NotYetError)])
+def test_a_disk_that_does_not_answer_may_come_back_and_a_closed_folder_does_not(monkeypatch, number, kind):
+    """A supervisor would start a program for ever that may not read its file, or never again after a broken mount."""
+    monkeypatch.setattr(Path, "stat", lambda *_, **__: (_ for _ in ()).throw(OSError(number, "no")))
+    with pytest.raises(UserError) as caught:
+        named_path("x")
+    assert type(caught.value) is kind
+
+
+def test_a_command_checks_its_files_too():
+    """``keys --dir`` and ``recordings list`` would show a traceback where the service says a sentence."""
+    parser = Parser(prog="x")
+    parser.add_subparsers().add_parser("list").add_argument("folder", type=Path)
+    with pytest.raises(UserError, match="cannot be looked at"):
+        parser.parse_args(["list", "a" * 300])
