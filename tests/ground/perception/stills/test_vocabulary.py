@@ -54,7 +54,8 @@ def test_a_name_that_a_model_has_twice_moves_no_other():
     assert words.names == ("car", "car", "truck", "bus")
     assert [words.names[place] for place in edge_ids] == ["truck", "bus"]
     vote = words.vote(says(("car", "car", "truck"), truck=0.9), called="truck", side_px=30)
-    assert vote.posterior is not None and vote.posterior.probabilities.argmax() == 2
+    assert vote.posterior is not None
+    assert vote.posterior.probabilities.argmax() == 2
 
 
 def test_imagenet_tells_a_vehicle_from_a_person_and_no_more():
