@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.scene_change import SceneChange
 from hvt_common.values import Image
 
 Affine = npt.NDArray[np.float64]
@@ -28,6 +29,8 @@ _LEAST_INLIERS: Final = 12
 _LEAST_INLIER_SHARE: Final = 0.3
 # No camera zooms or rolls this far between two frames: such an estimate is wrong.
 _SCALE_RANGE: Final = (0.5, 2.0)
+_SCENE_LEVELS: Final = 4.0
+"""Two scenes of less difference are a keyframe's sharper picture of the same water or fog."""
 _STILL_SHIFT: Final = 0.03
 """Of the picture's sides together: what came into view since is no larger."""
 _STILL_CHANGED: Final = 0.006
@@ -48,7 +51,7 @@ class CameraMotion:
             raise ValueError(f"camera motion scale is {scale}, must be above 0 and at most 1")
         self._scale = scale
         self._previous: _Gray | None = None
-        self.mark()
+        self.reset()
 
     def mark(self) -> None:
         """`still` compares with the newest image from now on."""
@@ -80,9 +83,12 @@ class CameraMotion:
         small = cv2.resize(image_bgr, small_size, interpolation=cv2.INTER_AREA)
         current = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
         previous, self._previous = self._previous, current
+        other = self._scene.take(current, capture_ns=0)
+        self.new_scene = False
         if previous is None or previous.shape != current.shape:
             return _identity()
         estimate = _by_flow(previous, current)
+        self.new_scene = other and estimate is None
         if estimate is None or not _plausible(estimate):
             return _identity()
         self._since = np.vstack((estimate, [0.0, 0.0, 1.0])) @ self._since
@@ -91,6 +97,9 @@ class CameraMotion:
     def reset(self) -> None:
         """Forget the last image: the next call gives the identity."""
         self._previous = None
+        self._scene = SceneChange(least_difference=_SCENE_LEVELS)
+        self.new_scene = False
+        """Whether the newest image shows another scene than the one before."""
         self.mark()
 
 

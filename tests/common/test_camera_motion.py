@@ -170,6 +170,27 @@ def test_ids_survive_a_shaking_camera(ground: np.ndarray, every: int) -> None:
     assert kept < 0.5
 
 
+def test_where_another_scene_begins_all_tracks_end() -> None:
+    """Boxes of a street would stand over the next camera's picture, and one of its cars would get another's id."""
+    rng = np.random.default_rng(1)
+    scenes = [cv2.GaussianBlur(rng.integers(0, 255, (180, 320, 3), np.uint8), (0, 0), 6) for _ in range(2)]
+    seen = Detections(
+        np.array([[40, 40, 80, 60]], np.float32), np.array([0.9], np.float32), np.zeros(1, np.int32)
+    )
+    tracker = ByteTracker(TrackerSettings(camera_motion="flow"), fps=15)
+    listed = []
+    for k, scene in enumerate([scenes[0]] * 6 + [scenes[1]] * 6):
+        searched = k in (0, 3, 8, 11)
+        image = np.clip(3 * (scene.astype(float) - 110) + rng.normal(0, 2, scene.shape), 0, 255).astype(
+            np.uint8
+        )
+        known = {"frame_index": k, "image_bgr": image}
+        tracks = tracker.update(seen, **known) if searched else tracker.predict(**known)
+        listed.append(tracks.ids.tolist())
+    assert listed == [[1]] * 6 + [[]] * 2 + [[2]] * 4
+    assert tracker.scene_began == 6
+
+
 def seen_since(ground: np.ndarray, cameras: list[np.ndarray], *, car_px: int | None = None) -> bool:
     """Whether the last picture is still, after the first was looked at; a car comes so far into it."""
     motion, rng = CameraMotion(scale=None), np.random.default_rng(1)

@@ -3,10 +3,11 @@
 Zhang et al., "ByteTrack: Multi-Object Tracking by Associating Every Detection Box", ECCV 2022. Confident detections
 are matched with predicted tracks first; tracks left over may take a weak detection near them; what is confident and
 still free starts a new track. The rules, constants and oddities are those of the authors' program, so that its
-results are reproduced. What is added: frames may pass without detection (`ByteTracker.predict`), and what finds no
-match after them is matched once more with a margin; the time of lost tracks is counted in frames whatever the
-rate of detection, and where a slow machine detects more seldom than that time lasts, in detections; a track has a
-class.
+results are reproduced.
+What is added: frames may pass without detection (`ByteTracker.predict`), and what finds no match after
+them is matched once more with a margin; all tracks end where another scene begins; the time of lost tracks is counted
+in frames whatever the rate of detection, and where a slow machine detects more seldom than that time lasts, in
+detections; a track has a class.
 """
 
 from __future__ import annotations
@@ -123,7 +124,7 @@ class ByteTracker:
     Class ids must be small (an index into class names), not negative.
 
     A track is confirmed when the next update finds it again (with a detection every n-th frame: n frames after the
-    one that started it), and at once at the first update of all. Only confirmed tracks that the last
+    one that started it), and at once at the first update of a scene. Only confirmed tracks that the last
     update found are listed; ``started`` marks the update that confirmed them or found them again.
     """
 
@@ -148,6 +149,8 @@ class ByteTracker:
         self._gaps: deque[int] = deque(maxlen=_LEAST_DETECTIONS)
         """Frames from one update to the next, of the last ones."""
         self._next_id = 1
+        self.scene_began = -1
+        """The newest frame that another scene began with, where the camera is followed; -1 before any."""
         if self._camera is not None:
             self._camera.reset()
 
@@ -168,7 +171,7 @@ class ByteTracker:
         """
         seen = TrackerInput.of(detections, low_confidence=self._settings.low_confidence)
         self._advance(frame_index, image_bgr, hold_unconfirmed=True)
-        first = self._updated_index is None
+        first = self._updated_index is None or self.scene_began > self._updated_index
         gap = 1 if self._updated_index is None else frame_index - self._updated_index
         self._gaps.append(gap)
         self._forget_stale(frame_index)
@@ -215,8 +218,10 @@ class ByteTracker:
         self._frame_index = frame_index
         affine = None if self._camera is None or image_bgr is None else self._camera.step(image_bgr)
         self.camera_step = affine
+        if self._camera is not None and self._camera.new_scene:
+            self.scene_began = frame_index
         table = self._table
-        if self._outdated(frame_index):
+        if self.scene_began == frame_index or self._outdated(frame_index):
             table.retain(np.zeros(len(table), bool))
         if not len(table):
             return

@@ -197,8 +197,10 @@ class Analyzer:
         # Whether the detector is to run on this frame. By frame counts alone, never by a clock.
         every, last = self.detect_every, self._detected_index
         rested = last is None or index - last >= every
+        new_scene = last is not None and self._tracker.scene_began > last
         if rested and last is not None and index - last < self._settings.detect_still_every:
             rested = not self._tracker.still
+        rested = rested or new_scene
         since_coded = 0 if self._coded_index is None else index - self._coded_index
         sparse = max(self._coded_gap, since_coded) > every
         if coded:

@@ -296,6 +296,7 @@ class Pipeline:
         due = frames is None or frames >= (_PUT_OFF if hurry else 1) * every
         if due and frames is not None and frames < self._detect_still_every:
             due = not parts.tracker.still
+        due = due or (last is not None and parts.tracker.scene_began > last)
         if due and parts.turns.take(self._turn_key, within_s=self._turn_s):
             self._detected_frame = index
             self.detections_run += 1
@@ -310,6 +311,8 @@ class Pipeline:
             self.tilt.take(self._vehicles(own), height_px=image.shape[0])
         else:
             own = parts.tracker.predict(frame_index=index, image_bgr=image)
+        if parts.tracker.scene_began == index:
+            parts.fusion.end_scene(index)
         before, affine = self._now.picture_index, parts.tracker.camera_step
         if before >= 0 and affine is not None:  # the tracker has followed it: it is not estimated twice
             parts.path.add(affine, start=before, end=index)

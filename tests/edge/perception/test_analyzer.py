@@ -157,6 +157,21 @@ def test_a_standing_picture_is_searched_less_often_until_something_moves():
     assert [one.frame.index for one in seen if one.detected] == [0, 15, 21, 26]
 
 
+def test_another_scene_is_searched_at_once():
+    """Boxes of the scene before, and its tracks, went to the ground until the next look was due."""
+    tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
+    settings = AnalyzerSettings(detect_every=8, candidates="source")
+    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, settings=settings)
+    other = np.random.default_rng(2).integers(0, 2, (6, 10, 3), np.uint8) * 200
+    other = cv2.resize(other, SIZE, interpolation=cv2.INTER_CUBIC)
+    other[100:132, 50:82] = (20, 20, 220)
+    switched = [replace(frame, source_bgr=other, base_bgr=other) for frame in FRAMES[4:12]]
+    frames = zip(FRAMES[:4] + switched, UNITS, strict=False)
+    seen = [analyzer.analyze(frame, unit) for frame, unit in frames]
+    assert [one.frame.index for one in seen if one.detected] == [0, 5]
+    assert [one.tracks.ids.tolist() for one in seen] == [[1]] * 4 + [[]] + [[2]] * 7
+
+
 def test_candidates_of_the_source_lie_in_base_pixels():
     """Stills would be cut at the wrong place where the detector looks at the camera's own frame."""
     view = View.fitted((640, 384), SIZE, fit="letterbox")

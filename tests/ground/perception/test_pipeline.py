@@ -181,6 +181,23 @@ def test_a_standing_picture_is_searched_less_often(pictures):
     assert all(len(one.track_ids) == 1 for one in rig.of(Overlay))
 
 
+def test_where_another_scene_begins_no_box_of_the_last_one_stays_and_the_new_one_is_searched_at_once(
+    pictures,
+):
+    """Of a camera that is switched the old boxes, the edge's too, stood over the new picture for half a second."""
+    rig = Rig(detect_every=8, detect_still_every=8)
+    other = np.random.default_rng(2).integers(0, 2, (6, 10, 3), np.uint8) * 200
+    other = cv2.resize(other, (320, 192), interpolation=cv2.INTER_CUBIC)
+    other[100:132, 50:82] = (20, 20, 220)
+    for picture in pictures[:10]:
+        index = picture.frame_index
+        rig.pipeline.analyze(replace(picture, picture=other) if index > 3 else picture, hurry=False)
+        if index in (2, 5):  # a step of the scene before comes late
+            rig.pipeline.edge_step(tracks_at(2 if index == 2 else 3, {32: (220.0, 20.0, 250.0, 50.0)}))
+    assert [one.track_ids.tolist() for one in rig.of(Overlay)] == [[1]] * 3 + [[1, 2]] + [[]] + [[3]] * 5
+    assert rig.pipeline.detections_run == 2, "at 0 and at 5"
+
+
 def test_on_a_machine_that_is_always_behind_something_is_detected_now_and_then(pictures):
     """Whatever comes into view would never have a box."""
     rig = Rig(detect_every=2)

@@ -19,9 +19,9 @@ times.
 smoothed over some detections. The edge's counts `EDGE_CLASS_WEIGHT` times, and as often more as its source is finer
 than the base. The classes of stills come after, in `refine`, and stand above both.
 
-**Expiry.** An edge's track ends when two steps in a row do not list it, or nothing has been reported of it for
-`PATIENCE_S`; if half of that passes from one step to the next, for twice the time between them. An entity that only
-a still has shown ends so long after the still.
+**Expiry.** All entities end where another scene begins. An edge's track ends when two steps in a row do not list it,
+or nothing has been reported of it for `PATIENCE_S`; if half of that passes from one step to the next, for twice the
+time between them. An entity that only a still has shown ends so long after the still.
 
 **Missed-detection evidence.** An edge-only entity is listed from a sure confidence on. If a step shows nothing at a
 ground-only one, of a class that the edge can name, it must be the surer the larger the share of objects is that the
@@ -138,6 +138,12 @@ class Fusion:
         """Return and forget (id that stays, id that is gone) of listed entities that turned out to be one."""
         merged, self._merged = self._merged, []
         return merged
+
+    def end_scene(self, frame_index: int) -> None:
+        """End all entities: another scene began with that frame. Steps of frames before it are ignored."""
+        self._entities, self._by_own, self._by_edge = [], {}, {}
+        if self._stepped >= 0:
+            self._stepped = max(self._stepped, frame_index - 1)
 
     def take_own(self, own: Tracks) -> None:
         """Take our tracker's list of the newest frame; frames rise."""

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from hvt_common.scene_change import SceneChange
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
-from hvt_edge.perception.scene_change import SceneChange
 
 STEP_NS = SECOND_NS // 3
 SIZE = (640, 360)
