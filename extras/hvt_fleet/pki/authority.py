@@ -9,7 +9,9 @@ from __future__ import annotations
 import datetime as dt
 import ipaddress
 import os
+import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from cryptography import x509
@@ -24,6 +26,7 @@ MACHINE_DAYS = 825
 """The longest that common TLS libraries accept for a server."""
 _CLOCKS_APART = dt.timedelta(hours=1)
 """A drone's clock may be behind: a certificate holds from a little before it was made."""
+_HOST_NAME = re.compile(r"(\*\.)?[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")
 
 
 class Authority:
@@ -65,8 +68,7 @@ class Authority:
             .sign(key, hashes.SHA256())
         )
         _make_folder(folder)
-        _write_key(folder / "ca.key", key)
-        _write(folder / "ca.pem", certificate.public_bytes(serialization.Encoding.PEM), mode=0o644)
+        _write_pair(folder, "ca", key, certificate)
         return cls(folder, key, certificate)
 
     @classmethod
@@ -110,8 +112,7 @@ class Authority:
             )
             .sign(self._key, hashes.SHA256())
         )
-        _write_key(self.folder / f"{name}.key", key)
-        _write(self.folder / f"{name}.pem", certificate.public_bytes(serialization.Encoding.PEM), mode=0o644)
+        _write_pair(self.folder, name, key, certificate)
 
     def valid_until(self, name: str) -> str:
         """The day on which a machine's certificate ends; says so where it cannot be read."""
@@ -122,8 +123,8 @@ class Authority:
         return f"{certificate.not_valid_after_utc:%Y-%m-%d}"
 
     def forget(self, name: str) -> None:
-        """Delete the pair of a machine. A copy elsewhere still holds: only rules without its name end it."""
-        for suffix in ("key", "pem"):
+        """Delete the files of a machine. A copy elsewhere still holds: only rules without its name end it."""
+        for suffix in ("key", "pem", "json5"):
             path = self.folder / f"{name}.{suffix}"
             try:
                 path.unlink(missing_ok=True)
@@ -143,10 +144,9 @@ def _host(text: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(text))
     except ValueError:
         pass
-    try:
-        return x509.DNSName(text)
-    except ValueError:
-        raise UserError(f"--host {text!r} is neither an address nor a host name") from None
+    if _HOST_NAME.fullmatch(text) is None:
+        raise UserError(f"--host {text!r} is neither an address nor a host name: give it without a port")
+    return x509.DNSName(text)
 
 
 def _make_folder(folder: Path) -> None:
@@ -156,20 +156,29 @@ def _make_folder(folder: Path) -> None:
         raise UserError(f"the folder {folder} cannot be made ({error.strerror})") from None
 
 
-def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+def _write_pair(
+    folder: Path, name: str, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate
+) -> None:
+    """Both, or as they were: a key is of no use beside another's certificate. The key is never readable by others."""
     pem = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    _write(path, pem, mode=0o600)
-
-
-def _write(path: Path, content: bytes, *, mode: int) -> None:
-    """Whole or not at all, and never readable by others for a moment."""
-    fresh = path.with_name(path.name + ".new")
+    public = certificate.public_bytes(serialization.Encoding.PEM)
+    fresh: dict[Path, Path] = {}
     try:
-        fresh.unlink(missing_ok=True)
-        with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-            file.write(content)
-        fresh.replace(path)
+        for path, content, mode in (
+            (folder / f"{name}.key", pem, 0o600),
+            (folder / f"{name}.pem", public, 0o644),
+        ):
+            fresh[path] = path.with_name(path.name + ".new")
+            fresh[path].unlink(missing_ok=True)
+            with os.fdopen(os.open(fresh[path], os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+                file.write(content)
+        for path, made in fresh.items():
+            made.replace(path)
     except OSError as error:
         raise UserError(f"{path} cannot be written ({error.strerror})") from None
+    finally:
+        for made in fresh.values():
+            with suppress(OSError):
+                made.unlink(missing_ok=True)

@@ -51,7 +51,6 @@ def run(argv: Sequence[str]) -> int:
     after = _changed(before, arguments)
     if arguments.command == "remove":
         authority.forget(name)
-        (folder / f"{name}.json5").unlink(missing_ok=True)
     else:
         authority.issue(name, hosts=arguments.host)
     after.write(folder)

@@ -51,7 +51,7 @@ def edge_file(name: str, roster: Roster, *, folder: str = KEYS_FOLDER) -> str:
     }
     grants |= {router.name: _toward_ground([name], command=True, label="self") for router in roster.routers}
     called = [one.hosts for one in roster.grounds] + [one.hosts for one in roster.routers]
-    hosts = [host for one in called for host in one]
+    hosts = [f"[{host}]" if ":" in host else host for one in called for host in one]
     head = f"hvt-edge --edge-id {name} --connect tls/{(*hosts, 'HOST')[0]}:7447 --zenoh-config {name}.json5"
     return _text(head, {}, name=name, grants=grants, folder=folder)
 

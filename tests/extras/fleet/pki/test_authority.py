@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import subprocess
 import sys
@@ -227,6 +229,7 @@ def test_a_renewed_ground_stays_where_it_moved_to(fleet: Fleet) -> None:
         (["add-edge", "UAV"], "edge id 'UAV' is not usable"),
         (["add-ground", "two", "--edges", "a/b"], "edge pattern 'a/b' is not usable"),
         (["add-ground", "two", "--host", "bä\u00dfe"], "--host 'bäße' is neither an address nor a host name"),
+        (["add-ground", "two", "--host", "192.0.2.1:7447"], "neither an address nor a host name: give it without a"),
         (["add-router", "two"], "the following arguments are required: --host"),
         (["new-ca"], "already holds a CA"),
         (["frobnicate"], "invalid choice"),
@@ -243,6 +246,43 @@ def test_what_cannot_be_is_a_sentence_and_changes_nothing(
     assert said.count("\n") == 1
     assert says in said
     assert {file: file.read_bytes() for file in fleet.folder.iterdir()} == before
+
+
+def test_a_disk_that_fills_up_between_key_and_certificate_changes_neither(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The machine would have a new key beside its old certificate, which opens nothing; and a CA none at all."""
+    before = {file: file.read_bytes() for file in fleet.folder.iterdir()}
+    opens = os.open
+
+    def full(path: Path, *given: int) -> int:
+        if Path(path).name == "uav-1.pem.new":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return opens(path, *given)
+
+    monkeypatch.setattr(os, "open", full)
+    with pytest.raises(UserError, match=r"uav-1.pem cannot be written \(No space left on device\)"):
+        fleet.keys("renew", "uav-1")
+    assert {file: file.read_bytes() for file in fleet.folder.iterdir()} == before
+
+
+def test_a_folder_in_the_place_of_a_file_is_a_sentence(fleet: Fleet) -> None:
+    """`remove` would end with a traceback, and nobody know whether the lost machine still has its rights."""
+    fleet.file("uav-1").unlink()
+    fleet.file("uav-1").mkdir()
+    with pytest.raises(UserError, match=r"uav-1.json5 cannot be deleted"):
+        run(["remove", "uav-1", "--dir", str(fleet.folder)])
+    fleet.file("uav-1").rmdir()
+    run(["remove", "uav-1", "--dir", str(fleet.folder)])
+    assert "uav-1" not in Roster.read(fleet.folder).names
+
+
+def test_an_edge_is_told_an_address_as_it_takes_it(tmp_path: Path) -> None:
+    """The line at the head of its file is copied: without brackets the edge refuses the endpoint."""
+    fleet = Fleet(tmp_path / "keys")
+    fleet.keys("add-ground", "base", "--host", "2001:db8::1")
+    fleet.keys("add-edge", "uav-1")
+    assert "--connect tls/[2001:db8::1]:7447 " in fleet.file("uav-1").read_text().splitlines()[0]
 
 
 def test_a_folder_without_a_ca_or_with_a_foreign_roster_is_a_sentence(tmp_path: Path) -> None:
