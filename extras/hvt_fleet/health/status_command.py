@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from http import HTTPStatus
+from http.client import HTTPConnection, HTTPException
 from typing import Any
 
 from rich.console import Console
@@ -18,9 +19,13 @@ from rich.table import Table
 from hvt_common.errors import FlightError, Parser
 from hvt_common.runtime.host_names import host_and_port
 from hvt_common.runtime.reporting import say
+from hvt_common.units import shown_text
 
 _PATIENCE_S = 5.0
 _MOST_BYTES = 16 * 2**20
+_MOST_WORD = 200
+_REFUSALS = (HTTPStatus.FORBIDDEN, HTTPStatus.SERVICE_UNAVAILABLE)
+"""Asked by a name that is not its own; or it stands still, or has not begun."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +43,6 @@ class StatusCommand:
         """Print it once, or each second; `FlightError` where none answers, `UserError` where none can."""
         arguments = self._parser().parse_args(argv)
         address: str = arguments.at
-        host_and_port(address, name="--at", example=self.address)
         console = Console(highlight=False, markup=False)  # an address or a device may have brackets in it
         if not arguments.watch:
             state, table = self._requested(address)
@@ -60,11 +64,19 @@ class StatusCommand:
             return 0
 
     def _requested(self, address: str) -> tuple[dict[str, Any], Table]:
+        host, port = host_and_port(address, name="--at", example=self.address)
         try:
-            with urllib.request.urlopen(f"http://{address}/state.json", timeout=_PATIENCE_S) as answer:
-                state: dict[str, Any] = json.loads(answer.read(_MOST_BYTES))
+            # The program itself, whatever proxy the environment names for web sites.
+            with closing(HTTPConnection(host, port, timeout=_PATIENCE_S)) as connection:
+                connection.request("GET", "/state.json")
+                answer = connection.getresponse()
+                data = answer.read(_MOST_BYTES)
+            if answer.status in _REFUSALS:
+                word = shown_text(data[:_MOST_WORD].decode(errors="replace").strip())
+                raise FlightError(f"what answers at {address} says: {word}")
+            state: dict[str, Any] = json.loads(data)
             return state, self.table(state)
-        except (OSError, urllib.error.URLError, ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, HTTPException, ValueError, KeyError, TypeError, AttributeError):
             raise FlightError(
                 f"no {self.what} answers at {address}: start one with --metrics {address}, or say where it is with "
                 "--at"

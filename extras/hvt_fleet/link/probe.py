@@ -64,6 +64,8 @@ def why_no_link(endpoint: str, files: TlsFiles) -> str:
     place = _Place(found["host"].strip("[]"), int(found["port"]))
     try:
         reason = _tls(place, files) if found["protocol"] == "tls" else _plain(place, found["protocol"])
+    except UnicodeError:  # a part of a name has 63 characters at most
+        reason = f"{place.host!r} is no name that a machine can have"
     except OSError as error:
         reason = _unreachable(place, error)
     return f"{found['protocol']}/{found['host']}:{found['port']}: {reason}"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import time
-import urllib.request
 from collections.abc import Callable
 from dataclasses import replace
+from http.client import HTTPConnection
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -150,12 +150,14 @@ def test_a_view_that_the_detector_does_not_know_is_told_everywhere(ground, monke
     assert 'hvt_view_trust_ratio{edge="uav-1"} 0.53' in text
     assert 'hvt_view_unlike{edge="uav-1"} 1.0' in text
     said = json.dumps(replace(state, loading=True).as_dict()).encode()
-    monkeypatch.setattr(urllib.request, "urlopen", lambda *_, **__: io.BytesIO(said))
     monkeypatch.setenv("COLUMNS", "300")
+    monkeypatch.setattr(HTTPConnection, "request", lambda *_: None)
+    answer = SimpleNamespace(status=200, read=lambda _most: said)
+    monkeypatch.setattr(HTTPConnection, "getresponse", lambda _: answer)
     assert watch.run([]) == 0
-    said = capsys.readouterr().out
-    assert "0 refined, UNKNOWN VIEW" in said
-    assert "detector loading" in said
+    shown = capsys.readouterr().out
+    assert "0 refined, UNKNOWN VIEW" in shown
+    assert "detector loading" in shown
     ground.sessions.close()
     ground.outputs.close()
     content = summary(ground.ended[0])

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import errno
 import http.client
-import io
 import json
 import socket
+import threading
 import time
-import urllib.request
 from contextlib import suppress
 from http.server import HTTPServer
 from socketserver import ThreadingMixIn
@@ -18,6 +17,7 @@ from rich.table import Table
 
 import hvt_edge.cli
 import hvt_ground.cli
+from hvt_common.errors import FlightError
 from hvt_common.runtime.failures import Failures
 from hvt_fleet.health.server import Answer, HealthServer
 from hvt_fleet.health.status_command import StatusCommand
@@ -114,16 +114,58 @@ def test_status_at_what_is_no_address(main, port, capsys):
     assert capsys.readouterr().err.partition(": ")[2] == said
 
 
-def test_status_says_brackets_as_they_are(monkeypatch, capsys):
-    """A part that fails with a device or an address in brackets ended it in a traceback, or lost them."""
+def serving(port, answer):
+    """A program's port that answers so."""
+    return HealthServer(
+        f"127.0.0.1:{port}",
+        {"/state.json": lambda: answer},
+        name="--metrics",
+        failures=Failures(time.time_ns),
+    )
+
+
+def status(port, *words):
+    """``PROGRAM status`` of it."""
 
     def table(state):
         made = Table(title="uav-1")
         made.add_row(state["reason"])
         return made
 
+    return StatusCommand("hvt-edge", "edge", f"127.0.0.1:{port}", table).run(words)
+
+
+def test_status_says_brackets_as_they_are_and_asks_no_proxy(monkeypatch, capsys):
+    """A part that fails with an address in brackets ended it in a traceback; beside a proxy no edge was there."""
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
     reason = "[/dev/video0] is busy, tcp/[fe80::1]:7447 too"
-    answer = json.dumps({"reason": reason}).encode()
-    monkeypatch.setattr(urllib.request, "urlopen", lambda *_, **__: io.BytesIO(answer))
-    assert StatusCommand("hvt-edge", "edge", "127.0.0.1:9465", table).run([]) == 0
+    (port,) = free_ports(1)
+    with serving(port, Answer(json.dumps({"reason": reason}).encode())):
+        eventually(lambda: answers(port), within_s=30, what="it serves")
+        assert status(port) == 0
     assert reason in capsys.readouterr().out
+
+
+def test_status_says_what_a_program_says_that_stands_still():
+    """An operator would start a second edge beside one that hangs."""
+    (port,) = free_ports(1)
+    with serving(port, Answer(b"it stands still\n", status=503)):
+        eventually(lambda: answers(port), within_s=30, what="it serves")
+        with pytest.raises(FlightError, match=f"what answers at 127.0.0.1:{port} says: it stands still"):
+            status(port)
+
+
+def test_status_at_a_port_that_speaks_no_http():
+    """A wrong port, such as that of SSH, would be a traceback."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+
+        def answer():
+            with other.accept()[0] as one:
+                one.sendall(b"SSH-2.0-OpenSSH_9.6\r\n")
+
+        thread = threading.Thread(target=answer, daemon=True)
+        thread.start()
+        with pytest.raises(FlightError, match="no edge answers"):
+            status(port)
+        thread.join()

@@ -116,6 +116,13 @@ def test_a_name_that_nobody_has(fleet: Fleet) -> None:
     assert "no machine of the name 'no-such-host.invalid' is known here" in said
 
 
+@pytest.mark.parametrize("host", ["a" * 64, "base..example"])
+def test_a_name_that_nobody_can_have(host: str) -> None:
+    """The thread that explains the link would end, and with it every later explanation."""
+    said = why_no_link(f"tcp/{host}:7447", TlsFiles())
+    assert said == f"tcp/{host}:7447: {host!r} is no name that a machine can have"
+
+
 def test_what_cannot_be_probed_says_so(fleet: Fleet) -> None:
     """UDP has no connection to refuse: silence would look like a diagnosis that forgot."""
     assert "cannot be seen from outside" in why_no_link("udp/127.0.0.1:7447", _files(fleet))
