@@ -53,7 +53,7 @@ def _print(compared: Compared) -> None:
             legible = compared.legible[number]
             read = f"{len(legible.every)} of {len(compared.codes)}"
             alone = f"{len(legible.every - compared.legible[0].video - legible.video)}"
-        figures = (f"{score.named_f1:.3f}", f"{score.false_per_frame:.1f}", f"{score.top1:.3f}")
+        figures = (f"{score.named_f1:.3f}", f"{score.false_per_frame:.1f}", f"{score.counts.top1_found:.3f}")
         table.add_row(one.name, *figures, read, alone, f"{one.total_bps / 1e3:.0f}")
     console.print(table)
     if compared.legible is not None:

@@ -27,7 +27,7 @@ from hvt_edge.source.resample import Resizer
 from hvt_study.commands.arguments import make_out
 from hvt_study.commands.progress import RunProgress
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
-from hvt_study.datasets.labels import NO_ID, inside_frame
+from hvt_study.datasets.labels import inside_frame
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.judged import Judged, judged
@@ -174,8 +174,7 @@ def detected(detector: Detector, image: Image, size: tuple[int, int]) -> FrameVi
     found: Detections = detector.detect(base)
     boxes = View.fitted(source_size, size, fit="letterbox").to_source(found.boxes_xyxy_px)
     names = tuple(detector.class_names[kind] for kind in found.class_ids.tolist())
-    ids = np.full(len(names), NO_ID, np.int64)
-    return FrameView(inside_frame(boxes, source_size), ids, names, found.confidences, names)
+    return FrameView.plain(inside_frame(boxes, source_size), names, found.confidences)
 
 
 def _rows(path: Path, view: FrameView, confidence: float) -> list[tuple[Any, ...]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -12,16 +12,17 @@ from rich.table import Table
 
 from hvt_common.units import parse_size
 from hvt_scene import Scene
-from hvt_study.metrics.track_table_score import Score, read_tracks, read_truth, score
+from hvt_study.metrics.classes import ClassScore
+from hvt_study.metrics.track_table_score import read_tracks, read_truth, score
 
-_ROWS = (
-    ("found (recall at IoU 0.5)", "recall"),
-    ("class right, of those found (top-1)", "top1"),
-    ("the same of small objects", "small_top1"),
-    ("macro-F1", "macro_f1"),
-    ("found with the right class", "seen_right"),
-    ("named F1", "named_f1"),
-    ("false objects a frame", "false_per_frame"),
+_ROWS: tuple[tuple[str, Callable[[ClassScore], float]], ...] = (
+    ("found (recall at IoU 0.5)", lambda one: one.recall),
+    ("class right, of those found (top-1)", lambda one: one.counts.top1_found),
+    ("the same of small objects", lambda one: one.by_size["small"].top1_found),
+    ("macro-F1", lambda one: one.macro_f1_all),
+    ("found with the right class", lambda one: one.counts.top1_all),
+    ("named F1", lambda one: one.named_f1),
+    ("false objects a frame", lambda one: one.false_per_frame),
 )
 
 
@@ -46,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print one column a table of tracks."""
     width, height = parse_size(arguments.size, name="--size")
     truth = read_truth(arguments.truth, class_names=arguments.classes.split(","))
-    columns: list[tuple[str, Score]] = []
+    columns: list[tuple[str, ClassScore]] = []
     for spec in arguments.tracks:
         name, separator, path = spec.rpartition("=")
         file = Path(path)
@@ -57,14 +58,14 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _print(columns: Sequence[tuple[str, Score]]) -> None:
+def _print(columns: Sequence[tuple[str, ClassScore]]) -> None:
     table = Table(title="What the ground knows, on every frame", title_justify="left", title_style="bold")
     table.add_column("", style="cyan", no_wrap=True)
     for name, _ in columns:
         table.add_column(name, justify="right")
-    table.add_row("objects on all frames", *(f"{one.objects}" for _, one in columns))
-    for label, field in _ROWS:
-        table.add_row(label, *(_shown(getattr(one, field)) for _, one in columns))
+    table.add_row("objects on all frames", *(f"{one.counts.labels}" for _, one in columns))
+    for label, figure in _ROWS:
+        table.add_row(label, *(_shown(figure(one)) for _, one in columns))
     Console(highlight=False, markup=False).print(table)
 
 

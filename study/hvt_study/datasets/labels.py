@@ -24,13 +24,18 @@ def no_boxes() -> Boxes:
     return np.empty((0, 4), np.float32)
 
 
+def no_ids() -> npt.NDArray[np.int64]:
+    """(0,) int64."""
+    return np.empty(0, np.int64)
+
+
 @dataclass(frozen=True, slots=True)
 class FrameLabels:
     """N objects, M regions and P things to be passed over in one source frame; boxes in source pixels, inside it."""
 
     boxes_xyxy_px: Boxes = field(default_factory=no_boxes)
     """(N, 4) float32, x2 and y2 exclusive."""
-    ids: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    ids: npt.NDArray[np.int64] = field(default_factory=no_ids)
     """(N,) the same for one object in all frames; `NO_ID` where the dataset knows none."""
     class_names: tuple[str, ...] = ()
     """N words of the dataset (car, van, truck, bus, pedestrian, people, bicycle, motor, tricycle …)."""
@@ -39,6 +44,21 @@ class FrameLabels:
     beside_xyxy_px: Boxes = field(default_factory=no_boxes)
     """(P, 4) float32: single objects that are not judged. Boxes on them count neither for nor against; labels in
     front of them are labels."""
+
+    @classmethod
+    def plain(
+        cls,
+        boxes: npt.ArrayLike,
+        names: Sequence[str],
+        *,
+        ignored: npt.ArrayLike = (),
+        beside: npt.ArrayLike = (),
+    ) -> FrameLabels:
+        """Objects of which nobody knows which is which; N, M and P boxes of x1 y1 x2 y2."""
+        known, regions, others = (
+            np.asarray(one, np.float32).reshape(-1, 4) for one in (boxes, ignored, beside)
+        )
+        return cls(known, np.full(len(known), NO_ID, np.int64), tuple(names), regions, others)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -99,12 +119,8 @@ class LabelDoubts:
         found = inside[list(once.values())].astype(np.float32)
         kinds = [name for name, *_ in once]
         passed = np.array([name.casefold() in IGNORED for name in kinds], bool)
-        return FrameLabels(
-            boxes_xyxy_px=found[~passed],
-            ids=np.full(np.count_nonzero(~passed), NO_ID, np.int64),
-            class_names=tuple(name for name, skip in zip(kinds, passed, strict=True) if not skip),
-            ignored_xyxy_px=found[passed],
-        )
+        judged = [name for name, skip in zip(kinds, passed, strict=True) if not skip]
+        return FrameLabels.plain(found[~passed], judged, ignored=found[passed])
 
     def sentences(self) -> list[str]:
         """What there is to say."""

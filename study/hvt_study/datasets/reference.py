@@ -8,14 +8,13 @@ killed does not ask twice.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
@@ -23,7 +22,7 @@ from hvt_common.inference.labels import first_synonym
 from hvt_common.values import Boxes, Image
 from hvt_edge.perception.crop import PADDING, crop_box
 from hvt_edge.source.resample import Resizer
-from hvt_study.datasets.labels import NO_ID, FrameLabels, inside_frame
+from hvt_study.datasets.labels import FrameLabels, inside_frame
 from hvt_study.datasets.sequence import Sequence
 
 CONFIDENCE = 0.25
@@ -53,7 +52,9 @@ class ReferenceLabels:
     @classmethod
     def unpack(cls, packed: Mapping[str, Any]) -> ReferenceLabels:
         """What `pack` gave."""
-        frames = {int(index): _labels(boxes, names) for index, (boxes, names) in packed["frames"].items()}
+        frames = {
+            int(index): FrameLabels.plain(boxes, names) for index, (boxes, names) in packed["frames"].items()
+        }
         return cls(frames, tuple(packed["class_set"]))
 
     def __or__(self, other: ReferenceLabels) -> ReferenceLabels:
@@ -114,13 +115,7 @@ def _label(
     if classifier is not None and len(boxes):
         answers = classifier.classify(list(_crops(image, boxes)))
         names = tuple(first_synonym(answer.class_name) for answer in answers)
-    return _labels(boxes, names)
-
-
-def _labels(boxes: npt.ArrayLike, names: Iterable[str]) -> FrameLabels:
-    """(N, 4) boxes in source pixels and their N words; nobody knows which object is which."""
-    array = np.asarray(boxes, np.float32).reshape(-1, 4)
-    return FrameLabels(array, np.full(len(array), NO_ID, np.int64), tuple(names))
+    return FrameLabels.plain(boxes, names)
 
 
 def _crops(image: Image, boxes: Boxes) -> Iterator[Image]:

@@ -9,9 +9,7 @@ from pathlib import Path
 from hvt_common.units import exact_rate
 from hvt_scene import CodeInView
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip
-from hvt_study.datasets.labels import NO_ID, FrameLabels
-
-__all__ = ["NO_ID", "FrameLabels", "Sequence", "shown_frame"]
+from hvt_study.datasets.labels import FrameLabels
 
 
 @dataclass(frozen=True, slots=True)

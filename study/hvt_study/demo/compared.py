@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.values import Image
-from hvt_scene import CodeInView, Scene
-from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_scene import CodeInView
+from hvt_study.datasets.labels import FrameLabels
+from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.demo.flown import Flown, read_flown
 from hvt_study.demo.legible import Legible, code_pictures, read_codes_of, stills_with_codes
 from hvt_study.demo.picture import Pair, Panel
-from hvt_study.metrics.track_table_score import Labelled, Score, score
+from hvt_study.metrics.classes import ClassScore
+from hvt_study.metrics.frames import FrameView
+from hvt_study.metrics.track_table_score import score
 from hvt_study.reading.reader import CodeReader
 from hvt_study.reading.score import Code, codes_to_read
 
-_LEAST_VISIBLE = 0.5
-"""An object of which less is to be seen is not judged."""
 _PAIRS = 6
 
 
@@ -30,12 +31,12 @@ class Compared:
     """The flights in the order given; the first is the video that others are held against."""
 
     flown: tuple[Flown, ...]
-    scores: tuple[Score, ...]
+    scores: tuple[ClassScore, ...]
     legible: tuple[Legible, ...] | None
     """None where no reader is installed."""
     codes: Mapping[int, Code]
     """What there was to read."""
-    truth: Mapping[int, Labelled]
+    truth: Mapping[int, FrameLabels]
     """By frame, from 1; base pixels."""
     views: Sequence[Sequence[CodeInView]]
     """By frame, from 0."""
@@ -44,12 +45,11 @@ class Compared:
     def panels(self) -> list[Panel]:
         """The middle of the flight as each shows it."""
         frame = (len(self.views) + 1) // 2
-        nothing = Labelled(np.empty((0, 4)), ())
         return [
             Panel(
                 f"{one.name}: named F1 {figures.named_f1:.3f}",
                 _newest(one, frame),
-                one.tracks.get(frame, nothing),
+                one.tracks.get(frame, FrameView()),
                 self.truth[frame],
             )
             for one, figures in zip(self.flown, self.scores, strict=True)
@@ -82,15 +82,17 @@ class Compared:
 def compare_flown(folder: Path, names: Sequence[str], *, seed: int, with_reader: bool) -> Compared:
     """Compare what edges of these names left in ``folder``; see `hvt_study.demo.flown.read_flown`."""
     flown = tuple(read_flown(folder, name) for name in names)
-    scene = Scene(seed, codes=True)
+    (scene,) = open_dataset(f"demo:{seed},codes")
+    assert scene.labels is not None, "a drawn scene says what is in it"
+    assert scene.codes is not None, "codes were asked for"
     sizes = {picture.shape[:2] for one in flown for picture in one.pictures.values()}
     if len(sizes) != 1:
         raise UserError(f"the flights in {folder} have base streams of {len(sizes)} sizes: fly them with one")
     ((high, wide),) = sizes
-    scale = wide / scene.size[0]
+    scale = wide / scene.source_size[0]
     frames = range(max(max(one.pictures) for one in flown))
-    truth = {index + 1: _truth(scene, index, scale=scale) for index in frames}
-    views = [scene.codes(index / NOMINAL_FPS) for index in frames]
+    truth = {index + 1: _scaled(scene.labels(index), scale) for index in frames}
+    views = [scene.codes(index) for index in frames]
     codes = codes_to_read(views)
 
     def read(one: Flown) -> Legible:
@@ -104,12 +106,9 @@ def compare_flown(folder: Path, names: Sequence[str], *, seed: int, with_reader:
     return Compared(flown, scores, legible, codes, truth, views, scale)
 
 
-def _truth(scene: Scene, index: int, *, scale: float) -> Labelled:
-    truth = scene.truth(index / NOMINAL_FPS)
-    judged = truth.visible >= _LEAST_VISIBLE
-    names = tuple(scene.class_names[kind] for kind in truth.class_ids[judged].tolist())
-    boxes = truth.boxes_source_px.astype(np.float64) * scale
-    return Labelled(boxes[judged], names, beside_xyxy_px=boxes[~judged])
+def _scaled(labels: FrameLabels, scale: float) -> FrameLabels:
+    boxes, beside = labels.boxes_xyxy_px * scale, labels.beside_xyxy_px * scale
+    return replace(labels, boxes_xyxy_px=boxes, beside_xyxy_px=beside)
 
 
 def _newest(one: Flown, frame: int) -> Image:

@@ -15,7 +15,8 @@ from hvt_archive.reading.recorded import read_recordings
 from hvt_common.errors import UserError
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
-from hvt_study.metrics.track_table_score import Labelled, read_tracks
+from hvt_study.metrics.frames import FrameView
+from hvt_study.metrics.track_table_score import read_tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +35,7 @@ class Flown:
     """One flight."""
 
     name: str
-    tracks: Mapping[int, Labelled]
+    tracks: Mapping[int, FrameView]
     """By frame, from 1; base pixels."""
     pictures: Mapping[int, Image]
     """Base pictures as decoded, by frame; those that the stream left out are missing."""

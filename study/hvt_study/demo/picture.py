@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,8 +13,9 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.values import Image
+from hvt_study.datasets.labels import FrameLabels
+from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.judged import LEAST_IOU, matched_rows
-from hvt_study.metrics.track_table_score import Labelled
 
 _Colour = tuple[int, int, int]
 
@@ -41,8 +43,8 @@ class Panel:
     title: str
     picture: Image
     """The base picture that was newest then."""
-    shown: Labelled
-    truth: Labelled
+    shown: FrameView
+    truth: FrameLabels
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +85,8 @@ def _panel(one: Panel) -> Image:
     partner = dict(matched_rows(shown, truth, least_iou=LEAST_IOU).tolist())
     for row in set(range(len(truth))) - set(partner.values()):
         cv2.rectangle(canvas, *_corners(truth[row]), _MISSED, 1, cv2.LINE_8)
-    for row, name in enumerate(one.shown.classes):
-        right = row in partner and one.truth.classes[partner[row]] == name
+    for row, name in enumerate(one.shown.class_names):
+        right = row in partner and one.truth.class_names[partner[row]] == name
         corners = _corners(shown[row])
         cv2.rectangle(canvas, *corners, _RIGHT if right else _WRONG, 2, cv2.LINE_8)
         _write(canvas, name, (corners[0][0], corners[0][1] - 4), _LIGHT, scale=0.42, shadow=True)
@@ -96,7 +98,7 @@ def _coarse(picture: Image) -> Image:
     return picture // step * step + step // 2
 
 
-def _corners(box: npt.NDArray[np.float64]) -> tuple[tuple[int, int], tuple[int, int]]:
+def _corners(box: npt.NDArray[np.floating[Any]]) -> tuple[tuple[int, int], tuple[int, int]]:
     x1, y1, x2, y2 = np.rint(box).astype(int).tolist()
     return (x1, y1), (x2, y2)
 

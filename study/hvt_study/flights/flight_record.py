@@ -22,7 +22,8 @@ from hvt_ground.perception.pipeline import Pipeline
 from hvt_ground.perception.stills.classify import object_crops
 from hvt_ground.perception.stills.decode import DecodedStill
 from hvt_ground.perception.stills.refine import Refiner, ShownClasses
-from hvt_study.metrics.frames import NO_ID, FrameView
+from hvt_study.datasets.labels import NO_ID
+from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.metrics.proxy import score_entropy_nats
 from hvt_study.metrics.stills import Opinion, RefinedObject, StillArrival
@@ -187,8 +188,7 @@ class FlightRecord:
     def detected(self, found: Detections, class_names: tuple[str, ...]) -> FrameView:
         """Plain detections."""
         names = tuple(class_names[kind] for kind in found.class_ids.tolist())
-        ids = np.full(len(names), NO_ID, np.int64)
-        return FrameView(self._inside(found.boxes_xyxy_px), ids, names, found.confidences, names)
+        return FrameView.plain(self._inside(found.boxes_xyxy_px), names, found.confidences)
 
     def complete(
         self,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from hvt_common.protocol.channels import Channel
-from hvt_study.metrics.frames import NO_ID
+from hvt_study.datasets.labels import NO_ID
 from hvt_study.metrics.stills import RefinedObject, StillArrival
 
 Accounting: TypeAlias = Literal["span", "pilot"]

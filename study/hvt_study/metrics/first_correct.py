@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import CensoredData, ecdf
 
-from hvt_study.metrics.frames import NO_ID, LabelledFrames
+from hvt_study.datasets.labels import NO_ID
+from hvt_study.metrics.frames import LabelledFrames
 from hvt_study.metrics.judged import LEAST_IOU, Judged, judged, matched_rows
 
 

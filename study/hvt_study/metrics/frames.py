@@ -14,23 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Boxes
-from hvt_study.datasets.labels import NO_ID, FrameLabels
-
-__all__ = ["NO_ID", "FrameLabels", "FrameView", "LabelledFrame", "LabelledFrames", "Rows", "rows_of"]
+from hvt_study.datasets.labels import NO_ID, FrameLabels, no_boxes, no_ids
 
 Rows: TypeAlias = npt.NDArray[np.bool_] | npt.NDArray[np.intp]
 """Which rows of parallel arrays: a mask, or indices."""
 
 
-def _no_boxes() -> Boxes:
-    return np.empty((0, 4), np.float32)
-
-
-def _no_ids() -> npt.NDArray[np.int64]:
-    return np.empty(0, np.int64)
-
-
-def _no_numbers() -> npt.NDArray[np.float32]:
+def no_numbers() -> npt.NDArray[np.float32]:
+    """(0,) float32."""
     return np.empty(0, np.float32)
 
 
@@ -38,13 +29,13 @@ def _no_numbers() -> npt.NDArray[np.float32]:
 class FrameView:
     """What the ground shows at one frame, N boxes; an empty one shows nothing."""
 
-    boxes_xyxy_px: Boxes = field(default_factory=_no_boxes)
+    boxes_xyxy_px: Boxes = field(default_factory=no_boxes)
     """(N, 4) float32, source pixels, inside the frame."""
-    ids: npt.NDArray[np.int64] = field(default_factory=_no_ids)
+    ids: npt.NDArray[np.int64] = field(default_factory=no_ids)
     """(N,) of the ground's tracks; `NO_ID` for plain detections."""
     class_names: tuple[str, ...] = ()
     """N names as shown, after refinement."""
-    confidences: npt.NDArray[np.float32] = field(default_factory=_no_numbers)
+    confidences: npt.NDArray[np.float32] = field(default_factory=no_numbers)
     """(N,) of the class that is shown, 0…1."""
     names_before: tuple[str, ...] = ()
     """N names without refinement: what the base stream says."""
@@ -52,6 +43,15 @@ class FrameView:
     def __post_init__(self) -> None:
         counts = {len(self.boxes_xyxy_px), len(self.ids), len(self.class_names), len(self.confidences)}
         assert counts == {len(self.names_before)}, "parallel arrays have one length"
+
+    @classmethod
+    def plain(
+        cls, boxes: npt.ArrayLike, names: Sequence[str], confidences: npt.NDArray[np.float32] | None = None
+    ) -> FrameView:
+        """Boxes of no track, which nothing has refined; without ``confidences`` all are sure."""
+        sure = np.ones(len(names), np.float32) if confidences is None else confidences
+        array, ids = np.asarray(boxes, np.float32).reshape(-1, 4), np.full(len(names), NO_ID, np.int64)
+        return cls(array, ids, tuple(names), sure, tuple(names))
 
     def __len__(self) -> int:
         return len(self.ids)

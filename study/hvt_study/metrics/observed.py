@@ -10,33 +10,26 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Boxes
-from hvt_study.metrics.frames import FrameLabels, FrameView, LabelledFrame
+from hvt_study.datasets.labels import FrameLabels, no_boxes, no_ids
+from hvt_study.metrics.frames import FrameView, LabelledFrame, no_numbers
 from hvt_study.metrics.stills import RefinedObject, StillArrival
-
-
-def _no_boxes() -> Boxes:
-    return np.empty((0, 4), np.float32)
-
-
-def _none_32() -> npt.NDArray[np.float32]:
-    return np.empty(0, np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class ObservedFrame:
     """The ground's list at one source frame, with all that metrics need of it; N tracks."""
 
-    boxes_xyxy_px: Boxes = field(default_factory=_no_boxes)
+    boxes_xyxy_px: Boxes = field(default_factory=no_boxes)
     """(N, 4) float32, source pixels."""
     classes: tuple[str, ...] = ()
     """N names as shown."""
-    ids: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    ids: npt.NDArray[np.int64] = field(default_factory=no_ids)
     """(N,) of the ground."""
-    confidences: npt.NDArray[np.float32] = field(default_factory=_none_32)
+    confidences: npt.NDArray[np.float32] = field(default_factory=no_numbers)
     """(N,) of the class that is shown."""
     classes_before: tuple[str, ...] = ()
     """N names without refinement."""
-    confidences_before: npt.NDArray[np.float32] = field(default_factory=_none_32)
+    confidences_before: npt.NDArray[np.float32] = field(default_factory=no_numbers)
     """(N,) of the last detection that was matched."""
     origins: tuple[str, ...] = ()
     """N words of `hvt_ground.events.Origin`: who knows of the track."""

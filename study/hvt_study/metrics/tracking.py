@@ -21,7 +21,8 @@ import motmetrics
 import numpy as np
 
 from hvt_common.values import iou
-from hvt_study.metrics.frames import NO_ID, LabelledFrames
+from hvt_study.datasets.labels import NO_ID
+from hvt_study.metrics.frames import LabelledFrames
 from hvt_study.metrics.hota import Hota, IdBoxes, hota
 from hvt_study.metrics.judged import LEAST_IOU, judged, matched_rows
 

@@ -15,7 +15,7 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import AccessUnit, Detections, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder
 from hvt_study.datasets.clip import NOMINAL_FPS
-from hvt_study.metrics.frames import NO_ID, FrameView
+from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.peers.dds_edge import most_stored
 from hvt_study.peers.dds_line import Line
@@ -175,8 +175,7 @@ class DdsGround:
 
     def _detections(self, found: Detections) -> FrameView:
         names = self._names(found.class_ids)
-        ids = np.full(len(names), NO_ID, np.int64)
-        return FrameView(self._inside(found.boxes_xyxy_px), ids, names, found.confidences, names)
+        return FrameView.plain(self._inside(found.boxes_xyxy_px), names, found.confidences)
 
     def _names(self, class_ids: np.ndarray[tuple[int], np.dtype[np.int32]]) -> tuple[str, ...]:
         return tuple(self.detector.class_names[kind] for kind in class_ids.tolist())

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
+from hvt_study.datasets.labels import NO_ID
 from hvt_study.metrics.bits import StillCounts, bit_split, still_counts
-from hvt_study.metrics.frames import NO_ID
 from hvt_study.metrics.proxy import proxies, score_entropy_nats
 from hvt_study.metrics.stills import Opinion, RefinedObject, StillArrival, still_delays_ms
 

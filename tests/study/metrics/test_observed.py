@@ -15,13 +15,13 @@ from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip
+from hvt_study.datasets.labels import NO_ID
 from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
 from hvt_study.metrics.bits import bit_split, still_counts
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.first_correct import first_correct
-from hvt_study.metrics.frames import NO_ID
 from hvt_study.metrics.observed import (
     arrivals,
     detected_frames,

@@ -12,27 +12,33 @@ from hvt_ground.events import Notice, Overlay
 from hvt_ground.sinks.tracks_table import TrackTable
 from hvt_scene import Scene
 from hvt_study.cli import main
-from hvt_study.metrics.track_table_score import Labelled, read_tracks, read_truth, score
+from hvt_study.datasets.labels import FrameLabels
+from hvt_study.metrics.frames import FrameView
+from hvt_study.metrics.track_table_score import read_tracks, read_truth, score
 
 AREA_PX = 1280 * 720
 
 
-def labelled(*rows: tuple[float, float, float, float, str]) -> Labelled:
-    return Labelled(np.array([row[:4] for row in rows], float).reshape(-1, 4), tuple(row[4] for row in rows))
+def objects(*rows: tuple[float, float, float, float, str]) -> FrameLabels:
+    return FrameLabels.plain([row[:4] for row in rows], [row[4] for row in rows])
+
+
+def shown(*rows: tuple[float, float, float, float, str]) -> FrameView:
+    return FrameView.plain([row[:4] for row in rows], [row[4] for row in rows])
 
 
 def test_known_answer() -> None:
     """A wrong formula here would make every comparison of methods worthless."""
-    truth = {1: labelled((0, 0, 10, 10, "car"), (100, 0, 200, 100, "van"), (300, 0, 310, 10, "car"))}
-    tracks = {1: labelled((1, 0, 11, 10, "car"), (100, 0, 200, 100, "car"), (600, 0, 610, 10, "bus"))}
+    truth = {1: objects((0, 0, 10, 10, "car"), (100, 0, 200, 100, "van"), (300, 0, 310, 10, "car"))}
+    tracks = {1: shown((1, 0, 11, 10, "car"), (100, 0, 200, 100, "car"), (600, 0, 610, 10, "bus"))}
     result = score(tracks, truth, frame_area_px=AREA_PX)
-    assert result.objects == 3
+    assert result.counts.labels == 3
     assert result.recall == pytest.approx(2 / 3)
-    assert result.top1 == pytest.approx(1 / 2)
-    assert result.small_top1 == 1.0
-    assert result.seen_right == pytest.approx(1 / 3)
+    assert result.counts.top1_found == pytest.approx(1 / 2)
+    assert result.by_size["small"].top1_found == 1.0
+    assert result.counts.top1_all == pytest.approx(1 / 3)
     # car: 1 hit of 2 objects and 2 claims; van: no hit.
-    assert result.macro_f1 == pytest.approx((2 * 1 / (2 + 2) + 0) / 2)
+    assert result.macro_f1_all == pytest.approx((2 * 1 / (2 + 2) + 0) / 2)
 
 
 def test_who_lists_a_hidden_object_is_neither_right_nor_wrong(tmp_path: Path) -> None:
@@ -42,25 +48,25 @@ def test_who_lists_a_hidden_object_is_neither_right_nor_wrong(tmp_path: Path) ->
     truth = read_truth(tmp_path / "gt.txt", class_names=("car",))
     seen = (0.0, 0.0, 10.0, 10.0, "car")
     results = [
-        score({1: labelled(seen, *more)}, truth, frame_area_px=AREA_PX)
+        score({1: shown(seen, *more)}, truth, frame_area_px=AREA_PX)
         for more in ((), ((50.0, 0.0, 70.0, 20.0, "car"),), ((200.0, 0.0, 220.0, 20.0, "car"),))
     ]
-    assert [one.objects for one in results] == [1, 1, 1]
+    assert [one.counts.labels for one in results] == [1, 1, 1]
     assert [one.false_per_frame for one in results] == [0, 0, 1]
     assert results[0].named_f1 == results[1].named_f1 == 1
 
 
 def test_a_track_counts_for_one_object_only() -> None:
     """One large box over two neighbours must not find both."""
-    truth = {1: labelled((0, 0, 10, 10, "car"), (0, 1, 10, 11, "car"))}
-    tracks = {1: labelled((0, 0, 10, 10, "car"))}
+    truth = {1: objects((0, 0, 10, 10, "car"), (0, 1, 10, 11, "car"))}
+    tracks = {1: shown((0, 0, 10, 10, "car"))}
     assert score(tracks, truth, frame_area_px=AREA_PX).recall == 0.5
 
 
 def test_frames_without_tracks_count_as_missed() -> None:
     """A ground that shows nothing for a while must lose points for it."""
-    truth = {frame: labelled((0, 0, 10, 10, "car")) for frame in (1, 2, 3, 4)}
-    tracks = {1: labelled((0, 0, 10, 10, "car"))}
+    truth = {frame: objects((0, 0, 10, 10, "car")) for frame in (1, 2, 3, 4)}
+    tracks = {1: shown((0, 0, 10, 10, "car"))}
     assert score(tracks, truth, frame_area_px=AREA_PX).recall == 0.25
 
 
@@ -91,9 +97,9 @@ def test_the_table_of_the_ground_reads_back(tmp_path: Path) -> None:
     table.close()
     read = read_tracks(path)
     assert set(read) == {1, 5}
-    assert read[1].classes == ("car", "van")
+    assert read[1].class_names == ("car", "van")
     np.testing.assert_allclose(read[1].boxes_xyxy_px[0], (1, 2, 11, 22))
-    assert read_tracks(path, column="base_class")[5].classes == ("moving",)
+    assert read_tracks(path, column="base_class")[5].class_names == ("moving",)
 
 
 def test_perfect_tracks_of_the_demo_score_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

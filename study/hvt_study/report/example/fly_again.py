@@ -23,11 +23,11 @@ from hvt_common.video.base_crop import base_crop
 from hvt_common.video.still_codecs import psnr_y_db
 from hvt_ground.events import Event, Refinement
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip
+from hvt_study.datasets.labels import NO_ID
 from hvt_study.flights.flight import Flight, FlightPlan, FlightReport
 from hvt_study.flights.flight_ground import GroundSide, SharedModels
 from hvt_study.matrix.plan import StudyPlan
 from hvt_study.metrics.classes import class_score
-from hvt_study.metrics.frames import NO_ID
 from hvt_study.metrics.observed import refined_frames, refined_objects
 from hvt_study.report.example.choice import CropExample, Example, Lane, Timeline, Word, percentile_rows
 from hvt_study.report.example.store import png_of
