@@ -19,7 +19,9 @@ _Part = TypeVar("_Part")
 _Answer = TypeVar("_Answer")
 _REDACTION = Redaction()
 _STEADY_NS = 60 * SECOND_NS
-"""A failure after it worked for so long is news, and begins with a short pause."""
+"""A failure after it worked for so long is news."""
+_STEADY_PAUSES = 10
+"""What has worked for so many first pauses is tried again after the first one: that costs little."""
 
 
 def reason_of(error: BaseException) -> str:
@@ -105,7 +107,7 @@ class Failures:
 
 
 class RetryPause:
-    """The wait before the next try: twice as long after each failure. Time is an argument."""
+    """The wait before the next try: twice as long after each failure that comes soon. Time is an argument."""
 
     def __init__(self, first_ns: int = SECOND_NS, longest_ns: int = 60 * SECOND_NS) -> None:
         self._first_ns = first_ns
@@ -120,7 +122,7 @@ class RetryPause:
 
     def failed(self, now_ns: int) -> None:
         """It failed, at the start or after it had worked for a while."""
-        steady = now_ns - self._failed_ns > self._pause_ns + _STEADY_NS
+        steady = now_ns - self._failed_ns > self._pause_ns + _STEADY_PAUSES * self._first_ns
         self._pause_ns = self._first_ns if steady else min(2 * self._pause_ns, self._longest_ns)
         self._pause_ns = max(self._first_ns, self._pause_ns)
         self._failed_ns = now_ns
