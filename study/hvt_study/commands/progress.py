@@ -18,6 +18,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 _LINE_EVERY_S = 60
 _FIRST_LINE_S = 1.0
 """What cannot be done at all says so sooner."""
+_SOON_S = 30.0
+"""Nearer to the end seconds are not told: the last runs, which end as they will, are all of it."""
 _REMEMBERED = 64
 _LEAST = 4
 
@@ -91,7 +93,8 @@ class RunProgress:
     def _more(self, left_s: float, failed: int) -> str:
         words = [f"{failed} failed"] if failed else []
         if left_s:
-            words.append(f"about {timedelta(seconds=round(left_s))} left")
+            told = f"about {timedelta(seconds=round(left_s))}" if left_s >= _SOON_S else "less than a minute"
+            words.append(f"{told} left")
         return ", ".join(words)
 
 
