@@ -171,7 +171,7 @@ class LookFlight(World):
 
     def run(self) -> dict[str, Any]:
         """Fly; return the summary."""
-        config = EdgeConfig(**{"pace": "lockstep", "edge_id": "uav-1", "quiet": True, "wait": 0.0} | dict(self.settings))
+        config = EdgeConfig(pace="lockstep", edge_id="uav-1", quiet=True, wait=0.0, **self.settings)
         config = check(with_profile(config, given=set(self.settings)))
         return Edge(config, stop=threading.Event(), world=self).run()
 
