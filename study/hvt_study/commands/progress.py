@@ -93,8 +93,10 @@ class RunProgress:
     def _more(self, left_s: float, failed: int) -> str:
         words = [f"{failed} failed"] if failed else []
         if left_s:
-            told = f"about {timedelta(seconds=round(left_s))}" if left_s >= _SOON_S else "less than a minute"
-            words.append(f"{told} left")
+            amount = (
+                f"about {timedelta(seconds=round(left_s))}" if left_s >= _SOON_S else "less than a minute"
+            )
+            words.append(f"{amount} left")
         return ", ".join(words)
 
 
