@@ -57,7 +57,7 @@ import json, socket, sys, time
 near = socket.create_connection((sys.argv[1], 7000))
 near.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 trips = []
-for _ in range(10):
+for _ in range(3):
     began = time.monotonic()
     near.sendall(b"x")
     near.recv(1)
@@ -195,7 +195,7 @@ def test_tcp_brings_every_byte_through_loss():
 def test_a_round_trip_takes_twice_the_delay():
     """A satellite would be as near as the next room."""
     _, trips, _ = over(script((0, LinkState(20_000_000, delay_s=0.1))), ground=ECHO, edge=PING)
-    assert len(trips) == 10
+    assert len(trips) == 3
     assert min(trips) >= 0.2
 
 

@@ -26,9 +26,9 @@ from hvt_edge.source.resample import Gate, Resizer
 
 _log = logging.getLogger(__name__)
 
-_FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS
+FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS
 _JOIN_S = 1.5
-_IDLE_S = 1.0
+IDLE_S = 1.0
 _MOST_PENDING = 8
 """Frames of a burst that are kept."""
 SOURCE_PART = "source"
@@ -124,7 +124,7 @@ class LiveSource(Source):
         self._resizer = Resizer(first_size, size, fit=fit, name=grabber.name)
         self.notes = () if grabber.notes is None else grabber.notes.taken()
         self.view = self._resizer.view
-        self._pause = RetryPause(_FIRST_WAIT_NS, _LONGEST_WAIT_NS)
+        self._pause = RetryPause(FIRST_WAIT_NS, _LONGEST_WAIT_NS)
         self._news = threading.Condition()
         self._pending: deque[tuple[int, Image]] = deque()
         """(when taken, picture), the latest last: of a burst all, else one."""
@@ -142,7 +142,7 @@ class LiveSource(Source):
         index = 0
         while index != self._limit:
             with self._news:
-                self._news.wait_for(lambda: self._pending or self._stop.is_set(), _IDLE_S)
+                self._news.wait_for(lambda: self._pending or self._stop.is_set(), IDLE_S)
                 item = self._pending.popleft() if self._pending else None
             if self._stop.is_set():
                 return
