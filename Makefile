@@ -30,11 +30,11 @@ endif
 demo: setup      ## three edges and one ground on the drawn scene: a table, demo.png, demo.rrd
 	@$(BIN)/python deploy/demo.py
 
-# One worker more than there are processors, for a worker often waits for the programs that it started. At night, where
-# flights in real time are most of it, one less. Nothing has a second chance. All tests of a file run in one process, so
+# Two workers more than there are processors, for a worker often waits for the programs that it started. At night, where
+# flights in real time are most of it, two less. Nothing has a second chance. All tests of a file run in one process, so
 # what a module flies is flown once; xdist 3.8 does not see its own groups with pytest 9.2.
 CORES := $(shell getconf _NPROCESSORS_ONLN)
-JOBS ?= $(shell expr $(CORES) + 1)
+JOBS ?= $(shell expr $(CORES) + 2)
 AT_ONCE = $(if $(CORE),--ignore=tests/extras) --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS= CORE=1
