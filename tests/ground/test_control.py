@@ -14,7 +14,7 @@ import zenoh
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
-from hvt_common.protocol.messages import ControlAnswer, ControlRequest, RoiHeader
+from hvt_common.protocol.messages import ControlAnswer, ControlRequest
 from hvt_common.transport.session import declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_common.video.still_codecs import JpegCodec
@@ -32,21 +32,16 @@ INFO = replace(
     messages.INFO, source_size=(960, 540), base_size=(640, 360), view_scale=2 / 3, class_names=("car",)
 )
 YES = ControlAnswer(session_id=7, accepted=True, reason="", still_request=3, frame_index=40, tracks=())
-HEADER = RoiHeader(
+HEADER = replace(
+    messages.ROI,
     session_id=7,
     sequence=9,
     frame_index=40,
-    capture_ns=5,
-    send_delay_ns=1,
-    flags=0,
     track_id=-1,
     box_source_px=(10.0, 20.0, 106.0, 84.0),
     crop_source_px=(10, 20, 106, 84),
     class_name="",
-    confidence=0.0,
     reason="asked",
-    codec="jpeg",
-    quality_pct=90,
     parameters={"ask": 3},
     also=(),
 )

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from hvt_common.protocol.messages import TrackStep, TrackStepDecoder
-from hvt_common.values import Frame, Tracks
+from hvt_common.values import Frame
 from hvt_edge.link.tracks_channel import TrackReporter, TrackReportSettings
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from media.clips import START_NS
+from rigs.examples import tracks_of
 
 PIXELS = np.zeros((8, 8, 3), np.uint8)
 
@@ -20,16 +21,8 @@ def seen(
     frame = Frame(index, START_NS + round(index * 1e9 / fps), PIXELS, PIXELS)
     count = len(ages)
     left = 10.0 * np.arange(count) + index
-    tracks = Tracks(
-        frame_index=index,
-        ids=np.arange(1, count + 1),
-        boxes_xyxy_px=np.stack([left, left, left + 20, left + 30], axis=1).astype(np.float32),
-        confidences=np.full(count, 0.5, np.float32),
-        class_ids=np.arange(count, dtype=np.int32),
-        born_frames=np.zeros(count, np.int64),
-        seen_frames=index - np.array(ages, np.int64),
-        started=np.zeros(count, bool),
-    )
+    boxes = np.stack([left, left, left + 20, left + 30], axis=1)
+    tracks = tracks_of(index, boxes, classes=range(count), seen=index - np.array(ages))
     return AnalyzedFrame(frame, PIXELS if coded else None, tracks, detected=detected)
 
 

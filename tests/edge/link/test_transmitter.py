@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
-from hvt_common.protocol.messages import MAX_ALSO, BaseHeader, CaptureTimes, Flags, Health, RoiHeader, Status
+from hvt_common.protocol.messages import MAX_ALSO, BaseHeader, CaptureTimes, Flags, RoiHeader, Status
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
@@ -22,7 +22,7 @@ from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.video.encoder_settings import STATUS_BYTES, base_overhead_bps
-from rigs.messages import feedback
+from rigs.messages import STATUS, feedback
 
 SECOND_NS = 1_000_000_000
 NOW_NS = 1_790_000_000 * SECOND_NS
@@ -123,46 +123,8 @@ def still(size: int = 100, **changes) -> Still:
 def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
     """A report with so many reasons."""
     counts = {f"{name}{number}": 4_000_000_000 for number in range(reasons)}
-    return Status(
-        session_id=2**64 - 1,
-        sequence=70_000,
-        state="running",
-        send_ns=at_ns,
-        media_ns=max(0, at_ns - NOW_NS),
-        last_base_sequence=70_000,
-        last_still_sequence=70_000,
-        base_bytes=10**9,
-        roi_bytes=10**9,
-        backlog_bytes=10**9,
-        meta_bytes=10**9,
-        overhead_bytes=10**9,
-        base_messages=10**6,
-        roi_messages=10**6,
-        backlog_messages=10**6,
-        meta_messages=10**6,
-        worst_window_bps=(10**7, 10**7, 10**7),
-        sent=counts,
-        deferred=counts,
-        dropped=counts,
-        health=Health(
-            frames_captured=10**6,
-            frames_encoded=10**6,
-            frames_dropped=10**6,
-            keyframes=10**4,
-            tracks=10**4,
-            base_queue=100,
-            still_queue=100,
-            encode_ms=1000.0,
-            detect_ms=1000.0,
-            feedback_age_ms=10_000,
-            frames_dropped_cpu=10**6,
-            frames_unanalyzed=10**6,
-            cores_needed=1.6,
-            cores_free=1.1,
-        ),
-        failed=(),
-        levers="",
-    )
+    known = replace(STATUS, session_id=2**64 - 1, send_ns=at_ns, media_ns=max(0, at_ns - NOW_NS))
+    return replace(known, sent=counts, deferred=counts, dropped=counts, failed=(), levers="")
 
 
 def test_a_base_message_says_what_the_ground_needs():

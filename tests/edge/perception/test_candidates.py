@@ -9,23 +9,14 @@ import pytest
 from hvt_common.values import Tracks, View
 from hvt_edge.perception.candidates import TrackMemory, sharpness
 from hvt_edge.perception.crop import MOST_PSNR_DB, BaseLoss
+from rigs.examples import tracks_of
 
 VIEW = View.fitted((1280, 720), (640, 360), fit="letterbox")
 
 
 def tracks(*boxes: tuple[float, float, float, float]) -> Tracks:
     """Confirmed cars, boxes in base pixels."""
-    count = len(boxes)
-    return Tracks(
-        frame_index=0,
-        ids=np.arange(1, count + 1),
-        boxes_xyxy_px=np.array(boxes, np.float32).reshape(-1, 4),
-        confidences=np.full(count, 0.8, np.float32),
-        class_ids=np.zeros(count, np.int32),
-        born_frames=np.zeros(count, np.int64),
-        seen_frames=np.zeros(count, np.int64),
-        started=np.ones(count, np.bool_),
-    )
+    return tracks_of(0, boxes, confidences=0.8, started=True)
 
 
 def candidates(*boxes: tuple[float, float, float, float], **pictures):

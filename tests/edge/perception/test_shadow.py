@@ -10,12 +10,13 @@ from hypothesis import strategies as st
 from hvt_common.inference.detect import Detector, open_detector
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
-from hvt_common.values import Detections, Frame, Tracks
+from hvt_common.values import Detections, Frame
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer, AnalyzerSettings
 from hvt_edge.perception.shadow import Detected, Shadow, ShadowGround, ShadowSettings
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
+from rigs.examples import tracks_of
 
 FPS = 15
 PERIOD_NS = 1_000_000_000 // FPS
@@ -40,18 +41,8 @@ def found(*places: int, confidence: float = 0.8, class_id: int = 0) -> Detection
 
 def seen(index: int, confidences: dict[int, float], picture: np.ndarray = PICTURE) -> AnalyzedFrame:
     """A decision step whose source shows objects at these places."""
-    places = list(confidences)
-    count = len(places)
-    tracks = Tracks(
-        frame_index=index,
-        ids=np.array(places, np.int64),
-        boxes_xyxy_px=np.array([box(place) for place in places], np.float32).reshape(-1, 4),
-        confidences=np.array(list(confidences.values()), np.float32),
-        class_ids=np.zeros(count, np.int32),
-        born_frames=np.zeros(count, np.int64),
-        seen_frames=np.full(count, index, np.int64),
-        started=np.zeros(count, bool),
-    )
+    boxes = {place: box(place) for place in confidences}
+    tracks = tracks_of(index, boxes, confidences=[confidences[place] for place in sorted(boxes)])
     frame = Frame(index=index, capture_ns=(index + 1) * PERIOD_NS, source_bgr=picture, base_bgr=picture)
     return AnalyzedFrame(frame, picture, tracks, detected=True)
 

@@ -16,11 +16,11 @@ from hvt_common.values import Frame, Still, View
 from hvt_common.video.base_crop import base_crop, coded_size
 from hvt_common.video.still_codecs import BaseMissingError, JpegCodec, still_codec
 from hvt_common.video.still_codecs.jpeg import jpeg_size
-from hvt_edge.perception.candidates import Candidate
 from hvt_edge.perception.crop import crop_box
 from hvt_edge.stills.maker import NoStill, StillMaker
 from hvt_edge.stills.policy.base import Request
 from media.base_coded import Hopeless, StandIn
+from rigs.examples import candidate
 
 SIZE = (1280, 720)
 CODEC = JpegCodec()
@@ -38,18 +38,7 @@ def scene(width: int, height: int, *, seed: int = 0) -> np.ndarray:
 
 def request_for(box, *, index: int = 0) -> Request:
     """A request for a still of one box."""
-    one = Candidate(
-        frame_index=index,
-        track_id=4,
-        box_base_px=box,
-        box_source_px=tuple(map(float, box)),
-        class_id=0,
-        class_name="car",
-        confidence=0.7,
-        area_share=0.01,
-        crop_area_px=1.0,
-        born_frame=0,
-    )
+    one = candidate(4, box, frame_index=index)
     return Request(one, "utility", 1.0)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,13 +11,14 @@ from hypothesis import strategies as st
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
-from hvt_common.protocol.messages import AlsoShown, RoiHeader
+from hvt_common.protocol.messages import AlsoShown
 from hvt_common.video.base_crop import coded_size
-from hvt_edge.perception.candidates import Candidate
 from hvt_edge.perception.crop import crop_box
 from hvt_edge.stills.crop_job import expected_bytes, union_crop
 from hvt_edge.stills.merging import ALSO_BYTES, group
 from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, CostEstimate, Request
+from rigs.examples import candidate
+from rigs.messages import ROI
 
 SOURCE = (1280, 720)
 PADDING = 0.15
@@ -26,19 +29,8 @@ def request_for(track_id: int, x: float, y: float, *, side: float = 20, score: f
     """A request for a still of a square object."""
     box = (x, y, x + side, y + side)
     size = coded_size(crop_box(box, padding=PADDING, source_size=SOURCE))
-    candidate = Candidate(
-        frame_index=7,
-        track_id=track_id,
-        box_base_px=box,
-        box_source_px=box,
-        class_id=0,
-        class_name="car",
-        confidence=0.5,
-        area_share=side * side / (1280 * 720),
-        crop_area_px=float(size[0] * size[1]),
-        born_frame=0,
-    )
-    return Request(candidate, "gain", score)
+    one = candidate(track_id, box, frame_index=7, confidence=0.5, crop_area_px=float(size[0] * size[1]))
+    return Request(one, "gain", score)
 
 
 @st.composite
@@ -132,26 +124,9 @@ def test_the_overhead_that_is_reckoned_with_is_the_real_one():
 
     def header(also: int) -> int:
         box = (1200.125, 600.5, 1300.375, 650.25)
-        return len(
-            RoiHeader(
-                session_id=2**63,
-                sequence=1200,
-                frame_index=4500,
-                capture_ns=-1,
-                send_delay_ns=30_000_000,
-                flags=0,
-                track_id=345,
-                box_source_px=box,
-                crop_source_px=(1185, 593, 1316, 658),
-                class_name="car",
-                confidence=0.812,
-                reason="gain",
-                codec="jpeg",
-                quality_pct=65,
-                parameters={},
-                also=tuple(AlsoShown(track_id=400 + number, box_source_px=box) for number in range(also)),
-            ).pack(b"x" * 1000)
-        )
+        objects = tuple(AlsoShown(track_id=400 + number, box_source_px=box) for number in range(also))
+        one = replace(ROI, session_id=2**63, box_source_px=box, reason="gain", parameters={}, also=objects)
+        return len(one.pack(b"x" * 1000))
 
     framing = overhead_bytes(1000, header(0), key=EdgeKeys("edge-1").key(Channel.ROI), encoding="image/jpeg")
     assert header(0) + framing == pytest.approx(STILL_OVERHEAD_BYTES, abs=15)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_common.values import Frame, Still, Tracks, View
+from hvt_common.values import Frame, Still, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import Candidate, TrackMemory
@@ -24,6 +24,7 @@ from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Gate, Suppression
 from media.base_coded import StandIn
 from media.clips import START_NS, hard_pictures
+from rigs.examples import tracks_of
 
 SIZE = (640, 360)
 PICTURE = hard_pictures(1, size=SIZE)[0]
@@ -89,17 +90,7 @@ class Rig:
     def consider(self, boxes: dict[int, tuple[float, ...]], *, base=FLAT, detected: bool = True) -> None:
         """The next decision step."""
         self.number += 1
-        count = len(boxes)
-        tracks = Tracks(
-            self.number,
-            np.array(list(boxes), np.int64),
-            np.array(list(boxes.values()), np.float32).reshape(count, 4),
-            np.full(count, 0.5, np.float32),
-            np.zeros(count, np.int32),
-            np.zeros(count, np.int64),
-            np.full(count, self.number),
-            np.zeros(count, np.bool_),
-        )
+        tracks = tracks_of(self.number, boxes)
         seen = AnalyzedFrame(
             Frame(self.number, self.now_ns, self.picture, self.picture), base, tracks, detected=detected
         )

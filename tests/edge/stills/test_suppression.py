@@ -15,41 +15,20 @@ from hvt_edge.perception.candidates import Candidate, TrackMemory, sharpness
 from hvt_edge.perception.crop import BaseLoss, measure_loss
 from hvt_edge.stills.suppression import Gate, Suppression
 from media.clips import hard_pictures
+from rigs.examples import candidate, tracks_of
 
 SECOND = 1_000_000_000
 VIEW = View.fitted((1920, 1080), (1280, 720), fit="letterbox")
 
 
-def candidate(**changes) -> Candidate:
-    """An ordinary car."""
-    plain = Candidate(
-        frame_index=100,
-        track_id=1,
-        box_base_px=(100, 100, 150, 140),
-        box_source_px=(150, 150, 225, 210),
-        class_id=3,
-        class_name="car",
-        confidence=0.8,
-        area_share=50 * 40 / (1280 * 720),
-        crop_area_px=7000,
-        born_frame=0,
-    )
-    return replace(plain, **changes)
+def car(**changes) -> Candidate:
+    """An ordinary car, which the source shows finer."""
+    return candidate(**{"frame_index": 100, "box_source_px": (150, 150, 225, 210), "born_frame": 0} | changes)
 
 
 def tracks(frame: int, boxes: dict[int, tuple], *, started=(), seen: int | None = None) -> Tracks:
     """Tracks at one frame."""
-    ids = sorted(boxes)
-    return Tracks(
-        frame_index=frame,
-        ids=np.array(ids, np.int64),
-        boxes_xyxy_px=np.array([boxes[i] for i in ids], np.float32).reshape(-1, 4),
-        confidences=np.full(len(ids), 0.75, np.float32),
-        class_ids=np.zeros(len(ids), np.int32),
-        born_frames=np.zeros(len(ids), np.int64),
-        seen_frames=np.full(len(ids), frame if seen is None else seen, np.int64),
-        started=np.array([i in started for i in ids], np.bool_),
-    )
+    return tracks_of(frame, boxes, seen=seen, started=[number in started for number in sorted(boxes)])
 
 
 def reason(suppression: Suppression, one: Candidate, now_ns: int) -> str | None:
@@ -65,24 +44,22 @@ SENT = {"sent_count": 1, "last_sent_frame": 10, "last_sent_ns": 10 * SECOND, "la
 def test_cooldown_then_gain_then_time():
     """One parked car would take the whole still budget, or never be seen again."""
     rest = Suppression.for_cooldown(2.0)
-    assert reason(rest, candidate(), 0) is None
-    assert reason(rest, candidate(**SENT), 10 * SECOND + 1_999_999_999) == "cooldown"
-    assert reason(rest, candidate(**SENT), 12 * SECOND) == "no_gain"
-    assert reason(rest, candidate(**SENT), 20 * SECOND - 1) == "no_gain"
-    assert reason(rest, candidate(**SENT), 20 * SECOND) is None
+    assert reason(rest, car(), 0) is None
+    assert reason(rest, car(**SENT), 10 * SECOND + 1_999_999_999) == "cooldown"
+    assert reason(rest, car(**SENT), 12 * SECOND) == "no_gain"
+    assert reason(rest, car(**SENT), 20 * SECOND - 1) == "no_gain"
+    assert reason(rest, car(**SENT), 20 * SECOND) is None
 
 
 def test_growth_or_sharpness_is_a_gain():
     """A car that has come nearer since its still would be shown as it was far away."""
     rest, now = Suppression.for_cooldown(2.0), 13 * SECOND
-    grown = candidate(**SENT, box_source_px=(150, 150, 225, 150 + 60 * 1.2))
+    grown = car(**SENT, box_source_px=(150, 150, 225, 150 + 60 * 1.2))
     assert reason(rest, grown, now) is None
-    nearly = candidate(**SENT, box_source_px=(150, 150, 225, 150 + 60 * 1.19))
+    nearly = car(**SENT, box_source_px=(150, 150, 225, 150 + 60 * 1.19))
     assert reason(rest, nearly, now) == "no_gain"
-    assert reason(rest, candidate(**SENT, last_sent_sharpness=100.0, sharpness=lambda: 121.0), now) is None
-    assert (
-        reason(rest, candidate(**SENT, last_sent_sharpness=100.0, sharpness=lambda: 119.0), now) == "no_gain"
-    )
+    assert reason(rest, car(**SENT, last_sent_sharpness=100.0, sharpness=lambda: 121.0), now) is None
+    assert reason(rest, car(**SENT, last_sent_sharpness=100.0, sharpness=lambda: 119.0), now) == "no_gain"
 
 
 def test_pixels_are_only_looked_at_when_it_matters():
@@ -92,16 +69,14 @@ def test_pixels_are_only_looked_at_when_it_matters():
         raise AssertionError("measured without need")
 
     rest = Suppression.for_cooldown(2.0)
-    assert reason(rest, candidate(sharpness=never), 0) is None
-    assert (
-        reason(rest, candidate(**SENT, last_sent_sharpness=1.0, sharpness=never), 11 * SECOND) == "cooldown"
-    )
+    assert reason(rest, car(sharpness=never), 0) is None
+    assert reason(rest, car(**SENT, last_sent_sharpness=1.0, sharpness=never), 11 * SECOND) == "cooldown"
 
 
 def test_border_waits_are_bounded():
     """Half a car would be sent although the whole one comes a moment later; or one at the border never."""
     rest = Suppression.for_cooldown(2.0)
-    touching = candidate(touches_border=True)
+    touching = car(touches_border=True)
     assert reason(rest, replace(touching, border_s=0.0), 0) == "border"
     assert reason(rest, replace(touching, border_s=0.99), 0) == "border"
     assert reason(rest, replace(touching, border_s=1.0), 0) is None
@@ -111,17 +86,17 @@ def test_border_waits_are_bounded():
 def test_a_part_does_not_follow_the_whole():
     """A track that leaves would be sent again as a fragment, which a classifier reads wrongly."""
     rest = Suppression.for_cooldown(2.0)
-    going = candidate(**SENT, touches_border=True, leaving=True, border_s=5.0)
+    going = car(**SENT, touches_border=True, leaving=True, border_s=5.0)
     assert reason(rest, going, 60 * SECOND) == "border"
     assert reason(rest, replace(going, last_sent_at_border=True), 60 * SECOND) is None
-    inside = candidate(**SENT, last_sent_at_border=True)
+    inside = car(**SENT, last_sent_at_border=True)
     assert reason(rest, inside, 13 * SECOND) is None  # whole at last
 
 
 def test_refused_stills_rest_in_every_variant():
     """A track whose base is good would be coded in vain at every step and hold up the others."""
     for rest in (Suppression.for_cooldown(2.0), Suppression.for_cooldown(0.0)):
-        refused = candidate(last_refused_ns=5 * SECOND)
+        refused = car(last_refused_ns=5 * SECOND)
         assert reason(rest, refused, 5 * SECOND + SECOND - 1) == "refused"
         assert reason(rest, refused, 6 * SECOND) is None
 
@@ -135,7 +110,7 @@ def test_refused_stills_rest_in_every_variant():
 def test_cooldown_zero_is_the_paper_s_plain_variant(sent_s, touches, leaving, border_s):
     """The paper's M1 to M5 could not be run as they are defined."""
     plain = Suppression.for_cooldown(0.0)
-    one = candidate(
+    one = car(
         last_sent_ns=None if sent_s is None else sent_s * SECOND,
         last_sent_area_px=None if sent_s is None else 1e9,
         sent_count=0 if sent_s is None else 1,

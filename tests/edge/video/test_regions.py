@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.values import Tracks
 from hvt_edge.video.regions import MOST_REGIONS, Region, TrackRegions
+from rigs.examples import tracks_of
 
 SIZE = (640, 360)
 
 
 def tracks(*boxes, confidences=None) -> Tracks:
     """Tracks at these boxes."""
-    count = len(boxes)
-    return Tracks(
-        frame_index=0,
-        ids=np.arange(1, count + 1),
-        boxes_xyxy_px=np.array(boxes, np.float32).reshape(-1, 4),
-        confidences=np.array([0.5] * count if confidences is None else confidences, np.float32),
-        class_ids=np.zeros(count, np.int32),
-        born_frames=np.zeros(count, np.int64),
-        seen_frames=np.zeros(count, np.int64),
-        started=np.zeros(count, np.bool_),
-    )
+    return tracks_of(0, boxes, confidences=0.5 if confidences is None else confidences)
 
 
 def test_tracks_are_quantised_finer():

@@ -15,6 +15,7 @@ from hvt_edge.perception.crop import BaseLoss
 from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.video.reconfigure import EncoderReconfiguration, ReconfigurationSettings
 from hvt_edge.video.share import FIRST_SHARE, Split, SplitSettings
+from rigs.examples import candidate
 
 SECOND = 1_000_000_000
 
@@ -34,20 +35,9 @@ def moment(seconds: float, *, from_source: bool = False) -> Step:
 
 def car(track_id: int, *, lost: float, confidence: float = 0.6, side: float = 30, **changes) -> Candidate:
     """A track, and what the base lost of it."""
-    plain = Candidate(
-        frame_index=0,
-        track_id=track_id,
-        box_base_px=(100, 100, 100 + side, 100 + side),
-        box_source_px=(100, 100, 100 + side, 100 + side),
-        class_id=0,
-        class_name="car",
-        confidence=confidence,
-        area_share=side * side / (1280 * 720),
-        crop_area_px=1.69 * side * side,
-        born_frame=0,
-        loss=lambda: BaseLoss(28.0, lost),
-    )
-    return replace(plain, **changes)
+    box = (100.0, 100.0, 100 + side, 100 + side)
+    plain = {"frame_index": 0, "confidence": confidence, "crop_area_px": 1.69 * side * side}
+    return candidate(track_id, box, **(plain | {"loss": lambda: BaseLoss(28.0, lost)} | changes))
 
 
 def split(total_bps: int, **changes) -> Split:

@@ -20,13 +20,14 @@ from websockets.sync.client import ClientConnection, connect
 
 from hvt_common.errors import UserError
 from hvt_common.transport.zenoh_config import key_pair
-from hvt_ground.events import Notice, Refinement
+from hvt_ground.events import Notice
 from hvt_web import server, site
 from hvt_web.requests import BadRequestError, EdgeRequests
 from hvt_web.server import WebPage
 from hvt_web.viewers import Hub
 from programs.fleet_keys import Fleet
 from programs.processes import eventually, free_ports
+from rigs.examples import refinement
 from rigs.flight import Flight
 
 
@@ -107,20 +108,7 @@ def test_on_this_machine_the_page_opens_without_more(local):
 def test_a_still_is_where_others_are_told_that_it_is(port):
     """The link on a map would lead to another still, or to none."""
     flight = Flight(1)
-    still = Refinement(
-        **dict.fromkeys(("frame_index", "capture_ns", "shown_index"), 0),
-        **dict.fromkeys(("class_before", "class_after"), "car"),
-        still_sequence=12,
-        track_id=1,
-        edge_track_id=2,
-        box_base_px=(0, 0, 9, 9),
-        still=b"\xff\xd8 12",
-        media_type="image/jpeg",
-        base_crop_bgr=None,
-        confidence=0.9,
-        reason="gain",
-        quality_pct=50,
-    )
+    still = refinement(still_sequence=12, shown_index=0)
     with WebPage(f"127.0.0.1:{port}", clock=time.time_ns) as page:
         feed = page.feed(flight.info())()
         for number in (11, 12, 13):  # the twelfth is not the twelfth one that came

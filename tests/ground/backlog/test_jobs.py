@@ -14,12 +14,13 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_ground.backlog.jobs import Destination, StillJob, VideoJob
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice, Refinement, VideoSample
+from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job, RealtimeWorker
 from hvt_ground.sinks import QueuedSink
 from programs.processes import eventually
 from rigs.backlog_chunks import video_object
+from rigs.examples import refinement
 from rigs.flight import Flight, RedSquares, SameAnswer
 
 
@@ -140,21 +141,11 @@ class Outage:
     def _read(self, still: ReceivedStill) -> None:
         header = still.header
         self.sink.log(
-            Refinement(
+            refinement(
                 frame_index=header.frame_index,
                 capture_ns=header.capture_ns,
                 still_sequence=header.sequence,
-                track_id=None,
-                edge_track_id=1,
-                box_base_px=(0, 0, 9, 9),
                 still=still.data,
-                media_type="image/jpeg",
-                base_crop_bgr=None,
-                class_before="car",
-                class_after="car",
-                confidence=0.9,
-                reason="new",
-                quality_pct=75,
                 stored=True,
             )
         )

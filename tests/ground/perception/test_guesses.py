@@ -6,6 +6,7 @@ import numpy as np
 
 from hvt_common.values import Tracks
 from hvt_ground.perception.guesses import Guesses
+from rigs.examples import tracks_of
 
 Thing = tuple[str, float, tuple[float, float], float]
 """Class, confidence, middle, side."""
@@ -14,19 +15,8 @@ STEP = np.array([[1.0, 0.0, 3.0], [0.0, 1.0, -2.0]])
 
 def tracks(frame: int, things: list[Thing]) -> Tracks:
     """All of them seen at this frame."""
-    count = len(things)
-    frames = np.full(count, frame, np.int64)
     boxes = [(x - side / 2, y - side / 4, x + side / 2, y + side / 4) for _, _, (x, y), side in things]
-    return Tracks(
-        frame_index=frame,
-        ids=np.arange(1, count + 1),
-        boxes_xyxy_px=np.array(boxes, np.float32).reshape(-1, 4),
-        confidences=np.array([one[1] for one in things], np.float32),
-        class_ids=np.zeros(count, np.int32),
-        born_frames=np.zeros(count, np.int64),
-        seen_frames=frames,
-        started=np.zeros(count, np.bool_),
-    )
+    return tracks_of(frame, boxes, confidences=[one[1] for one in things])
 
 
 def guessed(things: list[Thing], *, frames: int = 50, moves_px: float = 0.0) -> list[bool]:

@@ -15,21 +15,6 @@ def picture(value, *, height=4, width=6):
     return np.full((height, width, 3), value, np.uint8)
 
 
-def tracks(frame_index):
-    """No tracks, at that frame."""
-    none = np.empty(0, np.int64)
-    return Tracks(
-        frame_index=frame_index,
-        ids=none,
-        boxes_xyxy_px=np.empty((0, 4), np.float32),
-        confidences=np.empty(0, np.float32),
-        class_ids=np.empty(0, np.int32),
-        born_frames=none,
-        seen_frames=none,
-        started=np.empty(0, np.bool_),
-    )
-
-
 def test_a_frame_is_found_by_its_index_just_as_it_was():
     """A still would be shown beside, or pasted into, the picture of another moment."""
     history = History(max_frames=3)
@@ -72,7 +57,7 @@ def test_tracks_are_found_by_frame_and_bounded():
     assert history.oldest_tracked is None
     assert history.newest_tracked is None
     for index in (0, 1, 3, 4, 8):
-        history.add_tracks(tracks(index))
+        history.add_tracks(Tracks.none(index))
     assert (history.oldest_tracked, history.newest_tracked) == (1, 8)
     assert history.tracks(3).frame_index == 3
     assert history.tracks(0) is None
@@ -132,16 +117,16 @@ def test_a_new_session_begins_with_clear():
     """Frames of two flights would be mixed under one index."""
     history = History()
     history.add_frame(7, picture(7))
-    history.add_tracks(tracks(7))
+    history.add_tracks(Tracks.none(7))
     with pytest.raises(ValueError, match="frame 7 after frame 7"):
         history.add_frame(7, picture(0))
     with pytest.raises(ValueError, match="frame 0 after frame 7"):
-        history.add_tracks(tracks(0))
+        history.add_tracks(Tracks.none(0))
     history.clear()
     assert history.size_bytes == 0
     assert history.frame(7) is None
     history.add_frame(0, picture(0))
-    history.add_tracks(tracks(0))
+    history.add_tracks(Tracks.none(0))
     assert history.newest_tracked == 0
 
 

@@ -10,25 +10,17 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_ground.events import Refinement
 from hvt_ground.sinks.still_files import StillFiles
+from rigs.examples import refinement
 
 PIXELS = np.arange(12 * 20 * 3, dtype=np.uint8).reshape(12, 20, 3)
-STILL = Refinement(
+STILL = refinement(
     frame_index=11,
-    capture_ns=0,
     still_sequence=4,
     track_id=7,
-    edge_track_id=3,
     box_base_px=(10, 10, 20, 16),
-    still=b"",
     media_type="application/x-residual",
-    base_crop_bgr=None,
-    class_before="car",
     class_after="van",
-    confidence=0.9,
-    reason="gain",
-    quality_pct=50,
     still_bgr=PIXELS,
     crop_base_px=(8.0, 9.0, 28.0, 21.0),
     shown_index=9,

@@ -9,7 +9,8 @@ import av
 import cv2
 import numpy as np
 
-from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Traffic, VideoSample
+from rigs.examples import overlay, refinement
 
 START_NS = 1_790_000_000_000_000_000
 STEP_NS = 66_666_667
@@ -68,7 +69,6 @@ def session(
 ) -> Iterator[tuple[Event, int]]:
     """(event, bytes it took on the link): stills fill what the base leaves of the budget, at most two a frame."""
     size = (frames[0].shape[1], frames[0].shape[0])
-    ids = np.arange(1, tracks + 1, dtype=np.int64)
     classes = [("car", "van", "truck")[i % 3] for i in range(tracks)]
     refined: dict[int, tuple[str, float]] = {}
     received = sequence = 0
@@ -78,17 +78,16 @@ def session(
         yield VideoSample(index, capture_ns, data, keyframe), len(data)
         boxes = moving_boxes(index, tracks, size)
         yield (
-            Overlay(
+            overlay(
                 index,
-                capture_ns,
-                ids,
                 boxes,
-                tuple(classes),
-                tuple(refined.get(i, (classes[i], 0.0))[0] for i in range(tracks)),
-                np.array(
+                capture_ns=capture_ns,
+                base_classes=tuple(classes),
+                classes=tuple(refined.get(i, (classes[i], 0.0))[0] for i in range(tracks)),
+                confidences=np.array(
                     [refined.get(i, ("", 0.5 + index // 5 % 4 * 0.1))[1] for i in range(tracks)], np.float32
                 ),
-                np.array([i in refined for i in range(tracks)]),
+                refined=np.array([i in refined for i in range(tracks)]),
             ),
             0,
         )
@@ -103,7 +102,7 @@ def session(
             received += len(still)
             crop = _inside(frame, boxes[chosen])
             yield (
-                Refinement(
+                refinement(
                     frame_index=index,
                     capture_ns=capture_ns,
                     still_sequence=sequence,
@@ -111,13 +110,10 @@ def session(
                     edge_track_id=chosen + 100,
                     box_base_px=tuple(float(v) for v in boxes[chosen]),
                     still=still,
-                    media_type="image/jpeg",
                     base_crop_bgr=cv2.GaussianBlur(crop, (0, 0), 1.5),
                     class_before=before,
                     class_after=after,
-                    confidence=0.9,
                     reason="small",
-                    quality_pct=65,
                 ),
                 len(still),
             )

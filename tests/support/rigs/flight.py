@@ -19,10 +19,8 @@ from hvt_common.protocol.messages import (
     BaseHeader,
     Feedback,
     Flags,
-    Health,
     Info,
     RoiHeader,
-    Status,
     TrackStepEncoder,
 )
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -39,6 +37,8 @@ from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 from hvt_ground.perception.turns import Turns
 from media.clips import START_NS, framed, smooth_pictures
+from rigs import messages
+from rigs.examples import tracks_of
 
 SIZE = (320, 192)
 CLASSES = ("car", "bus")
@@ -62,17 +62,7 @@ def grainy_pictures(count: int) -> list[np.ndarray]:
 
 def tracks_at(index: int, boxes: dict[int, tuple[float, float, float, float]], *, class_id=0) -> Tracks:
     """A tracker's list at a frame: all of one class, at 0.8."""
-    ids = np.array(sorted(boxes), np.int64)
-    return Tracks(
-        frame_index=index,
-        ids=ids,
-        boxes_xyxy_px=np.array([boxes[i] for i in ids.tolist()], np.float32).reshape(-1, 4),
-        confidences=np.full(len(ids), 0.8, np.float32),
-        class_ids=np.full(len(ids), class_id, np.int32),
-        born_frames=np.full(len(ids), index, np.int64),
-        seen_frames=np.full(len(ids), index, np.int64),
-        started=np.zeros(len(ids), np.bool_),
-    )
+    return tracks_of(index, boxes, confidences=0.8, classes=class_id, born=index)
 
 
 class RedSquares:
@@ -195,25 +185,20 @@ class Flight:
     def info(self) -> Info:
         """What the edge answers."""
         now = time.time_ns()
-        return Info(
+        return replace(
+            messages.INFO,
             session_id=self.session_id,
-            edge="uav-1",
             software="0",
             started_ns=START_NS,
             source_size=SIZE,
             base_size=SIZE,
             view_scale=1.0,
-            view_offset_px=(0.0, 0.0),
-            fps=15.0,
-            codec="hevc",
             pace=self.pace,
-            method="M5",
-            budget_bps=800_000,
-            base_bps=650_000,
-            window_ns=1_000_000_000,
             class_names=CLASSES,
             received_ns=now,
             answered_ns=now,
+            still_codecs=(),
+            channels=(),
         )
 
     def base(self, index: int) -> Received:
@@ -267,7 +252,8 @@ class Flight:
     ) -> Received:
         """The edge's report after so many messages."""
         self._statuses += 1
-        report = Status(
+        report = replace(
+            messages.STATUS,
             session_id=self.session_id,
             sequence=self._statuses,
             state=state,
@@ -275,35 +261,11 @@ class Flight:
             media_ns=0,
             last_base_sequence=base - 1,
             last_still_sequence=roi - 1,
-            base_bytes=0,
-            roi_bytes=0,
-            backlog_bytes=0,
-            meta_bytes=0,
-            overhead_bytes=0,
             base_messages=base,
             roi_messages=roi,
             backlog_messages=backlog,
             meta_messages=meta,
-            worst_window_bps=(0, 0, 0),
-            sent={},
-            deferred={},
-            dropped={},
-            health=Health(
-                frames_captured=base,
-                frames_encoded=base,
-                frames_dropped=0,
-                keyframes=1,
-                tracks=0,
-                base_queue=0,
-                still_queue=0,
-                encode_ms=0.0,
-                detect_ms=0.0,
-                feedback_age_ms=-1,
-                frames_dropped_cpu=0,
-                frames_unanalyzed=0,
-                cores_needed=0.0,
-                cores_free=0.0,
-            ),
+            health=replace(messages.HEALTH, frames_captured=base, frames_encoded=base, frames_dropped=0),
             failed=(),
             levers="",
         )

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-from hvt_common.protocol.messages import BacklogStill, RoiHeader, pack_backlog_still
+from hvt_common.protocol.messages import BacklogStill, pack_backlog_still
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.disk import Store
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
 from rigs.flight import Flight
+from rigs.messages import ROI
 
 SIZE = (320, 192)
 S = 1_000_000_000
@@ -52,21 +54,16 @@ def opened(
 
 def packed_still(number: int, *, data: bytes = b"\xff" * 1500, session_id: int = 7) -> bytes:
     """A still as it is kept."""
-    header = RoiHeader(
+    header = replace(
+        ROI,
         session_id=session_id,
         sequence=number,
         frame_index=3,
         capture_ns=START_NS,
-        send_delay_ns=30_000_000,
         flags=8,
         track_id=1,
         box_source_px=(10.0, 10.0, 42.0, 42.0),
         crop_source_px=(6, 6, 46, 46),
-        class_name="car",
-        confidence=0.5,
-        reason="utility",
-        codec="jpeg",
-        quality_pct=65,
         parameters={},
         also=(),
     )

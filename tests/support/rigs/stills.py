@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from hvt_common.values import Posterior
-from hvt_ground.events import Refinement
 from hvt_ground.perception.stills.decode import Box
 from hvt_ground.perception.stills.match import StillSeen
+from rigs.examples import refinement
 
 
 def seen(
@@ -19,7 +19,7 @@ def seen(
     side_px: float = 20.0,
 ) -> StillSeen:
     """A still of an edge track that was read."""
-    event = Refinement(
+    event = refinement(
         frame_index=frame_index,
         capture_ns=frame_index * 66_666_667,
         still_sequence=sequence,
@@ -27,13 +27,10 @@ def seen(
         edge_track_id=edge,
         box_base_px=box,
         still=f"still {sequence}".encode(),
-        media_type="image/jpeg",
-        base_crop_bgr=None,
         class_before=class_name,
         class_after=posterior.class_name,
         confidence=posterior.confidence,
         reason="uncertainty",
-        quality_pct=50,
         shown_index=frame_index,
     )
     return StillSeen(event, posterior, side_px)

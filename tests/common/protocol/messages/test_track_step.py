@@ -15,25 +15,15 @@ from hvt_common.protocol.messages import TrackStep, TrackStepDecoder, TrackStepE
 from hvt_common.protocol.messages.range_coder import Context, Decoder, Encoder, NumberContexts
 from hvt_common.protocol.messages.track_boxes import MOST_BOXES
 from hvt_common.values import Tracks, iou
+from rigs.examples import tracks_of
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_790_000_000 * SECOND_NS
 
 
-def tracks_of(frame: int, boxes, *, ids=None, classes=None, confidences=None) -> Tracks:
+def car_tracks(frame: int, boxes, *, classes=3, confidences=0.7, **more) -> Tracks:
     """A tracker's list."""
-    boxes = np.asarray(boxes, np.float32).reshape(-1, 4)
-    count = len(boxes)
-    return Tracks(
-        frame_index=frame,
-        ids=np.asarray(range(1, count + 1) if ids is None else ids, np.int64),
-        boxes_xyxy_px=boxes,
-        confidences=np.asarray([0.7] * count if confidences is None else confidences, np.float32),
-        class_ids=np.asarray([3] * count if classes is None else classes, np.int32),
-        born_frames=np.zeros(count, np.int64),
-        seen_frames=np.full(count, frame, np.int64),
-        started=np.zeros(count, bool),
-    )
+    return tracks_of(frame, boxes, classes=classes, confidences=confidences, **more)
 
 
 def flight(steps: int, *, count: int = 50, side_px: float = 40, seed: int = 0) -> list[Tracks]:
@@ -49,7 +39,7 @@ def flight(steps: int, *, count: int = 50, side_px: float = 40, seed: int = 0) -
         here = rng.random(count) > 0.05
         boxes = np.concatenate((centre - sides / 2, centre + sides / 2), axis=1)[here]
         found.append(
-            tracks_of(
+            car_tracks(
                 5 * step,
                 boxes,
                 ids=1 + 3 * np.flatnonzero(here),
@@ -131,11 +121,11 @@ def test_births_deaths_returns_and_changes_arrive():
     box = [100, 100, 140, 130]
     far = [600.0, 300, 650, 340]
     sent = [
-        tracks_of(0, [box, far], ids=[4, 9]),
-        tracks_of(2, [box], ids=[4]),
-        tracks_of(4, [box, far], ids=[4, 9], classes=[5, 3], confidences=[0.2, 0.7]),
-        tracks_of(6, [], ids=[]),
-        tracks_of(8, [far, box], ids=[9, 2**32 - 1]),
+        car_tracks(0, [box, far], ids=[4, 9]),
+        car_tracks(2, [box], ids=[4]),
+        car_tracks(4, [box, far], ids=[4, 9], classes=[5, 3], confidences=[0.2, 0.7]),
+        car_tracks(6, [], ids=[]),
+        car_tracks(8, [far, box], ids=[9, 2**32 - 1]),
     ]
     decoder = TrackStepDecoder()
     got = [decoder.decode(step) for step in encoded(sent)]
@@ -149,7 +139,7 @@ def test_births_deaths_returns_and_changes_arrive():
 
 def test_between_steps_the_tracks_move_on():
     """At three steps a second, boxes would jump."""
-    sent = [tracks_of(5 * step, [[10 + 20 * step, 50, 50 + 20 * step, 80]]) for step in range(6)]
+    sent = [car_tracks(5 * step, [[10 + 20 * step, 50, 50 + 20 * step, 80]]) for step in range(6)]
     decoder = TrackStepDecoder()
     assert decoder.predicted(frame_index=3) is None
     for step in encoded(sent):
@@ -167,7 +157,7 @@ def test_a_crowd_is_cut_to_the_most_confident():
     corner = rng.uniform(-1e5, 1e5, (3000, 2))
     boxes = np.concatenate((corner, corner + rng.uniform(0, 3e4, (3000, 2))), axis=1)
     sure = rng.random(3000).astype(np.float32)
-    sent = tracks_of(0, boxes, confidences=sure, classes=rng.integers(0, 2048, 3000))
+    sent = car_tracks(0, boxes, confidences=sure, classes=rng.integers(0, 2048, 3000))
     step = encoded([sent])[0]
     got = TrackStepDecoder().decode(TrackStep.parse(step.pack()))
     assert MOST_BOXES / 2 <= len(got) <= MOST_BOXES
@@ -178,9 +168,9 @@ def test_a_crowd_is_cut_to_the_most_confident():
 def test_frames_must_rise_at_the_edge():
     """A wrong order is a bug there, and would be one of many unread steps at the ground."""
     encoder = TrackStepEncoder(session_id=1)
-    encoder.encode(tracks_of(5, []), capture_ns=5)
+    encoder.encode(car_tracks(5, []), capture_ns=5)
     with pytest.raises(ValueError, match="frame_index is 5, must be above 5"):
-        encoder.encode(tracks_of(5, []), capture_ns=6)
+        encoder.encode(car_tracks(5, []), capture_ns=6)
 
 
 @given(data=st.binary(max_size=400), alone=st.booleans())

@@ -14,6 +14,7 @@ from hvt_edge.perception.crop import BaseLoss
 from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.stills.policy.m6 import ExpectedGain
 from hvt_edge.stills.policy.registry import METHODS, method
+from rigs.examples import candidate
 
 NOW = 20_000_000_000
 M6 = ExpectedGain()
@@ -35,21 +36,9 @@ def step(**changes) -> Step:
 
 def car(track_id: int = 1, *, lost: float = 0.5, sharp: float = 500.0, **changes) -> Candidate:
     """Half a blur."""
-    plain = Candidate(
-        frame_index=300,
-        track_id=track_id,
-        box_base_px=(100, 100, 132, 132),
-        box_source_px=(200, 200, 264, 264),
-        class_id=3,
-        class_name="car",
-        confidence=0.6,
-        area_share=0.001,
-        crop_area_px=7000,
-        born_frame=200,
-        loss=lambda: BaseLoss(28.0, lost),
-        sharpness=lambda: sharp,
-    )
-    return replace(plain, **changes)
+    box = (100.0, 100.0, 132.0, 132.0)
+    plain = {"box_source_px": (200, 200, 264, 264), "area_share": 0.001, "loss": lambda: BaseLoss(28.0, lost)}
+    return candidate(track_id, box, **(plain | {"sharpness": lambda: sharp} | changes))
 
 
 def sent(one: Candidate, *, seconds: float, **changes) -> Candidate:

@@ -15,6 +15,7 @@ from hvt_edge.perception.candidates import Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import CostEstimate, CostModel, Step
 from hvt_edge.stills.policy.paper import Small, Utility
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
+from rigs.examples import candidate
 
 SECOND = 1_000_000_000
 FPS = 15.0
@@ -34,22 +35,10 @@ def step(frame: int = 300, **changes) -> Step:
     return replace(plain, **changes)
 
 
-def candidate(track_id: int = 1, **changes) -> Candidate:
-    """An ordinary car."""
-    plain = Candidate(
-        frame_index=300,
-        track_id=track_id,
-        box_base_px=(100, 100, 150, 140),
-        box_source_px=(150, 150, 225, 210),
-        class_id=3,
-        class_name="car",
-        confidence=0.8,
-        area_share=50 * 40 / (1280 * 720),
-        crop_area_px=7000,
-        born_frame=200,
-        frames_since_start=100,
-    )
-    return replace(plain, **changes)
+def car(track_id: int = 1, **changes) -> Candidate:
+    """An ordinary one."""
+    plain = {"box_source_px": (150, 150, 225, 210), "confidence": 0.8, "frames_since_start": 100}
+    return candidate(track_id, **(plain | changes))
 
 
 @st.composite
@@ -62,7 +51,7 @@ def candidates(draw):
         sent = draw(st.one_of(st.none(), st.integers(200, 300)))
         waiting = draw(st.integers(0, 100))
         result.append(
-            candidate(
+            car(
                 track_id,
                 box_base_px=(x, y, x + w, y + h),
                 area_share=w * h / (1280 * 720),
@@ -108,7 +97,7 @@ def test_every_method_is_a_pure_function_of_its_input(name, given_candidates, ro
 def test_m0_sends_nothing():
     """The baseline would not be a baseline."""
     assert method("M0").video_only
-    assert method("M0").requests([candidate(confidence=0.01)], step()) == []
+    assert method("M0").requests([car(confidence=0.01)], step()) == []
     assert [name for name in METHODS if method(name).video_only] == ["M0", "R0"]
 
 
@@ -116,14 +105,14 @@ def test_m1_is_due_every_15_frames_most_overdue_first():
     """Tracks would be forgotten, or sent more often than the paper's interval."""
     policy = method("M1")
     for sent, due in ((286, False), (285, True), (200, True), (300, False)):
-        assert bool(policy.requests([candidate(last_sent_frame=sent)], step())) == due
+        assert bool(policy.requests([car(last_sent_frame=sent)], step())) == due
     order = [
-        candidate(1, last_sent_frame=280),
-        candidate(2, last_sent_frame=100),
-        candidate(3, last_sent_frame=285),
+        car(1, last_sent_frame=280),
+        car(2, last_sent_frame=100),
+        car(3, last_sent_frame=285),
     ]
     assert [one.candidate.track_id for one in policy.requests(order, step())] == [2, 1, 3]
-    assert policy.requests([candidate(born_frame=300, frames_since_start=0)], step())[0].score == 0
+    assert policy.requests([car(born_frame=300, frames_since_start=0)], step())[0].score == 0
 
 
 def test_m1_serves_each_track_once_a_second():
@@ -131,7 +120,7 @@ def test_m1_serves_each_track_once_a_second():
     policy, last = method("M1"), {}
     sends = dict.fromkeys((1, 2, 3), 0)
     for frame in range(0, 151, 5):
-        now = [candidate(i, frame_index=frame, born_frame=0, last_sent_frame=last.get(i)) for i in sends]
+        now = [car(i, frame_index=frame, born_frame=0, last_sent_frame=last.get(i)) for i in sends]
         for request in policy.requests(now, step(frame)):
             last[request.candidate.track_id] = frame
             sends[request.candidate.track_id] += 1
@@ -141,7 +130,7 @@ def test_m1_serves_each_track_once_a_second():
 def test_m2_wants_one_still_a_start():
     """A new object would not be looked at, or one object for ever."""
     policy = method("M2")
-    new = candidate(started=True, frames_since_start=0, born_frame=300)
+    new = car(started=True, frames_since_start=0, born_frame=300)
     assert [one.reason for one in policy.requests([new], step())] == ["new"]
     answered = replace(new, last_sent_frame=300)
     assert policy.requests([answered], step()) == []
@@ -153,7 +142,7 @@ def test_m2_wants_one_still_a_start():
 def test_m2_waits_a_second_and_no_longer():
     """A start without room in the budget would be lost, or haunt the queue for ever."""
     policy = method("M2")
-    waiting = [candidate(frames_since_start=frames) for frames in (0, 15, 16)]
+    waiting = [car(frames_since_start=frames) for frames in (0, 15, 16)]
     assert [bool(policy.requests([one], step())) for one in waiting] == [True, True, False]
     assert method("M2", patience_s=0).requests([waiting[1]], step()) == []
 
@@ -161,25 +150,25 @@ def test_m2_waits_a_second_and_no_longer():
 def test_m3_follows_the_classifier_once_it_has_spoken():
     """Stills would go on for objects that are settled, or not go where the classifier is lost."""
     policy = method("M3")
-    assert len(policy.requests([candidate(confidence=0.49)], step())) == 1
-    assert policy.requests([candidate(confidence=0.5)], step()) == []
+    assert len(policy.requests([car(confidence=0.49)], step())) == 1
+    assert policy.requests([car(confidence=0.5)], step()) == []
     sure, unsure = ClassPosterior("minivan", 0.9, 0.4), ClassPosterior("minivan", 0.2, 3.0)
-    assert policy.requests([candidate(confidence=0.1, posterior=sure)], step()) == []
-    assert len(policy.requests([candidate(confidence=0.95, posterior=unsure)], step())) == 1
-    order = [candidate(1, confidence=0.4), candidate(2, confidence=0.2), candidate(3, posterior=unsure)]
+    assert policy.requests([car(confidence=0.1, posterior=sure)], step()) == []
+    assert len(policy.requests([car(confidence=0.95, posterior=unsure)], step())) == 1
+    order = [car(1, confidence=0.4), car(2, confidence=0.2), car(3, posterior=unsure)]
     assert [one.candidate.track_id for one in policy.requests(order, step())] == [2, 3, 1]
 
 
 def test_m4_wants_the_small_smallest_first():
     """Stills would go to objects that the base already shows large."""
     policy = method("M4")
-    some = [candidate(i, area_share=share) for i, share in ((1, 0.015), (2, 0.0149), (3, 0.001))]
+    some = [car(i, area_share=share) for i, share in ((1, 0.015), (2, 0.0149), (3, 0.001))]
     assert [one.candidate.track_id for one in policy.requests(some, step())] == [3, 2]
 
 
 def test_m5_known_answer():
     """The score would not be the paper's."""
-    one = candidate(
+    one = car(
         confidence=0.6,
         area_share=0.006,
         crop_area_px=8000,
@@ -223,7 +212,7 @@ def test_m5_score_is_monotone_in_every_term(some, index, draw):
 def test_m5_asks_for_what_fits_and_always_for_the_best():
     """The queue would fill with stills that never find room, or small ones would starve a needed large one."""
     cost = CostEstimate(fixed_bytes=1000, bytes_per_px=0, mean_bytes=1000)
-    some = [candidate(i, confidence=0.1 * i) for i in range(1, 9)]
+    some = [car(i, confidence=0.1 * i) for i in range(1, 9)]
     for room, count in ((0, 1), (999, 1), (1000, 1), (3500, 3), (8000, 8), (1e9, 8)):
         wanted = method("M5").requests(some, step(cost=cost, allowance_bytes=room))
         assert [one.candidate.track_id for one in wanted] == list(range(1, count + 1))
@@ -232,7 +221,7 @@ def test_m5_asks_for_what_fits_and_always_for_the_best():
 def test_m5_leaves_the_settled_alone():
     """Bytes would be spent on an object that is large, certain and just refined."""
     now = round(300 / FPS * SECOND)
-    settled = candidate(
+    settled = car(
         area_share=0.02, crop_area_px=31_000, last_sent_ns=now, posterior=ClassPosterior("bus", 0.99, 0.02)
     )
     assert method("M5").requests([settled], step()) == []
@@ -243,13 +232,13 @@ def test_cost_model_learns_the_line():
     """M5 would weigh stills by a price that is not theirs."""
     model, rng = CostModel(), np.random.default_rng(1)
     before = model.estimate()
-    assert before.of(candidate(crop_area_px=10_000)) == pytest.approx(640 + 1200)
+    assert before.of(car(crop_area_px=10_000)) == pytest.approx(640 + 1200)
     for _ in range(150):
         area = float(rng.uniform(1_000, 40_000))
         model.observe(area_px=area, size_bytes=round((300 + 0.3 * area) * rng.uniform(0.95, 1.05)))
     line = model.estimate()
     for area in (2_000, 10_000, 40_000):
-        assert line.of(candidate(crop_area_px=area)) == pytest.approx(300 + 0.3 * area, rel=0.12)
+        assert line.of(car(crop_area_px=area)) == pytest.approx(300 + 0.3 * area, rel=0.12)
     assert line.mean_bytes == pytest.approx(300 + 0.3 * 20_500, rel=0.3)
 
 
@@ -260,7 +249,7 @@ def test_cost_is_always_positive_and_never_falls_with_area(observed):
     for area, size in observed:
         model.observe(area_px=area, size_bytes=size)
     line = model.estimate()
-    small, large = (line.of(candidate(crop_area_px=area)) for area in (64, 262_144))
+    small, large = (line.of(car(crop_area_px=area)) for area in (64, 262_144))
     assert 1 <= small <= large
     assert np.isfinite(large)
     assert line.mean_bytes > 0
@@ -281,7 +270,7 @@ def test_same_areas_do_not_upset_the_cost():
     model = CostModel()
     for _ in range(200):
         model.observe(area_px=5_000.0, size_bytes=2_000)
-    assert model.estimate().of(candidate(crop_area_px=5_000)) == pytest.approx(2_000, rel=0.05)
+    assert model.estimate().of(car(crop_area_px=5_000)) == pytest.approx(2_000, rel=0.05)
 
 
 def test_registry_names_all_and_says_what_is_accepted():
@@ -289,7 +278,7 @@ def test_registry_names_all_and_says_what_is_accepted():
     assert [*METHODS][:7] == ["M0", "M1", "M2", "M3", "M4", "M5", "M6"]
     assert {*METHODS} >= {"permissive", "conf_size_top1", "strict_small_only", "balanced_top2"}
     assert method("m5").name == "M5"
-    assert method("M1", every_frames=30).requests([candidate(last_sent_frame=280)], step()) == []
+    assert method("M1", every_frames=30).requests([car(last_sent_frame=280)], step()) == []
     with pytest.raises(UserError, match="method 'M9' is not known: choose one of M0, M1,"):
         method("M9")
     with pytest.raises(UserError, match="method M4 has no parameter 'every_frames': it has area_share"):
@@ -307,7 +296,7 @@ def test_tuning_reads_what_a_user_writes():
     """A weight would be ignored, or a slip end in a traceback."""
     assert tuning(["min_gain=0.05, lookahead=2", "min_gain=0.1"]) == {"min_gain": 0.1, "lookahead": 2.0}
     assert tuning([]) == {}
-    assert method("M6", **tuning(["min_gain=0.5"])).requests([candidate()], step()) == []
+    assert method("M6", **tuning(["min_gain=0.5"])).requests([car()], step()) == []
     for bad in ("min_gain", "min_gain=", "=3", "min gain=3", "min_gain=much", ""):
         with pytest.raises(UserError, match=r"--tune .* is not accepted: write KEY=VALUE"):
             tuning([bad])

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.policy.selectors import SELECTORS, select
+from rigs.examples import candidate
 
 BY_NAME = {row.name: row for row in SELECTORS}
 AREA = 1280 * 720
@@ -146,18 +146,10 @@ def test_as_a_method_only_this_frame_s_detections_count():
     )
 
     def one(track_id, confidence, *, detected=True, side=40.0):
-        return Candidate(
-            frame_index=5,
-            track_id=track_id,
-            box_base_px=(0, 0, side, side),
-            box_source_px=(0, 0, side, side),
-            class_id=0,
-            class_name="car",
-            confidence=confidence,
-            area_share=side * side / AREA,
-            crop_area_px=1,
-            born_frame=0,
-            detected=detected,
+        box = (0.0, 0.0, side, side)
+        share = side * side / AREA
+        return candidate(
+            track_id, box, frame_index=5, confidence=confidence, area_share=share, detected=detected
         )
 
     some = [

@@ -19,17 +19,15 @@ from hvt_archive.exports.maps import write_geojson, write_kml
 from hvt_archive.exports.tables import write_csv, write_mot, write_parquet
 from hvt_gateways.mcap.file import McapFile
 from hvt_gateways.transport_stream.vmti import vmti_local_set
-from hvt_ground.events import Overlay, Places
+from hvt_ground.events import Places
+from rigs.examples import overlay
 
-OVERLAY = Overlay(
+OVERLAY = overlay(
     41,
-    1_700_000_000_000_000_000,
-    np.array([7]),
-    np.array([[10, 20.5, 30, 60.5]], np.float32),
-    ("car",),
-    ("car",),
-    np.array([0.8764], np.float32),
-    np.array([False]),
+    [[10, 20.5, 30, 60.5]],
+    capture_ns=1_700_000_000_000_000_000,
+    track_ids=np.array([7]),
+    confidences=np.array([0.8764], np.float32),
     places=Places(np.array([[52.0, 13.0]]), np.array([[3.0, 2.0, 0.0]])),
 )
 RECORDED = SimpleNamespace(

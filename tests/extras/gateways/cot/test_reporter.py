@@ -17,6 +17,7 @@ from hvt_gateways.cot.event import CotMessage
 from hvt_gateways.cot.reporter import SessionReporter, sensor_of
 from hvt_gateways.cot.type_table import default_types
 from hvt_ground.events import MessageTiming, Overlay, Places, PoseUpdate, Refinement
+from rigs import examples
 from rigs.messages import INFO
 
 VIEW = View.fitted((1920, 1080), (1280, 720), fit="letterbox")
@@ -74,40 +75,17 @@ def overlay(capture_ns: int = 50 * SECOND_NS, *, ids=(1, 2), places=True, **chan
     at = [moved(52.0, 13.0, north_m=100.0 * one, east_m=0.0) for one in ids]
     ellipses = np.tile([4.0, 2.0, 30.0], (count, 1))
     values = {
-        "frame_index": 7,
-        "capture_ns": capture_ns,
         "track_ids": np.array(ids, np.int64),
-        "boxes_base_px": np.zeros((count, 4), np.float32),
-        "base_classes": ("car",) * count,
-        "classes": ("car",) * count,
         "confidences": np.full(count, 0.87, np.float32),
-        "refined": np.zeros(count, np.bool_),
         "places": Places(np.array(at, np.float64), ellipses.astype(np.float64)) if places else None,
     }
-    return Overlay(**{**values, **changes})
+    return examples.overlay(7, np.zeros((count, 4)), capture_ns=capture_ns, **(values | changes))
 
 
 def still(track_id: int | None, sequence: int = 3, **changes) -> Refinement:
     """A still of a track."""
-    return Refinement(
-        **{
-            "frame_index": 7,
-            "capture_ns": 0,
-            "still_sequence": sequence,
-            "track_id": track_id,
-            "edge_track_id": 5,
-            "box_base_px": (0, 0, 9, 9),
-            "still": b"",
-            "media_type": "image/jpeg",
-            "base_crop_bgr": None,
-            "class_before": "car",
-            "class_after": "truck",
-            "confidence": 0.9,
-            "reason": "gain",
-            "quality_pct": 50,
-            **changes,
-        }
-    )
+    values = {"frame_index": 7, "still_sequence": sequence, "track_id": track_id, "class_after": "truck"}
+    return examples.refinement(**(values | changes))
 
 
 def test_a_track_is_an_atom_with_a_uid_of_its_own():

@@ -28,6 +28,7 @@ from hvt_ground.sinks import QueuedSink
 from media.klv_reader import ReadStream, read_stream
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes
 from programs.processes import eventually, free_ports
+from rigs.examples import overlay
 
 FRAMES, SIZE, KEYINT, TRACKS = 60, (320, 192), 20, 4
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
@@ -58,15 +59,12 @@ def events() -> list[Event]:
             found.append(PoseUpdate(frame, at_ns, pose_at(frame), VIEW))
         found.append(VideoSample(frame, at_ns, data, keyframe))
         waiting.append(
-            Overlay(
-                frame_index=frame,
+            overlay(
+                frame,
+                moving_boxes(frame, TRACKS, SIZE),
                 capture_ns=at_ns,
                 track_ids=np.arange(1, TRACKS + 1) + frame,
-                boxes_base_px=moving_boxes(frame, TRACKS, SIZE),
-                base_classes=("car",) * TRACKS,
                 classes=("car", "van") * (TRACKS // 2),
-                confidences=np.full(TRACKS, 0.8, np.float32),
-                refined=np.zeros(TRACKS, np.bool_),
             )
         )
         if len(waiting) > 2:

@@ -18,6 +18,7 @@ from hvt_gateways.transport_stream.vmti import MOST_BYTES
 from hvt_geo.locator import SurfaceLocator
 from hvt_ground.events import Overlay, Places
 from media.klv_reader import KlvPacket, packets_of
+from rigs import examples
 
 NOW_NS = 1_790_000_000 * SECOND_NS + 123_456_789
 SIZE = (1280, 720)
@@ -48,17 +49,12 @@ def overlay(count: int, **changes) -> Overlay:
     x = np.linspace(10, 1200, count, dtype=np.float32)
     boxes = np.stack((x, np.full(count, 100.5), x + 40, np.full(count, 131.0)), axis=1).astype(np.float32)
     values = {
-        "frame_index": 70_000,
-        "capture_ns": NOW_NS,
         "track_ids": np.arange(200, 200 + count),
-        "boxes_base_px": boxes,
-        "base_classes": ("car",) * count,
         "classes": tuple("Überbus" if row % 2 else "car" for row in range(count)),
         "confidences": np.linspace(0.99, 0.3, count, dtype=np.float32),
-        "refined": np.zeros(count, np.bool_),
         "places": Places(np.tile((-33.499, 151.2512), (count, 1)), np.ones((count, 3))),
     }
-    return Overlay(**(values | changes))
+    return examples.overlay(70_000, boxes, capture_ns=NOW_NS, **(values | changes))
 
 
 def test_every_item_of_a_pose_comes_back_within_its_step():

@@ -269,24 +269,7 @@ def test_a_scale_that_no_picture_has_costs_nothing(scale, good):
 
 def test_a_still_of_more_bytes_than_any_has_is_not_taken():
     """A few hundred of them in a queue would be a gigabyte."""
-    header = RoiHeader(
-        session_id=1,
-        sequence=0,
-        frame_index=0,
-        capture_ns=0,
-        send_delay_ns=0,
-        flags=0,
-        track_id=-1,
-        box_source_px=(0, 0, 8, 8),
-        crop_source_px=(0, 0, 8, 8),
-        class_name="",
-        confidence=0,
-        reason="",
-        codec="jpeg",
-        quality_pct=65,
-        parameters={},
-        also=(),
-    )
+    header = replace(ROI, also=())
     largest = bytes(RoiHeader.MAX_PAYLOAD)
     assert RoiHeader.parse(header.pack(largest), largest) == header
     with pytest.raises(WireError, match="longer than"):

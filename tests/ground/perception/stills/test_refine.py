@@ -10,11 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_common.values import Posterior, Tracks, iou
+from hvt_common.values import Posterior, iou
 from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.match import Matcher
 from hvt_ground.perception.stills.refine import MAX_HELD, Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary
+from rigs.examples import tracks_of
 from rigs.footprint import footprint_bytes
 from rigs.stills import seen
 
@@ -29,18 +30,10 @@ A_NEAR = (106.0, 100.0, 146.0, 120.0)  # IoU with A 0.74, with B 0.25
 
 def tracks(frame_index, boxes, *, born=None, classes=None, confidences=None):
     """Tracks at a frame from ``{id: box}``; all cars at 0.5 that were born at frame 0 unless said."""
-    ids = sorted(boxes)
-    born, classes, confidences = born or {}, classes or {}, confidences or {}
-    return Tracks(
-        frame_index=frame_index,
-        ids=np.array(ids, np.int64),
-        boxes_xyxy_px=np.array([boxes[i] for i in ids], np.float32).reshape(-1, 4),
-        confidences=np.array([confidences.get(i, 0.5) for i in ids], np.float32),
-        class_ids=np.array([classes.get(i, 0) for i in ids], np.int32),
-        born_frames=np.array([born.get(i, 0) for i in ids], np.int64),
-        seen_frames=np.full(len(ids), frame_index, np.int64),
-        started=np.zeros(len(ids), np.bool_),
-    )
+    listed = {"born": born or {}, "classes": classes or {}, "confidences": confidences or {}}
+    plain = {"born": 0, "classes": 0, "confidences": 0.5}
+    values = {name: [of.get(one, plain[name]) for one in sorted(boxes)] for name, of in listed.items()}
+    return tracks_of(frame_index, boxes, **values)
 
 
 def says(*probabilities):

@@ -13,11 +13,12 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, group_of
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
-from hvt_common.values import Posterior, Tracks
+from hvt_common.values import Posterior
 from hvt_edge.perception.crop import PADDING
 from hvt_ground.perception.fusion.fuse import unified_names
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import LEAST_SIDE_PX, Vocabulary, check_common
+from rigs.examples import tracks_of
 from rigs.stills import seen
 
 AERIAL = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
@@ -124,16 +125,7 @@ def flown(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, m
     """What is shown of a track after these stills."""
     from hvt_ground.perception.history import History
 
-    tracks = Tracks(
-        frame_index=0,
-        ids=np.array([1]),
-        boxes_xyxy_px=np.array([[10, 10, 50, 40]], np.float32),
-        confidences=np.array([confidence], np.float32),
-        class_ids=np.array([base], np.int32),
-        born_frames=np.zeros(1, np.int64),
-        seen_frames=np.zeros(1, np.int64),
-        started=np.zeros(1, np.bool_),
-    )
+    tracks = tracks_of(0, [(10, 10, 50, 40)], confidences=confidence, classes=base)
     history = History(track_frames=10)
     history.add_tracks(tracks)
     refiner = Refiner(mode, fps=15, vocabulary=words, calibrated=calibrated)

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_ground.events import Overlay, Refinement
+from hvt_ground.events import Overlay
 from hvt_ground.sinks.rerun.labels import Word, place_labels, place_legend
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from programs.rrd import Recording
+from rigs.examples import refinement
 
 SIZE = (1280, 720)
 
@@ -137,21 +138,8 @@ def ink(read: Recording, entity: str, frame: int) -> list[int]:
     ]
 
 
-REFINED = Refinement(
-    frame_index=0,
-    capture_ns=1_790_000_000_000_000_000,
-    still_sequence=0,
-    track_id=4,
-    edge_track_id=9,
-    box_base_px=(700, 300, 760, 340),
-    still=b"",
-    media_type="image/jpeg",
-    base_crop_bgr=None,
-    class_before="car",
-    class_after="car",
-    confidence=0.95,
-    reason="utility",
-    quality_pct=65,
+REFINED = refinement(
+    capture_ns=1_790_000_000_000_000_000, track_id=4, box_base_px=(700, 300, 760, 340), confidence=0.95
 )
 """A still of a car that is one."""
 
@@ -174,7 +162,7 @@ def test_an_object_that_somebody_chose_is_named(tmp_path):
         ({"class_after": "other", "doubted": True}, "track 4: doubted, car? other .95"),
         (
             {"track_id": None, "unread": True, "note": "waffle iron .31"},
-            "edge track 9: car (waffle iron .31)",
+            "edge track 5: car (waffle iron .31)",
         ),
     ],
 )

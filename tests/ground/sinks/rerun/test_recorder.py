@@ -26,6 +26,7 @@ from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.still_places import CANVAS, SLOTS, Gallery, frame_of, placed
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes, session
 from programs.rrd import Recording
+from rigs import examples
 
 SIZE = (320, 192)
 FRAMES = 45
@@ -452,17 +453,9 @@ def _another(port: int) -> int:
 
 def overlay(frame: int, boxes: np.ndarray, *, refined: bool = False, confidence: float = 0.8) -> Overlay:
     """Cars 1, 2, 3 … at the boxes."""
-    count = len(boxes)
-    return Overlay(
-        frame,
-        START_NS + frame * STEP_NS,
-        np.arange(1, count + 1),
-        boxes.astype(np.float32),
-        ("car",) * count,
-        ("car",) * count,
-        np.full(count, confidence, np.float32),
-        np.full(count, refined),
-    )
+    count, capture_ns = len(boxes), START_NS + frame * STEP_NS
+    values = {"refined": np.full(count, refined), "confidences": np.full(count, confidence, np.float32)}
+    return examples.overlay(frame, boxes, capture_ns=capture_ns, **values)
 
 
 def test_an_overlay_that_shows_the_same_writes_nothing() -> None:

@@ -17,6 +17,7 @@ from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.still_places import FRESH_NS, PATCHES, Moved, Patches, Placement
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames
 from programs.rrd import Recording
+from rigs.examples import overlay, refinement
 
 
 def settings(path: Path) -> RecorderSettings:
@@ -28,16 +29,7 @@ def settings(path: Path) -> RecorderSettings:
 
 def _overlay(frame: int, boxes: Sequence[np.ndarray], ids: Sequence[int]) -> Overlay:
     """Cars."""
-    return Overlay(
-        frame,
-        START_NS + frame * STEP_NS,
-        np.array(ids, np.int64),
-        np.array(boxes, np.float32).reshape(-1, 4),
-        ("car",) * len(ids),
-        ("car",) * len(ids),
-        np.full(len(ids), 0.8, np.float32),
-        np.zeros(len(ids), np.bool_),
-    )
+    return overlay(frame, boxes, capture_ns=START_NS + frame * STEP_NS, track_ids=np.array(ids, np.int64))
 
 
 def _one_still(
@@ -50,20 +42,13 @@ def _one_still(
         "frame_index": frame,
         "capture_ns": START_NS + frame * STEP_NS,
         "still_sequence": sequence,
-        "track_id": 1,
-        "edge_track_id": 9,
         "box_base_px": box,
         "still": cv2.imencode(".jpg", picture)[1].tobytes(),
-        "media_type": "image/jpeg",
         "base_crop_bgr": picture[::2, ::2],
-        "class_before": "car",
         "class_after": "van",
-        "confidence": 0.9,
-        "reason": "small",
-        "quality_pct": 65,
         "crop_base_px": (box[0] - 10, box[1] - 10, box[2] + 10, box[3] + 10),
     }
-    return Refinement(**(values | changes))
+    return refinement(**(values | changes))
 
 
 def test_a_still_lies_on_the_enhanced_picture_and_goes_with_its_object(tmp_path: Path) -> None:
