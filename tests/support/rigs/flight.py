@@ -43,6 +43,14 @@ from rigs.examples import tracks_of
 SIZE = (320, 192)
 CLASSES = ("car", "bus")
 _ids = itertools.count(1000)
+_IDLE = replace(
+    messages.HEALTH,
+    **dict.fromkeys(("frames_dropped", "tracks", "base_queue", "still_queue"), 0),
+    **dict.fromkeys(("frames_dropped_cpu", "frames_unanalyzed"), 0),
+    **dict.fromkeys(("encode_ms", "detect_ms", "cores_needed", "cores_free"), 0.0),
+    keyframes=1,
+    feedback_age_ms=-1,
+)
 
 
 def square_box(index: int) -> tuple[float, float, float, float]:
@@ -252,6 +260,9 @@ class Flight:
     ) -> Received:
         """The edge's report after so many messages."""
         self._statuses += 1
+        counts = dict.fromkeys(
+            ("base_bytes", "roi_bytes", "backlog_bytes", "meta_bytes", "overhead_bytes"), 0
+        )
         report = replace(
             messages.STATUS,
             session_id=self.session_id,
@@ -265,7 +276,9 @@ class Flight:
             roi_messages=roi,
             backlog_messages=backlog,
             meta_messages=meta,
-            health=replace(messages.HEALTH, frames_captured=base, frames_encoded=base, frames_dropped=0),
+            **counts,
+            **{name: {} for name in ("sent", "deferred", "dropped")},
+            health=replace(_IDLE, frames_captured=base, frames_encoded=base),
             failed=(),
             levers="",
         )
