@@ -48,9 +48,9 @@ from hvt_ground.sinks.timing import SessionTiming, timing_table
 from programs.rrd import Recording
 from programs.small_disk import small_disk
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
+from rigs.examples import seen
 from rigs.flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from rigs.handled import WatchedInbox, check, end
-from rigs.stills import seen
 
 FIRST_STORED = 2**31
 PICTURE = DecodedFrame(0, 0, 0, np.zeros((8, 8, 3), np.uint8))

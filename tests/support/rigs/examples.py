@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.values import Tracks
+from hvt_common.values import Posterior, Tracks
 from hvt_edge.perception.candidates import Candidate
 from hvt_ground.events import Overlay, Refinement
+from hvt_ground.perception.stills.decode import Box
+from hvt_ground.perception.stills.match import StillSeen
 
 
 def tracks_of(
@@ -99,3 +101,31 @@ def overlay(frame_index: int, boxes: Any, *, capture_ns: int = 0, **changes: Any
         "refined": np.zeros(count, np.bool_),
     }
     return Overlay(**(fields | changes))
+
+
+def seen(
+    sequence: int,
+    frame_index: int,
+    posterior: Posterior,
+    box: Box,
+    *,
+    edge: int,
+    class_name: str = "car",
+    side_px: float = 20.0,
+) -> StillSeen:
+    """A still of an edge track that was read."""
+    event = refinement(
+        frame_index=frame_index,
+        capture_ns=frame_index * 66_666_667,
+        still_sequence=sequence,
+        track_id=None,
+        edge_track_id=edge,
+        box_base_px=box,
+        still=f"still {sequence}".encode(),
+        class_before=class_name,
+        class_after=posterior.class_name,
+        confidence=posterior.confidence,
+        reason="uncertainty",
+        shown_index=frame_index,
+    )
+    return StillSeen(event, posterior, side_px)

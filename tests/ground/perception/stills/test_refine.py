@@ -15,9 +15,8 @@ from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.match import Matcher
 from hvt_ground.perception.stills.refine import MAX_HELD, Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary
-from rigs.examples import tracks_of
+from rigs.examples import seen, tracks_of
 from rigs.footprint import footprint_bytes
-from rigs.stills import seen
 
 DETECTOR = ("car", "van", "person")
 CLASSIFIER = ("Person", "car", "van")

@@ -18,8 +18,7 @@ from hvt_edge.perception.crop import PADDING
 from hvt_ground.perception.fusion.fuse import unified_names
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import LEAST_SIDE_PX, Vocabulary, check_common
-from rigs.examples import tracks_of
-from rigs.stills import seen
+from rigs.examples import seen, tracks_of
 
 AERIAL = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
 VEHICLES = {"car", "van", "truck", "bus", "motor"}
