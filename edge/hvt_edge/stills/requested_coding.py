@@ -29,6 +29,7 @@ _STEP_PCT = 10
 _FLOOR_PCT = 20
 """Below it a smaller picture of better quality shows more."""
 _SHRINKS = (0.7, 0.5, 0.35, 0.25)
+_LEAST_SIDE = 8
 _TRIES = 4
 _FILLED = 0.85
 """Share of the allowance from which no further try is made."""
@@ -47,8 +48,8 @@ class Capacity:
     total_bps: int
 
     def wait_s(self, size_bytes: int) -> float:
-        """About how long so many bytes take: to get free in the window, and on a link of that rate."""
-        return 2 * 8 * size_bytes / self.total_bps
+        """About how long so many bytes take: to get free in the second that is past, and on a link of that rate."""
+        return 1 + 8 * size_bytes / self.total_bps
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +222,7 @@ def _note(best: _Tried, wanted: _Tried, capacity: Capacity) -> str:
     ):
         return ""
     (width, height), wait_s = best.size, capacity.wait_s(best.size_bytes)
-    note = f"{width}x{height} pixels at quality {best.quality_pct} come within about {max(1.0, wait_s):.1f} s"
+    note = f"{width}x{height} pixels at quality {best.quality_pct} come within about {wait_s:.1f} s"
     if wanted.size_bytes <= best.size_bytes:
         return note
     return (
@@ -238,10 +239,13 @@ def _refusal(tries: _Tries, wanted: _Tried, capacity: Capacity) -> str:
         return "the video already shows it as well as the source does"
     least = min(better, key=lambda one: one.size_bytes)
     (width, height), shrink = wanted.size, 0.9 * math.sqrt(capacity.most_bytes / least.size_bytes)
+    smaller = int(width * shrink), int(height * shrink)
+    advice = f"ask for a smaller region, {smaller[0]}x{smaller[1]} or so"
+    if min(smaller) < _LEAST_SIDE:  # a camera's own video is never left out, and may take all
+        advice = "raise the budget"
     return (
         f"{width}x{height} pixels take {_kb(least.size_bytes)} to show more than the video does, and "
-        f"{bitrate_text(capacity.total_bps)} carry {_kb(capacity.most_bytes)} at once: ask for a smaller region, "
-        f"{max(8, int(width * shrink))}x{max(8, int(height * shrink))} or so"
+        f"{bitrate_text(capacity.total_bps)} carry {_kb(capacity.most_bytes)} at once beside it: {advice}"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 
 import cv2
 import numpy as np
@@ -100,7 +101,10 @@ def test_what_the_video_shows_as_well_is_refused_and_what_is_too_large_says_what
     large = code_requested(job(as_base(70)), codec=JPEG, quality_pct=65, capacity=Capacity(900, 1500, 15_000))
     assert isinstance(large, NothingCloser)
     assert "240x160 pixels take" in large.reason
-    assert "15 kbps carry 1.5 kB at once: ask for a smaller region" in large.reason
+    assert "15 kbps carry 1.5 kB at once beside it: ask for a smaller region" in large.reason
+    full = code_requested(job(as_base(70)), codec=JPEG, quality_pct=65, capacity=Capacity(0, 0, 150_000))
+    assert isinstance(full, NothingCloser)
+    assert full.reason.endswith("150 kbps carry 0.0 kB at once beside it: raise the budget")
 
 
 @settings(max_examples=40, deadline=None)
@@ -197,6 +201,10 @@ def test_in_flight_it_is_full_prompt_and_better_than_the_video_with_every_method
             assert width * height > 50_000, "only what is large is too large"
             continue
         assert look.delay_s <= bound_s
+        if said := re.search(r"within about ([\d.]+) s", look.note):
+            assert look.delay_s + 8 * look.size_bytes / budget_bps <= float(said[1]) + 0.2, (
+                "it is said in advance"
+            )
         assert look.image.shape[:2] == (height, width) or look.note
         image = cv2.resize(look.image, (width, height), interpolation=cv2.INTER_CUBIC)
         assert psnr_y_db(image, look.source) > psnr_y_db(look.base, look.source)

@@ -43,6 +43,7 @@ class RequestedLook:
     refusal: str = ""
     note: str = ""
     header: RoiHeader | None = None
+    size_bytes: int = 0
     image: Image | None = None
     source: Image | None = None
     """The source's pixels of the same crop, at the size of the still."""
@@ -159,7 +160,7 @@ class LookFlight(World):
                 continue
             x1, y1, x2, y2 = header.crop_source_px
             size = header.parameters.get("w", x2 - x1), header.parameters.get("h", y2 - y1)
-            look.header = header
+            look.header, look.size_bytes = header, len(data)
             look.image = still_codec(header.codec).decode(data, size=size, parameters=header.parameters)
             look.source = np.ascontiguousarray(self.sources[header.frame_index][y1:y2, x1:x2])
             picture, view = self._bases.get(header.frame_index), self.view
@@ -184,6 +185,7 @@ class _Asking(Source):
     def __init__(self, inner: Source, flight: LookFlight) -> None:
         self._inner, self._flight = inner, flight
         self.view, self.fps, self.frame_count = inner.view, inner.fps, inner.frame_count
+        self.camera_stream = inner.camera_stream
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         for frame in self._inner.frames(start_ns=start_ns):
