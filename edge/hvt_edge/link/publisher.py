@@ -19,7 +19,7 @@ from hvt_common.protocol.messages import (
     UnknownVersionError,
     WireError,
 )
-from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import declare_publisher, open_session, serve
@@ -32,8 +32,8 @@ _log = logging.getLogger(__name__)
 _PUBLISHED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.POSE, Channel.BACKLOG, Channel.STATUS)
 _MOST_PER_S = 1000
 """Requests, or reports: a ground sends some ten a second."""
-_AGAIN_NS = 2 * SECOND_NS
-"""A ground asks within a fraction of it."""
+_AGAIN_NS = {Channel.INFO: (2 * SECOND_NS,) * 2, Channel.FEEDBACK: (2 * SECOND_NS, 64 * SECOND_NS)}
+"""First and longest pause before it is declared anew: a ground asks within a fraction of it; some never report."""
 _NEEDED = (Channel.BASE, Channel.ROI, Channel.STATUS)
 """Channels that a ground subscribes to in any case; one that only shows the video may leave out the others."""
 
@@ -127,7 +127,7 @@ class ZenohLink:
         try:
             self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
             if channel is Channel.STATUS and self._listener is not None:  # about once a second
-                self._listener.declare_info_again(there=self.has_ground())
+                self._listener.declare_again(there=self.has_ground())
         except zenoh.ZError as error:
             _log.debug("%s was not sent: %s", channel, error)
 
@@ -164,12 +164,13 @@ class EdgeListener:
         self.unusable = 0
         """Messages from grounds that were skipped: damaged, foreign or of another version."""
         self._version_said = False
-        self._without_request_ns: int | None = None
-        """Since when a ground is there that has not asked for `Info`, or since it was declared anew."""
-        self._requested = False
-        self._info = serve(self.session, Channel.INFO, keys=self.keys, answer=self._on_info)
-        serve(self.session, Channel.CONTROL, keys=self.keys, answer=self._on_control)
-        self._feedback = self.session.declare_subscriber(self.keys.key(Channel.FEEDBACK), self._on_feedback)
+        self._heard: set[Channel] = set()
+        """Of who is there now."""
+        self._waits: dict[Channel, RetryPause] = {}
+        """Channels of which nothing is heard while a ground is there."""
+        self._declared: dict[Channel, zenoh.Queryable[None] | zenoh.Subscriber[None]] = {}
+        for channel in (Channel.INFO, Channel.CONTROL, Channel.FEEDBACK):
+            self._declare(channel)
         self._token = self.session.liveliness().declare_token(self.keys.key(Channel.ALIVE))
 
     def close(self) -> None:
@@ -182,25 +183,39 @@ class EdgeListener:
     def __exit__(self, *_error: object) -> None:
         self.close()
 
-    def declare_info_again(self, *, there: bool) -> None:
-        """Declare `Info` anew while a ground is ``there`` that does not ask for it; call it about once a second.
+    def declare_again(self, *, there: bool) -> None:
+        """Declare anew what a ground that is ``there`` does not use; call it about once a second.
 
-        A declaration comes once: where UDP has lost it, the ground could ask nobody, and show nothing of this flight.
+        A declaration comes once: where UDP has lost it, the ground could ask nobody and show nothing of this flight,
+        or its reports would steer nothing. With ``info`` goes ``control``, which nobody need ask.
         """
         now_ns = self.clock()
         if not there:
-            self._requested, self._without_request_ns = False, None
-        elif self._requested:
-            self._without_request_ns = None
-        elif self._without_request_ns is None:
-            self._without_request_ns = now_ns
-        elif now_ns - self._without_request_ns >= _AGAIN_NS:
-            self._without_request_ns = now_ns
-            self._info.undeclare()  # type: ignore[no-untyped-call]
-            self._info = serve(self.session, Channel.INFO, keys=self.keys, answer=self._on_info)
+            self._heard.clear()
+            self._waits.clear()
+        for channel in _AGAIN_NS if there else ():
+            pause = self._waits.setdefault(channel, RetryPause(*_AGAIN_NS[channel]))
+            if channel in self._heard or not pause.due(now_ns):
+                continue
+            if pause.pause_ns:
+                self._declare(channel)
+                if channel is Channel.INFO:
+                    self._declare(Channel.CONTROL)
+            pause.failed(now_ns)
+
+    def _declare(self, channel: Channel) -> None:
+        if channel in self._declared:
+            self._declared[channel].undeclare()  # type: ignore[no-untyped-call]
+        if channel is Channel.FEEDBACK:
+            self._declared[channel] = self.session.declare_subscriber(
+                self.keys.key(channel), self._on_feedback
+            )
+        else:
+            answer = self._on_info if channel is Channel.INFO else self._on_control
+            self._declared[channel] = serve(self.session, channel, keys=self.keys, answer=answer)
 
     def _on_info(self, query: bytes) -> bytes | None:
-        self._requested = True
+        self._heard.add(Channel.INFO)
         if query:
             try:
                 self.answers.on_info_request(InfoRequest.parse(query))
@@ -228,6 +243,7 @@ class EdgeListener:
         return data
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
+        self._heard.add(Channel.FEEDBACK)
         self._watch(Channel.FEEDBACK)
         try:
             feedback = Feedback.parse(sample.payload.to_bytes())

@@ -57,35 +57,49 @@ def test_a_ground_of_another_version_commands_nothing(caplog, monkeypatch):
     assert caplog.messages == [said]
 
 
-def test_a_ground_that_does_not_ask_is_told_again_whom_to_ask(monkeypatch):
-    """One datagram that UDP loses at the start would leave a ground without a picture for the whole flight."""
+def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):
+    """One datagram that UDP loses at the start would leave a ground without a picture, or its reports unheard."""
     declared, now_s = [], [0.0]
 
     def serve(_session: object, channel: Channel, **told: object) -> MagicMock:
         declared.append((channel, told["answer"]))
         return MagicMock()
 
+    def subscribe(key: str, callback: object) -> MagicMock:
+        assert key == EdgeKeys("uav-1").key(Channel.FEEDBACK)
+        declared.append((Channel.FEEDBACK, callback))
+        return MagicMock()
+
     monkeypatch.setattr(publisher, "serve", serve)
+    reports: list[Feedback] = []
     answers = publisher.Answers(
-        info=lambda _received_ns: b"info", control=lambda _request: ANSWER, on_feedback=lambda _feedback: None
+        info=lambda _received_ns: b"info", control=lambda _request: ANSWER, on_feedback=reports.append
     )
     listener = publisher.EdgeListener(
-        MagicMock(),
+        MagicMock(declare_subscriber=subscribe),
         EdgeKeys("uav-1"),
         answers,
         failures=MagicMock(),
         clock=lambda: round(now_s[0] * SECOND_NS),
     )
 
-    def after(seconds: int, *, there: bool) -> int:
+    def after(seconds: int, *, there: bool) -> tuple[int, int, int]:
         before = len(declared)
         for _ in range(seconds):
             now_s[0] += 1
-            listener.declare_info_again(there=there)
-        return [channel for channel, _ in declared[before:]].count(Channel.INFO)
+            listener.declare_again(there=there)
+        channels = [channel for channel, _ in declared[before:]]
+        return tuple(channels.count(one) for one in (Channel.INFO, Channel.CONTROL, Channel.FEEDBACK))
 
-    assert after(10, there=False) == 0
-    assert after(7, there=True) == 3
-    assert declared[-1][1](b"") == b"info"
-    assert after(10, there=True) == 0, "it has asked"
-    assert (after(1, there=False), after(3, there=True)) == (0, 1), "another, or the same on another way"
+    assert after(10, there=False) == (0, 0, 0)
+    assert after(7, there=True) == (3, 3, 2)
+    answer = next(answer for channel, answer in reversed(declared) if channel is Channel.INFO)
+    assert answer(b"") == b"info"
+    assert after(30, there=True) == (0, 0, 2), "it has asked, and reports nothing: it may only listen"
+    report = next(answer for channel, answer in reversed(declared) if channel is Channel.FEEDBACK)
+    report(SimpleNamespace(payload=SimpleNamespace(to_bytes=FEEDBACK.pack)))
+    assert len(reports) == 1
+    assert after(100, there=True) == (0, 0, 0), "all is heard"
+    assert (after(1, there=False), after(3, there=True)) == ((0, 0, 0), (1, 1, 1)), (
+        "another, or on another way"
+    )
