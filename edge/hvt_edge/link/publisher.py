@@ -164,7 +164,7 @@ class EdgeListener:
         self.unusable = 0
         """Messages from grounds that were skipped: damaged, foreign or of another version."""
         self._version_said = False
-        self._heard: set[Channel] = set()
+        self._used: set[Channel] = set()
         """Of who is there now."""
         self._waits: dict[Channel, RetryPause] = {}
         """Channels of which nothing is heard while a ground is there."""
@@ -191,11 +191,11 @@ class EdgeListener:
         """
         now_ns = self.clock()
         if not there:
-            self._heard.clear()
+            self._used.clear()
             self._waits.clear()
         for channel in _AGAIN_NS if there else ():
             pause = self._waits.setdefault(channel, RetryPause(*_AGAIN_NS[channel]))
-            if channel in self._heard or not pause.due(now_ns):
+            if channel in self._used or not pause.due(now_ns):
                 continue
             if pause.pause_ns:
                 self._declare(channel)
@@ -215,7 +215,7 @@ class EdgeListener:
             self._declared[channel] = serve(self.session, channel, keys=self.keys, answer=answer)
 
     def _on_info(self, query: bytes) -> bytes | None:
-        self._heard.add(Channel.INFO)
+        self._used.add(Channel.INFO)
         if query:
             try:
                 self.answers.on_info_request(InfoRequest.parse(query))
@@ -243,7 +243,7 @@ class EdgeListener:
         return data
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
-        self._heard.add(Channel.FEEDBACK)
+        self._used.add(Channel.FEEDBACK)
         self._watch(Channel.FEEDBACK)
         try:
             feedback = Feedback.parse(sample.payload.to_bytes())

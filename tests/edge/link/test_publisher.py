@@ -99,7 +99,7 @@ def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):
     report = next(answer for channel, answer in reversed(declared) if channel is Channel.FEEDBACK)
     report(SimpleNamespace(payload=SimpleNamespace(to_bytes=FEEDBACK.pack)))
     assert len(reports) == 1
-    assert after(100, there=True) == (0, 0, 0), "all is heard"
+    assert after(100, there=True) == (0, 0, 0), "all is used"
     assert (after(1, there=False), after(3, there=True)) == ((0, 0, 0), (1, 1, 1)), (
         "another, or on another way"
     )
