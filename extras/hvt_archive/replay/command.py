@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -27,7 +26,7 @@ from hvt_common.errors import Parser, UserError
 from hvt_common.protocol.channels import Channel, check_edge_pattern, matches, parse_key
 from hvt_common.protocol.messages import READ_VERSIONS, Feedback, Info, WireError
 from hvt_common.runtime.process import stop_on_signals
-from hvt_common.runtime.reporting import print_table, say, write_json
+from hvt_common.runtime.reporting import print_table, write_json
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.recordings import BacklogRecordings
@@ -63,7 +62,7 @@ _MOST_PAUSE_S = 5.0
 
 
 def run(argv: Sequence[str]) -> int:
-    """Replay a file; `UserError` where it is none, or for a setting of the link."""
+    """Replay a file; `UserError` where it is none, or has nothing to show, or for a setting of the link."""
     parser = Parser(prog="hvt-ground replay", description=__doc__, add_help=False)
     parser.add_argument("--speed", type=float, default=math.inf)
     parser.add_argument("--help", "-h", action="store_true")
@@ -88,11 +87,14 @@ def run(argv: Sequence[str]) -> int:
         config = replace(config, provider="cpu")
     config = checked(config)
     check_outputs(config, reads=files)
-    sessions = _Replay(config, messages, speed=given.speed).run()
+    replay = _Replay(config, messages, speed=given.speed)
+    sessions = replay.run()
+    if not (sessions or replay.stop.is_set()):
+        raise UserError(
+            f"{files[0]} has no session that can be shown, of an edge that --edges {config.edges} names"
+        )
     for content in sessions:
         print_table(f"{content['edge']}: received", table(content))
-    if not sessions:
-        say(f"hvt-ground: {files[0]} has no session that can be shown")
     if config.summary is not None:
         write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions)
     return 0
@@ -142,7 +144,7 @@ class _Replay:
         self._messages = messages
         self._speed = speed
         self._now_ns = 0
-        self._stop = stop_on_signals()
+        self.stop = stop_on_signals()
 
     def run(self) -> list[dict[str, Any]]:
         """Play all of it; a summary a session."""
@@ -190,13 +192,13 @@ class _Replay:
         with Progress(transient=True, disable=self._config.quiet) as progress:
             task = progress.add_task("replay", total=size)
             for item in self._messages():
-                if self._stop.is_set():
+                if self.stop.is_set():
                     return
                 if parse_key(item.key) is None or item.key.endswith(f"/{Channel.INFO}"):
                     continue
                 pause_s = (item.received_ns - self._now_ns) / SECOND_NS / self._speed if self._now_ns else 0.0
-                if pause_s > 0:
-                    time.sleep(min(pause_s, _MOST_PAUSE_S))
+                if pause_s > 0 and self.stop.wait(min(pause_s, _MOST_PAUSE_S)):
+                    return
                 self._now_ns = max(self._now_ns, item.received_ns)
                 progress.advance(task, item.size_bytes)
                 yield item

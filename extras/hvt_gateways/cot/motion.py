@@ -25,8 +25,13 @@ class MotionTrail:
         self._places: deque[tuple[int, Place]] = deque(maxlen=_MOST_PLACES)
 
     def add(self, at_ns: int, place: Place, *, error_m: float) -> Motion | None:
-        """Take a place of that time; the motion from the oldest one, None where it may have stood still."""
+        """Take a place of that time; the motion from the oldest one, None where it may have stood still.
+
+        After one of a time far ahead, or where the clock was set back, it begins anew.
+        """
         places = self._places
+        if places and places[-1][0] - at_ns > _WINDOW_NS:
+            places.clear()
         if places and at_ns <= places[-1][0]:
             return None
         places.append((at_ns, place))

@@ -104,4 +104,12 @@ def test_what_has_stopped_stands_ten_seconds_later():
     for second in range(8, 16):
         motion = trail.add(second * SECOND_NS, away(40), error_m=3.0)
     assert motion is None
-    assert trail.add(3 * SECOND_NS, away(500), error_m=3.0) is None, "time does not go back"
+    assert trail.add(8 * SECOND_NS, away(500), error_m=3.0) is None, "time does not go back"
+
+
+def test_one_place_of_the_future_does_not_end_course_and_speed():
+    """A pose with a wrong time, or a clock that is set back, would take the arrow from the map for the flight."""
+    trail = MotionTrail()
+    assert trail.add(10**6 * SECOND_NS, away(0), error_m=3.0) is None
+    motions = [trail.add(second * SECOND_NS, away(10 * second), error_m=3.0) for second in range(3)]
+    assert motions[-1] is not None
