@@ -80,7 +80,7 @@ def _described(path: Path) -> RecordingRow | None:
         for chunk in reader.stream():
             content.add(chunk)
         state = path.stat()
-    except (OSError, RuntimeError, ValueError, LookupError):
+    except (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError):
         return None
     edge = entry.application_id.removeprefix("hvt-")
     session = entry.recording_id.removeprefix(f"{edge}-")

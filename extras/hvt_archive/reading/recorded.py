@@ -52,6 +52,9 @@ _ONE_COMPONENT = {MAP_CAMERA: _POSE, SESSION: _INFO, STILL_MESSAGES: _MESSAGE}
 """The components that are read of these entities."""
 _SAMPLE, _PICTURE, _CAPTION = "VideoStream:sample", "EncodedImage:blob", "Boxes2D:labels"
 
+_ODD = (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
+"""What a file raises that is no recording, or has other values under the names of ours."""
+
 _Rows = dict[tuple[str, str], list[Timed] | SpooledRows]
 """By entity and component; what grows with the flight is on disk."""
 
@@ -146,7 +149,7 @@ def read_recordings(paths: Sequence[Path], *, locator: Locator = NOWHERE) -> Rec
         )
     try:
         return _recorded(*names.pop(), rows, locator, spool)
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
+    except _ODD as error:
         raise UserError(
             f"{', '.join(map(str, paths))}: not as hvt-ground writes a recording ({type(error).__name__}: {error})"
         ) from None
@@ -221,7 +224,7 @@ def _hashes(rows: Iterable[Timed]) -> set[int]:
 def _opened(path: Path, spool: Spool, number: int) -> _File:
     try:
         return _read(path, spool, number)
-    except (OSError, RuntimeError, ValueError, LookupError) as error:
+    except _ODD as error:
         refused = f"{path} is no recording ({error}): give .rrd files of hvt-ground"
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / "whole.rrd"
@@ -229,7 +232,7 @@ def _opened(path: Path, spool: Spool, number: int) -> _File:
             if not copy_whole_messages(path, whole):
                 raise UserError(refused)
             file = _read(whole, spool, number)
-        except (OSError, RuntimeError, ValueError, LookupError):
+        except _ODD:
             raise UserError(refused) from None
     _log.warning("%s breaks off: what comes before is exported", path)
     return file

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import rerun as rr
 from faster_coco_eval import COCO
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
@@ -301,6 +302,12 @@ def test_what_cannot_be_is_said_in_one_sentence(recording, tmp_path, capsys):
     wrong = tmp_path / "wrong.rrd"
     wrong.write_bytes(b"RRF2" + bytes(100))
     assert "wrong.rrd is no recording" in refused(capsys, wrong, "--to", "mp4")
+    foreign = tmp_path / "foreign.rrd"
+    with rr.RecordingStream("another program") as stream:
+        stream.save(foreign)
+        stream.set_time("frame", duration=1.5)
+        stream.log("/video", rr.VideoStream(codec=rr.VideoCodec.H265, sample=bytes(9)))
+    assert "foreign.rrd is no recording" in refused(capsys, foreign, "--to", "mp4")
     assert "absent.rrd is no recording" in refused(capsys, tmp_path / "absent.rrd", "--to", "mp4")
     assert "--to is missing: give one of mp4, mkv, ts" in refused(capsys, recording)
     assert "'avi'" in refused(capsys, recording, "--to", "avi")

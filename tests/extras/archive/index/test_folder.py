@@ -16,7 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
 
+import pyarrow as pa
 import pytest
+import rerun as rr
 
 from hvt_archive.index.database import INDEX, read_index
 from hvt_archive.index.files import claimed, is_claimed
@@ -118,6 +120,10 @@ def test_files_tell_the_same_when_the_index_is_lost(tmp_path, flown):
     (tmp_path / INDEX).unlink()
     (tmp_path / "mine.rrd").write_bytes((tmp_path / NAMES[0]).read_bytes())
     (tmp_path / "hvt-uav-1-20261122-140000.rrd").write_text("no recording")
+    with rr.RecordingStream("hvt-uav-1", recording_id="uav-1-00ff") as odd:
+        odd.save(tmp_path / "hvt-uav-1-20261122-150000.rrd")
+        boxes = rr.Boxes2D(centers=[[1, 2]], half_sizes=[[1, 2]], class_ids=[3])
+        odd.log("/base/tracks", boxes, rr.AnyValues(track_id=pa.array([[1, 2]])))
     after = look(tmp_path)
     assert [replace(one, written_ns=0) for one in after] == [replace(one, written_ns=0) for one in before]
 
