@@ -13,6 +13,7 @@ from pathlib import Path
 from hvt_common.errors import UserError, absent
 from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
 from hvt_common.inference.store import known_classes
+from hvt_common.units import shown_text
 
 KNOWN_LABELS: Mapping[str, tuple[str, ...]] = {"coco": COCO_NAMES, "visdrone": VISDRONE_NAMES}
 """Names that stand for a file. A number of classes alone never means one of these."""
@@ -142,4 +143,6 @@ def _names(value: object) -> tuple[str, ...] | None:
         value = numbered_names(numbers)
     if not isinstance(value, list | tuple) or not 0 < len(value) <= MAX_LABELS:
         return None
-    return tuple(str(item)[:MAX_LABEL_CHARS] for item in value)
+    # What no terminal, table or message can hold is ``?``.
+    plain = (shown_text(str(item)[:MAX_LABEL_CHARS]).replace("\n", "?") for item in value)
+    return tuple(name or f"class {number}" for number, name in enumerate(plain))

@@ -71,6 +71,7 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
         ({"names": "{0: small car, 1: bus}"}, ("small car", "bus")),
         ({"classes": '{"bus": 1, "car": 0}'}, ("car", "bus")),
         ({"names": '{"nc": 2}'}, None),
+        ({"names": r"{0: 'a\ud800', 1: 'b\nc', 2: ''}"}, ("a?", "b?c", "class 2")),
     ],
 )
 def test_names_in_metadata_are_read_but_never_run(

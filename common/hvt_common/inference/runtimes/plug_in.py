@@ -51,7 +51,9 @@ class PlugInDetector:
         model = spec.partition(":")[2]
         self._part = loaded(entry, lambda make: make(model) if model else make(), what=_WHAT)
         names: Any = getattr(self._part, "class_names", ())
-        text = isinstance(names, list | tuple) and all(isinstance(name, str) and name for name in names)
+        text = isinstance(names, list | tuple) and all(
+            isinstance(name, str) and name and name.isprintable() for name in names
+        )
         self.class_names: tuple[str, ...] = tuple(names) if text else ()
         try:
             if not self.class_names:

@@ -74,6 +74,7 @@ def test_answers_are_clipped_sorted_and_those_below_the_confidence_left_out(inst
     [
         ("('a',)", "1 / 0", "does not work: ZeroDivisionError"),
         ("None", GOOD, "its class_names are None, and have to be words"),
+        ("['a\\ud800']", GOOD, "and have to be words"),
         ("('a',)", "[]", "detect gave list, and has to give Detections"),
         ("('a',)", GOOD, "class ids that are no whole numbers from 0 to 0"),
         ("('a', 'b')", GOOD.replace("0.3", "3"), "confidences outside 0…1"),
