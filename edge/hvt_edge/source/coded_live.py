@@ -26,7 +26,7 @@ from hvt_edge.source.camera_stream import (
 )
 from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit
 from hvt_edge.source.live import SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
-from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped
+from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped, packets_of
 
 _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
 """A camera is surveyed before the flight until its second keyframe, within these."""
@@ -50,7 +50,7 @@ class CodedStreamGrabber(StreamGrabber):
 
 def _packets(container: Any, stream: Any, decoder: CameraDecoder) -> Iterator[Shot]:
     stamped = is_stamped(container)
-    for packet in container.demux(stream):
+    for packet in packets_of(container, stream):
         if packet.size:
             at_s = None if packet.pts is None else float(packet.pts * packet.time_base)
             taken = CameraPacket(bytes(packet), at_s, decoder)

@@ -25,6 +25,7 @@ LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "ud
 _OPEN_S = 10.0
 _RESTART_S = 2.5
 _UNDECODED_S = 10.0
+"""Without a picture, while something comes; where nothing does, `_READ_S` counts."""
 _MOST_TIMES = 64
 _READ_S = 2.0  # also how long closing may take
 
@@ -126,7 +127,7 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
     # Undecodable packets are left out: joined between keyframes, or losses. FFmpeg's error after ten seconds of them.
     times: dict[Fraction, int] = {}
     whole_s, stamped = time.monotonic(), is_stamped(container)
-    for packet in container.demux(stream):
+    for packet in packets_of(container, stream):
         camera_ns = camera_time_ns(packet, stamped=stamped)
         if packet.pts is not None and camera_ns is not None:
             times[packet.pts * packet.time_base] = camera_ns
@@ -146,6 +147,17 @@ def _decoded(container: Any, stream: Any, pictures: Pictures) -> Iterator[Shot]:
                 yield Shot(partial(pictures.bgr, frame), camera_ns)
         if len(times) > _MOST_TIMES:
             times.clear()
+
+
+def packets_of(container: Any, stream: Any) -> Iterator[Any]:
+    """The packets of the film as they come. Raises `SignalLost` where for ten seconds sound or data alone came."""
+    came_s = time.monotonic()
+    for packet in container.demux():  # of the film alone it would not return while others come
+        if packet.stream.index == stream.index:
+            yield packet
+            came_s = time.monotonic()
+        elif time.monotonic() - came_s > _UNDECODED_S:
+            raise SignalLost("it sends no picture")
 
 
 def camera_time_ns(packet: av.Packet[Any], *, stamped: bool) -> int | None:

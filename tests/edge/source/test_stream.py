@@ -1,0 +1,50 @@
+"""A network stream that goes on without its picture."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from fractions import Fraction
+from types import SimpleNamespace
+
+import av
+import numpy as np
+import pytest
+
+from hvt_edge.source import stream
+from hvt_edge.source.coded_live import CodedStreamGrabber
+from hvt_edge.source.live import SignalLost
+from hvt_edge.source.stream import StreamGrabber
+
+
+def film_that_stops() -> io.BytesIO:
+    """MPEG-TS: ten pictures, sound beside them and for long after."""
+    data = io.BytesIO()
+    with av.open(data, "w", format="mpegts") as output:
+        film, sound = output.add_stream("libx265", rate=25), output.add_stream("mp2", rate=48_000)
+        film.width, film.height, film.options = 128, 64, {"tune": "zerolatency", "x265-params": "log-level=0"}
+        for number in range(10):
+            picture = av.VideoFrame.from_ndarray(np.full((64, 128, 3), number, np.uint8), format="rgb24")
+            output.mux(film.encode(picture))
+        output.mux(film.encode(None))
+        for number in range(200):
+            tone = av.AudioFrame.from_ndarray(np.zeros((1, 2 * 1152), np.int16), layout="stereo")
+            tone.sample_rate, tone.pts, tone.time_base = 48_000, 1152 * number, Fraction(1, 48_000)
+            output.mux(sound.encode(tone))
+    data.seek(0)
+    return data
+
+
+@pytest.mark.parametrize("grabber", [StreamGrabber, CodedStreamGrabber])
+def test_a_camera_of_which_sound_alone_goes_on_has_stopped(monkeypatch, grabber):
+    """It would never be opened again: where a camera's encoder hangs, its microphone or its telemetry does not."""
+    seconds = itertools.count()
+    monkeypatch.setattr(stream, "time", SimpleNamespace(monotonic=lambda: next(seconds) / 4))
+    connection = av.open(film_that_stops())
+    monkeypatch.setattr(av, "open", lambda _url, **_settings: connection)
+    camera = grabber("tcp://camera")
+    camera.open()
+    assert camera.grab()
+    with pytest.raises(SignalLost, match="no picture"):
+        all(iter(camera.grab, None))
+    camera.close()
