@@ -24,7 +24,8 @@ class CameraClock:
     """Turns a camera's time stamps into this process's time; one for each time that the camera was opened.
 
     A clock that is set as ours is (NTP) is taken at its word. Of any other only the differences count: the frame
-    that came quickest is taken to have come at once. Times never go back.
+    that came quickest is taken to have come at once. Times never go back: where they would, as when the camera first
+    says what its clock reads, they go on at half the pace until they have met.
     """
 
     def __init__(self) -> None:
@@ -32,7 +33,8 @@ class CameraClock:
         self._former_ns: int | None = None
         self._delay_ns: int | None = None
         self._since_ns = 0
-        self._last_ns = 0
+        self._last_ns = self._came_ns = 0
+        """Capture time of the newest frame, and when it came."""
         self._recent: deque[int] = deque(maxlen=_RECENT)
         """Delays of the newest frames."""
 
@@ -44,7 +46,10 @@ class CameraClock:
     def capture_ns(self, camera_ns: int | None, *, now_ns: int) -> int:
         """The capture time of the frame that has just come; ``camera_ns`` is None where the camera does not say."""
         taken_ns = now_ns if camera_ns is None else camera_ns + self._ahead_ns(now_ns - camera_ns, now_ns)
-        self._last_ns = max(self._last_ns + 1, min(taken_ns, now_ns))
+        taken_ns = min(taken_ns, now_ns)
+        if taken_ns <= self._last_ns:
+            taken_ns = self._last_ns + max(1, (now_ns - self._came_ns) // 2)
+        self._last_ns, self._came_ns = taken_ns, now_ns
         self._recent.append(now_ns - self._last_ns)
         return self._last_ns
 

@@ -16,6 +16,7 @@ from hvt_edge.source import live
 from hvt_edge.source.camera_clock import CameraClock
 from hvt_edge.source.live import LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
+from hvt_edge.source.resample import Gate
 from programs.rtsp_camera import RtspCamera
 
 MS = 1_000_000
@@ -71,6 +72,19 @@ def test_camera_times_without_jitter_and_never_back():
     assert times[-1] < back[0]
     assert back == [zero + at * MS for at in (300, 340, 380)], "else none would be due for an hour"
     assert clock.capture_ns(None, now_ns=zero + 400 * MS) == zero + 400 * MS
+
+
+def test_a_camera_that_says_its_time_late_stops_no_picture():
+    """Its first RTCP report comes seconds after its first frame: no frame would be due until its time had been."""
+    clock, gate, times = CameraClock(), Gate(15), []
+    for number in range(400):
+        now_ns = 1_000_000 * SECOND_NS + number * SECOND_NS // 25
+        camera_ns = now_ns - (3 if number >= 100 else 999_000) * SECOND_NS
+        at_ns = clock.capture_ns(camera_ns, now_ns=now_ns)
+        times += [(now_ns, at_ns)] if gate.accept(at_ns) else []
+    assert max(later - earlier for (earlier, _), (later, _) in pairwise(times)) < SECOND_NS // 4
+    assert all(earlier < later for (_, earlier), (_, later) in pairwise(times))
+    assert times[-1][0] - times[-1][1] == 3 * SECOND_NS
 
 
 @pytest.mark.timeout(120)
