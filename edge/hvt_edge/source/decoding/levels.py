@@ -43,8 +43,8 @@ class Stretch:
         first, bits = self._range is None, bits or 8 * levels.itemsize
         least: float = _LEAST_SPAN
         if np.issubdtype(levels.dtype, np.floating):
-            finite = levels[np.isfinite(levels)]
-            levels = np.nan_to_num(levels, nan=float(finite.min(initial=np.inf)) if finite.size else 0.0)
+            seen = np.isfinite(levels)
+            levels = np.where(seen, levels, levels[seen].min() if seen.any() else 0)
             least = _LEAST_DEGREES
         low, high = self._settle(np.percentile(levels[::_EACH, ::_EACH], (_LOW_PCT, _HIGH_PCT)), at_s)
         missing = max(0.0, least - (high - low)) / 2
