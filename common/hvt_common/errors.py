@@ -151,6 +151,7 @@ def exit_with_sentence(
     redaction = Redaction(sys.argv[1:] if argv is None else argv)
     sys.excepthook = _traceback_without(redaction)
     try:
+        _check_folder()
         code = run(argv)
         print(end="", flush=True)  # no error where there is no standard output at all
     except (UserError, FlightError) as error:
@@ -162,6 +163,13 @@ def exit_with_sentence(
             raise
         return 1
     return code
+
+
+def _check_folder() -> None:
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise UserError("the folder that this was started in is gone: change to one that is there") from None
 
 
 def _traceback_without(

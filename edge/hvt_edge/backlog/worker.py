@@ -293,7 +293,7 @@ class StoreWorker:
 
 def _free_bytes(folder: Path) -> int | None:
     # Where it will be, before it is made.
-    for path in (folder.absolute(), *folder.absolute().parents):
+    for path in (folder, *folder.parents):
         try:
             return shutil.disk_usage(path).free
         except FileNotFoundError:

@@ -121,6 +121,16 @@ def test_the_free_space_of_a_disk_that_hangs_is_unknown_and_holds_up_nobody(tmp_
     assert asked_by == {"hvt-store"}
 
 
+def test_a_relative_folder_whose_place_is_gone_costs_the_store_alone(tmp_path, monkeypatch):
+    """The flight would end with a traceback, because nobody can say how full its disk is."""
+    monkeypatch.chdir(tmp_path)
+    tmp_path.rmdir()
+    worker = worker_of(Path("store"), Link())
+    worker.offer(UNIT)
+    eventually(lambda: worker.failed, within_s=10, what="it was tried")
+    worker.close()
+
+
 def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
     """The segment would never end, and never be sent: the outage's video would wait for the next one."""
     disk, link = threading.Event(), Link()

@@ -252,6 +252,14 @@ def test_only_what_can_never_work_ends_with_code_2(open_it, kind, capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
+def test_a_folder_that_is_gone_from_under_a_shell_is_said(tmp_path, monkeypatch, capsys):
+    """Whoever has made a folder anew got a traceback of the first relative name, whatever was asked."""
+    monkeypatch.chdir(tmp_path)
+    tmp_path.rmdir()
+    assert exit_with_sentence(lambda _: 0, program="hvt", argv=None) == 2
+    assert "folder that this was started in is gone" in capsys.readouterr().err
+
+
 POSITION = ardupilotmega.MAVLink(None).global_position_int_encode(0, 10**7, 2 * 10**7, 0, 0, 0, 0, 0, 0)
 
 

@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import time
+import weakref
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -63,9 +64,7 @@ class _GrowingFile:
     def __init__(self, path: str) -> None:
         self._file = os.open(path, os.O_RDONLY)
         self._ended = False
-
-    def __del__(self) -> None:
-        os.close(self._file)  # PyAV lets go of it, and does not close it
+        weakref.finalize(self, os.close, self._file)  # PyAV lets go of it, and does not close it
 
     def read(self, size: int) -> bytes:
         """At most ``size`` bytes; nothing, also to later calls, once it has not grown for ten seconds."""
