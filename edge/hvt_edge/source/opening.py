@@ -76,7 +76,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
         if not stream.holds_a_clip:
             return live(stream)
         stream.close()
-    elif spec.startswith("/dev/"):
+    elif _is_device(spec):
         return live(CameraGrabber(spec, fps=fps, clock=clock))
     else:
         _check_there(spec, scheme, growing=growing)
@@ -108,6 +108,11 @@ def shown(spec: str) -> str:
     return spec if is_demo(spec) or _is_there(spec) else redacted(spec)
 
 
+def _is_device(spec: str) -> bool:
+    # A file or a folder there is one, as in /dev/shm.
+    return spec.startswith("/dev/") and not (Path(spec).is_file() or Path(spec).is_dir())
+
+
 def _is_there(spec: str) -> bool:
     try:
         return bool(spec) and Path(spec).exists()
@@ -119,7 +124,7 @@ def _check_coded(spec: str) -> None:
     # Raise `UserError` for anything but coded video; whether it is HEVC is checked when it is open.
     kinds = (
         ("the drawn demo", is_demo(spec)),
-        ("a device", spec.startswith("/dev/")),
+        ("a device", _is_device(spec)),
         ("a folder", Path(spec).is_dir()),
     )
     for kind, is_it in kinds:

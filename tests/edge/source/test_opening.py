@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import socket
+import tempfile
 import threading
 import time
 from fractions import Fraction
@@ -192,7 +193,7 @@ def test_source_fps_overrides_a_clips_own_times(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "pattern", ["{:07d}.jpg", "img{:06d}.jpg", "shot-{}.png", "{}.bmp", "a{}.webp", "b{}.tif"]
+    "pattern", ["{:07d}.jpg", "img{:06d}.jpg", "shot-{}.png", "{}.bmp", "a{}.webp", "b{}.tif", "²{}.png"]
 )
 def test_sequence_folders_play_in_order(tmp_path, pattern):
     """VisDrone and UAVDT sequences would not play as they are, or play 1, 10, 11, 2."""
@@ -543,6 +544,12 @@ def test_a_missing_camera_is_one_sentence():
     """A wrong device number would end in OpenCV's own words."""
     assert "/dev/video97 does not exist" in refused("/dev/video97")
     assert "no video device" in refused(os.devnull)
+
+
+def test_a_clip_in_memory_is_no_camera():
+    """/dev/shm is where a clip is put that no disk should slow down."""
+    with tempfile.NamedTemporaryFile(dir="/dev/shm") as clip:
+        assert "is an empty file" in refused(clip.name)
 
 
 @pytest.mark.parametrize("size", [(1281, 720), (1280, 719), (62, 720), (1280, 8194), (0, 0), (-64, 64)])
