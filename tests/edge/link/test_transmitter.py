@@ -20,26 +20,17 @@ from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, BudgetSettings, RollingB
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.receivers import PrimaryReceiver
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.video.encoder_settings import STATUS_BYTES, base_overhead_bps
 from rigs.messages import STATUS, feedback
+from rigs.world import Puts, make_transmitter
 
 SECOND_NS = 1_000_000_000
 NOW_NS = 1_790_000_000 * SECOND_NS
 JPEG = "image/jpeg"
 
 
-class Out:
-    """Keeps what was put, as a link would carry it."""
-
-    def __init__(self) -> None:
-        self.puts: list[tuple[Channel, bytes, bytes, str]] = []
-
-    def put(
-        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
-    ) -> None:
-        """Keep it."""
-        self.puts.append((row, payload, attachment or b"", encoding))
+class Out(Puts):
+    """Which knows the line."""
 
     def line_bytes(self, keys: EdgeKeys) -> int:
         """What all of it takes on the line."""
@@ -84,11 +75,10 @@ class Rig:
     ) -> None:
         self.out, self.ledger, self.waits = Out(), Ledger(), []
         self.budget = CountingBudget(BudgetSettings(total_bps, round(total_bps * 0.8), fps=15))
-        self.sender = Transmitter(
+        self.sender = make_transmitter(
             self.out,
             ledger=self.ledger,
             budget=self.budget,
-            edge_id="uav-1",
             session_id=2**64 - 1,
             lockstep=lockstep,
             wait_until=self.waits.append,

@@ -16,8 +16,8 @@ from hvt_common.protocol.messages import BacklogKind, RoiHeader
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Transmitter
 from rigs.keeping import STILL, Out
+from rigs.world import make_transmitter
 
 S = 1_000_000_000
 NOW_NS = 1_790_000_000 * S
@@ -30,14 +30,8 @@ class Rig:
     def __init__(self) -> None:
         self.out, self.ledger, self.waits = Out(), Ledger(), []
         self.out.dark = True
-        self.sender = Transmitter(
-            self.out,
-            ledger=self.ledger,
-            budget=RollingBudget(BudgetSettings(TOTAL, 400_000, fps=15)),
-            edge_id="uav-1",
-            session_id=7,
-            lockstep=False,
-            wait_until=self.waits.append,
+        self.sender = make_transmitter(
+            self.out, ledger=self.ledger, budget=(TOTAL, 400_000), session_id=7, wait_until=self.waits.append
         )
 
     def still(self, number: int, size: int, *, now_ns: int = NOW_NS) -> None:

@@ -10,13 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.protocol.frame_account import FRAME_GROUPS, FrameAccount
-from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit
 from hvt_edge.keyframes import Keyframes
-from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
@@ -24,18 +21,11 @@ from hvt_edge.operating import LoopClock
 from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.video.frame_decision import Action, FrameDecision
 from hvt_edge.video.frame_skip import FrameSkip
-from hvt_edge.video.stage import BaseStage
 from media.clips import framed, smooth_pictures
+from rigs.world import Puts, make_base_stage, make_transmitter
 
 SIZE = (128, 96)
 FRAMES = list(framed(smooth_pictures(40, size=SIZE)))
-
-
-class Nowhere:
-    """Takes all messages."""
-
-    def put(self, channel, payload, *, attachment=None, encoding="") -> None:
-        """Nothing."""
 
 
 class Unmoved:
@@ -87,20 +77,10 @@ class Flight:
         self.counts, self.has_viewer, self.held_by = FrameCounts(), True, None
         self.unreadable = self.passed_over = self.missed = 0
         keyframes, inbox = Keyframes(), FeedbackInbox()
-        self.stage = BaseStage(
+        self.stage = make_base_stage(
             DrawnUnits(),
+            make_transmitter(Puts(), budget=(8_000_000, 4_000_000), lockstep=lockstep),
             keyframes=keyframes,
-            transmitter=Transmitter(
-                Nowhere(),
-                ledger=Ledger(),
-                budget=RollingBudget(BudgetSettings(8_000_000, 4_000_000, fps=15)),
-                edge_id="uav-1",
-                session_id=1,
-                lockstep=lockstep,
-                wait_until=lambda _at_ns: None,
-            ),
-            local_copy=None,
-            first_keyframe_bytes=5000,
             frame_skip=FrameSkip(decimation),
             admits=lambda _now_ns, _line_bytes, _coding_ns: self.held_by is None,
             holder=lambda _now_ns: self.held_by,

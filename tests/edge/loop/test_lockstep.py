@@ -7,21 +7,19 @@ import threading
 import pytest
 
 from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.operating import LoopClock
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.frame_skip import FrameSkip
-from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures
 from rigs.messages import counted, feedback
+from rigs.world import make_base_stage, make_transmitter
 
 SIZE = (320, 192)
 
@@ -83,20 +81,12 @@ class Stills:
 def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
     """With ``--fps auto`` a run in lockstep would stand still for 20 s at the first frame that was never sent."""
     ground, stills, counts, keyframes = Ground(), Stills(), FrameCounts(), Keyframes()
-    stage = BaseStage(
+    stage = make_base_stage(
         BaseEncoder(EncoderSettings(size=SIZE, fps=5.0, bitrate_bps=100_000, preset="ultrafast")),
-        keyframes=keyframes,
-        transmitter=Transmitter(
-            ground,
-            ledger=Ledger(),
-            budget=RollingBudget(BudgetSettings(800_000, 400_000, fps=5)),
-            edge_id="uav-1",
-            session_id=1,
-            lockstep=True,
-            wait_until=lambda _at_ns: None,
+        make_transmitter(
+            ground, budget=RollingBudget(BudgetSettings(800_000, 400_000, fps=5)), lockstep=True
         ),
-        local_copy=None,
-        first_keyframe_bytes=5000,
+        keyframes=keyframes,
         frame_skip=FrameSkip(3),
     )
     clock = LoopClock(lambda: 0, lockstep=True)

@@ -9,17 +9,13 @@ from itertools import pairwise
 import pytest
 
 from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.keyframes import Keyframes
-from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.perception.cpu_budget import CpuBudget
@@ -29,6 +25,7 @@ from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
 from rigs.messages import counted, feedback
+from rigs.world import make_base_stage, make_transmitter
 
 SIZE = (320, 192)
 
@@ -82,21 +79,8 @@ class BlockedStills:
 
 def base_stage(out: Out) -> BaseStage:
     """That sends there."""
-    return BaseStage(
-        BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=100_000, preset="ultrafast")),
-        keyframes=Keyframes(),
-        transmitter=Transmitter(
-            out,
-            ledger=Ledger(),
-            budget=RollingBudget(BudgetSettings(800_000, 400_000, fps=15)),
-            edge_id="uav-1",
-            session_id=1,
-            lockstep=False,
-            wait_until=lambda _at_ns: None,
-        ),
-        local_copy=None,
-        first_keyframe_bytes=5000,
-    )
+    encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=100_000, preset="ultrafast"))
+    return make_base_stage(encoder, make_transmitter(out))
 
 
 @pytest.mark.timeout(120)

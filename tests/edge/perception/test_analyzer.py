@@ -13,7 +13,7 @@ import pytest
 
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.protocol.ledger import Ledger
-from hvt_common.protocol.messages import RoiHeader, StillResult
+from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -22,8 +22,6 @@ from hvt_common.values import Frame, View
 from hvt_common.video.hevc import YuvPicture
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.keyframes import Keyframes
-from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.worker import StillWorker
@@ -32,7 +30,7 @@ from hvt_edge.wiring.perception import make_analyzer
 from media.clips import framed, smooth_pictures
 from programs.processes import eventually
 from rigs.flight import CLASSES, SIZE, NothingSeen, RedSquares, square_box
-from rigs.still_stage import make_still_stage
+from rigs.world import Puts, make_still_stage, make_transmitter
 
 NOISE = (
     8
@@ -277,32 +275,13 @@ def test_with_candidates_of_the_source_the_camera_is_followed_on_the_source():
         given.clear()
 
 
-class Out:
-    """Keeps what was put."""
-
-    def __init__(self) -> None:
-        self.stills: list[RoiHeader] = []
-
-    def put(self, row, payload, *, attachment=None, encoding="") -> None:
-        """Keep the header."""
-        self.stills.append(RoiHeader.parse(attachment, payload))
-
-
 class Rig:
     """A still stage with a real budget of 200 kbps for stills, and all that left it."""
 
     def __init__(self, *, detector=None) -> None:
-        self.out, self.outcomes = Out(), Counter()
+        self.out, self.outcomes = Puts(), Counter()
         self.memory, self.keyframes, self.ledger = TrackMemory(), Keyframes(), Ledger()
-        sender = Transmitter(
-            self.out,
-            ledger=self.ledger,
-            budget=RollingBudget(BudgetSettings(400_000, 200_000, fps=15)),
-            edge_id="edge-1",
-            session_id=1,
-            lockstep=False,
-            wait_until=lambda _at: None,
-        )
+        sender = make_transmitter(self.out, budget=(400_000, 200_000), ledger=self.ledger)
         self.stage = make_still_stage(
             sender,
             make(detector=detector),
@@ -333,9 +312,9 @@ def test_a_track_gets_its_stills_when_they_are_due():
     """M1 would send nothing, or stills of the wrong moment."""
     rig = Rig()
     rig.run()
-    assert [one.sequence for one in rig.out.stills] == list(range(len(rig.out.stills)))
-    assert [one.frame_index for one in rig.out.stills] == [0, 15]
-    for one in rig.out.stills:
+    assert [one.sequence for one, _ in rig.out.stills] == list(range(len(rig.out.stills)))
+    assert [one.frame_index for one, _ in rig.out.stills] == [0, 15]
+    for one, _ in rig.out.stills:
         np.testing.assert_allclose(one.box_source_px, square_box(one.frame_index), atol=6)
     assert rig.ledger.outcomes("sent") == {"due": len(rig.out.stills)}
     assert rig.stage.analyzer.tracks == 1
@@ -392,7 +371,7 @@ def test_the_worker_takes_all_frames_in_order_and_finishes():
                 time.sleep(0.001)
             worker.take(frame, unit)
     assert rig.stage.analyzer.frames == 30
-    assert [one.frame_index for one in rig.out.stills] == [0, 15]
+    assert [one.frame_index for one, _ in rig.out.stills] == [0, 15]
 
 
 def test_stills_that_fail_stop_alone_and_go_on_from_a_keyframe(caplog):

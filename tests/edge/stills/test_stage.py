@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 
 from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.ledger import Ledger
-from hvt_common.protocol.messages import RoiHeader, StillResult
+from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Frame, View
@@ -20,8 +19,6 @@ from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import JpegCodec, StillCodec
 from hvt_edge.keyframes import Keyframes
-from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
@@ -32,7 +29,7 @@ from media.base_coded import StandIn
 from media.clips import framed, smooth_pictures
 from programs.processes import eventually
 from rigs.flight import CLASSES, SIZE, RedSquares, square_box
-from rigs.still_stage import make_still_stage
+from rigs.world import Puts, make_still_stage, make_transmitter
 
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 _NOISE = np.random.default_rng(0).normal(0, 12, (SIZE[1], SIZE[0]))
@@ -43,26 +40,6 @@ FRAMES = [
 ]
 _ENCODER = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
 UNITS = [_ENCODER.encode(frame) for frame in FRAMES]
-
-
-class Out:
-    """Keeps what was put, in order."""
-
-    def __init__(self) -> None:
-        self.puts: list[tuple[Channel, bytes, bytes]] = []
-
-    def put(self, row, payload, *, attachment=None, encoding="") -> None:
-        """Keep it."""
-        self.puts.append((row, payload, attachment or b""))
-
-    @property
-    def stills(self) -> list[tuple[RoiHeader, bytes]]:
-        """Headers and bytes."""
-        return [
-            (RoiHeader.parse(extra, payload), payload)
-            for row, payload, extra in self.puts
-            if row is Channel.ROI
-        ]
 
 
 def make_analyzer(candidates: str = "decoded", *, detector=None, every: int = 5) -> Analyzer:
@@ -87,16 +64,8 @@ class Rig:
         codec: StillCodec | None = None,
         ring: FrameRing | None = None,
     ) -> None:
-        self.out, self.outcomes, self.keyframes = Out(), Counter(), Keyframes()
-        self.sender = Transmitter(
-            self.out,
-            ledger=Ledger(),
-            budget=RollingBudget(BudgetSettings(400_000, 200_000, fps=15)),
-            edge_id="edge-1",
-            session_id=1,
-            lockstep=False,
-            wait_until=lambda _at: None,
-        )
+        self.out, self.outcomes, self.keyframes = Puts(), Counter(), Keyframes()
+        self.sender = make_transmitter(self.out, budget=(400_000, 200_000))
         self.stage = make_still_stage(
             self.sender,
             analyzer or make_analyzer("source" if sparse else "decoded"),
@@ -202,7 +171,7 @@ def test_the_tracks_of_a_step_go_before_its_stills():
     before = rig.stage.latest_tracks
     assert before is None
     rig.run(11)
-    assert [row for row, _, _ in rig.out.puts[:2]] == [Channel.TRACKS, Channel.ROI]
+    assert [row for row, *_ in rig.out.puts[:2]] == [Channel.TRACKS, Channel.ROI]
     assert [payload[0] for row, payload, _ in rig.out.puts if row is Channel.TRACKS] == [0, 5, 10]
     assert rig.stage.latest_tracks.frame_index == 10
 

@@ -23,7 +23,7 @@ from programs.processes import eventually
 from rigs.flight import CLASSES, RedSquares
 from rigs.keeping import FRAMES, SIZE, Rig
 from rigs.kept import opened
-from rigs.still_stage import make_still_stage
+from rigs.world import make_still_stage
 
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 _NOISE = np.random.default_rng(0).normal(0, 12, (SIZE[1], SIZE[0]))

@@ -12,20 +12,18 @@ import pytest
 
 from hvt_archive.local_copy import LocalCopy
 from hvt_common.protocol.ledger import Account, Ledger
-from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.backlog.stage import State
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
-from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.source.opening import open_source
 from hvt_edge.video.frame_decision import Action, FrameDecision
 from hvt_edge.video.passthrough import PassthroughStage, UnitInputs, decide_unit
 from media.clips import START_NS, hard_pictures, smooth_pictures
 from media.hevc_camera import SIZE, write_clip
 from rigs import keeping
+from rigs.world import Puts, make_transmitter
 
 LIVE, OFFLINE, RETURNING = State.LIVE, State.OFFLINE, State.RETURNING
 LEFT_OUT = FrameDecision(Action.HOLD)
@@ -70,19 +68,6 @@ def test_the_decision_is_as_its_table_says():
         assert decide_unit(inputs) == decision, inputs
 
 
-class Kept:
-    """Where bytes go."""
-
-    def __init__(self) -> None:
-        self.headers: list[BaseHeader] = []
-        self.units: list[bytes] = []
-
-    def put(self, channel, payload, *, attachment=None, encoding="") -> None:
-        """Keep it."""
-        self.headers.append(BaseHeader.parse(attachment, payload))
-        self.units.append(payload)
-
-
 class Rig:
     """A stage with all that it needs, without a store; ``paused_ns`` counts what it has waited."""
 
@@ -95,18 +80,15 @@ class Rig:
         copy=None,
         waits=True,
     ) -> None:
-        self.kept, self.failures, self.ledger = Kept(), Failures(time.time_ns), Ledger()
+        self.kept, self.failures, self.ledger = Puts(), Failures(time.time_ns), Ledger()
         self.now_ns = START_NS
         self.keyframes = Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=2.0))
         self.stage = PassthroughStage(
             self.keyframes,
-            Transmitter(
+            make_transmitter(
                 self.kept,
                 ledger=self.ledger,
-                budget=RollingBudget(BudgetSettings(budget_bps, budget_bps, fps=15)),
-                edge_id="uav-1",
-                session_id=1,
-                lockstep=False,
+                budget=(budget_bps, budget_bps),
                 wait_until=lambda at_ns: self.wait(at_ns - self.now_ns),
             ),
             failures=self.failures,
@@ -165,7 +147,7 @@ def test_what_breaks_the_budget_is_left_out_up_to_the_next_keyframe(burst, waits
     assert all(two == one + 1 or two in keys for one, two in pairwise(sent))
     decoder = BaseDecoder(size=SIZE)
     assert all(decoder.decode(unit) is not None for unit in rig.kept.units)
-    assert [one.sequence for one in rig.kept.headers] == list(range(len(sent))), "no ground takes it for lost"
+    assert [one.sequence for one in rig.kept.base] == list(range(len(sent))), "no ground takes it for lost"
     (part,) = rig.failures.parts
     assert (part.part, part.working) == ("passthrough", True)
     assert "the budget's window has no room for a " in part.reason

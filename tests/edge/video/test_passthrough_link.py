@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from functools import partial
 
 import numpy as np
 import pytest
@@ -16,15 +15,12 @@ from hvt_common.values import CameraUnit, Frame
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
-from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating import Operating
 from hvt_edge.source.contract import CameraStream, SeenUnit
 from hvt_edge.video.passthrough import PassthroughStage
-from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.wiring.link import make_budget, make_camera_rates, make_least_link, make_pacer
-from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
 from media.clips import START_NS
 from rigs.messages import counted, feedback
+from rigs.world import make_operating, make_reconfiguration, make_transmitter
 
 SIZE, FPS = (1280, 720), 25
 PIXELS = np.zeros((8, 8, 3), np.uint8)
@@ -61,33 +57,19 @@ class Flight:
         """How old each unit was when the ground had it."""
         self.seconds: Counter[int] = Counter()
         """Frames that the ground has got, by the second in which they were taken."""
-        self.operating = Operating(
-            budget_bps=config.budget_bps,
-            video_share=config.fixed_share,
-            base_bps=config.base_bps,
-            method=config.method,
-            decimation=1,
-        )
+        self.operating = make_operating(config)
         self.pacer = make_pacer(config, stream, SIZE)
         self.ledger, self.in_flight = Ledger(), BaseInFlight()
-        self.transmitter = Transmitter(
+        self.transmitter = make_transmitter(
             self,
             ledger=self.ledger,
             budget=make_budget(config, base_bps=config.base_bps, decimation=1),
-            edge_id=config.edge_id,
-            session_id=1,
-            lockstep=False,
             wait_until=lambda at_ns: self.wait(at_ns - self.now_ns),
             pacer=self.pacer,
             in_flight=self.in_flight,
         )
-        self.reconfiguration = EncoderReconfiguration(
-            self.operating,
-            reconfiguration_settings(config, SIZE),
-            open_encoder=partial(make_encoder, config, size=SIZE),
-            transmitter=self.transmitter,
-            split=None,
-            pacer=self.pacer,
+        self.reconfiguration = make_reconfiguration(
+            self.operating, config, SIZE, self.transmitter, pacer=self.pacer
         )
         rates = make_camera_rates(
             config, stream, reconfiguration=self.reconfiguration, operating=self.operating, pacer=self.pacer

@@ -12,7 +12,6 @@ import pytest
 
 from hvt_archive.local_copy import LocalCopy
 from hvt_common.errors import FlightError, UserError
-from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Frame
@@ -20,32 +19,17 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, least_budget_bps
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.regions import TrackRegions
-from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder, encoder_context
 from media.clips import START_NS, framed, hard_pictures, smooth_pictures
 from rigs.flight import tracks_at
+from rigs.world import Puts, make_base_stage, make_transmitter
 
 SIZE = (320, 192)
 SECOND_NS = 1_000_000_000
 SETTINGS = EncoderSettings(size=SIZE, fps=15.0, bitrate_bps=50_000, preset="ultrafast", side_data=True)
-
-
-class Kept:
-    """Where bytes go."""
-
-    def __init__(self) -> None:
-        self.units: list[bytes] = []
-
-    def put(
-        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
-    ) -> None:
-        """Keep the base stream's."""
-        if row is Channel.BASE:
-            self.units.append(payload)
 
 
 class Rig:
@@ -62,25 +46,17 @@ class Rig:
         reopens=True,
         total_bps=800_000,
     ) -> None:
-        self.kept, self.failures, self.reopened = Kept(), Failures(time.time_ns), 0
+        self.kept, self.failures, self.reopened = Puts(), Failures(time.time_ns), 0
         self.opened: list[int] = []
         self.ledger = Ledger()
         self.frame_skip = frame_skip or FrameSkip()
         self.keyframes = Keyframes(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
-        self.stage = BaseStage(
+        budget = (total_bps, total_bps // 2)
+        self.stage = make_base_stage(
             BaseEncoder(replace(SETTINGS, fps=15.0 / self.frame_skip.decimation)),
+            make_transmitter(self.kept, ledger=self.ledger, budget=budget, lockstep=True),
             keyframes=self.keyframes,
-            transmitter=Transmitter(
-                self.kept,
-                ledger=self.ledger,
-                budget=RollingBudget(BudgetSettings(total_bps, total_bps // 2, fps=15)),
-                edge_id="uav-1",
-                session_id=1,
-                lockstep=True,
-                wait_until=lambda _at_ns: None,
-            ),
             local_copy=recorder,
-            first_keyframe_bytes=5000,
             regions=regions,
             frame_skip=self.frame_skip,
             reconfigure=self._reconfigure if reconfigures else None,
@@ -277,23 +253,14 @@ def test_the_least_budget_that_is_accepted_holds_in_every_second_to_the_byte(siz
     """A thin link would get twice what it carries with each keyframe."""
     config = EdgeConfig(source="demo", method="M0", fps=fps, size=size, video_share=1.0)
     total_bps = round(above * least_budget_bps(config, size, share=1.0))
-    kept, ledger, failures = Kept(), Ledger(), Failures(time.time_ns)
+    kept, ledger, failures = Puts(), Ledger(), Failures(time.time_ns)
     settings = encoder_settings(
         size=size, fps=fps, preset="ultrafast", total_bps=total_bps, base_bps=total_bps, edge_id="edge-1"
     )
-    stage = BaseStage(
+    budget = RollingBudget(BudgetSettings(total_bps, total_bps, fps=fps))
+    stage = make_base_stage(
         BaseEncoder(settings),
-        keyframes=Keyframes(),
-        transmitter=Transmitter(
-            kept,
-            ledger=ledger,
-            budget=RollingBudget(BudgetSettings(total_bps, total_bps, fps=fps)),
-            edge_id="edge-1",
-            session_id=1,
-            lockstep=True,
-            wait_until=lambda _at_ns: None,
-        ),
-        local_copy=None,
+        make_transmitter(kept, ledger=ledger, budget=budget, edge_id="edge-1", lockstep=True),
         first_keyframe_bytes=total_bps // 40,
         failures=failures,
     )

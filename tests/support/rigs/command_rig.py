@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from functools import partial
 
 import cv2
 import numpy as np
 
-from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import ControlAnswer, ControlRequest, RoiHeader
 from hvt_common.units import parse_bitrate
@@ -18,8 +16,6 @@ from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.commands import Commands
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating import Operating
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
@@ -30,11 +26,10 @@ from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.stage import StillSender
 from hvt_edge.stills.suppression import Suppression
-from hvt_edge.video.reconfigure import EncoderReconfiguration
-from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
 from media.base_coded import StandIn
 from media.clips import START_NS
 from rigs.flight import tracks_at
+from rigs.world import Puts, make_operating, make_reconfiguration, make_transmitter
 
 SOURCE, BASE = (960, 540), (640, 360)
 VIEW = View.fitted(SOURCE, BASE, fit="letterbox")
@@ -49,35 +44,17 @@ def picture(index: int) -> np.ndarray:
     return np.ascontiguousarray(np.roll(WORLD, 4 * index, axis=1))
 
 
-class Out:
-    """Keeps the stills that were sent."""
-
-    def __init__(self) -> None:
-        self.stills: list[tuple[RoiHeader, bytes]] = []
-
-    def put(self, row, payload, *, attachment=None, encoding="") -> None:
-        """Keep it, if it is a still."""
-        if row is Channel.ROI:
-            self.stills.append((RoiHeader.parse(attachment, payload), payload))
-
-
 class Rig:
     """The side channel of an edge, frame by frame; a car drives from left to right."""
 
     def __init__(self, budget="400kbps", *, share=0.75, name="M1", codec="jpeg", ring_s=5.0) -> None:
         argv = {"source": "demo", "size": BASE, "budget": parse_bitrate(budget, name="b"), "method": name}
         self.config = check(EdgeConfig(**argv, video_share=share, preset="ultrafast"))
-        self.out, self.outcomes, self.keyframes = Out(), Counter(), Keyframes()
+        self.out, self.outcomes, self.keyframes = Puts(), Counter(), Keyframes()
         self.budget = RollingBudget(BudgetSettings(self.config.budget_bps, self.config.base_bps, fps=15))
         self.ledger = Ledger()
-        self.sender = Transmitter(
-            self.out,
-            ledger=self.ledger,
-            budget=self.budget,
-            edge_id="edge-1",
-            session_id=SESSION,
-            lockstep=False,
-            wait_until=lambda _at: None,
+        self.sender = make_transmitter(
+            self.out, ledger=self.ledger, budget=self.budget, edge_id="edge-1", session_id=SESSION
         )
         maker = StillMaker(codec=StandIn(), fallback=JpegCodec()) if codec == "residual" else StillMaker()
         self.outbox = Outbox()
@@ -102,20 +79,8 @@ class Rig:
             on_outcome=lambda *outcome: self.outcomes.update([outcome]),
             on_demand=self.on_demand,
         )
-        self.operating = Operating(
-            budget_bps=self.config.budget_bps,
-            video_share=self.config.fixed_share,
-            base_bps=self.config.base_bps,
-            method=self.config.method,
-            decimation=1,
-        )
-        self.reconfiguration = EncoderReconfiguration(
-            self.operating,
-            reconfiguration_settings(self.config, BASE),
-            open_encoder=partial(make_encoder, self.config, size=BASE),
-            transmitter=self.sender,
-            split=None,
-        )
+        self.operating = make_operating(self.config)
+        self.reconfiguration = make_reconfiguration(self.operating, self.config, BASE, self.sender)
         self.index, self.request_ns = -1, 0
         self.commands = Commands(
             self.config,

@@ -7,7 +7,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,20 +35,17 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating import Operating
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxStill
 from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.reconfigure import EncoderReconfiguration
-from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
-from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
 from hvt_ground.backlog.assembly import BacklogAssembly
 from media.clips import START_NS, framed, smooth_pictures
 from rigs.kept import INFO, S, opened
 from rigs.messages import feedback
+from rigs.world import make_base_stage, make_operating, make_reconfiguration, make_transmitter
 
 SIZE = (320, 192)
 FRAMES = framed(smooth_pictures(210, size=SIZE))
@@ -176,14 +172,11 @@ class Rig:
         self.in_flight, self.outbox, self.ledger = BaseInFlight(), Outbox(), Ledger()
         pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))) if adapt else None
         self.pacer = pacer
-        self.sender = Transmitter(
+        self.sender = make_transmitter(
             self.out,
             ledger=self.ledger,
             budget=RollingBudget(BudgetSettings(*budget, fps=15, borrow_unused=borrow_unused)),
-            edge_id="uav-1",
             session_id=session_id,
-            lockstep=False,
-            wait_until=lambda _at_ns: None,
             pacer=pacer,
             in_flight=self.in_flight,
         )
@@ -211,13 +204,7 @@ class Rig:
         self.stills = StillSender(
             self.outbox, maker=maker or StillMaker(), transmitter=self.sender, backlog=self.backlog
         )
-        self.operating = Operating(
-            budget_bps=config.budget_bps,
-            video_share=config.fixed_share,
-            base_bps=config.base_bps,
-            method=config.method,
-            decimation=1,
-        )
+        self.operating = make_operating(config)
         self.watched = False
         """Somebody subscribes to the video who is no ground."""
         self.link_control = LinkControl(
@@ -228,14 +215,7 @@ class Rig:
             transmitter=self.sender,
             keyframes=self.keyframes,
             inbox=inbox or FeedbackInbox(),
-            reconfiguration=EncoderReconfiguration(
-                self.operating,
-                reconfiguration_settings(config, SIZE),
-                open_encoder=partial(make_encoder, config, size=SIZE),
-                transmitter=self.sender,
-                split=None,
-                pacer=pacer,
-            ),
+            reconfiguration=make_reconfiguration(self.operating, config, SIZE, self.sender, pacer=pacer),
             clock=lambda: self.now_ns,
             pacer=pacer,
             in_flight=self.in_flight,
@@ -248,12 +228,10 @@ class Rig:
         self.asked: list[int] = []
         """When the link was asked for room for a frame."""
         self.admits: Callable[[int, int, int], bool] = self.link_control.admits
-        self.stage = BaseStage(
+        self.stage = make_base_stage(
             BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=200_000, preset="ultrafast")),
+            self.sender,
             keyframes=self.keyframes,
-            transmitter=self.sender,
-            local_copy=None,
-            first_keyframe_bytes=5000,
             admits=self._asked_to_admit,
             backlog=self.backlog,
         )

@@ -30,20 +30,17 @@ from hvt_edge.config import EdgeConfig, check, check_rate
 from hvt_edge.control.link_control import LinkControl
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.feedback import FeedbackInbox
-from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating import Operating
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.frame_skip import LimitedFrameSkip
-from hvt_edge.video.reconfigure import EncoderReconfiguration
-from hvt_edge.video.stage import BaseStage
 from hvt_edge.wiring.link import make_budget, make_pacer
-from hvt_edge.wiring.video import first_decimation, make_encoder, make_frame_skip, reconfiguration_settings
+from hvt_edge.wiring.video import first_decimation, make_encoder, make_frame_skip
 from rigs.kept import INFO
 from rigs.messages import feedback
+from rigs.world import make_base_stage, make_operating, make_reconfiguration, make_transmitter
 
 _WAY_NS = SECOND_NS // 50
 _REPORT_NS, _IDLE_REPORT_NS = SECOND_NS // 8, SECOND_NS // 2
@@ -185,33 +182,24 @@ class LiveFlight:
     def _build(self, size: tuple[int, int], store: Path | None) -> None:
         config = self.config
         decimation = first_decimation(config, size)
-        self.operating = Operating(
-            budget_bps=config.budget_bps,
-            video_share=config.fixed_share,
-            base_bps=config.base_bps,
-            method=config.method,
-            decimation=decimation,
-        )
+        self.operating = make_operating(config, decimation=decimation)
         self.pacer = make_pacer(config, None, size)
         in_flight, outbox = BaseInFlight(), Outbox()
         self.failures = Failures(self._clock)
-        self.transmitter = Transmitter(
+        self.transmitter = make_transmitter(
             self,
             ledger=self.ledger,
             budget=make_budget(config, base_bps=config.base_bps, decimation=decimation),
-            edge_id=config.edge_id,
-            session_id=1,
-            lockstep=False,
             wait_until=self._wait_until,
             pacer=self.pacer,
             in_flight=in_flight,
         )
-        reconfiguration = EncoderReconfiguration(
+        reconfiguration = make_reconfiguration(
             self.operating,
-            reconfiguration_settings(config, size),
+            config,
+            size,
+            self.transmitter,
             open_encoder=lambda **rates: self._opened(size, **rates),
-            transmitter=self.transmitter,
-            split=None,
             pacer=self.pacer,
         )
         self.backlog = None
@@ -253,11 +241,10 @@ class LiveFlight:
             backlog=self.backlog,
             failures=self.failures,
         )
-        self.stage = BaseStage(
+        self.stage = make_base_stage(
             self._opened(size, total_bps=config.budget_bps, base_bps=config.base_bps, decimation=decimation),
+            self.transmitter,
             keyframes=self.keyframes,
-            transmitter=self.transmitter,
-            local_copy=None,
             first_keyframe_bytes=config.base_bps // 40,
             frame_skip=LimitedFrameSkip(
                 make_frame_skip(config, decimation, size=size), reconfiguration.least_decimation

@@ -1,0 +1,151 @@
+"""Real parts of an edge, put together as in flight; a test says only what it is about."""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import partial
+from typing import Any
+
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import BaseHeader, RoiHeader
+from hvt_common.values import View
+from hvt_edge.backlog.stage import BacklogStage
+from hvt_edge.config import EdgeConfig
+from hvt_edge.keyframes import Keyframes
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.operating import Operating
+from hvt_edge.perception.analyzer import Analyzer
+from hvt_edge.perception.candidates import TrackMemory
+from hvt_edge.perception.frame_ring import FrameRing
+from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.on_demand import OnDemand
+from hvt_edge.stills.outbox import Outbox
+from hvt_edge.stills.policy.registry import method
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.stage import StillSender, StillStage
+from hvt_edge.stills.suppression import Suppression
+from hvt_edge.video.reconfigure import EncoderReconfiguration
+from hvt_edge.video.stage import BaseStage
+from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
+
+
+class Puts:
+    """A link that keeps what was put, in order."""
+
+    def __init__(self) -> None:
+        self.puts: list[tuple[Channel, bytes, bytes, str]] = []
+
+    def put(
+        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+    ) -> None:
+        """Keep it."""
+        self.puts.append((row, payload, attachment or b"", encoding))
+
+    @property
+    def base(self) -> list[BaseHeader]:
+        """Headers of the base stream."""
+        return [BaseHeader.parse(extra, data) for row, data, extra, _ in self.puts if row is Channel.BASE]
+
+    @property
+    def units(self) -> list[bytes]:
+        """Its access units."""
+        return [data for row, data, _, _ in self.puts if row is Channel.BASE]
+
+    @property
+    def stills(self) -> list[tuple[RoiHeader, bytes]]:
+        """Headers and bytes."""
+        return [
+            (RoiHeader.parse(extra, data), data) for row, data, extra, _ in self.puts if row is Channel.ROI
+        ]
+
+
+def make_transmitter(
+    out: Any, *, budget: RollingBudget | tuple[int, int] = (800_000, 400_000), **parts: Any
+) -> Transmitter:
+    """That puts into ``out``; ``budget`` is one, or its total and the video's share, bits a second."""
+    if isinstance(budget, tuple):
+        budget = RollingBudget(BudgetSettings(*budget, fps=15))
+    plain: dict[str, Any] = {
+        "ledger": Ledger(),
+        "edge_id": "uav-1",
+        "session_id": 1,
+        "lockstep": False,
+        "wait_until": lambda _at_ns: None,
+    }
+    return Transmitter(out, budget=budget, **(plain | parts))
+
+
+def make_base_stage(encoder: Any, transmitter: Transmitter, **parts: Any) -> BaseStage:
+    """Of this encoder, without a copy and without a store."""
+    plain = {"keyframes": Keyframes(), "local_copy": None, "first_keyframe_bytes": 5000}
+    return BaseStage(encoder, transmitter=transmitter, **(plain | parts))
+
+
+def make_operating(config: EdgeConfig, *, decimation: int = 1) -> Operating:
+    """As a flight with these settings begins."""
+    return Operating(
+        budget_bps=config.budget_bps,
+        video_share=config.fixed_share,
+        base_bps=config.base_bps,
+        method=config.method,
+        decimation=decimation,
+    )
+
+
+def make_reconfiguration(
+    operating: Operating, config: EdgeConfig, size: tuple[int, int], transmitter: Transmitter, **parts: Any
+) -> EncoderReconfiguration:
+    """Of a real encoder, with fixed shares."""
+    plain = {"open_encoder": partial(make_encoder, config, size=size), "split": None, "pacer": None}
+    settings = reconfiguration_settings(config, size)
+    return EncoderReconfiguration(operating, settings, transmitter=transmitter, **(plain | parts))
+
+
+def make_still_stage(
+    transmitter: Transmitter,
+    analyzer: Analyzer,
+    *,
+    keyframes: Keyframes,
+    outcomes: Counter[tuple[str, str]],
+    view: View,
+    class_names: tuple[str, ...],
+    maker: StillMaker | None = None,
+    memory: TrackMemory | None = None,
+    outbox: Outbox | None = None,
+    reporter=None,
+    backlog: BacklogStage | None = None,
+    ring: FrameRing | None = None,
+) -> StillStage:
+    """Of method M1, without suppression; ``outcomes`` counts what becomes of candidates.
+
+    Grounds may request stills of what ``ring`` holds.
+    """
+    outbox, maker = Outbox() if outbox is None else outbox, maker or StillMaker()
+    on_demand = None
+    if ring is not None:
+        on_demand = OnDemand(
+            ring, outbox=outbox, maker=maker, view=view, class_names=class_names, line=transmitter
+        )
+    chooser = Chooser(
+        method("M1"),
+        outbox=outbox,
+        suppression=Suppression.for_cooldown(0),
+        maker=maker,
+        memory=TrackMemory() if memory is None else memory,
+        view=view,
+        class_names=class_names,
+        settings=ChooserSettings(fps=15, most_bytes=10_000),
+        on_outcome=lambda *outcome: outcomes.update([outcome]),
+        on_demand=on_demand,
+    )
+    return StillStage(
+        analyzer,
+        chooser,
+        outbox=outbox,
+        sender=StillSender(outbox, maker=maker, transmitter=transmitter, backlog=backlog),
+        transmitter=transmitter,
+        keyframes=keyframes,
+        reporter=reporter,
+    )
