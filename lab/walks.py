@@ -40,8 +40,9 @@ _WALKS = {
         "a command, from hvt-ground set-budget to the encoder",
         39,
     ),
-    ("EdgeSessions.handle",): ("a message at the ground, received", 67),
-    ("GroundSession._analyze",): ("a frame at the ground, analyzed", 36),
+    ("EdgeSessions.handle",): ("a message at the ground, received", 45),
+    ("perception.make_pipeline",): ("a session's perception at the ground, made", 27),
+    ("Pipeline.analyze",): ("a frame at the ground, analyzed", 34),
     ("Recorder.log",): ("an event at the ground, recorded", 12),
 }
 _MEASURED = {one for functions in _WALKS for one in functions}

@@ -74,9 +74,9 @@ class GroundSession:
     """Fed by the receiving thread in order; a worker analyzes, so that decoding never waits for detection.
 
     In real time the worker passes over what comes too fast. In lockstep nothing is skipped, and the same input
-    gives the same tracks. ``pipeline_of`` and ``worker_of`` make perception and its worker; ``later``: perception
-    waits for models, and the worker makes it once they are there. Without ``reports`` nothing is reported, and the
-    edge's clock is this one (Unix nanoseconds without steps).
+    gives the same tracks. ``worker_of`` makes the worker, which makes perception by ``pipeline_of`` before its first
+    picture, and may wait for models there. Without ``reports`` nothing is reported, and the edge's clock is this one
+    (Unix nanoseconds without steps).
     """
 
     def __init__(  # noqa: PLR0915
@@ -90,7 +90,6 @@ class GroundSession:
         backlog_perception: BacklogPerception | None = None,
         worker_of: WorkerFactory | None = None,
         locator: Locator = NOWHERE,
-        later: bool = False,
     ) -> None:
         self.sinks = sinks
         self._queued = [one for one in sinks if isinstance(one, QueuedSink)]
@@ -106,7 +105,7 @@ class GroundSession:
         self.receive_latency = self._account.receive_latency
         self.overlay_latency = self._account.overlay_latency
         self._make_pipeline = partial(pipeline_of, self._emit)
-        self._pipeline = None if later else self._make_pipeline()
+        self._pipeline: Pipeline | None = None
         self.frames_decoded = self.frames_received = self.stills_received = 0
         self.steps_received = 0
         """Reports of the edge's tracks."""
@@ -332,14 +331,14 @@ class GroundSession:
 
     @property
     def pipeline(self) -> Pipeline:
-        """Its perception; for the worker's thread, which waits here until the models are open."""
+        """Its perception; for the worker's thread, which makes it, and waits here until the models are open."""
         if self._pipeline is None:
             self._pipeline = self._make_pipeline()
         return self._pipeline
 
     @property
     def perceived(self) -> Pipeline | NothingPerceived:
-        """The counts of perception, also while it waits for its models."""
+        """The counts of perception, also before it is made."""
         return self._pipeline or NothingPerceived()
 
     @property

@@ -135,7 +135,6 @@ class SessionFactory:
             reports=reports,
             backlog_perception=make_backlog_perception(config, models, info=info, trust=trust),
             locator=locator,
-            later=models.loading or models.error is not None,
         )
 
     def open_backlog(self, info: Info) -> BacklogRecording:

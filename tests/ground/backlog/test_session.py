@@ -250,7 +250,7 @@ def test_the_hole_of_an_outage_is_filled(flight, tmp_path):
         rig.base(*range(25))
         for index in range(65, 75):
             rig.base(index)
-        tracks, detections = rig.session.pipeline.tracks, rig.session.pipeline.detections_run
+        tracks, detections = rig.session.perceived.tracks, rig.session.perceived.detections_run
         newest = video_object(flight, range(40, 65))
         # It begins in mid-GOP, with some that came, as an edge hands over what was not acknowledged.
         oldest = video_object(flight, range(22, 40))
@@ -259,11 +259,11 @@ def test_the_hole_of_an_outage_is_filled(flight, tmp_path):
         assert {full(flight, "base", 40, newest), full(flight, "base", 22, oldest)} <= set(
             rig.acknowledged_ranges()
         )
-        assert (rig.session.pipeline.tracks, rig.session.pipeline.detections_run) == (tracks, detections)
+        assert (rig.session.perceived.tracks, rig.session.perceived.detections_run) == (tracks, detections)
         assert rig.session.last_frame_index == 74
         for index in range(75, 80):  # one by one: a burst would leave out detections
             rig.base(index)
-        assert rig.session.pipeline.tracks == tracks, "the tracker of now went on undisturbed"
+        assert rig.session.perceived.tracks == tracks, "the tracker of now went on undisturbed"
         assert rig.session.backlog.totals.frames == 40
         assert rig.session.backlog.totals.left_out == 0, "what leads up to them is no frame of the outage"
         assert rig.session.frames_decoded == 40
@@ -336,7 +336,7 @@ def test_stills_of_an_outage_are_shown_at_their_own_time(flight, tmp_path):
         rig.put(flight.still(10, 0))
         rig.base(*range(65, 90))
         kept = {sequence: still_object(flight, 26 + sequence, sequence) for sequence in range(1, 13)}
-        refined = rig.session.pipeline.refined
+        refined = rig.session.perceived.refined
         for sequence in (5, 1, 12, 2, 3, 4, 6, 7, 8, 9, 10, 11):
             rig.put(*backlog(flight, "still", sequence, kept[sequence], chunk_bytes=300))
         rig.put(*backlog(flight, "still", 5, kept[5]))  # its acknowledgement was lost
@@ -345,8 +345,8 @@ def test_stills_of_an_outage_are_shown_at_their_own_time(flight, tmp_path):
         )
         results = [one.still_sequence for report in rig.port.reports for one in report.stills]
         assert sorted(results) == list(range(13)), "the edge hears of each once"
-        assert rig.session.pipeline.refined == refined
-        assert rig.session.pipeline.outcomes["frame lost"] == 12
+        assert rig.session.perceived.refined == refined
+        assert rig.session.perceived.outcomes["frame lost"] == 12
     recording = Recording(tmp_path / "0.rrd")
     shown = [frame for frame, _ in recording.stills()]
     assert [frame for frame in shown if 25 < frame < 65] == list(range(27, 39))
@@ -415,8 +415,8 @@ def test_a_still_at_a_frame_that_is_known_speaks_on_its_track(flight, tmp_path):
         for index in range(25):  # one by one: a worker that is behind leaves detection out
             rig.base(index)
         rig.put(*backlog(flight, "still", 0, still_object(flight, 15, 0)))
-        assert rig.session.pipeline.outcomes["matched"] == 1
-        assert rig.session.pipeline.refined == 1
+        assert rig.session.perceived.outcomes["matched"] == 1
+        assert rig.session.perceived.refined == 1
 
 
 def test_a_still_of_an_edge_track_that_is_known_now_speaks_on_it(flight, tmp_path):
@@ -428,7 +428,7 @@ def test_a_still_of_an_edge_track_that_is_known_now_speaks_on_it(flight, tmp_pat
         rig.base(*range(70, 80))
         rig.put(*backlog(flight, "still", 0, still_object(flight, 30, 0, track_id=31)))
         rig.put(*backlog(flight, "still", 1, still_object(flight, 31, 1, track_id=32)))
-        outcomes = rig.session.pipeline.outcomes
+        outcomes = rig.session.perceived.outcomes
         assert (outcomes["matched"], outcomes["frame lost"] + outcomes["late"]) == (1, 1)
 
 

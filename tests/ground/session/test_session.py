@@ -118,7 +118,7 @@ def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
             for one in items
         )
         assert session.ledger.line_bytes == expected
-        assert session.pipeline.tracks >= 1
+        assert session.perceived.tracks >= 1
         wait_for(lambda: rig.port.reports and rig.port.reports[-1].last_frame_index == 29)
         last = rig.port.reports[-1]
         assert (last.base_messages, last.roi_messages, last.lost, last.corrupt) == (30, 2, 0, 0)
@@ -152,7 +152,7 @@ def test_the_edges_tracks_are_counted_and_shown(pace):
             + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
             for one in items
         )
-        assert session.pipeline.tracks == 2
+        assert session.perceived.tracks == 2
         assert session.pipeline.steps_used == 3
         assert session.pipeline.list_at(19).origins == ("edge+base", "edge")
 
@@ -475,7 +475,7 @@ def test_slow_detection_never_holds_up_decoding(flight):
         began = time.monotonic()
         rig.put(*bases(flight, *range(30)))
         wait_for(lambda: rig.opened and rig.opened[0].frames_decoded == 30)
-        assert rig.opened[0].pipeline.detections_run <= 2 + (time.monotonic() - began) / 0.3
+        assert rig.opened[0].perceived.detections_run <= 2 + (time.monotonic() - began) / 0.3
         rig.settle()
     (session,) = rig.ended
     assert session.last_frame_index == 29, "the newest is tracked, whatever is left out"
@@ -492,7 +492,7 @@ def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
                 rig.settle()
         wait_for(lambda: len(rig.reader.had_base) == 20)
         assert all(rig.reader.had_base)
-        assert rig.receiver.session.pipeline.refined >= 1  # a busy machine may lose the track between
+        assert rig.receiver.session.perceived.refined >= 1  # a busy machine may lose the track between
 
 
 def test_a_still_before_its_frame_waits_for_its_track(flight):
@@ -501,10 +501,10 @@ def test_a_still_before_its_frame_waits_for_its_track(flight):
         rig.port.flight = flight
         rig.put(*bases(flight, 0, 1, 2), flight.still(6, 0))
         rig.settle()
-        assert rig.receiver.session.pipeline.refined == 0
+        assert rig.receiver.session.perceived.refined == 0
         rig.put(*bases(flight, *range(3, 12)))
         rig.settle()
-        wait_for(lambda: rig.receiver.session.pipeline.refined == 1)
+        wait_for(lambda: rig.receiver.session.perceived.refined == 1)
 
 
 def test_lockstep_sees_every_frame_and_answers_every_still():
@@ -520,7 +520,7 @@ def test_lockstep_sees_every_frame_and_answers_every_still():
                 )
             rig.settle()
             session = rig.receiver.session
-            assert session.pipeline.detections_run == 20
+            assert session.perceived.detections_run == 20
             answered = [one.still_sequence for report in rig.port.reports for one in report.stills]
             assert answered == list(range(20))
             frames = [report.last_frame_index for report in rig.port.reports]
