@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from fractions import Fraction
 
 from hvt_common.errors import UserError
@@ -115,6 +116,16 @@ def parse_share(text: str, *, name: str) -> float:
 def bitrate_text(bps: float) -> str:
     """800000 → ``800 kbps``."""
     return f"{bps / 1e6:.2f} Mbps" if bps >= 1e6 else f"{bps / 1e3:.0f} kbps"
+
+
+def utc_text(unix_ns: int, *, milliseconds: bool = True) -> str:
+    """``2026-11-22T13:01:02.345Z``; empty where no calendar has the time, which may come from the wire."""
+    try:
+        time = datetime.fromtimestamp(unix_ns // SECOND_NS, UTC)
+    except (ValueError, OverflowError, OSError):
+        return ""
+    rest = f".{unix_ns // 1_000_000 % 1000:03d}" if milliseconds else ""
+    return time.strftime("%Y-%m-%dT%H:%M:%S") + rest + "Z"
 
 
 def exact_rate(fps: float) -> Fraction:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -15,6 +14,7 @@ from hvt_common.runtime.process import lower_priority
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_ground.events import Event, MessageTiming, Notice, Overlay, Refinement, VideoSample
 from hvt_ground.report.state import EdgeState, GroundState, SessionState
+from hvt_ground.sinks import SinkWriter
 from hvt_ground.sinks.palette import class_colour
 from hvt_web.video.pictures import Pictures, jpeg
 from hvt_web.viewers import EdgePage, Hub, text
@@ -27,10 +27,8 @@ _SHOWN_BY_BROWSERS = ("image/jpeg", "image/png", "image/webp")
 _MILLION = 1_000_000
 
 
-class SessionFeed:
+class SessionFeed(SinkWriter[Event]):
     """Writes one session of an edge to the page of it. ``clock`` is the ground's, Unix nanoseconds."""
-
-    path = None
 
     def __init__(self, info: Info, page: EdgePage, hub: Hub, *, clock: Callable[[], int]) -> None:
         lower_priority()  # viewers never slow down what receives and records
@@ -77,9 +75,6 @@ class SessionFeed:
     def skipped(self, count: int) -> None:  # noqa: ARG002 - one is as bad as many
         """Pictures may be missing."""
         self._pictures.gap()
-
-    def close(self, hurry: threading.Event | None = None) -> None:
-        """Nothing is held back."""
 
     def _video(self, sample: VideoSample) -> None:
         if self._late_ns > _TOO_LATE_NS and not sample.keyframe:

@@ -18,10 +18,9 @@ from typing import Any, Final
 from hvt_archive.exports.ways import Fix, line, parts_of
 from hvt_common.errors import UserError
 from hvt_common.geodesy import metres_per_degree, moved, turned_deg
-from hvt_common.units import SECOND_NS
+from hvt_common.units import SECOND_NS, utc_text
 from hvt_ground.recordings.contract import Recorded
 from hvt_ground.sinks.palette import class_colour
-from hvt_ground.sinks.tracks_table import utc_text
 
 _EVERY_NS: Final = SECOND_NS
 _ELLIPSE_CORNERS: Final = 24

@@ -11,9 +11,9 @@ import cv2
 
 from hvt_archive.exports.video import pictures
 from hvt_common.errors import UserError
+from hvt_common.units import utc_text
 from hvt_ground.events import Overlay
 from hvt_ground.recordings.contract import Recorded
-from hvt_ground.sinks.tracks_table import utc_text
 
 STILL_COLUMNS = ("file", "base_file", "frame_index", "capture_utc", "caption")
 """``base_file`` shows what the base stream had there, empty where the recording does not say; ``frame_index`` is

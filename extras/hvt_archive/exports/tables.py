@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hvt_ground.recordings.contract import Recorded
-from hvt_ground.sinks.tracks_table import COLUMNS, track_rows
+from hvt_ground.sinks.event_tables import TRACK_COLUMNS, track_rows
 
 _BATCH_ROWS = 100_000
 _TYPES = {
@@ -27,16 +27,16 @@ _TYPES = {
 
 
 def write_csv(recorded: Recorded, path: Path) -> None:
-    """One line a track and frame, the columns of `hvt_ground.sinks.tracks_table`."""
+    """One line a track and frame, the columns of `hvt_ground.sinks.event_tables`."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
+        writer.writerow(TRACK_COLUMNS)
         writer.writerows(_rows(recorded))
 
 
 def write_parquet(recorded: Recorded, path: Path) -> None:
     """The same as a Parquet file."""
-    schema = pa.schema([(name, _TYPES[name]) for name in COLUMNS])
+    schema = pa.schema([(name, _TYPES[name]) for name in TRACK_COLUMNS])
     rows = _rows(recorded)
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:
         while batch := list(islice(rows, _BATCH_ROWS)):
@@ -59,12 +59,12 @@ def write_mot(recorded: Recorded, path: Path) -> None:
 
     Tracks that stills doubt are left out: the format has no word for them.
     """
-    doubted = COLUMNS.index("doubted")
+    doubted = TRACK_COLUMNS.index("doubted")
     with path.open("w", encoding="utf-8") as file:
         for overlay in recorded.overlays():
             for row in track_rows(overlay):
                 if not row[doubted]:
-                    _, _, *values = row[: COLUMNS.index("confidence") + 1]
+                    _, _, *values = row[: TRACK_COLUMNS.index("confidence") + 1]
                     file.write(",".join(map(str, (overlay.frame_index + 1, *values))) + ",-1,-1,-1\n")
 
 

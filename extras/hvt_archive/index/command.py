@@ -13,9 +13,8 @@ from pathlib import Path
 from hvt_archive.index.database import read_index
 from hvt_common.errors import Parser, UserError
 from hvt_common.runtime.reporting import say
-from hvt_common.units import SECOND_NS, parse_limit, shown_text
+from hvt_common.units import SECOND_NS, parse_limit, shown_text, utc_text
 from hvt_ground.recordings.row import RecordingRow
-from hvt_ground.sinks.tracks_table import utc_text
 
 _HEAD = ("file", "edge", "begin (UTC)", "length", "MB", "frames", "stills", "tracks by class")
 

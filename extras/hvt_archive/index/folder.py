@@ -22,7 +22,7 @@ from hvt_common.units import SECOND_NS
 from hvt_ground.control import EdgeClient
 from hvt_ground.extras import Service
 from hvt_ground.recordings.row import RecordingRow
-from hvt_ground.sinks import QueuedSink
+from hvt_ground.sinks import QueuedSink, SinkWriter
 
 _log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ _DOUBT_NS = 3600 * SECOND_NS
 """For so long after the clock was set nothing goes for its age: who set it may set it again."""
 
 
-class IndexWriter:
+class IndexWriter(SinkWriter[RecordingRow | None]):
     """Writes the index; a sink for one thread. Files are removed when one was closed, or an item is None.
 
     At the beginning it is brought to what is in the folder: files that are gone are forgotten, those that a killed
@@ -79,11 +79,8 @@ class IndexWriter:
         if item is None or item.whole:
             self._remove_due(now)
 
-    def skipped(self, count: int) -> None:
-        """The next row of a file says it all; one that was closed is read at the next start."""
-
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Close the index; a second call does nothing."""
+        """Close the index."""
         self._index.close()
 
     def _pass_time(self) -> Moment:

@@ -25,6 +25,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, READ_VERSIONS, Info, WireError
 from hvt_common.transport.inbox import Received
+from hvt_ground.sinks import SinkWriter
 from hvt_ground.sinks.line_file import check_there
 
 _log = logging.getLogger(__name__)
@@ -38,14 +39,14 @@ _MOST_EDGES = 256
 _TYPES = [int, str, str, bytes, bytes]
 
 
-class MessageLog:
+class MessageLog(SinkWriter[Received]):
     """Appends messages to a new file; takes the place of one of that name. `UserError` where it cannot be written.
 
     The file and the one before it are at most ``most_bytes`` together, or one message longer.
     """
 
     def __init__(self, path: Path, *, most_bytes: int) -> None:
-        self.path = path
+        self.path: Path = path
         self._most_bytes = most_bytes
         self._answers: OrderedDict[str, bytes] = OrderedDict()
         """The record of the last answer to ``info``, by key."""
@@ -107,11 +108,8 @@ class MessageLog:
                 f"message log {self.path} cannot be written any further: {error.strerror}"
             ) from error
 
-    def skipped(self, count: int) -> None:
-        """They are missing, as if they had been lost on the link."""
-
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Close the file; a second call does nothing."""
+        """Close the file."""
         self._file.close()
 
 

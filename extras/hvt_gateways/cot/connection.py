@@ -31,6 +31,7 @@ with warnings.catch_warnings():
 from hvt_common.errors import UserError, absent
 from hvt_common.runtime.host_names import is_group
 from hvt_gateways.cot.event import CotMessage
+from hvt_ground.sinks import SinkWriter
 
 _log = logging.getLogger(__name__)
 
@@ -157,14 +158,12 @@ def _settings(url: str, environment: Mapping[str, str]) -> dict[str, str]:
     return {**settings, "COT_URL": f"{scheme}://{parts.netloc}"}
 
 
-class CotConnection:
+class CotConnection(SinkWriter[CotMessage]):
     """An open connection; the sink of a `QueuedSink`, which makes it anew once it has failed.
 
     `log` never waits: of each uid the newest event is to be sent, in turn. What the other side sends is read and
     thrown away. Raises `UserError` where it cannot be opened within five seconds; `log` does so after it has failed.
     """
-
-    path = None
 
     def __init__(self, url: str, environment: Mapping[str, str] = os.environ) -> None:
         self._url = url
@@ -192,11 +191,8 @@ class CotConnection:
                 del self._unsent[next(iter(self._unsent))]
         self._notify()
 
-    def skipped(self, count: int) -> None:
-        """Newer ones follow."""
-
     def close(self, hurry: threading.Event | None = None) -> None:
-        """Send what waits, within a second, and close; a second call does nothing."""
+        """Send what waits, within a second, and close."""
         with self._lock:
             self._ending = True
             if hurry is not None and hurry.is_set():

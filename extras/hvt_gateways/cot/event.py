@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 from xml.etree.ElementTree import Element, SubElement, tostring
 
-from hvt_ground.sinks.tracks_table import utc_text
+from hvt_common.units import utc_text
 
 UNKNOWN_M: Final = 9_999_999.0
 """The schema's value for an unknown height or error."""

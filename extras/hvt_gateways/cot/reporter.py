@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, TypeVar
@@ -20,7 +19,7 @@ from hvt_gateways.cot.motion import MotionTrail
 from hvt_gateways.cot.schedule import STALE_NS, PlacedTrack, TrackSchedule
 from hvt_gateways.cot.type_table import TypeTable
 from hvt_ground.events import Event, MessageTiming, Overlay, PoseUpdate, Refinement
-from hvt_ground.sinks.contract import Sink
+from hvt_ground.sinks import Sink, SinkWriter
 
 _log = logging.getLogger(__name__)
 
@@ -48,14 +47,12 @@ def no_address(_still: Refinement) -> str:
     return ""
 
 
-class SessionReporter:
+class SessionReporter(SinkWriter[Event]):
     """Reports one session to ``targets``; ``clock`` is the ground's, ``wall_ns`` what receivers go by.
 
     What was stored at the edge, and what is older than its time to go stale, is not reported. A track that is lost is
     not reported any more and goes stale by itself, as all do when the session ends.
     """
-
-    path = None
 
     def __init__(
         self,
@@ -104,12 +101,6 @@ class SessionReporter:
                 address = self._still_address(item)
                 if address:
                     _put(self._stills, track_id, address)
-
-    def skipped(self, count: int) -> None:
-        """Nothing to do: later events repeat it."""
-
-    def close(self, hurry: threading.Event | None = None) -> None:
-        """Nothing is held back."""
 
     def _age_ns(self, capture_ns: int) -> int:
         """The age since capture. In lockstep capture is media time: there everything is from now."""

@@ -30,6 +30,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
 from hvt_gateways.decodable import DecodableRun
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, VideoSample
+from hvt_ground.sinks import SinkWriter
 from hvt_ground.sinks.line_file import check_there
 from hvt_ground.sinks.palette import Rgb, class_colour
 from hvt_ground.sinks.rerun.stills import event_text, still_picture
@@ -49,11 +50,11 @@ class _At:
     capture_ns: int
 
 
-class McapFile:
+class McapFile(SinkWriter[Event]):
     """An MCAP file; takes the place of one of that name. `UserError` where it cannot be written."""
 
     def __init__(self, path: Path, *, edge: str) -> None:
-        self.path = path
+        self.path: Path = path
         self._edge = edge
         self._run = DecodableRun()
         try:
@@ -92,7 +93,7 @@ class McapFile:
         self._run.interrupt()
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Write index and footer, and close; a second call does nothing."""
+        """Write index and footer, and close."""
         if self._file.closed:
             return
         try:

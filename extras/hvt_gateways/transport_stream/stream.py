@@ -33,6 +33,7 @@ from hvt_gateways.transport_stream.timeline import TIME_BASE, Timeline
 from hvt_gateways.transport_stream.uas import Platform, uas_local_set
 from hvt_ground.events import Event, Overlay, PoseUpdate, VideoSample
 from hvt_ground.poses import PoseTrail
+from hvt_ground.sinks import SinkWriter
 
 if TYPE_CHECKING:
     from hvt_ground.recordings.contract import Recorded
@@ -45,14 +46,12 @@ _USUAL_FPS: Final = 15.0
 """A recording does not say it; it counts where a clock was set."""
 
 
-class TransportStream:
+class TransportStream(SinkWriter[Event]):
     """Writes into ``output``, or to an SRT URL; ``trail`` has the poses where all are known before.
 
     ``ended`` is called once after the end. What was stored at the edge during an outage is left out: a stream does
     not go back.
     """
-
-    path: Path | None = None
 
     def __init__(
         self,
@@ -102,7 +101,7 @@ class TransportStream:
         self._moments.forget()
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Say what waits, and end; a second call does nothing."""
+        """Say what waits, and end."""
         container = self._container
         if container is None:
             return

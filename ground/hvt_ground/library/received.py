@@ -12,7 +12,6 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self
 
 from hvt_common.config import load, settings_words
@@ -24,6 +23,7 @@ from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
 from hvt_ground.extras import checked, config_class
+from hvt_ground.sinks import SinkWriter
 
 _MOST_QUEUED, MOST_QUEUED_BYTES = 32, 128 * 2**20
 """Events, of which each may be a picture, and their pixels."""
@@ -141,10 +141,8 @@ class _Events(queue.Queue[Received]):
         self.maxsize = _MOST_QUEUED if self._bytes < MOST_QUEUED_BYTES else max(1, len(self.queue))
 
 
-class _Queue:
+class _Queue(SinkWriter[Event]):
     # The events of one session, decoded, for the program's queue; waits while that is full.
-
-    path: Path | None = None
 
     def __init__(self, events: _Events, stop: threading.Event, info: Info) -> None:
         self._events = events
@@ -167,9 +165,6 @@ class _Queue:
     def skipped(self, count: int) -> None:
         del count
         self._awaits_keyframe = {False: True, True: True}
-
-    def close(self, hurry: threading.Event | None = None) -> None:
-        """There is nothing to close."""
 
     def _put(self, received: Received) -> None:
         waits = self._info.pace == "lockstep"

@@ -21,6 +21,7 @@ from pathlib import Path
 from hvt_common.units import SECOND_NS, Limit
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.row import FileAccount, RecordingRow
+from hvt_ground.sinks.contract import SinkWriter
 from hvt_ground.sinks.line_file import claim_name
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.recording_file import RecordingFile
@@ -35,7 +36,7 @@ _MOST_LATE_OPEN, _MOST_LATE = 4, 32
 """Files of backlog beside former ones: each costs 80 kB before its first byte."""
 
 
-class SessionFiles:
+class SessionFiles(SinkWriter[Event]):
     """A sink, as `Recorder`. Without ``split`` all goes into the file of ``settings``.
 
     Otherwise that gives the names: ``flight.rrd`` becomes ``flight-0001.rrd``, ``flight-0002.rrd`` and, for what
@@ -73,11 +74,6 @@ class SessionFiles:
         self._late_left = _MOST_LATE
         self._opened(self._recorder.file)
 
-    @property
-    def path(self) -> Path | None:
-        """The file that was opened last."""
-        return self._newest_path
-
     def log(self, item: Event) -> None:
         """Record an event in the file of its time."""
         if isinstance(item, FrameEvent):
@@ -89,7 +85,7 @@ class SessionFiles:
             self._report_all()
 
     def skipped(self, count: int) -> None:
-        """As of a `Recorder`."""
+        """See `Recorder`."""
         self._recorder.skipped(count)
 
     def close(self, hurry: threading.Event | None = None) -> None:
@@ -187,7 +183,7 @@ class SessionFiles:
 
     def _opened(self, file: RecordingFile, *, backlog: bool = False) -> RecordingFile:
         self._accounts[file] = FileAccount(backlog=backlog or self._backlog)
-        self._newest_path = file.path
+        self.path = file.path
         self._report(file)
         return file
 

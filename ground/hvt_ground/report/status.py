@@ -7,13 +7,12 @@ from typing import Any
 
 from hvt_common.protocol.edge_words import counts_text
 from hvt_common.runtime.failures import FailedPart, Failures
-from hvt_common.units import bitrate_text
+from hvt_common.units import bitrate_text, utc_text
 from hvt_ground.events import Event
 from hvt_ground.report.state import EdgeState, GroundState
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink, Sink
-from hvt_ground.sinks.tracks_table import utc_text
 
 
 def status_text(state: GroundState) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from hvt_common.transport.inbox import Received
 from hvt_ground.events import Overlay, Refinement, VideoSample
 
+T = TypeVar("T")
 T_contra = TypeVar("T_contra", contravariant=True)
 
 _SMALL_BYTES = 512
@@ -26,15 +27,21 @@ class Sink(Protocol[T_contra]):
         """Write the buffer; skip slow extras once ``hurry`` is set."""
 
 
-class SinkWriter(Sink[T_contra], Protocol[T_contra]):
-    """A sink that one thread uses. An error that it raises ends it."""
+class SinkWriter(Generic[T]):
+    """A sink that one thread uses; this one writes to no file, and holds nothing. An error that it raises ends it."""
 
-    @property
-    def path(self) -> Path | None:
-        """The file that was opened last; None without one."""
+    path: Path | None = None
+    """The file that was opened last; None without one."""
+
+    def log(self, item: T) -> None:
+        """Write an item, or pass it by."""
+        raise NotImplementedError
 
     def skipped(self, count: int) -> None:
         """So many items were left out before the next one."""
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """Write what is held back; skip slow extras once ``hurry`` is set. A second call does nothing."""
 
 
 def is_stored(item: object) -> bool:

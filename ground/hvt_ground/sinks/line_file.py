@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from hvt_common.errors import UserError
+from hvt_ground.sinks.contract import SinkWriter
 
 
 def check_there(file: int, path: Path) -> None:
@@ -41,14 +42,14 @@ def has_nothing(path: Path) -> bool:
     return stat.S_ISREG(found.st_mode) and not found.st_size
 
 
-class LineFile:
+class LineFile(SinkWriter[str]):
     """A new file with a first line of ``columns``; comma-separated. Takes the place of one of that name.
 
     Raises `UserError` where it cannot be created, or (from `log`) written any further.
     """
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
-        self.path = path
+        self.path: Path = path
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
         self._size_bytes, fresh = 0, has_nothing(path)
         try:
@@ -76,11 +77,8 @@ class LineFile:
             raise UserError(f"table {self.path} cannot be written any further: {error.strerror}") from error
         self._size_bytes += len(item.encode())
 
-    def skipped(self, count: int) -> None:
-        """Nothing to do: skipped lines are lost."""
-
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Close the file; a second call does nothing."""
+        """Close the file."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1

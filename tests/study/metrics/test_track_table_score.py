@@ -9,7 +9,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_ground.events import Notice, Overlay
-from hvt_ground.sinks.tracks_table import TrackTable
+from hvt_ground.sinks.event_tables import TrackTable
 from hvt_scene import Scene
 from hvt_study.cli import main
 from hvt_study.datasets.labels import FrameLabels

@@ -11,7 +11,6 @@ import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -21,7 +20,7 @@ from rerun.chunk import Chunk
 from hvt_common.units import bitrate_text
 from hvt_common.video.annex_b import parameter_sets
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
-from hvt_ground.sinks.contract import is_stored
+from hvt_ground.sinks.contract import SinkWriter, is_stored
 from hvt_ground.sinks.palette import AMBER, GREY, VERMILLION, Rgb
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.blueprint import session_chunk, static_chunks
@@ -92,7 +91,7 @@ class RecorderSettings:
     """Payload of the append log at which it is compacted: that costs some 50 kB, and this much is in memory."""
 
 
-class Recorder:
+class Recorder(SinkWriter[Event]):
     """Records the events of one edge's session. Several may run in one process, each in one thread.
 
     When `log` returns, the event is in the file: killing the process loses nothing that was logged. Raises
@@ -120,11 +119,7 @@ class Recorder:
         self._traffic_end: tuple[int, int] | None = None
         """Where the plots would end, had no more come."""
         self.file = self._into = self.open_file(settings.path)
-
-    @property
-    def path(self) -> Path | None:
-        """The file that is written to; None in a viewer."""
-        return self.file.path
+        self.path = settings.path
 
     @property
     def size_bytes(self) -> int:
@@ -197,6 +192,7 @@ class Recorder:
         The former one is left open, for `close_file`.
         """
         self.file = self._into = file
+        self.path = file.path
         cost = self._size_limit.logged_bytes
         contexts = [one for layer in LAYERS for one in self._new_classes(layer)]
         # What is of a later time is in there already.
@@ -231,9 +227,7 @@ class Recorder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _note_shown(self, row: TableRow) -> None:

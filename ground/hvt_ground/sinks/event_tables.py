@@ -1,0 +1,144 @@
+"""Tables of a session that grow with it: the ground's tracks, and its stills with a picture beside the table each.
+
+The recording shows stills that it has room for; here nothing is left out, and nothing is coded again.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hvt_common.errors import UserError
+from hvt_common.units import utc_text
+from hvt_ground.events import Event, Overlay, Places, Refinement
+from hvt_ground.sinks.contract import SinkWriter
+from hvt_ground.sinks.line_file import LineFile
+
+TRACK_COLUMNS = (
+    *("frame_index", "capture_utc", "id", "x", "y", "w", "h", "confidence"),
+    *("base_class", "class", "refined", "origin", "late", "doubted"),
+    *("latitude", "longitude", "error_m"),
+)
+"""``frame_index`` counts from 0, as on the wire, and ``x y w h`` are base pixels; ``capture_utc`` is the time at the
+camera by the edge's clock; ``base_class`` is what the detectors say without stills, ``class`` the same after
+refinement, ``refined`` 1 once a still has refined it; ``origin``: ``base``, ``edge``, ``edge+base`` or ``still``;
+``late``: 1 where it is of stored video that came after an outage, behind later frames; ``doubted``: 1 where stills
+say that it is nothing of mine, or the view is unlike what the detector knows; ``latitude longitude`` are where it
+stands (WGS 84, degrees) and ``error_m`` half the longer axis of the ellipse that holds it with 95 %, empty where no
+pose tells. A source frame that the base stream left out has lines too where the edge reported it."""
+
+STILL_COLUMNS = (
+    *("file", "frame_index", "known_frame_index", "still", "track", "edge_track", "x", "y", "w", "h"),
+    *("class_before", "class_after", "confidence", "reason"),
+)
+"""``frame_index`` is what the still shows and ``known_frame_index`` when it was known here, both from 0; ``x y w h``
+is where the whole picture lies in the base picture of ``frame_index``, base pixels."""
+
+
+class _EventTable(SinkWriter[Event]):
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+        self._file = LineFile(path, columns)
+        self.path: Path = path
+
+    def _append(self, *rows: tuple[object, ...]) -> None:
+        text = io.StringIO(newline="")
+        csv.writer(text, lineterminator="\n").writerows(rows)
+        self._file.log(text.getvalue())
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """Close the table."""
+        self._file.close(hurry)
+
+
+class TrackTable(_EventTable):
+    """A CSV file of one line a track and frame; other events than overlays pass it by."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, TRACK_COLUMNS)
+
+    def log(self, item: Event) -> None:
+        """Append the tracks of an overlay."""
+        if isinstance(item, Overlay) and len(item.track_ids):
+            self._append(*track_rows(item))
+
+
+class StillFiles(_EventTable):
+    """A CSV file, and beside it a PNG a still, named after both: ``<table>-000012.png``. Other events pass it by.
+
+    A still of several objects has a line for each and one picture.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, STILL_COLUMNS)
+        self._last = -1
+
+    def log(self, item: Event) -> None:
+        """Write a still; `UserError` where there is no room for it."""
+        if not isinstance(item, Refinement) or item.still_bgr is None or item.crop_base_px is None:
+            return
+        picture = picture_of(item, self.path)
+        if item.still_sequence != self._last:
+            _, data = cv2.imencode(".png", item.still_bgr)
+            try:
+                picture.write_bytes(data.tobytes())
+            except OSError as error:
+                raise UserError(f"still {picture} cannot be written: {error.strerror}") from error
+            self._last = item.still_sequence
+        self._append(_still_row(item, picture.name))
+
+
+def track_rows(overlay: Overlay) -> Iterator[tuple[object, ...]]:
+    """One row of `TRACK_COLUMNS` a track."""
+    origins = overlay.origins or ("base",) * len(overlay.track_ids)
+    for row, track_id in enumerate(overlay.track_ids.tolist()):
+        x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
+        yield (
+            overlay.frame_index,
+            utc_text(overlay.capture_ns),
+            track_id,
+            *(f"{value:.1f}" for value in (x1, y1, x2 - x1, y2 - y1)),
+            f"{overlay.confidences[row]:.3f}",
+            overlay.base_classes[row],
+            overlay.classes[row],
+            int(overlay.refined[row]),
+            origins[row],
+            int(overlay.stored),
+            0 if overlay.doubted is None else int(overlay.doubted[row]),
+            *_place_texts(overlay.places, row),
+        )
+
+
+def _place_texts(places: Places | None, row: int) -> tuple[str, str, str]:
+    if places is None or not np.isfinite(places.places_deg[row]).all():
+        return "", "", ""
+    latitude, longitude = places.places_deg[row]
+    return f"{latitude:.7f}", f"{longitude:.7f}", f"{places.ellipses[row, 0]:.1f}"
+
+
+def picture_of(still: Refinement, table: Path) -> Path:
+    """The picture of a still, beside the table; it is there where the still was decoded and has a place."""
+    return table.with_name(f"{table.stem}-{still.still_sequence:06d}.png")
+
+
+def _still_row(item: Refinement, name: str) -> tuple[object, ...]:
+    assert item.crop_base_px is not None, "only stills with a place have a row"
+    x1, y1, x2, y2 = item.crop_base_px
+    return (
+        name,
+        item.shown_index,
+        item.frame_index,
+        item.still_sequence,
+        "" if item.track_id is None else item.track_id,
+        item.edge_track_id,
+        *(f"{value:.3f}" for value in (x1, y1, x2 - x1, y2 - y1)),
+        item.class_before,
+        item.class_after,
+        f"{item.confidence:.3f}",
+        item.reason,
+    )
