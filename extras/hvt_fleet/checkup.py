@@ -8,16 +8,21 @@ import logging
 import os
 import shutil
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import zenoh
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import Finding, say
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_fleet.link.diagnose import visit
 
 _STYLES: Mapping[str, str] = {"ok": "green", "unknown": "cyan", "warning": "yellow", "wrong": "bold red"}
 
@@ -132,3 +137,37 @@ class _Said(logging.Handler):
         if not self._warnings or finding.state not in ("ok", "unknown"):
             return finding
         return replace(finding, state="warning", todo="; ".join(self._warnings))
+
+
+_PEER_S = 3.0
+_SAMPLE_S = 0.1
+
+
+def check_link(settings: LinkSettings, find_peer: Callable[[zenoh.Session], str], *, other: str) -> Finding:
+    """Open the link for some seconds. ``find_peer`` says who of the ``other`` side is there; empty while nobody is.
+
+    Raises `UserError` for endpoints, keys and ports that cannot be used.
+    """
+    with open_session(settings) as session:
+        for _ in _until(_PEER_S):
+            found = find_peer(session)
+            if found:
+                return Finding("ok", found)
+        linked = bool(session.info.links())
+    if linked:
+        return Finding("warning", f"there is a link, and no {other} on it", f"start the {other}")
+    config, listen = configure(settings)
+    explained = visit(config)
+    if explained:
+        return Finding("warning", "; ".join(explained), f"start the {other}, or mend what stands there")
+    where = ", ".join(listen) or "nothing"
+    return Finding(
+        "warning", f"listens on {where}; no {other} came within {_PEER_S:.0f} s", f"start the {other}"
+    )
+
+
+def _until(seconds: float) -> Iterator[None]:
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        yield
+        time.sleep(_SAMPLE_S)

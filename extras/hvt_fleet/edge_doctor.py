@@ -39,9 +39,8 @@ from hvt_edge.wiring import (
     store_folder,
 )
 from hvt_edge.world import World
-from hvt_fleet.checkup import check_clock, check_folder, print_findings, run_checks
+from hvt_fleet.checkup import check_clock, check_folder, check_link, print_findings, run_checks
 from hvt_fleet.link.duplicate_edge import refuse_duplicate_edge
-from hvt_fleet.link.reach import check_link
 
 _DESCRIPTION = (
     "Check what a flight with these settings needs; takes the settings of hvt-edge. --json is for programs."

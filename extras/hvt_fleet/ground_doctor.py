@@ -15,8 +15,7 @@ from hvt_common.inference.detect import detect_every
 from hvt_common.protocol.channels import Channel, parse_key, selector
 from hvt_common.runtime.host_names import check_port
 from hvt_common.runtime.reporting import Finding, check_writable
-from hvt_fleet.checkup import check_clock, check_folder, print_findings, run_checks
-from hvt_fleet.link.reach import check_link
+from hvt_fleet.checkup import check_clock, check_folder, check_link, print_findings, run_checks
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import all_extras, checked, config_class
 from hvt_ground.perception.models import Models

@@ -40,7 +40,7 @@ class GeoExtra(Extra):
         The file is looked at once, here: `UserError` where it is no elevation model. One that goes later ends no
         flight.
         """
-        from hvt_geo.locator import SurfaceLocator  # noqa: PLC0415 - as above
+        from hvt_geo.camera import SurfaceLocator  # noqa: PLC0415 - as above
 
         if terrain is None:
             return lambda _flight: SurfaceLocator()

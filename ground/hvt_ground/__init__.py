@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hvt_ground.library.received import listen
+    from hvt_ground.library import listen
 
 __all__ = ["listen"]
 
@@ -16,7 +16,7 @@ __all__ = ["listen"]
 def __getattr__(name: str) -> Any:
     """Only who uses it loads it."""
     if name == "listen":
-        from hvt_ground.library.received import listen  # noqa: PLC0415
+        from hvt_ground.library import listen  # noqa: PLC0415
 
         return listen
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

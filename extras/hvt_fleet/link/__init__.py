@@ -1,4 +1,4 @@
 """Explains in one sentence why there is no link: `diagnose`, by `certificate`, `probe` and `strangers`.
 
-`duplicate_edge` finds another edge of one id, `reach` whether the other side is there.
+`duplicate_edge` finds another edge of one id.
 """

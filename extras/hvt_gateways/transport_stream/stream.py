@@ -28,8 +28,7 @@ from hvt_gateways.transport_stream.destination import (
     Output,
     StreamFile,
 )
-from hvt_gateways.transport_stream.moments import Moment, Moments
-from hvt_gateways.transport_stream.timeline import TIME_BASE, Timeline
+from hvt_gateways.transport_stream.moments import TIME_BASE, Moment, Moments, Timeline
 from hvt_gateways.transport_stream.uas import Platform, uas_local_set
 from hvt_ground.events import Event, Overlay, PoseUpdate, VideoSample
 from hvt_ground.poses import PoseTrail

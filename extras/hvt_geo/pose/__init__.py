@@ -1,1 +1,1 @@
-"""Poses of the camera for an edge: `fixed`, from `files` beside the clip, from an autopilot by `mavlink`."""
+"""Poses of an edge's camera: fixed (`opening`), from `files` beside the clip, from an autopilot by `mavlink`."""

@@ -18,8 +18,7 @@ from typing import Any
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
 from hvt_geo.pose.angles import compass_deg, euler_deg
-from hvt_geo.pose.mavlink_frames import FrameParser
-from hvt_geo.pose.mavlink_transport import Address, Connection
+from hvt_geo.pose.mavlink_transport import Address, Connection, FrameParser
 
 _log = logging.getLogger(__name__)
 

@@ -25,12 +25,12 @@ from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import FusedTracks, Fusion
 from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import History, as_bgr
+from hvt_ground.perception.models import Turns
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner, ShownClasses
 from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
-from hvt_ground.perception.turns import Turns
 
 __all__ = ["DecodedFrame", "NothingPerceived", "Pipeline", "PipelineParts", "ReceivedStill"]
 

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial, wraps
-from typing import ParamSpec
+from typing import Literal, ParamSpec
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.clock_offset import ClockOffset
@@ -28,13 +28,14 @@ from hvt_common.protocol.messages import (
     TrackStep,
     TrackStepDecoder,
 )
+from hvt_common.transport.flood import TokenBucket
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.receiver import BasePacket
 from hvt_ground.link.sequence_window import StillSequenceWindow
@@ -44,7 +45,6 @@ from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipel
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.poses import NOWHERE, Locator, SessionPoses
 from hvt_ground.session.edge_port import ReceiverReports
-from hvt_ground.session.session_log import Level, SessionLog
 from hvt_ground.sinks import QueuedSink, Sink
 
 _MILLION = 1_000_000
@@ -527,3 +527,29 @@ class GroundSession:
             event = self.poses.located(event)
         for sink in self.sinks:
             sink.log(event)
+
+
+Level = Literal["info", "warning", "error"]
+
+_BURST, _EVERY_NS = 60, SECOND_NS
+"""So many at once, then one a second."""
+
+
+class SessionLog:
+    """Gives out lines; in a flood of them some are left out, and counted. ``at``: frame index and capture time."""
+
+    def __init__(self, emit: Callable[[Notice], None], *, clock: Callable[[], int]) -> None:
+        self._emit, self._clock = emit, clock
+        self._bucket = TokenBucket(burst=_BURST, every_ns=_EVERY_NS)
+        self._left_out = 0
+
+    def note(self, level: Level, text: str, *, at: tuple[int, int], last: bool = False) -> None:
+        """Give out a line; one of the ``last`` is never left out."""
+        if not (last or self._bucket.take(self._clock())):
+            self._left_out += 1
+            return
+        if self._left_out:
+            what = f"{self._left_out} lines were left out here: the edge gave rise to too many"
+            self._left_out = 0
+            self._emit(Notice(*at, "warning", what))
+        self._emit(Notice(*at, level, text))

@@ -1,6 +1,6 @@
 """Sinks of events: recordings, live views, tables; each behind a queue, so that its failure is its own.
 
-Beside what is listed here there are `event_tables`, `timing`, `palette` (colours),
+Beside what is listed here there are `event_tables`, `palette` (colours),
 `line_file`, the `contract` and the room `rerun`. Extras bring others (`hvt_ground.extras`).
 """
 

@@ -1,4 +1,4 @@
-"""Tables of a session that grow with it: the ground's tracks, and its stills with a picture beside the table each.
+"""Tables that grow with a session: the ground's tracks, its stills with a picture each, and the times of messages.
 
 The recording shows stills that it has room for; here nothing is left out, and nothing is coded again.
 """
@@ -16,8 +16,8 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.units import utc_text
-from hvt_ground.events import Event, Overlay, Places, Refinement
-from hvt_ground.sinks.contract import SinkWriter
+from hvt_ground.events import Event, MessageTiming, Overlay, Places, Refinement, StillsRead
+from hvt_ground.sinks.contract import Sink, SinkWriter
 from hvt_ground.sinks.line_file import LineFile
 
 TRACK_COLUMNS = (
@@ -142,3 +142,74 @@ def _still_row(item: Refinement, name: str) -> tuple[object, ...]:
         f"{item.confidence:.3f}",
         item.reason,
     )
+
+
+TIMING_COLUMNS = (
+    *("kind", "sequence", "frame_index", "capture_ns", "send_ns", "received_ns", "shown_ns"),
+    *("line_bytes", "clock_offset_ns", "edge", "session"),
+)
+"""One line a message. Times are Unix nanoseconds, 0 where there is none; -1 is the ``frame_index`` of one that is
+about no frame. ``kind``: base, roi, tracks, status; backlog-still, backlog-base, backlog-info for a chunk of the
+backlog. ``capture_ns`` and ``send_ns`` are by the edge's clock, ``received_ns`` and ``shown_ns`` by this one;
+``shown_ns``: when it was decoded and recorded (base), read by the classifier (roi), or taken in; 0: never, or a chunk
+of the past that did not complete an object, or one of no use. ``line_bytes``: what it cost on the line, headers of
+Zenoh, TCP and IP included. ``clock_offset_ns``: the edge's clock less this one, as known then: the delay of a message
+is ``received_ns - (capture_ns - clock_offset_ns)``."""
+_MOST_UNREAD = 512
+"""Stills whose line waits until they are read; more than the session's own queue holds."""
+
+
+def timing_table(path: Path) -> LineFile:
+    """The file, for all sessions of a ground."""
+    return LineFile(path, TIMING_COLUMNS)
+
+
+class SessionTiming:
+    """Makes the lines of one session, of its `MessageTiming` and `StillsRead` events, for any thread.
+
+    ``table`` takes them; it is not closed with this.
+    """
+
+    def __init__(self, table: Sink[str], *, edge: str, session_id: int) -> None:
+        self._table = table
+        self._whose = (edge, f"{session_id:016x}")
+        self._lock = threading.Lock()
+        self._unread: dict[int, MessageTiming] = {}
+
+    def log(self, item: Event) -> None:
+        """Write a message that has been dealt with; a still's line is written when it has been read."""
+        if not isinstance(item, MessageTiming | StillsRead):
+            return
+        with self._lock:
+            if isinstance(item, StillsRead):
+                for sequence in item.sequences:
+                    if (still := self._unread.pop(sequence, None)) is not None:
+                        self._write(still, handled_ns=item.at_ns)
+            elif item.handled_ns is not None:
+                self._write(item, handled_ns=item.handled_ns)
+            else:
+                self._unread[item.sequence] = item
+                if len(self._unread) > _MOST_UNREAD:
+                    self._write(self._unread.pop(next(iter(self._unread))), handled_ns=0)
+
+    def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
+        """Write the stills that were never read."""
+        with self._lock:
+            for still in self._unread.values():
+                self._write(still, handled_ns=0)
+            self._unread.clear()
+
+    def _write(self, message: MessageTiming, *, handled_ns: int) -> None:
+        values = (
+            message.kind,
+            message.sequence,
+            message.frame_index,
+            message.capture_ns,
+            message.send_ns,
+            message.received_ns,
+            handled_ns,
+            message.line_bytes,
+            message.clock_offset_ns,
+            *self._whose,
+        )
+        self._table.log(",".join(map(str, values)) + "\n")

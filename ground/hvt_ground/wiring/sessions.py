@@ -24,11 +24,10 @@ from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
-from hvt_ground.sinks.event_tables import StillFiles, TrackTable, picture_of
+from hvt_ground.sinks.event_tables import SessionTiming, StillFiles, TrackTable, picture_of, timing_table
 from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.wiring.files import backlog_path, free_path, output_path
 from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline, make_trust
 

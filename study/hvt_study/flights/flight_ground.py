@@ -29,9 +29,8 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.link.reassemble import Arrival as AccessUnitArrival
 from hvt_ground.link.receiver import BasePacket
-from hvt_ground.perception.models import ModelFacts
+from hvt_ground.perception.models import ModelFacts, Turns
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
-from hvt_ground.perception.turns import Turns
 from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
 from hvt_ground.session.session import GroundSession
 from hvt_ground.wiring import Models, make_pipeline

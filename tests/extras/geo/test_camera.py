@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from hvt_common.values import Orientation, Pose, View
-from hvt_geo.camera import ground_points, places_of_boxes
-from hvt_geo.locator import footprint
+from hvt_geo.camera import footprint, ground_points, places_of_boxes
 
 SIZE = (1000, 500)
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")

@@ -42,9 +42,9 @@ from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
+from hvt_ground.sinks.event_tables import SessionTiming, timing_table
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.still_places import SLOTS
-from hvt_ground.sinks.timing import SessionTiming, timing_table
 from programs.rrd import Recording
 from programs.small_disk import small_disk
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object

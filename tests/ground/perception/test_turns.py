@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from hvt_ground.config import GroundConfig, check
+from hvt_ground.perception.models import Turns
 from hvt_ground.perception.pipeline import DecodedFrame
-from hvt_ground.perception.turns import Turns
 from hvt_ground.wiring import Models
 from hvt_ground.wiring.perception import make_pipeline
 from rigs.flight import Flight, NothingSeen

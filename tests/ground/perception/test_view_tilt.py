@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hvt_ground.perception.view_tilt import ViewTilt
+from hvt_ground.perception.stills.refine import ViewTilt
 
 
 def vehicles(growth: float, *, seed: int, count: int = 6) -> np.ndarray:

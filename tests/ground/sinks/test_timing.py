@@ -13,8 +13,8 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_ground.events import MessageTiming, StillsRead
+from hvt_ground.sinks.event_tables import TIMING_COLUMNS, SessionTiming, timing_table
 from hvt_ground.sinks.line_file import LineFile
-from hvt_ground.sinks.timing import COLUMNS, SessionTiming, timing_table
 
 
 def message(kind: str = "base", *, sequence: int, handled_ns: int | None = 3_000) -> MessageTiming:
@@ -53,7 +53,7 @@ def test_a_line_says_all_of_a_message(tmp_path):
         "edge": "uav-1",
         "session": "00000000000000a1",
     }
-    assert tuple(first) == COLUMNS
+    assert tuple(first) == TIMING_COLUMNS
     assert second["shown_ns"] == "0"
 
 
@@ -102,7 +102,7 @@ def test_a_device_that_refuses_is_not_removed(tmp_path):
 WRITER = r"""
 import sys, time
 from pathlib import Path
-from hvt_ground.sinks.timing import timing_table
+from hvt_ground.sinks.event_tables import timing_table
 table = timing_table(Path(sys.argv[1]))
 for number in range(10**9):
     table.log(f"base,{number}\n")

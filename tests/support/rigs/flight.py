@@ -30,12 +30,12 @@ from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.models import Turns
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import FrameReadings, ObjectReading
 from hvt_ground.perception.stills.decode import DecodedStill
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary
-from hvt_ground.perception.turns import Turns
 from media.clips import START_NS, framed, smooth_pictures
 from rigs import messages
 from rigs.examples import tracks_of

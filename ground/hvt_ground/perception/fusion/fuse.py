@@ -25,7 +25,7 @@ time between them. An entity that only a still has shown ends so long after the 
 
 **Missed-detection evidence.** An edge-only entity is listed from a sure confidence on. If a step shows nothing at a
 ground-only one, of a class that the edge can name, it must be the surer the larger the share of objects is that the
-edge usually reports (`missed_detections`). That ends when nothing is reported for `PATIENCE_S`, and does not hold
+edge usually reports (`MissedDetections`). That ends when nothing is reported for `PATIENCE_S`, and does not hold
 for `FORGET_S` after a still has shown it.
 
 **Duplicates.** A box of one side on top of one of the other is listed once (`SAME_IOU`); so are two boxes of
@@ -49,8 +49,7 @@ import numpy.typing as npt
 from hvt_common.tracking.association import assign
 from hvt_common.values import Detections, Tracks, iou
 from hvt_ground.perception.fusion.camera_path import CameraPath
-from hvt_ground.perception.fusion.entity import MISSED_STEPS, Entity, Observation
-from hvt_ground.perception.fusion.missed_detections import MissedDetections
+from hvt_ground.perception.fusion.entity import MISSED_STEPS, Entity, MissedDetections, Observation
 from hvt_ground.perception.fusion.object_list import FusedTracks, FusionRules, list_entities, reported_boxes
 
 __all__ = ["FusedTracks", "Fusion", "unified_names"]

@@ -8,8 +8,7 @@ import pytest
 
 from hvt_common.geodesy import moved
 from hvt_common.units import SECOND_NS
-from hvt_gateways.cot.motion import MotionTrail
-from hvt_gateways.cot.schedule import STALE_NS, PlacedTrack, TrackSchedule
+from hvt_gateways.cot.schedule import STALE_NS, MotionTrail, PlacedTrack, TrackSchedule
 
 HERE = (52.0, 13.0)
 

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.units import SECOND_NS
-from hvt_gateways.transport_stream.moments import Moment, Moments
-from hvt_gateways.transport_stream.timeline import Timeline
+from hvt_gateways.transport_stream.moments import Moment, Moments, Timeline
 from hvt_ground.events import Overlay
 
 STEP_NS = SECOND_NS // 15

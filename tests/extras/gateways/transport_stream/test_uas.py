@@ -15,7 +15,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose, View
 from hvt_gateways.transport_stream.uas import Platform, sensor_angles, uas_local_set
 from hvt_gateways.transport_stream.vmti import MOST_BYTES
-from hvt_geo.locator import SurfaceLocator
+from hvt_geo.camera import SurfaceLocator
 from hvt_ground.events import Overlay, Places
 from media.klv_reader import KlvPacket, packets_of
 from rigs import examples

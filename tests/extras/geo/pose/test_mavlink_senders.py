@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from hvt_edge.loop.pose import open_pose
 from hvt_geo.pose.angles import euler_deg
-from hvt_geo.pose.mavlink_frames import FrameParser
+from hvt_geo.pose.mavlink_transport import FrameParser
 
 
 class Device:

@@ -14,8 +14,7 @@ pytest.importorskip("pymavlink")
 
 
 from hvt_edge.loop.pose import open_pose
-from hvt_geo.pose.mavlink_frames import MAX_FRAME_BYTES, FrameParser
-from hvt_geo.pose.mavlink_transport import Address, Connection
+from hvt_geo.pose.mavlink_transport import MAX_FRAME_BYTES, Address, Connection, FrameParser
 
 pytestmark = pytest.mark.timeout(60)
 

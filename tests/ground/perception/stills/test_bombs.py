@@ -81,7 +81,7 @@ print((peak() - before) // 1024, shown)
 _PAST = """
 import pickle, resource, sys
 from hvt_common.protocol.messages import BacklogUnit
-from hvt_ground.backlog.video import BacklogVideo
+from hvt_ground.backlog.session_backlog import BacklogVideo
 size, good, bombs = pickle.load(sys.stdin.buffer)
 video = BacklogVideo(base_size=size)
 unit = lambda number, data: BacklogUnit(number, number, True, data)

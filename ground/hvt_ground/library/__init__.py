@@ -1,1 +1,0 @@
-"""The ground as a part of another program: `received` gives it the events."""
