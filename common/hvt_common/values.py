@@ -159,6 +159,10 @@ class Detections:
     def __len__(self) -> int:
         return len(self.confidences)
 
+    def take(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> Detections:
+        """Those at ``rows``, an index or mask."""
+        return Detections(self.boxes_xyxy_px[rows], self.confidences[rows], self.class_ids[rows])
+
     @classmethod
     def none(cls) -> Detections:
         """No detections at all."""

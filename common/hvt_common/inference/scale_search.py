@@ -1,9 +1,10 @@
-"""The scale at which a detector promises most objects, found in flight.
+"""The scales at which a detector promises most objects, found in flight.
 
 Of cars of five pixels a network that learnt them at twenty says next to nothing, and of the same picture enlarged
 nearly all. So now and then one quarter of the picture is looked at enlarged too. Where that promises far more objects
 (the sum of calibrated confidences is the expected number of true ones), the whole is looked at so from then on, part
-by part, until it promises no more than the whole alone. docs/embedded-models.md has what that finds and costs.
+by part, until it promises no more than the whole alone. And each third picture is looked at reduced too, each one
+while there is something large: a network overlooks what fills a third of the picture. See docs/embedded-models.md.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.inference.tiles import Tile, tile_boxes, with_tiles
+from hvt_common.inference.tiles import Tile, are_large, tile_boxes, with_large, with_tiles
 from hvt_common.values import Detections, Image
 
 _log = logging.getLogger(__name__)
@@ -34,6 +35,7 @@ _MORE, _LEAST_MORE = 3.0, 8.0
 _STILL_MORE: Final = 2.0
 _IN_VAIN: Final = 3
 """So many pictures in a row that promise less than `_STILL_MORE` times as much end it."""
+_REDUCED_EVERY: Final = 3
 _RARER: Final = 3
 """Five runs in place of one are due so many times more rarely."""
 
@@ -49,6 +51,8 @@ class ScaleSearch:
         self._confidence = confidence
         self._pictures = self._probes = self._in_vain = 0
         self._due, self._before = 1, 0.0
+        self._large = True
+        """The picture before showed something large, or there was none."""
         self.enlarged = False
         """Each picture is looked at in parts, enlarged."""
 
@@ -59,9 +63,10 @@ class ScaleSearch:
     def take(self, whole: Detections, image_bgr: Image) -> Detections:
         """All that is found on the next picture, ``whole`` being what its one run has found."""
         size = (image_bgr.shape[1], image_bgr.shape[0])
+        self._pictures += 1
+        whole = self._with_large(whole, image_bgr)
         if max(size) > _MOST_SIDE:
             return whole
-        self._pictures += 1
         tiles = tile_boxes(size, _GRID, overlap=_OVERLAP)
         if self.enlarged:
             found = with_tiles(whole, image_bgr, tiles, self._detect_enlarged)
@@ -73,6 +78,14 @@ class ScaleSearch:
             self._before = promised
             self._probe(whole, image_bgr, tiles[self._probes % len(tiles)])
         return whole
+
+    def _with_large(self, whole: Detections, image_bgr: Image) -> Detections:
+        found = whole
+        if self._large or self._pictures % _REDUCED_EVERY == 0:
+            found = with_large(whole, image_bgr, self._detected)
+        shown = found.boxes_xyxy_px[found.confidences >= self._confidence]
+        self._large = bool(are_large(shown, image_bgr).any())
+        return found
 
     def _probe(self, whole: Detections, image_bgr: Image, tile: Tile) -> None:
         x1, y1, x2, y2 = tile
@@ -101,8 +114,11 @@ class ScaleSearch:
     def _detect_enlarged(self, part_bgr: Image) -> Detections:
         scale = _MOST_SIDE / max(part_bgr.shape[:2])
         large = cv2.resize(part_bgr, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        found = self._detect(np.asarray(large, np.uint8)) or Detections.none()
+        found = self._detected(np.asarray(large, np.uint8))
         return Detections(found.boxes_xyxy_px / np.float32(scale), found.confidences, found.class_ids)
+
+    def _detected(self, image_bgr: Image) -> Detections:
+        return self._detect(image_bgr) or Detections.none()
 
     def _promise(self, found: Detections, among: npt.NDArray[np.bool_] | None = None) -> float:
         counted = found.confidences >= self._confidence

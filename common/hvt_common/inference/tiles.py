@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, Literal, Protocol, runtime_checkable
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -44,6 +46,14 @@ _SAME_IOU: Final = 0.45
 _ANY_CLASS_IOU: Final = 0.7
 _INSIDE: Final = 0.8
 _COVERED: Final = 0.5
+_REDUCED_SIDE: Final = 256
+"""The longer one of a reduced picture, in pixels …"""
+_LEAST_REDUCED: Final = 0.6
+_LARGE_PX: Final = 24
+"""… and that of what counts as large in it. With 32 a tenth of thermal cars is missed."""
+_SURE: Final = 0.5
+_PART: Final = 0.02
+"""Of a vehicle's box; a person seen from above is a thirtieth."""
 _ACROSS: Final = 0.7
 """Two partial are of one object if they share so much of the longer one's extent along the truncated."""
 
@@ -204,6 +214,32 @@ def with_tiles(
     return _merged(parts, np.concatenate(truncated))
 
 
+def with_large(whole: Detections, image_bgr: Image, detect: Callable[[Image], Detections]) -> Detections:
+    """What was found in the whole picture and what is large of what ``detect`` finds in it reduced, as one list.
+
+    Where a vehicle fills much of the picture a network that learnt them at twenty pixels sees its mirror, a
+    pedestrian. Reduced it sees the vehicle, and what is a part of it is left out.
+    """
+    scale = _REDUCED_SIDE / max(image_bgr.shape[:2])
+    if scale > _LEAST_REDUCED:
+        return whole
+    small = cv2.resize(image_bgr, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    found = detect(np.asarray(small, np.uint8))
+    found = replace(found, boxes_xyxy_px=found.boxes_xyxy_px / np.float32(scale))
+    large = found.take(np.flatnonzero(are_large(found.boxes_xyxy_px, image_bgr)))
+    sure = large.boxes_xyxy_px[large.confidences >= _SURE]
+    tiny = _areas(whole.boxes_xyxy_px)[:, None] < _PART * _areas(sure)[None]
+    part = np.any(tiny & (_shared_of_smaller(whole.boxes_xyxy_px, sure) > _INSIDE), axis=1)
+    parts = [whole.take(np.flatnonzero(~part)), large]
+    return _merged(parts, np.zeros(sum(map(len, parts)), bool))
+
+
+def are_large(boxes: Boxes, image_bgr: Image) -> npt.NDArray[np.bool_]:
+    """(N,) which of the boxes are so large in the picture that `with_large` looks for their like."""
+    sides = boxes[:, 2:] - boxes[:, :2]
+    return np.asarray(sides.max(axis=1) >= _LARGE_PX / _REDUCED_SIDE * max(image_bgr.shape[:2]))
+
+
 def _truncated(boxes: Boxes, tile: Tile, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
     # (N,) True for boxes that touch a border of the tile that is not one of the picture.
     x1, y1, x2, y2 = tile
@@ -284,5 +320,9 @@ def _shared_of_smaller(a_xyxy: Boxes, b_xyxy: Boxes) -> npt.NDArray[np.float32]:
     shared = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(
         -1
     )
-    areas_a, areas_b = ((c[..., 2:] - c[..., :2]).prod(-1) for c in (a, b))
-    return np.asarray(shared / np.maximum(np.minimum(areas_a, areas_b), 1e-6), np.float32)
+    smaller = np.minimum(_areas(a), _areas(b))
+    return np.asarray(shared / np.maximum(smaller, 1e-6), np.float32)
+
+
+def _areas(boxes: Boxes) -> npt.NDArray[np.float32]:
+    return np.asarray((boxes[..., 2:] - boxes[..., :2]).prod(-1))

@@ -87,7 +87,7 @@ class EnsembleDetector:
             found.append(Detections(one.boxes_xyxy_px, sure, ids[one.class_ids]))
         fused = fuse(found, self._groups, self._vague)
         counts = fused.confidences >= self._confidence
-        return Detections(fused.boxes_xyxy_px[counts], fused.confidences[counts], fused.class_ids[counts])
+        return fused.take(counts)
 
 
 def fuse(

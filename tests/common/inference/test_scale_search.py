@@ -1,4 +1,4 @@
-"""The scale is found: objects that are too small for the network are looked at enlarged, while that pays."""
+"""The scale is found: objects that are too small for the network are looked at enlarged, and large ones reduced."""
 
 from __future__ import annotations
 
@@ -23,16 +23,20 @@ def picture(count: int, side_px: int) -> Image:
 
 
 class Squares:
-    """A network that sees squares of 10 pixels and more; it counts its runs."""
+    """A network that sees squares of 10 to 100 pixels, corners of larger ones; it counts its runs."""
 
     def __init__(self) -> None:
-        self.runs = 0
+        self.runs = self.reduced = 0
 
     def detect(self, image: Image) -> Detections:
-        """As wide as the picture is, or enlarged."""
-        self.runs += 1
+        """As wide as the picture is, enlarged or reduced."""
+        if max(image.shape) <= 256:
+            self.reduced += 1
+        else:
+            self.runs += 1
         _, _, stats, _ = cv2.connectedComponentsWithStats((image[..., 0] > 127).astype(np.uint8))
-        boxes = np.array([(x, y, x + w, y + h) for x, y, w, h, _ in stats[1:] if min(w, h) >= 10], np.float32)
+        squares = [one[:4] if max(one[2:4]) <= 100 else (*one[:2], 12, 12) for one in stats[1:]]
+        boxes = np.array([(x, y, x + w, y + h) for x, y, w, h in squares if min(w, h) >= 10], np.float32)
         count = len(boxes)
         return Detections(boxes.reshape(-1, 4), np.full(count, 0.8, np.float32), np.zeros(count, np.int32))
 
@@ -110,3 +114,24 @@ def test_a_detector_that_fails_in_between_promises_nothing():
     search = ScaleSearch(lambda _: None, confidence=0.4)
     assert len(search.take(Detections.none(), picture(200, 5))) == 0
     assert not search.enlarged
+
+
+def test_a_large_object_is_found_reduced_and_its_parts_are_none(caplog):
+    """A car that filled a third of the picture had no box, and its mirror was a pedestrian."""
+    large, network = picture(0, 5), Squares()
+    large[60:260, 200:400] = 255
+    search = ScaleSearch(network.detect, confidence=0.4)
+    found = [search.take(network.detect(large), large) for _ in range(12)]
+    for one in found:
+        np.testing.assert_allclose(one.boxes_xyxy_px, [[200, 60, 400, 260]], atol=2)
+    assert network.reduced == 12
+    assert len(search.take(Detections.none(), picture(0, 5))) == 0
+    assert not search.enlarged
+
+
+def test_without_large_objects_each_third_picture_is_looked_at_reduced(caplog):
+    """A drone far above would pay for what is never there."""
+    near, network = picture(200, 12), Squares()
+    search = ScaleSearch(network.detect, confidence=0.4)
+    assert {len(search.take(network.detect(near), near)) for _ in range(30)} == {200}
+    assert network.reduced == 1 + 10

@@ -188,7 +188,7 @@ class Redetection:
         inside = _share_inside(found.boxes_xyxy_px, crops).max(axis=1) >= _INSIDE_SHARE
         unnamed = overlaps.max(axis=0) < _NEW_OBJECT_IOU
         new = inside & unnamed & (found.confidences >= self._new_confidence)
-        return Detections(found.boxes_xyxy_px[new], found.confidences[new], found.class_ids[new])
+        return found.take(new)
 
 
 def object_crops(still: DecodedStill, *, view: View) -> list[Image]:
