@@ -10,7 +10,7 @@ from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence, needs_extra
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import start_log
-from hvt_common.runtime.plug_ins import the_one
+from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
 
 _DESCRIPTION = """Receive what edges publish over Zenoh: decode, detect, track, refine classes by
@@ -50,9 +50,10 @@ def _run(argv: Sequence[str] | None) -> int:
     if words and not words[0].startswith("-"):
         entry = the_one(_EXTRA_COMMANDS, words[0], what="command", built_in=False)
         if entry is not None:
-            with needs_extra("'hvt[ground]'"):
-                run = entry.load()
-            return int(run(words[1:]))
+            if words[0] in _BROUGHT:
+                with needs_extra("'hvt[ground]'"):
+                    entry.load()
+            return int(loaded(entry, lambda run: run, what="command")(words[1:]))
         if words[0] in _BROUGHT:
             raise UserError(
                 f"hvt-ground {words[0]} is of an extra that is not installed: pip install 'hvt[ground]'"

@@ -99,6 +99,21 @@ def test_an_edge_without_its_doctor_says_so(found, says, monkeypatch, capsys):
     assert capsys.readouterr().err == f"hvt-edge: {says}\n"
 
 
+@pytest.mark.parametrize(
+    ("where", "says"),
+    [
+        ("hvt_nowhere:run", "does not load: ModuleNotFoundError: No module named 'hvt_nowhere'"),
+        ("json:absent", "does not load: AttributeError: module 'json' has no attribute 'absent'"),
+    ],
+)
+def test_a_command_of_another_package_that_does_not_load(where, says, monkeypatch, capsys):
+    """A traceback, or advice to install a part of HVT that has nothing to do with it."""
+    found = {"mine": (EntryPoint("mine", where, "hvt.ground_commands"),)}
+    monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: found)
+    assert main(["mine"]) == 2
+    assert capsys.readouterr().err == f"hvt-ground: command 'mine' of {where} {says}\n"
+
+
 def test_a_link_without_its_doctor_is_a_link(monkeypatch, free_port):
     """Who leaves an extra out would have no link, in place of one that nobody explains."""
     monkeypatch.setattr("hvt_common.runtime.plug_ins.installed", lambda _group: {})
