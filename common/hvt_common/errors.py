@@ -22,6 +22,7 @@ _MAY_COME = frozenset(
         *(errno.EADDRNOTAVAIL, errno.EADDRINUSE, errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH),
         *(errno.EHOSTDOWN, errno.ECONNREFUSED, errno.ECONNRESET, errno.ECONNABORTED, errno.ETIMEDOUT),
         *(errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EBUSY, errno.EAGAIN),
+        *(errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM),
     }
 )
 _NEVER_SEEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
@@ -48,7 +49,7 @@ class NotYetError(UserError):
 
 
 def may_come(error: OSError) -> bool:
-    """Whether time may mend it: something is not there or not free yet, or a name that no server knows yet."""
+    """Whether time may mend it: something is not there, not free or used up, or a name that no server knows yet."""
     return isinstance(error, socket.gaierror | TimeoutError) or error.errno in _MAY_COME
 
 

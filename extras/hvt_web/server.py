@@ -23,7 +23,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 from hvt_common.errors import NotYetError, UserError, listening_trouble, may_come
 from hvt_common.protocol.messages import Info
-from hvt_common.runtime.failures import Awaited, Failures
+from hvt_common.runtime.failures import Awaited, Failures, reason_of
 from hvt_common.runtime.host_names import host_and_port, is_loopback
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Refinement
@@ -42,6 +42,7 @@ REQUEST_S = 10.0
 """So long a client may take for TLS, and from an answer to the next whole request."""
 STALL_S = 20.0
 """So long a client may take none of the sent bytes."""
+_PART = "web page"
 _CLOSE_S = 5.0
 """So long a closed connection may take for the rest."""
 _END_S = 2.0
@@ -81,7 +82,8 @@ class WebPage(Service):
             _check_keys(*keys)
         self._clock = clock
         self._recorded = recorded
-        self._socket = Awaited(lambda: _bound(host, port), "web page", failures or Failures(clock))
+        self._failures = failures or Failures(clock)
+        self._socket = Awaited(lambda: _bound(host, port), _PART, self._failures)
         self._stop = threading.Event()
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
         start = f"{'http' if keys is None else 'https'}://{shown}:{port}/"
@@ -163,6 +165,8 @@ class WebPage(Service):
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._served())
+        except Exception as error:  # noqa: BLE001 - the flight goes on, and its status says what it lacks
+            self._failures.failed(_PART, reason_of(error))
         finally:
             self._loop.close()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hvt_common.errors import NotYetError, Parser, UserError, named_path
+from hvt_common.errors import NotYetError, Parser, UserError, may_come, named_path
 
 
 @pytest.mark.parametrize(
@@ -34,6 +34,12 @@ def test_a_disk_that_does_not_answer_may_come_back_and_a_closed_folder_does_not(
     with pytest.raises(UserError) as caught:
         named_path("x")
     assert type(caught.value) is kind
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOBUFS])
+def test_what_is_used_up_may_be_free_again(number):
+    """A page that waits for its port while descriptors are used up would never come."""
+    assert may_come(OSError(number, "no"))
 
 
 def test_a_command_checks_its_files_too():

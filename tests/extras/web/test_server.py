@@ -19,6 +19,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import ClientConnection, connect
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures
 from hvt_common.transport.zenoh_config import key_pair
 from hvt_ground.events import Notice
 from hvt_web import server, site
@@ -54,6 +55,21 @@ def public(port) -> Iterator[int]:
     """A page that other machines reach."""
     with WebPage(f"0.0.0.0:{port}", clock=time.time_ns):
         yield port
+
+
+def test_a_server_that_ends_says_so(port, monkeypatch):
+    """The page would be gone, and status and log know of nothing."""
+
+    async def serve(_server, sockets):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr("hvt_web.server._Server.serve", serve)
+    failures = Failures(time.time_ns)
+    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns, failures=failures):
+        eventually(lambda: failures.now, within_s=10, what="it is known")
+    assert [(one.part, one.reason) for one in failures.now] == [
+        ("web page", "RuntimeError: can't start new thread")
+    ]
 
 
 def asked(port: int, path: str, method: str = "GET", body: bytes = b"", **headers: str):
