@@ -172,7 +172,7 @@ def test_the_tracks_of_a_step_go_before_its_stills():
     assert before is None
     rig.run(11)
     assert [row for row, *_ in rig.out.puts[:2]] == [Channel.TRACKS, Channel.ROI]
-    assert [payload[0] for row, payload, _ in rig.out.puts if row is Channel.TRACKS] == [0, 5, 10]
+    assert [payload[0] for row, payload, *_ in rig.out.puts if row is Channel.TRACKS] == [0, 5, 10]
     assert rig.stage.latest_tracks.frame_index == 10
 
 
