@@ -182,7 +182,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "stills",
             f"{stills['received']}, {bitrate_text(content['roi_bps'])}"
-            + (f" ({outcomes})" if outcomes else "")
+            + (f" (of the objects in them: {outcomes})" if outcomes else "")
             + (f"; the edge did not send: {not_sent}" if not_sent else ""),
         ),
         ("tracks", tracks),
