@@ -13,14 +13,16 @@
 
 from __future__ import annotations
 
-import ast
 import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
+
+import yaml
 
 from hvt_common.errors import UserError
 from hvt_common.inference.labels import decoded, numbered_names, read_labels
@@ -30,6 +32,8 @@ LOOKED_IN = (
     "labels/, annotations/, Annotations/, beside the pictures, and COCO's JSON in annotations/ and beside"
 )
 """For sentences."""
+YAML = (".yaml", ".yml")
+"""Endings."""
 _PICTURES = ("images", "JPEGImages", "data", "obj_train_data")
 _LABELS = (
     *(("labels", ".txt"), ("annotations", ".txt")),
@@ -123,9 +127,9 @@ def class_file(place: Path, pictures: list[Path]) -> Path | None:
 
 def read_class_file(path: Path) -> tuple[str, ...]:
     """Names one a line, or ``names`` of YOLO's YAML, a list or a table by number; `UserError` where none is."""
-    if path.suffix not in (".yaml", ".yml"):
+    if path.suffix not in YAML:
         return read_labels(path)
-    names = _yaml_names(read_text(path))
+    names = _yaml_names(path)
     if not names:
         raise UserError(f"{path} has no class names; accepted is names: with a list, or a table by number")
     return names
@@ -147,13 +151,12 @@ def _is_coco(path: Path) -> bool:
 
 def yaml_folders(path: Path) -> list[Path]:
     """Where the pictures of a YOLO set are: its ``path``, else beside it, else in ``train``, ``val`` and ``test``."""
-    said = dict(re.findall(r"(?m)^(path|train|val|test)\s*:[ \t]*['\"]?([^'\"#\n]+)", read_text(path)))
-    root = path.parent / said.pop("path", ".").strip()
+    said = _read_yaml(path)
+    root = path.parent / _words(said.get("path", "."))[0]
     if root != path.parent and root.is_dir():
         return [root]
-    places = dict.fromkeys(
-        place for one in said.values() if (place := (root / one.strip()).resolve()).is_dir()
-    )
+    named = [word for part in ("train", "val", "test") for word in _words(said.get(part, ()))]
+    places = dict.fromkeys(place for one in named if (place := (root / one).resolve()).is_dir())
     outer = [one for one in places if places.keys().isdisjoint(one.parents)]
     here = path.parent.resolve()
     elsewhere = any(here not in (one, *one.parents) for one in outer)
@@ -162,10 +165,27 @@ def yaml_folders(path: Path) -> list[Path]:
 
 def keypoint_columns(path: Path | None) -> int:
     """Columns of keypoints behind the box in YOLO's labels, as ``kpt_shape`` of its YAML says; 0 for none."""
-    if path is None or path.suffix not in (".yaml", ".yml"):
+    if path is None or path.suffix not in YAML:
         return 0
-    shape = re.search(r"(?m)^kpt_shape\s*:\s*\[\s*(\d{1,4})\s*,\s*([23])\s*\]", read_text(path))
-    return 0 if shape is None else int(shape[1]) * int(shape[2])
+    shape = _words(_read_yaml(path).get("kpt_shape", ()))
+    known = len(shape) == 2 and all(one.isdecimal() for one in shape)
+    return int(shape[0]) * int(shape[1]) if known else 0
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    """A table whose words are all text; `UserError` where the file is no YAML. What is no table is an empty one."""
+    try:
+        found = yaml.load(read_text(path), yaml.BaseLoader)  # noqa: S506 - makes text, lists and tables alone
+    except (yaml.YAMLError, RecursionError) as error:
+        said = " ".join(str(error).split())
+        raise UserError(f"{path} is no YAML ({said}): mend it, or name the classes in classes.txt") from None
+    return found if isinstance(found, dict) else {}
+
+
+def _words(value: object) -> list[str]:
+    """Of a word, or of a list; what is neither is none."""
+    every = [value] if isinstance(value, str) else list(value) if isinstance(value, list | tuple) else []
+    return [one for one in every if isinstance(one, str)]
 
 
 def read_text(path: Path) -> str:
@@ -208,53 +228,12 @@ def _instead(root: Path, parts: tuple[str, ...], folder: str, suffix: str) -> It
     yield root.joinpath(folder, *parts).with_suffix(suffix)
 
 
-def _yaml_names(text: str) -> tuple[str, ...]:
-    begin = re.search(r"(?m)^[\"']?names[\"']?\s*:[ \t]*(?:&\w+[ \t]*)?(?=(.*)$)", text)
-    if begin is None:
-        return ()
-    rest = text[begin.end() :]
-    if rest[:1] in ("[", "{"):
-        entries = list(_flow(rest))
-    else:
-        entries = []
-        for line in rest.splitlines()[1:]:
-            if re.match(r"\s*-\s+\S|\s*['\"]?\d+['\"]?\s*:", line):
-                entries.append(line.strip().removeprefix("- "))
-            elif line.strip() and not line.lstrip().startswith("#"):
-                break
-    keyed = [re.match(r"\s*['\"]?(\d{1,6})['\"]?\s*:\s*(.*)", one, re.DOTALL) for one in entries]
-    if all(keyed):
-        return numbered_names({int(one[1]): _plain(one[2]) for one in keyed if one is not None})
-    return tuple(_plain(one) for one in entries)
-
-
-def _flow(text: str) -> Iterator[str]:
-    """The entries of a list or table in brackets, which may go over lines; quotes keep commas and brackets."""
-    entry, depth = "", 0
-    for word in re.findall(r"'(?:''|[^'])*'|\"(?:\\.|[^\"\\])*\"|(?<=\s)#[^\n]*|.", text, re.DOTALL):
-        depth += (word in ("[", "{")) - (word in ("]", "}"))
-        if not depth or (word == "," and depth == 1):
-            if entry.strip():
-                yield entry.strip()
-            entry = ""
-            if not depth:
-                return
-        elif word not in ("[", "{") and not word.startswith("#"):
-            entry += word
-
-
-def _plain(word: str) -> str:
-    """Without quotes and a comment."""
-    word = word.strip()
-    quoted = re.match(r"'((?:''|[^'])*)'|\"(?:\\.|[^\"\\])*\"", word)
-    if quoted is None:
-        return word.partition(" #")[0].strip()
-    if quoted[1] is not None:
-        return quoted[1].replace("''", "'")
-    try:
-        return str(ast.literal_eval(quoted[0]))
-    except (ValueError, SyntaxError):
-        return quoted[0].strip('"')
+def _yaml_names(path: Path) -> tuple[str, ...]:
+    names = _read_yaml(path).get("names", ())
+    if not isinstance(names, dict):
+        return tuple(_words(names) if isinstance(names, list) else ())
+    numbers = {int(key): str(name) for key, name in names.items() if re.fullmatch(r"\d{1,6}", str(key))}
+    return numbered_names(numbers) if len(numbers) == len(names) else ()
 
 
 @dataclass(frozen=True, slots=True)

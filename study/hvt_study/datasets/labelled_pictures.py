@@ -26,6 +26,7 @@ from hvt_edge.source.folder import sequence_files
 from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.datasets.label_files import (
     LOOKED_IN,
+    YAML,
     Folders,
     VocFile,
     check_strange,
@@ -42,12 +43,10 @@ from hvt_study.datasets.label_files import (
 from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts
 from hvt_study.datasets.layouts.mot import open_mot
 from hvt_study.datasets.layouts.options import Options
-from hvt_study.datasets.layouts.visdrone import table_of
-from hvt_study.datasets.visdrone_rows import read_image_rows
+from hvt_study.datasets.visdrone_rows import image_labels
 from hvt_study.datasets.yolo_labels import YOLO_COLUMNS, read_yolo, yolo_names
 
 _TRUTH = "gt/gt.txt"
-_YAML = (".yaml", ".yml")
 _SAME_SHAPE = 0.01
 """So much may the ratio of the sides differ where a picture was resized to whole pixels."""
 
@@ -91,7 +90,7 @@ class LabelledPicture:
             return self.labels
         if isinstance(self.labels, Path):
             if self.visdrone:
-                return _from_visdrone(self.labels, size)
+                return image_labels(self.labels, size)
             return read_yolo(self.labels, self.class_names, size, self.doubts, keypoints=self.keypoints)
         scale = self._scale(size)
         rows: list[_Annotation]
@@ -139,7 +138,7 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
     doubts = LabelDoubts()
     if place.suffix == ".json" and place.is_file():
         return _coco_pictures(place, doubts)
-    if place.suffix in _YAML and place.is_file():
+    if place.suffix in YAML and place.is_file():
         return _of_yaml(place, classes)
     if place.is_file():
         return [LabelledPicture(place, None, ())]
@@ -227,10 +226,6 @@ def _coco_beside(place: Path, files: Sequence[Path], doubts: LabelDoubts) -> lis
         raise UserError(f"{place} has no label of {some}: looked in {LOOKED_IN}")
     check_strange(place, files)
     return [LabelledPicture(file, None, ()) for file in files]
-
-
-def _from_visdrone(path: Path, size: tuple[int, int]) -> FrameLabels:
-    return table_of(read_image_rows(path), size=size).at(0)
 
 
 def _coco_pictures(path: Path, doubts: LabelDoubts) -> list[LabelledPicture]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 
@@ -29,8 +29,8 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
 from hvt_study.datasets.label_files import class_file, keypoint_columns
-from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts, covered_share
-from hvt_study.datasets.visdrone_rows import read_image_rows
+from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts
+from hvt_study.datasets.visdrone_rows import image_labels
 from hvt_study.datasets.yolo_labels import read_yolo, yolo_names
 
 SCHEME = "still:"
@@ -54,8 +54,6 @@ _YOLO = "labels"
 """Folder of YOLO's label files."""
 _ACROSS, _DOWN = range(-3, 4), range(-2, 3)
 """Mirror images on each axis: enough for the widest view on its whole way."""
-_COVERED = 0.5
-"""An object with so much of it in regions of which nothing is known is not asked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,21 +91,6 @@ class _Way:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Annotations:
-    """What is in a picture, as parallel arrays in the order of the file."""
-
-    boxes_px: Boxes
-    """(N, 4) x1 y1 x2 y2 in pixels of the picture."""
-    classes: tuple[str, ...]
-    ignored_px: Boxes
-    """(K, 4): regions of which nothing is known."""
-    beside_px: Boxes
-    """(P, 4): single objects that are not asked for."""
-    class_set: tuple[str, ...] = tuple(sorted(VISDRONE_NAMES))
-    """All classes that the annotations may use, sorted."""
-
-
 def annotation_file(picture: Path) -> Path:
     """Where the annotations of a picture are, or would be."""
     beside = picture.with_suffix(".txt")
@@ -118,47 +101,22 @@ def annotation_file(picture: Path) -> Path:
 
 
 def read_annotations(
-    path: Path, *, classes: Sequence[str] = (), size: tuple[int, int] = (0, 0)
-) -> Annotations:
-    """Read what `annotation_file` names; `UserError` names the first line that is wrong.
+    path: Path, size: tuple[int, int], *, classes: Sequence[str] = ()
+) -> tuple[FrameLabels, tuple[str, ...]]:
+    """What `annotation_file` names, in a picture of this (width, height), and all classes that it may use, sorted.
 
-    Args:
-        path: of VisDrone-DET, or of YOLO in a folder ``labels``.
-        classes: names of YOLO's classes; none: those of ``classes.txt`` beside that folder.
-        size: (width, height) of the picture, of which YOLO's numbers are shares.
+    ``classes`` are names of YOLO's; none: those of ``classes.txt`` beside its folder. What is wrong is left out;
+    `UserError` where all is.
     """
     if path.parent.name != _YOLO:
-        return _visdrone(path)
+        return image_labels(path, size), tuple(sorted(VISDRONE_NAMES))
     root = path.parent.parent
     names = yolo_names(root, tuple(classes) or None)
     doubts = LabelDoubts()
     found = read_yolo(path, names, size, doubts, keypoints=keypoint_columns(class_file(root, [])))
     for sentence in doubts.sentences():
         _log.warning("%s", sentence)
-    return Annotations(
-        boxes_px=found.boxes_xyxy_px,
-        classes=found.class_names,
-        ignored_px=found.ignored_xyxy_px,
-        beside_px=found.beside_xyxy_px,
-        class_set=tuple(sorted({name for name in names if name.casefold() not in IGNORED})),
-    )
-
-
-def _visdrone(path: Path) -> Annotations:
-    """Of a VisDrone-DET file.
-
-    Objects that lie mostly in ignored regions are left out, as in VisDrone's toolkit; empty boxes, too.
-    """
-    rows = read_image_rows(path)
-    solid = (rows.boxes[:, 2:] > rows.boxes[:, :2]).all(axis=1)
-    hidden = covered_share(rows.boxes, rows.boxes[rows.land & solid]) >= _COVERED
-    judged = rows.counts & solid & ~hidden
-    return Annotations(
-        boxes_px=rows.boxes[judged],
-        classes=tuple(VISDRONE_NAMES[kind - 1] for kind in rows.categories[judged].tolist()),
-        ignored_px=rows.boxes[rows.land & solid],
-        beside_px=rows.boxes[~rows.counts & ~rows.land & solid],
-    )
+    return found, tuple(sorted({name for name in names if name.casefold() not in IGNORED}))
 
 
 @dataclass(slots=True)
@@ -179,8 +137,10 @@ class VirtualCamera:
     """False: the annotations are not looked at."""
     classes: tuple[str, ...] = ()
     """Of YOLO's labels; none: those of ``classes.txt``."""
-    annotations: Annotations | None = field(init=False)
-    """Of the picture and of all its mirror images that may come into view."""
+    annotations: FrameLabels | None = field(init=False)
+    """Of the picture and of all its mirror images that may come into view, in pixels of the picture."""
+    class_set: tuple[str, ...] = field(init=False, default=())
+    """All classes that the annotations may use, sorted."""
     size: tuple[int, int] = field(init=False)
     """(width, height) of its frames in pixels: those of the window at its narrowest, and even."""
     _picture: Image = field(init=False, repr=False)
@@ -203,7 +163,7 @@ class VirtualCamera:
         file = annotation_file(self.picture_path)
         self.annotations = None
         if self.annotated and file.is_file():
-            found = read_annotations(file, classes=self.classes, size=(wide, high))
+            found, self.class_set = read_annotations(file, (wide, high), classes=self.classes)
             self.annotations = _mirrored(found, size=(wide, high))
         self._way = _Way.of(self.seed)
 
@@ -242,15 +202,15 @@ class VirtualCamera:
         """
         if self.annotations is None:
             return None
-        boxes, visible = self._seen(self.annotations.boxes_px, index)
-        ignored, there = self._seen(self.annotations.ignored_px, index)
-        beside, near = self._seen(self.annotations.beside_px, index)
+        boxes, visible = self._seen(self.annotations.boxes_xyxy_px, index)
+        ignored, there = self._seen(self.annotations.ignored_xyxy_px, index)
+        beside, near = self._seen(self.annotations.beside_xyxy_px, index)
         rows = np.flatnonzero(visible >= _LEAST_VISIBLE)
         partly = boxes[(visible < _LEAST_VISIBLE) & (visible > 0)]
         return FrameLabels(
             boxes_xyxy_px=boxes[rows],
             ids=rows.astype(np.int64) + 1,
-            class_names=tuple(self.annotations.classes[row] for row in rows.tolist()),
+            class_names=tuple(self.annotations.class_names[row] for row in rows.tolist()),
             ignored_xyxy_px=ignored[there > 0],
             beside_xyxy_px=np.concatenate([beside[near > 0], partly]),
         )
@@ -299,19 +259,14 @@ def open_camera(spec: str, *, fps: float, seed: int = 0, annotated: bool = True)
     return VirtualCamera(Path(name), heights, fps, seed, annotated)
 
 
-def _mirrored(found: Annotations, *, size: tuple[int, int]) -> Annotations:
+def _mirrored(found: FrameLabels, *, size: tuple[int, int]) -> FrameLabels:
     """Those of a picture of this (width, height), mirrored at each of its edges again and again."""
     tiles = [(across, down) for down in _DOWN for across in _ACROSS]
-    boxes = [_in_tile(found.boxes_px, tile, size=size) for tile in tiles]
-    ignored = [_in_tile(found.ignored_px, tile, size=size) for tile in tiles]
-    beside = [_in_tile(found.beside_px, tile, size=size) for tile in tiles]
-    return replace(
-        found,
-        boxes_px=np.concatenate(boxes),
-        classes=found.classes * len(tiles),
-        ignored_px=np.concatenate(ignored),
-        beside_px=np.concatenate(beside),
+    boxes, ignored, beside = (
+        np.concatenate([_in_tile(each, tile, size=size) for tile in tiles])
+        for each in (found.boxes_xyxy_px, found.ignored_xyxy_px, found.beside_xyxy_px)
     )
+    return FrameLabels.plain(boxes, found.class_names * len(tiles), ignored=ignored, beside=beside)
 
 
 def _in_tile(boxes: Boxes, tile: tuple[int, int], *, size: tuple[int, int]) -> Boxes:

@@ -146,12 +146,12 @@ def test_two_hundred_real_annotations(data):
     files = sorted((data / "visdrone" / "annotations").glob("*.txt"))
     from hvt_study.datasets.virtual_camera import read_annotations
 
-    found = [read_annotations(file) for file in files]
+    found = [read_annotations(file, (10_000, 10_000))[0] for file in files]
     assert len(files) == 200
     # 12330 objects by their categories, of which a few lie in ignored regions or are empty.
-    assert 12_000 < sum(len(one.classes) for one in found) <= 12_330
-    assert sum(len(one.ignored_px) for one in found) == 550  # category 0
-    assert sum(len(one.beside_px) for one in found) == 12  # category 11, "others"
+    assert 12_000 < sum(len(one.class_names) for one in found) <= 12_330
+    assert sum(len(one.ignored_xyxy_px) for one in found) == 550  # category 0
+    assert sum(len(one.beside_xyxy_px) for one in found) == 12  # category 11, "others"
 
 
 def test_covered_share_counts_nothing_twice():

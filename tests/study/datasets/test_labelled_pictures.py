@@ -327,6 +327,13 @@ def test_names_of_a_yaml_are_those_of_a_yaml_reader(
     assert read_class_file(text(tmp_path / "data.yaml", yaml)) == names
 
 
+@pytest.mark.parametrize("yaml", ["names: [car", "names: *nobody\n", "a: 1\n---\nnames: [car]\n", "[" * 5000])
+def test_a_yaml_that_is_none_is_one_sentence(tmp_path: Path, yaml: str) -> None:
+    """Half a file would give half of the classes."""
+    with pytest.raises(UserError, match=r"data\.yaml is no YAML \("):
+        read_class_file(text(tmp_path / "data.yaml", yaml))
+
+
 @pytest.mark.parametrize("shape", ["kpt_shape: [3, 2]", "kpt_shape: [2, 3]", ""])
 def test_keypoints_behind_a_box_are_no_polygon(tmp_path: Path, shape: str) -> None:
     """Labels of Ultralytics' pose gave boxes around the keypoints (ultralytics#13221)."""

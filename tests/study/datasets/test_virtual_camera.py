@@ -62,10 +62,10 @@ def test_it_moves_and_every_frame_has_noise_of_its_own(picture):
 
 def test_regions_without_labels_are_known(picture):
     """What VisDrone says nothing about must not count as a false alarm."""
-    found = read_annotations(picture.with_suffix(".txt"))
-    assert found.classes == ("car",)
-    assert found.ignored_px.tolist() == [[10, 10, 60, 60]]
-    assert found.beside_px.tolist() == [[500, 300, 520, 320]]  # a single object: boxes on it alone
+    found, _ = read_annotations(picture.with_suffix(".txt"), (960, 540))
+    assert found.class_names == ("car",)
+    assert found.ignored_xyxy_px.tolist() == [[10, 10, 60, 60]]
+    assert found.beside_xyxy_px.tolist() == [[500, 300, 520, 320]]  # a single object: boxes on it alone
     camera = VirtualCamera(picture)
     seen = [camera.labels(index) for index in range(0, 200, 20)]
     assert sum(len(one.ignored_xyxy_px) for one in seen) > 0

@@ -100,7 +100,7 @@ def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
         fps=NOMINAL_FPS,
         source_size=camera.size,
         labels=None if known is None else StillLabels(picture, view, seed, options.classes),
-        class_set=() if known is None else known.class_set,
+        class_set=camera.class_set,
         attributes={"view": f"{view:g}", "seed": str(seed)},
         files=(picture,) if known is None else (picture, annotation_file(picture)),
     )

@@ -15,12 +15,11 @@ from functools import partial
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_common.inference.class_names import VISDRONE_NAMES
-from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
+from hvt_study.datasets.label_table import TableLabels
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import Sequence
-from hvt_study.datasets.visdrone_rows import VisDroneRows, read_video_rows
+from hvt_study.datasets.visdrone_rows import video_table
 
 _FPS = 30.0
 """The dataset does not say; its drones filmed at 24 to 30."""
@@ -49,25 +48,6 @@ def open_visdrone(root: Path, options: Options) -> Mapping[str, Callable[[], Seq
     return found
 
 
-def visdrone_table(path: Path, size: tuple[int, int]) -> LabelTable:
-    """All labels of a sequence whose pictures have this (width, height)."""
-    return table_of(read_video_rows(path), size=size)
-
-
-def table_of(rows: VisDroneRows, *, size: tuple[int, int]) -> LabelTable:
-    """Objects that are asked for, and what is not: regions, and single objects ("others", and those of score 0)."""
-    judged, passed = rows.counts, ~rows.counts
-    return LabelTable.of(
-        frames=rows.frames[judged],
-        boxes=rows.boxes[judged],
-        ids=rows.ids[judged],
-        class_ids=rows.categories[judged] - 1,
-        class_names=VISDRONE_NAMES,
-        ignored=Regions(rows.frames[passed], rows.boxes[passed], rows.land[passed]),
-        size=size,
-    )
-
-
 def _open(name: str, folder: Path, annotations: Path, options: Options) -> Sequence:
     images = ImageSequence(folder)
     labels = None
@@ -77,7 +57,7 @@ def _open(name: str, folder: Path, annotations: Path, options: Options) -> Seque
                 f"VisDrone sequence {folder} has no annotations {annotations}: "
                 "add them, or ask for pictures alone with ?labels=none"
             )
-        labels = TableLabels(visdrone_table, (annotations, images.size), images.first_number)
+        labels = TableLabels(video_table, (annotations, images.size), images.first_number)
         _check_frames(labels, annotations)
     return images.sequence(name=name, dataset="visdrone", fps=options.fps or _FPS, labels=labels)
 
