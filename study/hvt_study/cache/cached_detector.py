@@ -2,15 +2,12 @@
 
 What a detection cost is remembered with it, so that a flight can still say what it would have spent. An answer is
 named by all that decides it: the content of the model file, what runs it, the code and the versions of the libraries
-on the way, and the pixels. Each entry carries a checksum; one that was cut off or changed is thrown away, and the
-detector is asked again.
+on the way, and the pixels. One that was cut off or changed is asked for again.
 """
 
 from __future__ import annotations
 
 import hashlib
-import logging
-import os
 import time
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -19,19 +16,16 @@ from pathlib import Path
 import msgpack
 import numpy as np
 
-from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector
 from hvt_common.inference.runtimes.ir_file import files_of
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Detections, Image
 from hvt_study.cache.code_digest import DETECTING, code_digest
-from hvt_study.cache.results import CacheError, file_digest
+from hvt_study.cache.results import file_digest, keep, make_folder, read_kept
 
-_log = logging.getLogger(__name__)
 _PACKAGES = ("numpy", "opencv-python-headless", "onnxruntime", "onnxruntime-gpu", "openvino")
 """Those that may have a say in an answer, as far as they are installed."""
-_CHECKSUM_BYTES = 16
 _digest_of_file = cache(file_digest)
 """Once in a process: a model that is changed under a running study is not noticed by it."""
 
@@ -56,11 +50,7 @@ class CachedDetector(OnnxDetector):
             *_versions(),
         )
         self._name = " ".join(said).encode()
-        self._folder = folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"detections {folder} cannot be made ({error.strerror}): name a folder") from None
+        self._folder = make_folder(folder)
         self.saved_cpu_s = 0.0
         """What the answers out of memory would have cost, less what it took to remember."""
 
@@ -98,17 +88,8 @@ def _versions() -> tuple[str, ...]:
 
 def _read(path: Path) -> tuple[Detections, float] | None:
     """What lies there; None where there is nothing, or nothing whole."""
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        _log.warning("%s cannot be read (%s): the detector is asked again", path, error.strerror)
-        return None
-    checksum, body = data[:_CHECKSUM_BYTES], data[_CHECKSUM_BYTES:]
-    if checksum != _checksum(body):
-        _log.warning("%s is damaged: the detector is asked again", path)
-        path.unlink(missing_ok=True)
+    body = read_kept(path)
+    if body is None:
         return None
     cost_s, boxes, confidences, class_ids = msgpack.unpackb(body)
     found = Detections(
@@ -120,20 +101,5 @@ def _read(path: Path) -> tuple[Detections, float] | None:
 
 
 def _write(path: Path, found: Detections, cost_s: float) -> None:
-    """Keep an answer; whole or not at all, for another process may be reading."""
     arrays = (found.boxes_xyxy_px, "<f4"), (found.confidences, "<f4"), (found.class_ids, "<i4")
-    body: bytes = msgpack.packb([cost_s, *(one.astype(dtype).tobytes() for one, dtype in arrays)])
-    scratch = path.with_suffix(f".{os.getpid()}")
-    try:
-        scratch.write_bytes(_checksum(body) + body)
-        scratch.replace(path)
-    except OSError as error:
-        scratch.unlink(missing_ok=True)
-        raise CacheError(
-            f"detections {path.parent} cannot be written ({error.strerror}): what is in it stays; make room, or name "
-            "another with --cache"
-        ) from None
-
-
-def _checksum(body: bytes) -> bytes:
-    return hashlib.sha256(body).digest()[:_CHECKSUM_BYTES]
+    keep(path, msgpack.packb([cost_s, *(one.astype(dtype).tobytes() for one, dtype in arrays)]))

@@ -1,4 +1,4 @@
-"""Results that are never worked out twice: small JSON files, named by the content that decides them.
+"""What is never worked out twice, whole or not at all: small files, named by the content that decides them.
 
 Each carries a checksum of its own. One that was cut off or changed is thrown away with a warning and made again.
 """
@@ -9,14 +9,15 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError
 
 _log = logging.getLogger(__name__)
-_CHUNK_BYTES = 1 << 20
+
+_CHECKSUM_BYTES = 16
 FLIGHTS = "flights"
 """Of the cache: results of flights."""
 
@@ -37,18 +38,60 @@ def file_digest(path: Path) -> str:
     Raises:
         UserError: it cannot be read.
     """
-    digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
-            while chunk := file.read(_CHUNK_BYTES):
-                digest.update(chunk)
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): name a file that can") from None
-    return digest.hexdigest()
+
+
+def make_folder(folder: Path) -> Path:
+    """The folder of a cache, which is made; `UserError` where it cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cache {folder} cannot be made ({error.strerror}): name a folder") from None
+    return folder
+
+
+def read_kept(path: Path) -> bytes | None:
+    """What `keep` put there; None where there is nothing, or nothing whole."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        _log.warning("%s cannot be read (%s) and is made again", path, error.strerror)
+        return None
+    body = data[_CHECKSUM_BYTES:]
+    if data[:_CHECKSUM_BYTES] != _checksum(body):
+        _log.warning("%s is damaged and is made again", path)
+        path.unlink(missing_ok=True)
+        return None
+    return body
+
+
+def keep(path: Path, body: bytes) -> None:
+    """Write it, whole or not at all, whenever the process dies; another one may be reading.
+
+    Raises:
+        CacheError: it cannot be written.
+    """
+    scratch = path.with_suffix(f".{os.getpid()}")
+    try:
+        path.parent.mkdir(exist_ok=True)
+        scratch.write_bytes(_checksum(body) + body)
+        scratch.replace(path)
+    except OSError as error:
+        scratch.unlink(missing_ok=True)
+        raise CacheError(
+            f"cache {path.parent} cannot be written ({error.strerror}): what is in it stays; make room, or name "
+            "another with --cache"
+        ) from None
 
 
 class ResultCache:
-    """A folder of results. Several processes may use it at once.
+    """A folder of results, which JSON can hold. Several processes may use it at once.
 
     Raises:
         UserError: the folder cannot be made.
@@ -56,52 +99,33 @@ class ResultCache:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"cache {folder} cannot be made ({error.strerror}): name a folder") from None
+        self._folder = make_folder(folder)
 
     def get(self, key: str) -> dict[str, Any] | None:
         """What was put under this key; None where there is nothing, or nothing whole."""
-        path = self._path(key)
-        try:
-            checksum, _, text = path.read_text(encoding="utf-8").partition("\n")
-        except FileNotFoundError:
-            return None
-        except (OSError, UnicodeDecodeError) as error:
-            _log.warning("%s cannot be read (%s) and is made again", path, error)
-            return None
-        if checksum != _checksum(text):
-            _log.warning("%s is damaged and is made again", path)
-            path.unlink(missing_ok=True)
-            return None
-        found: dict[str, Any] = json.loads(text)
+        body = read_kept(self._path(key))
+        found: dict[str, Any] | None = None if body is None else json.loads(body)
+        return found
+
+    def put(self, key: str, result: Mapping[str, Any]) -> None:
+        """Keep a result."""
+        keep(self._path(key), json.dumps(result, separators=(",", ":")).encode())
+
+    def known(self, key: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+        """What was put under this key; else it is made, and put there."""
+        found: Mapping[str, Any] | None = self.get(key)
+        if found is None:
+            found = make()
+            self.put(key, found)
         return found
 
     def count(self) -> int:
         """How many there are."""
         return sum(1 for _ in self._folder.glob("*/*.json"))
 
-    def put(self, key: str, result: Mapping[str, Any]) -> None:
-        """Keep a result; whole or not at all, whenever the process dies."""
-        path = self._path(key)
-        text = json.dumps(result, separators=(",", ":"))
-        scratch = path.with_suffix(f".{os.getpid()}")
-        try:
-            path.parent.mkdir(exist_ok=True)
-            scratch.write_text(f"{_checksum(text)}\n{text}", encoding="utf-8")
-            scratch.replace(path)
-        except OSError as error:
-            scratch.unlink(missing_ok=True)
-            raise CacheError(
-                f"cache {self._folder} cannot be written ({error.strerror}): what is in it stays; make room, or name "
-                "another with --cache"
-            ) from None
-
     def _path(self, key: str) -> Path:
         return self._folder / key[:2] / f"{key}.json"
 
 
-def _checksum(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+def _checksum(body: bytes) -> bytes:
+    return hashlib.sha256(body).digest()[:_CHECKSUM_BYTES]

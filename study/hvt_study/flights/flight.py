@@ -15,7 +15,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -27,7 +27,6 @@ from hvt_common.inference.tiles import tiled
 from hvt_common.protocol.ledger import LedgerSummary
 from hvt_common.protocol.messages import Info, StillResult
 from hvt_common.transport.inbox import Received
-from hvt_common.units import SECOND_NS
 from hvt_common.values import Fit, Frame
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig
@@ -41,7 +40,7 @@ from hvt_ground.wiring import Models
 from hvt_study.cache.cached_detector import CachedDetector
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip, FrameSource
 from hvt_study.flights.flight_ground import GroundSide, InlineExecutor
-from hvt_study.flights.flight_link import START_NS, FlightInbox, FlightOutlet, MediaClock
+from hvt_study.flights.flight_link import START_NS, FlightInbox, FlightOutlet, MediaClock, frame_ns
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.serial_link import LinkReport, SerialLink
 
@@ -100,6 +99,15 @@ def coded_frames(frames: int, fps: float) -> frozenset[int]:
     return frozenset(
         frame_index for k in range(count) if (frame_index := math.ceil(k * NOMINAL_FPS / fps)) < frames
     )
+
+
+def picture_age_p95_ms(shown_ns: Sequence[tuple[int, int]], frames: int) -> float:
+    """Of (arrival, capture) of every picture, seen at each of so many frames from the first picture on."""
+    shown = np.array(shown_ns, np.int64).reshape(-1, 2)
+    at_ns = np.array([frame_ns(frame_index) for frame_index in range(frames)], np.int64)
+    at_ns = at_ns[at_ns >= shown[0, 0]] if len(shown) else at_ns[:0]
+    newest = shown[np.searchsorted(shown[:, 0], at_ns, side="right") - 1, 1]
+    return float(np.percentile((at_ns - newest) / 1e6, 95)) if len(at_ns) else 0.0
 
 
 def fly(plan: FlightPlan, *, detector: Detector, models: Models) -> FlightReport:
@@ -227,7 +235,7 @@ class Flight:
             messages=dict(outlet.messages),
             max_frame_bytes=outlet.max_frame_bytes,
             link=LinkReport.of(self.ground.base_delays_ns, self.ground.arrivals),
-            picture_age_p95_ms=self._picture_age_p95_ms(),
+            picture_age_p95_ms=picture_age_p95_ms(self.ground.shown_ns, frames),
             edge_cpu_ms=1e3 * (self._cpu_s + saved_cpu_s) / frames,
             digest=outlet.digest,
             back_bytes=self.ground.back_bytes,
@@ -258,20 +266,8 @@ class Flight:
     def _pass_over(self, until_frame: int) -> None:
         """The source did not give the frames before this one."""
         for frame_index in range(self._next_frame, until_frame):
-            self.ground.pass_over(
-                frame_index, capture_ns=START_NS + round(frame_index * SECOND_NS / NOMINAL_FPS)
-            )
+            self.ground.pass_over(frame_index, capture_ns=frame_ns(frame_index))
         self._next_frame = max(self._next_frame, until_frame)
-
-    def _picture_age_p95_ms(self) -> float:
-        """Over the frames from the first picture on."""
-        shown = np.array(self.ground.shown_ns, np.int64).reshape(-1, 2)
-        at_ns = START_NS + np.round(np.arange(self.plan.clip.frame_count) * SECOND_NS / NOMINAL_FPS).astype(
-            np.int64
-        )
-        at_ns = at_ns[at_ns >= shown[0, 0]]
-        newest = shown[np.searchsorted(shown[:, 0], at_ns, side="right") - 1, 1]
-        return float(np.percentile((at_ns - newest) / 1e6, 95)) if len(at_ns) else 0.0
 
 
 class _NoGround:

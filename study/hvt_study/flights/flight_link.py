@@ -12,12 +12,19 @@ from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.protocol.messages import BaseHeader, CaptureTimes, RoiHeader, Status, StillResult, TrackStep
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.transport.inbox import Received
+from hvt_common.units import SECOND_NS
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import Answers
 from hvt_edge.perception.shadow import Detected
+from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.serial_link import SerialLink
 
 START_NS = 1_700_000_000_000_000_000
+
+
+def frame_ns(frame_index: int) -> int:
+    """Capture of a frame of the clip."""
+    return START_NS + round(frame_index * SECOND_NS / NOMINAL_FPS)
 
 
 class MediaClock(SteadyClock):

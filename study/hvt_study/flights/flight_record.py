@@ -22,7 +22,7 @@ from hvt_ground.perception.pipeline import Pipeline
 from hvt_ground.perception.stills.classify import object_crops
 from hvt_ground.perception.stills.decode import DecodedStill
 from hvt_ground.perception.stills.refine import Refiner, ShownClasses
-from hvt_study.datasets.labels import NO_ID
+from hvt_study.datasets.labels import NO_ID, inside_frame
 from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.metrics.proxy import score_entropy_nats
@@ -249,8 +249,7 @@ class FlightRecord:
         return Opinion(view.class_names[row], confidence, score_entropy_nats(confidence, self._classes))
 
     def _inside(self, boxes_base_px: Boxes) -> Boxes:
-        limits = np.array([*self._view.source_size, *self._view.source_size], np.float32)
-        return np.clip(self._view.to_source(boxes_base_px), 0, limits)
+        return inside_frame(self._view.to_source(boxes_base_px), self._view.source_size)
 
     def _seconds(self, at_ns: int) -> float:
         return (at_ns - self._started_ns) / 1e9

@@ -6,7 +6,6 @@ Of one run two rows never stand: what was flown now takes the place of what was 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -16,11 +15,11 @@ from hvt_common.errors import UserError
 from hvt_study.cache.results import content_key
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.matrix.plan import StudyPlan
+from hvt_study.runs.match_total import SAME_TOTAL
+from hvt_study.runs.spec import said_run
 
 RunRow = Mapping[str, Any]
 _CONDITIONS = ("dataset", "sequence", "regime", "budget_bps", "labels", "size", "max_frames", "detect_every")
-_SAME_TOTAL = 1e-4
-"""Of a total: rates that come back from another accounting are rounded."""
 
 
 def staying(done: Iterable[RunRow], earlier: Iterable[RunRow]) -> list[dict[str, Any]]:
@@ -43,7 +42,7 @@ def check_parameters(plan: StudyPlan, earlier: Iterable[RunRow], *, out: Path) -
     """`UserError` where a table holds runs of a method of this study with other parameters: no report takes both."""
     tunes = {method.name: list((plan.tune or {}).get(method.name, ())) for method in plan.methods}
     for row in earlier:
-        known = _run(row).get("tune")
+        known = said_run(row).get("tune")
         if row["failed"] or known is None or known == tunes.get(row["method"], known):
             continue
         said = " ".join(known) or "its defaults"
@@ -53,26 +52,18 @@ def check_parameters(plan: StudyPlan, earlier: Iterable[RunRow], *, out: Path) -
         )
 
 
-def _run(row: RunRow) -> Mapping[str, Any]:
-    try:
-        run = json.loads(row["config"])["run"]
-    except (ValueError, KeyError, TypeError):  # no row of ours
-        return {}
-    return run if isinstance(run, Mapping) else {}
-
-
 def _up_to_date(row: RunRow, totals: Mapping[str, int | None]) -> bool:
     if not row["matched_to"] or _place(row) not in totals:
         return True
     total, target = totals[_place(row)], row["target_bps"]
     if not total or not target:
         return False
-    return math.isclose(target, total, rel_tol=_SAME_TOTAL)
+    return math.isclose(target, total, rel_tol=SAME_TOTAL)
 
 
 def _place(row: RunRow) -> str:
     """Names a run that decides what it spends, by what it is and not by how: those that match its total share it."""
-    run = _run(row)
+    run = said_run(row)
     if not run:
         return str(row["key"])
     whose = run.get("target") or run

@@ -17,22 +17,19 @@ from collections.abc import Generator
 from contextlib import closing
 from itertools import groupby
 
-import numpy as np
-
 from hvt_common.inference.detect import Detector
-from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame
 from hvt_edge.link.budget import RollingBudget
 from hvt_edge.source.resample import Resizer
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip, FrameSource
-from hvt_study.flights.flight import FlightReport, coded_frames
+from hvt_study.flights.flight import FlightReport, coded_frames, picture_age_p95_ms
+from hvt_study.flights.flight_link import START_NS, frame_ns
 from hvt_study.peers.dds_edge import DdsEdge, pass_rates
 from hvt_study.peers.dds_ground import DdsGround
 from hvt_study.peers.dds_line import Line
 from hvt_study.peers.dds_settings import DdsSettings
 from hvt_study.serial_link import LinkReport
 
-_START_NS = 1_700_000_000_000_000_000
 _LONGEST_TAIL_S = 30
 """How long after the clip the last second pass may take."""
 
@@ -68,7 +65,7 @@ def fly_dds(
     most_bytes = int(budget_bps * clip.frame_count / NOMINAL_FPS / 8)
     resizer = Resizer(clip.source_size, size, fit="letterbox")
     edge = DdsEdge(rates, size=size, settings=settings, segments=segments, line=line, most_bytes=most_bytes)
-    ground = DdsGround(detector, settings, resizer.view, segments, line, started_ns=_frame_ns(0))
+    ground = DdsGround(detector, settings, resizer.view, segments, line, started_ns=frame_ns(0))
     with closing(_by_frame(FrameSource(clip, resizer, frames=coded), clip.frame_count)) as frames:
         for now_ns, frame in frames:
             ground.advance(now_ns)
@@ -77,7 +74,7 @@ def fly_dds(
             if frame is not None:
                 edge.first_pass(frame)
             edge.second_pass(now_ns)
-            if now_ns > _frame_ns(clip.frame_count) and edge.idle and line.empty and not ground.requests:
+            if now_ns > frame_ns(clip.frame_count) and edge.idle and line.empty and not ground.requests:
                 break
     ground.close(frames=clip.frame_count)
     return _report(clip.frame_count, edge=edge, ground=ground, line=line)
@@ -94,17 +91,13 @@ def _segments(coded: frozenset[int], segment_frames: int) -> tuple[tuple[int, ..
 def _by_frame(source: FrameSource, frames: int) -> Generator[tuple[int, Frame | None], None, None]:
     """(time, frame to code) of every frame, and empty ones after the clip for what is still to come."""
     frame_index = 0
-    for frame in source.frames(start_ns=_START_NS):
+    for frame in source.frames(start_ns=START_NS):
         for between in range(frame_index, frame.index):
-            yield _frame_ns(between), None
+            yield frame_ns(between), None
         yield frame.capture_ns, frame
         frame_index = frame.index + 1
     for after in range(frame_index, frames + round(_LONGEST_TAIL_S * NOMINAL_FPS)):
-        yield _frame_ns(after), None
-
-
-def _frame_ns(frame_index: int) -> int:
-    return _START_NS + round(frame_index * SECOND_NS / NOMINAL_FPS)
+        yield frame_ns(after), None
 
 
 def _report(frames: int, *, edge: DdsEdge, ground: DdsGround, line: Line) -> FlightReport:
@@ -115,18 +108,7 @@ def _report(frames: int, *, edge: DdsEdge, ground: DdsGround, line: Line) -> Fli
         messages=dict(line.messages),
         max_frame_bytes=line.max_frame_bytes,
         link=LinkReport.of(ground.delays_ns, line.arrivals),
-        picture_age_p95_ms=_picture_age_p95_ms(ground.shown_ns, frames),
+        picture_age_p95_ms=picture_age_p95_ms(ground.shown_ns, frames),
         edge_cpu_ms=1e3 * edge.cpu_s / frames,
         digest=line.digest,
     )
-
-
-def _picture_age_p95_ms(shown_ns: list[tuple[int, int]], frames: int) -> float:
-    """Over the frames from the first picture on, as `hvt_study.flights.flight` has it."""
-    shown = np.array(shown_ns, np.int64).reshape(-1, 2)
-    at_ns = np.array([_frame_ns(frame_index) for frame_index in range(frames)], np.int64)
-    at_ns = at_ns[at_ns >= shown[0, 0]] if len(shown) else at_ns[:0]
-    if not len(at_ns):
-        return 0.0
-    newest = shown[np.searchsorted(shown[:, 0], at_ns, side="right") - 1, 1]
-    return float(np.percentile((at_ns - newest) / 1e6, 95))

@@ -15,6 +15,7 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import AccessUnit, Detections, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder
 from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.datasets.labels import inside_frame
 from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.peers.dds_edge import most_stored
@@ -181,8 +182,7 @@ class DdsGround:
         return tuple(self.detector.class_names[kind] for kind in class_ids.tolist())
 
     def _inside(self, boxes_base_px: np.ndarray) -> np.ndarray:
-        limits = np.array([*self.view.source_size, *self.view.source_size], np.float32)
-        return np.clip(self.view.to_source(boxes_base_px), 0, limits)
+        return inside_frame(self.view.to_source(boxes_base_px), self.view.source_size)
 
     def _full(self, picture: Image) -> Image:
         """Base size, whatever the scale of the first pass."""

@@ -97,19 +97,17 @@ class Readings:
         """Video that spends what another method spent, within one per cent; None where no budget does."""
 
         def spends(budget_bps: int) -> float | None:
-            key = content_key(
-                "weight", edge_flags(spec, budget_bps=budget_bps, shape=VideoShape(fps)), self._content()
-            )
-            known = self._cache.get(key)
-            if known is None:
+            shape = VideoShape(fps)
+
+            def dry_run() -> dict[str, float | None]:
                 try:
-                    known = {
-                        "bps": dry_run_bps(spec, self._context, budget_bps=budget_bps, shape=VideoShape(fps))
-                    }
+                    return {"bps": dry_run_bps(spec, self._context, budget_bps=budget_bps, shape=shape)}
                 except UserError:
-                    known = {"bps": None}
-                self._cache.put(key, known)
-            return None if known["bps"] is None else float(known["bps"])
+                    return {"bps": None}
+
+            flags = edge_flags(spec, budget_bps=budget_bps, shape=shape)
+            bps = self._cache.known(content_key("weight", flags, self._content()), dry_run)["bps"]
+            return None if bps is None else float(bps)
 
         found = match(spends, target_bps=target_bps)
         if found is None or not within(found.total_bps, target_bps):
@@ -158,11 +156,7 @@ class Readings:
 
     def _known(self, key: tuple[Any, ...], make: Callable[[], ReadFlight]) -> ReadFlight:
         name = content_key("read", key, self._content())
-        known = self._cache.get(name)
-        if known is None:
-            known = _packed(make())
-            self._cache.put(name, known)
-        return _unpacked(known)
+        return _unpacked(self._cache.known(name, lambda: _packed(make())))
 
     def _content(self) -> tuple[Any, ...]:
         """All that decides a flight beside its settings."""

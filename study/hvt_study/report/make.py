@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 
 from hvt_study.matrix.accounting import in_accounting
@@ -28,6 +27,7 @@ from hvt_study.report.tables.arm_tables import (
 )
 from hvt_study.report.tables.matrix_table import matrix_table
 from hvt_study.report.tables.pair_tables import differences_table, equal_table
+from hvt_study.runs.spec import table_of
 
 _MATRICES = ("named_f1", "map_50", "hota")
 
@@ -175,7 +175,7 @@ def _failed(rows: Sequence[RunRow]) -> Iterator[Part]:
 def _provenance(rows: Sequence[RunRow]) -> Iterator[Part]:
     said: dict[str, list[str]] = {}
     for row in rows:
-        for name, version in _versions(row["versions"]).items():
+        for name, version in table_of(row["versions"]).items():
             if version not in said.setdefault(name, []):
                 said[name].append(version)
     if said:
@@ -187,14 +187,6 @@ def _provenance(rows: Sequence[RunRow]) -> Iterator[Part]:
         "Every row of results.parquet has the full configuration (config), the software (versions), hashes of the "
         "clip and the models (content) and of all payloads (digest), in the columns of these names."
     )
-
-
-def _versions(text: str) -> dict[str, str]:
-    try:
-        found = json.loads(text or "{}")
-    except json.JSONDecodeError:
-        return {}
-    return {str(name): str(version) for name, version in found.items()} if isinstance(found, dict) else {}
 
 
 def _there(part: Part | None) -> Iterator[Part]:

@@ -15,6 +15,8 @@ from hvt_study.runs.spec import MATCH_TOLERANCE
 _STEP = 1.01
 _CLOSE = 0.003
 """Of the target on the grid: with half a step it stays within one per cent of the real one."""
+SAME_TOTAL = 1e-4
+"""Of a total: rates that come back from another accounting are rounded."""
 _TRIES = 7
 _USUAL_RATIO = 0.98
 """What a video-only method spends of the budget that it is given."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
+from typing import Any
 
 import cv2
 from filelock import FileLock
@@ -121,17 +122,16 @@ def _with_reference(
     size = base_size if smaller else None
     name = content_key("labels", "tiles", found.content, found.software, sequence.clip_frames, size)
     store = ResultCache(cache / "labels")
+
+    def label() -> dict[str, Any]:
+        detector = tiled(found.detector, "auto")
+        return reference_labels(sequence, detector=detector, classifier=found.classifier, size=size).pack()
+
     try:
         with FileLock(cache / "labels" / f"{name}.lock"):
-            known = store.get(name)
-            if known is not None:
-                return with_labels(sequence, ReferenceLabels.unpack(known))
-            labels = reference_labels(
-                sequence, detector=tiled(found.detector, "auto"), classifier=found.classifier, size=size
-            )
-            store.put(name, labels.pack())
+            known = store.known(name, label)
     except OSError as error:
         raise CacheError(
             f"cache {cache} cannot be used ({error.strerror}): name another with --cache"
         ) from None
-    return with_labels(sequence, labels)
+    return with_labels(sequence, ReferenceLabels.unpack(known))

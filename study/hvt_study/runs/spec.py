@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 MATCH_TOLERANCE = 0.01
 """A run that is to match another's total may miss it by so much, and is marked failed beyond."""
@@ -69,3 +70,18 @@ class RunSpec:
         """Names the spec: hexadecimal, the same on every machine. Contents of clips and models are not in it."""
         text = json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def said_run(row: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The spec of a row of ``results.parquet``, out of its ``config``; empty where it is no row of ours."""
+    run = table_of(row["config"]).get("run")
+    return run if isinstance(run, Mapping) else {}
+
+
+def table_of(text: str | None) -> Mapping[str, Any]:
+    """A table in JSON, as columns of a row hold it; empty for anything else."""
+    try:
+        found = json.loads(text or "{}")
+    except (ValueError, TypeError):
+        return {}
+    return found if isinstance(found, Mapping) else {}

@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 
 from hvt_common.errors import UserError
 from hvt_study.report.data.conditions import USUAL, Conditions, conditions_of, how_they_differ, tune_of
+from hvt_study.runs.match_total import SAME_TOTAL
 from hvt_study.runs.methods import METHODS, Kind
 
 RunRow: TypeAlias = Mapping[str, Any]
@@ -16,8 +17,6 @@ RunRow: TypeAlias = Mapping[str, Any]
 BySequence: TypeAlias = Mapping[str, RunRow]
 """One run of each sequence; the key is dataset and name."""
 _WHOSE = ("regime", "method", "still_codec", "matched_to", "matched_codec")
-_SAME_TOTAL = 1e-4
-"""Of a total: rates that come back from another accounting are rounded."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -207,7 +206,7 @@ def _at_total(matching: Sequence[RunRow], run: RunRow) -> RunRow | None:
     total = run["total_bps"]
     known = [row for row in matching if row["target_bps"] is not None]
     nearest = min(known, key=lambda row: abs(row["target_bps"] - total), default=None)
-    if nearest is None or abs(nearest["target_bps"] - total) > _SAME_TOTAL * total:
+    if nearest is None or abs(nearest["target_bps"] - total) > SAME_TOTAL * total:
         return None
     return nearest
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
+
+from hvt_study.runs.spec import said_run, table_of
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -49,8 +50,8 @@ def tune_of(row: Mapping[str, Any]) -> tuple[str, ...]:
 def how_they_differ(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
     """Where the configurations of two rows part, ``tune: none and a=1``; else their software, contents or totals."""
     for left, right in (
-        (_run(one["config"]), _run(other["config"])),
-        *((_parsed(one[column]), _parsed(other[column])) for column in ("versions", "content")),
+        (said_run(one), said_run(other)),
+        *((table_of(one[column]), table_of(other[column])) for column in ("versions", "content")),
     ):
         ours, theirs = _flat(left), _flat(right)
         parts = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
@@ -64,7 +65,7 @@ def how_they_differ(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
 @lru_cache(maxsize=100_000)
 def _said(config: str) -> tuple[Conditions, tuple[str, ...]]:
     """Every caption asks for it."""
-    run = _run(config)
+    run = said_run({"config": config})
     models = run.get("models")
     size = run.get("size") or USUAL.size
     conditions = Conditions(
@@ -74,19 +75,6 @@ def _said(config: str) -> tuple[Conditions, tuple[str, ...]]:
         refine=str((models.get("refine") if isinstance(models, Mapping) else None) or USUAL.refine),
     )
     return conditions, tuple(map(str, run.get("tune") or ()))
-
-
-def _run(config: str) -> Mapping[str, Any]:
-    run = _parsed(config).get("run")
-    return run if isinstance(run, Mapping) else {}
-
-
-def _parsed(text: str) -> Mapping[str, Any]:
-    try:
-        found = json.loads(text or "{}")
-    except json.JSONDecodeError:
-        return {}
-    return found if isinstance(found, Mapping) else {}
 
 
 def _flat(content: Mapping[str, Any]) -> dict[str, Any]:
