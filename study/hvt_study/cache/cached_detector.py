@@ -22,7 +22,7 @@ from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Detections, Image
 from hvt_study.cache.code_digest import DETECTING, code_digest
-from hvt_study.cache.results import file_digest, keep, make_folder, read_kept
+from hvt_study.cache.results import file_digest, make_folder, read_whole, write_whole
 
 _PACKAGES = ("numpy", "opencv-python-headless", "onnxruntime", "onnxruntime-gpu", "openvino")
 """Those that may have a say in an answer, as far as they are installed."""
@@ -88,7 +88,7 @@ def _versions() -> tuple[str, ...]:
 
 def _read(path: Path) -> tuple[Detections, float] | None:
     """What lies there; None where there is nothing, or nothing whole."""
-    body = read_kept(path)
+    body = read_whole(path)
     if body is None:
         return None
     cost_s, boxes, confidences, class_ids = msgpack.unpackb(body)
@@ -102,4 +102,4 @@ def _read(path: Path) -> tuple[Detections, float] | None:
 
 def _write(path: Path, found: Detections, cost_s: float) -> None:
     arrays = (found.boxes_xyxy_px, "<f4"), (found.confidences, "<f4"), (found.class_ids, "<i4")
-    keep(path, msgpack.packb([cost_s, *(one.astype(dtype).tobytes() for one, dtype in arrays)]))
+    write_whole(path, msgpack.packb([cost_s, *(one.astype(dtype).tobytes() for one, dtype in arrays)]))

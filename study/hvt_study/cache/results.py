@@ -54,8 +54,8 @@ def make_folder(folder: Path) -> Path:
     return folder
 
 
-def read_kept(path: Path) -> bytes | None:
-    """What `keep` put there; None where there is nothing, or nothing whole."""
+def read_whole(path: Path) -> bytes | None:
+    """What `write_whole` put there; None where there is nothing, or nothing whole."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -71,7 +71,7 @@ def read_kept(path: Path) -> bytes | None:
     return body
 
 
-def keep(path: Path, body: bytes) -> None:
+def write_whole(path: Path, body: bytes) -> None:
     """Write it, whole or not at all, whenever the process dies; another one may be reading.
 
     Raises:
@@ -103,13 +103,13 @@ class ResultCache:
 
     def get(self, key: str) -> dict[str, Any] | None:
         """What was put under this key; None where there is nothing, or nothing whole."""
-        body = read_kept(self._path(key))
+        body = read_whole(self._path(key))
         found: dict[str, Any] | None = None if body is None else json.loads(body)
         return found
 
     def put(self, key: str, result: Mapping[str, Any]) -> None:
         """Keep a result."""
-        keep(self._path(key), json.dumps(result, separators=(",", ":")).encode())
+        write_whole(self._path(key), json.dumps(result, separators=(",", ":")).encode())
 
     def known(self, key: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
         """What was put under this key; else it is made, and put there."""

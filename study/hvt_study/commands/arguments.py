@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -16,7 +17,6 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.inference.labels import first_synonym
 from hvt_common.inference.runtimes.plug_in import plug_in_of
 from hvt_common.inference.store import EMBEDDED_DETECTOR, MOTION, parts_of
-from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.source.contract import check_shape
@@ -36,6 +36,33 @@ _LEAST_KBPS, _MOST_KBPS = 20.0, 100_000.0
 _MOST_JOBS = 256
 _ALL_AT_ONCE = 10_000
 """A cluster has a queue of its own."""
+
+
+_USUAL: Mapping[str, dict[str, Any]] = {
+    "--classes": {"default": "", "metavar": "NAME,…", "help": "of YOLO labels without classes.txt"},
+    "--detector": {"metavar": "FILE"},
+    "--edge-detector": {"metavar": "FILE", "help": "of the edge (default: the ground's)"},
+    "--labelled": {
+        "default": "",
+        "metavar": "KIND,…",
+        "help": "kinds that the labels know, such as vehicle; others count neither way (default: all they name)",
+    },
+    "--max-frames": {"type": int, "metavar": "N", "help": "frames of the clip, 15 a second"},
+    "--methods": {"metavar": "NAME,…", "help": "which to fly"},
+    "--out": {"type": Path, "required": True, "metavar": "DIR"},
+    "--provider": {
+        "default": "cpu",
+        "help": "what runs the networks, as of hvt-edge; auto may choose another each time",
+    },
+    "--rates": {"metavar": "KBPS,…", "help": "budgets in kbps"},
+    "--size": {"default": "1280x720", "metavar": "WxH", "help": "size of the base stream"},
+}
+"""Options that several commands have."""
+
+
+def option(parser: argparse.ArgumentParser, name: str, **own: Any) -> None:
+    """Add one of those that several commands have, with what is this command's ``own``; no default is not shown."""
+    parser.add_argument(name, **{"default": argparse.SUPPRESS, **_USUAL[name], **own})
 
 
 def add_pool_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,20 +96,14 @@ def add_accounting(parser: argparse.ArgumentParser, *, default: str) -> None:
 def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True, writes: bool = True) -> None:
     """All that decides which runs there are; ``methods`` where several may be named, ``writes`` with ``--out``."""
     parser.add_argument("datasets", nargs="+", metavar="DATASET", help=", ".join(DATASETS))
-    parser.add_argument(
+    option(
+        parser,
         "--detector",
         action="append",
-        default=argparse.SUPPRESS,
-        metavar="FILE",
         help="of the ground, and of reference labels: FILE.onnx or a model's name; may be given several times "
         "(default: the embedded one)",
     )
-    parser.add_argument(
-        "--edge-detector",
-        default=argparse.SUPPRESS,
-        metavar="FILE",
-        help="of the edge (default: the ground's)",
-    )
+    option(parser, "--edge-detector")
     parser.add_argument(
         "--classifier",
         action="append",
@@ -93,7 +114,7 @@ def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True,
     parser.add_argument("--refine", default="fuse", choices=("replace", "fuse"), help="as of hvt-ground")
     every = ",".join(METHODS)
     if methods:
-        parser.add_argument("--methods", default=every, metavar="NAME,…", help="which to fly")
+        option(parser, "--methods", default=every)
         parser.add_argument(
             "--matched-to",
             default=argparse.SUPPRESS,
@@ -132,27 +153,19 @@ def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True,
         help="frames from one detection to the next at edge and ground; DDS looks at every frame that it codes, and "
         "with 1 so does the rest",
     )
-    parser.add_argument("--size", default="1280x720", metavar="WxH", help="size of the base stream")
-    parser.add_argument(
-        "--max-frames", type=int, default=argparse.SUPPRESS, metavar="N", help="frames of a sequence"
-    )
+    option(parser, "--size")
+    option(parser, "--max-frames", help="frames of a sequence")
     parser.add_argument(
         "--limit", type=int, default=argparse.SUPPRESS, metavar="N", help="sequences of a dataset"
     )
     parser.add_argument(
         "--only", action="append", default=[], metavar="NAME", help="sequences, or patterns of them"
     )
-    parser.add_argument(
-        "--provider",
-        default="cpu",
-        help="what runs the networks, as of hvt-edge; auto may choose another each time",
-    )
-    parser.add_argument(
+    option(parser, "--provider")
+    option(
+        parser,
         "--out",
-        type=Path,
         required=writes,
-        default=argparse.SUPPRESS,
-        metavar="DIR",
         help="results.parquet, report.html, …" if writes else "not needed: nothing is written",
     )
     parser.add_argument(
@@ -181,6 +194,25 @@ def parse_rates(text: str) -> tuple[int, ...]:
     return tuple(sorted(rates))
 
 
+def names_of(text: str) -> tuple[str, ...]:
+    """Names between commas."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def base_size(text: str) -> tuple[int, int]:
+    """``--size`` of a base stream, (width, height); `UserError` for one that cannot be flown."""
+    size = parse_size(text, name="--size")
+    check_shape(size=size, fps=15)
+    return size
+
+
+def flown_frames(frames: int | None) -> int | None:
+    """``--max-frames``; `UserError` for so few that there is nothing to measure."""
+    if frames is not None and frames < _LEAST_FRAMES:
+        raise UserError(f"--max-frames {frames} is too few: give {_LEAST_FRAMES} or more")
+    return frames
+
+
 def open_sequences(arguments: argparse.Namespace) -> tuple[tuple[str, Sequence], ...]:
     """(URI, sequence) of all that the arguments name; `UserError` where labels are asked for that nobody made."""
     limit = getattr(arguments, "limit", None)
@@ -193,16 +225,13 @@ def open_sequences(arguments: argparse.Namespace) -> tuple[tuple[str, Sequence],
 
 def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequence]]) -> StudyPlan:
     """What the arguments ask for, with these of `open_sequences`; `UserError` for what cannot be."""
-    size = parse_size(arguments.size, name="--size")
-    check_shape(size=size, fps=15)
-    frames = getattr(arguments, "max_frames", None)
-    if frames is not None and frames < _LEAST_FRAMES:
-        raise UserError(f"--max-frames {frames} is too few: give {_LEAST_FRAMES} or more")
+    size = base_size(arguments.size)
+    frames = flown_frames(getattr(arguments, "max_frames", None))
     if arguments.detect_every < 1:
         raise UserError(
             f"--detect-every {arguments.detect_every} is not accepted: give a whole number from 1"
         )
-    codecs = tuple(dict.fromkeys(word.strip() for word in arguments.still_codecs.split(",")))
+    codecs = tuple(dict.fromkeys(names_of(arguments.still_codecs)))
     for codec in codecs:
         still_codec(codec)
     plan = StudyPlan(
@@ -249,16 +278,6 @@ def jobs_of(arguments: argparse.Namespace) -> int:
     if not 1 <= jobs <= _MOST_JOBS:
         raise UserError(f"--jobs {jobs} is not accepted: give a whole number from 1 to {_MOST_JOBS}")
     return jobs
-
-
-def make_out(folder: Path, *, name: str) -> Path:
-    """The file of that name in ``--out``, which is made; `UserError` now where it could not be written later."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"--out {folder} cannot be made ({error.strerror}): name a folder") from None
-    check_writable(folder / name, name="--out")
-    return folder / name
 
 
 def _cache(arguments: argparse.Namespace) -> Path:

@@ -6,14 +6,18 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import write_json
-from hvt_common.units import parse_size
-from hvt_edge.source.contract import check_shape
-from hvt_study.commands.arguments import add_pool_arguments, make_out, open_pool, parse_rates
+from hvt_study.commands.arguments import (
+    add_pool_arguments,
+    base_size,
+    flown_frames,
+    names_of,
+    open_pool,
+    option,
+    parse_rates,
+)
+from hvt_study.commands.output import decimals, make_out, print_columns, print_lines, share, writing
 from hvt_study.commands.progress import RunProgress
 from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, CompareRow, compare
 from hvt_study.matrix.verdict import Verdict, verdicts
@@ -21,7 +25,6 @@ from hvt_study.runs.methods import chosen_names
 from hvt_study.runs.spec import ModelChoice
 
 _CLIPS = "a video, a folder of images, a MOTChallenge sequence (img1/, gt/gt.txt), demo, or still:PICTURE"
-_LEAST_FRAMES = 30
 _HEADS = ("named", "halves", "false", "class", "all", "base", "still", "track", "fps", "p95", "CPU")
 _ONE_TARGET_HEADS = ("found", "halves", "named", "gaps", "worst", "ids", "all", "fps", "p95", "CPU")
 _ONE_TARGET_LEGEND = (
@@ -42,34 +45,15 @@ _LEGEND = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Clip, models, rates, methods, and where the results go."""
     parser.add_argument("clip", metavar="CLIP", help=_CLIPS)
-    parser.add_argument(
-        "--detector",
-        required=True,
-        default=argparse.SUPPRESS,
-        metavar="FILE",
-        help="of the ground and of the reference labels: FILE.onnx or a model's name",
-    )
-    parser.add_argument(
-        "--edge-detector", default=argparse.SUPPRESS, metavar="FILE", help="of the edge (default: the same)"
-    )
-    parser.add_argument("--rates", default="150,200,300,400,800", metavar="KBPS,…", help="budgets in kbps")
-    parser.add_argument("--methods", default=",".join(COMPARED), metavar="NAME,…", help="which to fly")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        default=argparse.SUPPRESS,
-        metavar="DIR",
-        help="compare.json, compare.png, and cache, where finished flights lie",
-    )
-    parser.add_argument(
-        "--size",
-        metavar="WxH",
-        help="size of the base stream (default: 1280x720, or what the source fills of it)",
-    )
-    parser.add_argument(
-        "--max-frames", type=int, default=300, metavar="N", help="frames of the clip, 15 a second"
-    )
+    help_text = "of the ground and of the reference labels: FILE.onnx or a model's name"
+    option(parser, "--detector", required=True, help=help_text)
+    option(parser, "--edge-detector")
+    option(parser, "--rates", default="150,200,300,400,800")
+    option(parser, "--methods", default=",".join(COMPARED))
+    option(parser, "--out", help="compare.json, compare.png, and cache, where finished flights lie")
+    size = "size of the base stream (default: 1280x720, or what the source fills of it)"
+    option(parser, "--size", default=None, help=size)
+    option(parser, "--max-frames", default=300)
     add_pool_arguments(parser)
     parser.add_argument(
         "--labels",
@@ -77,18 +61,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "exact", "reference"),
         help="exact where the source knows them, or what the detector says of untouched frames",
     )
-    parser.add_argument("--classes", default="", metavar="NAME,…", help="of YOLO labels without classes.txt")
-    parser.add_argument(
-        "--labelled",
-        default="",
-        metavar="KIND,…",
-        help="kinds that the labels know, such as vehicle; others count neither way (default: all they name)",
-    )
-    parser.add_argument(
-        "--provider",
-        default="cpu",
-        help="what runs the networks, as of hvt-edge; auto may choose another each time",
-    )
+    option(parser, "--classes")
+    option(parser, "--labelled")
+    option(parser, "--provider")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -103,11 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError(f"nothing could be flown: {result.missing[0].reason}")
     from hvt_study.report.figures.compare_plot import plot  # noqa: PLC0415 - Matplotlib, before it says a word
 
-    try:
+    with writing(folder):
         write_json(file, list(result.rows))
         plot(result, folder / "compare.png")
-    except OSError as error:
-        raise UserError(f"--out {folder} cannot be written ({error.strerror}): name another") from None
     print_result(result)
     print_verdicts(verdicts(plan, result))
     return 0
@@ -115,47 +88,34 @@ def run(arguments: argparse.Namespace) -> int:
 
 def print_result(result: CompareResult) -> None:
     """One line a method and rate: named F1 of the whole clip, and of both halves beside it."""
-    console = Console(highlight=False, markup=False)
-    table = Table(
-        title=f"{result.clip}, {result.labels} labels",
-        title_justify="left",
-        title_style="bold",
-        box=None,
-        padding=(0, 1, 0, 0),
-        pad_edge=False,
+    headline = "recall" if result.one_target else "named_f1"
+    rows = (
+        (
+            f"{whole['rate_kbps']:g}",
+            whole["method"],
+            share(whole[headline]),
+            f"{share(first[headline])} {share(second[headline])}",
+            *(_held(whole) if result.one_target else _listed(whole)),
+        )
+        for whole, first, second in result.flights
     )
-    for head, style in (("kbps", None), ("method", "cyan")):
-        table.add_column(head, justify="left" if style else "right", style=style, no_wrap=True)
-    for head in _ONE_TARGET_HEADS if result.one_target else _HEADS:
-        table.add_column(head, justify="right", no_wrap=True)
-    before = None
-    for whole, first, second in result.flights:
-        if before not in (None, whole["rate_kbps"]):
-            table.add_section()
-        before = whole["rate_kbps"]
-        headline = "recall" if result.one_target else "named_f1"
-        halves = f"{_share(first[headline])} {_share(second[headline])}"
-        cells = _held(whole) if result.one_target else _listed(whole)
-        table.add_row(f"{before:g}", whole["method"], _share(whole[headline]), halves, *cells)
-    console.print(table)
-    console.print(_ONE_TARGET_LEGEND if result.one_target else _LEGEND, markup=False, soft_wrap=True)
+    heads = ("kbps", "method", *(_ONE_TARGET_HEADS if result.one_target else _HEADS))
+    print_columns(f"{result.clip}, {result.labels} labels", heads, rows, words=("method",), gap=1)
+    print_lines(_ONE_TARGET_LEGEND if result.one_target else _LEGEND)
     for one in result.missing:
-        console.print(f"{one.method} at {one.rate_kbps:g} kbps: not available, {one.reason}", markup=False)
+        print_lines(f"{one.method} at {one.rate_kbps:g} kbps: not available, {one.reason}")
 
 
 def print_verdicts(found: Sequence[Verdict]) -> None:
     """What to fly at each rate, and how."""
-    console = Console(highlight=False, markup=False)
     for one in found:
-        console.print(f"\n{one.sentence}", markup=False, soft_wrap=True)
-        if one.command:
-            console.print(f"fly this: {one.command}", markup=False, soft_wrap=True)
+        print_lines(f"\n{one.sentence}", *([f"fly this: {one.command}"] if one.command else []))
 
 
 def _listed(row: CompareRow) -> tuple[str, ...]:
     return (
-        _number(row["false_per_frame"]),
-        _share(row["class_agreement"]),
+        decimals(row["false_per_frame"], 1),
+        share(row["class_agreement"]),
         f"{row['total_bps'] / 1e3:.0f}",
         f"{row['base_bps'] / 1e3:.0f}",
         f"{row['roi_bps'] / 1e3:.0f}",
@@ -169,27 +129,14 @@ def _held(row: CompareRow) -> tuple[str, ...]:
     counts = ("-" if row[name] is None else str(row[name]) for name in ("gaps", "id_switches"))
     gaps, switches = counts
     total = f"{row['total_bps'] / 1e3:.0f}"
-    return _share(named), gaps, _number(row["longest_gap_s"]), switches, total, *_pace(row)
+    return share(named), gaps, decimals(row["longest_gap_s"], 1), switches, total, *_pace(row)
 
 
 def _pace(row: CompareRow) -> tuple[str, ...]:
     return f"{row['fps']:.1f}", f"{row['delay_p95_ms']:.0f}", f"{row['edge_cpu_ms']:.0f}"
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"
-
-
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}".replace("0.", ".")
-
-
 def _plan(arguments: argparse.Namespace) -> ComparePlan:
-    size = None if arguments.size is None else parse_size(arguments.size, name="--size")
-    if size is not None:
-        check_shape(size=size, fps=15)
-    if arguments.max_frames < _LEAST_FRAMES:
-        raise UserError(f"--max-frames {arguments.max_frames} is too few: give {_LEAST_FRAMES} or more")
     return ComparePlan(
         clip=arguments.clip,
         models=ModelChoice(
@@ -200,13 +147,9 @@ def _plan(arguments: argparse.Namespace) -> ComparePlan:
         rates_bps=parse_rates(arguments.rates),
         cache=(arguments.out / "cache").absolute(),
         methods=chosen_names(arguments.methods, COMPARED),
-        size=size,
-        max_frames=arguments.max_frames,
+        size=None if arguments.size is None else base_size(arguments.size),
+        max_frames=flown_frames(arguments.max_frames),
         labels=arguments.labels,
-        classes=_words(arguments.classes),
-        labelled=_words(arguments.labelled),
+        classes=names_of(arguments.classes),
+        labelled=names_of(arguments.labelled),
     )
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())

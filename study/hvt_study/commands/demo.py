@@ -6,13 +6,9 @@ import argparse
 from importlib.util import find_spec
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
+from hvt_study.commands.output import print_columns, print_lines
 from hvt_study.demo.compared import Compared, compare_flown
 from hvt_study.demo.picture import write_picture
-
-_WIDTH = 100
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,15 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print(compared: Compared) -> None:
-    console = Console(highlight=False, markup=False)
-    if not console.is_terminal:  # a file has room for every column
-        console.width = max(console.width, _WIDTH)
-    table = Table(
-        title="What the ground knew, on every frame", title_justify="left", title_style="bold", box=None
-    )
-    table.add_column("", style="cyan", no_wrap=True)
-    for head in ("named F1", "false a frame", "class right", "codes read", "in stills alone", "kbps"):
-        table.add_column(head, justify="right", no_wrap=True)
+    rows = []
     for number, (one, score) in enumerate(zip(compared.flown, compared.scores, strict=True)):
         read, alone = "-", "-"
         if compared.legible is not None:
@@ -54,11 +42,12 @@ def _print(compared: Compared) -> None:
             read = f"{len(legible.every)} of {len(compared.codes)}"
             alone = f"{len(legible.every - compared.legible[0].video - legible.video)}"
         figures = (f"{score.named_f1:.3f}", f"{score.false_per_frame:.1f}", f"{score.counts.top1_found:.3f}")
-        table.add_row(one.name, *figures, read, alone, f"{one.total_bps / 1e3:.0f}")
-    console.print(table)
+        rows.append((one.name, *figures, read, alone, f"{one.total_bps / 1e3:.0f}"))
+    heads = ("", "named F1", "false a frame", "class right", "codes read", "in stills alone", "kbps")
+    print_columns("What the ground knew, on every frame", heads, rows, words=("",), gap=2)
     if compared.legible is not None:
-        console.print(
+        print_lines(
             "codes read: right at least once, in six base pictures spread over the time in view, or in any still"
         )
     else:
-        console.print("codes: counted where the reader is installed: pip install 'hvt[reading]'")
+        print_lines("codes: counted where the reader is installed: pip install 'hvt[reading]'")

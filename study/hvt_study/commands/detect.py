@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from hvt_common.errors import UserError, check_not_read
 from hvt_common.inference.class_names import kind_of
@@ -24,7 +22,8 @@ from hvt_common.inference.tiles import tiled
 from hvt_common.units import parse_size
 from hvt_common.values import Detections, Image, View
 from hvt_edge.source.resample import Resizer
-from hvt_study.commands.arguments import make_out
+from hvt_study.commands.arguments import names_of, option
+from hvt_study.commands.output import decimals, make_out, print_columns, writing
 from hvt_study.commands.progress import RunProgress
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
 from hvt_study.datasets.labels import inside_frame
@@ -52,46 +51,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="pictures, folders of them, labelled sets (YOLO, Pascal VOC, VisDrone, COCO's JSON), "
         "or a MOTChallenge sequence (img1/, gt/gt.txt)",
     )
-    parser.add_argument("--out", type=Path, required=True, default=argparse.SUPPRESS, metavar="DIR")
-    parser.add_argument("--detector", default=EMBEDDED_DETECTOR, metavar="FILE", help="as of hvt-edge")
+    option(parser, "--out")
+    option(parser, "--detector", default=EMBEDDED_DETECTOR, help="as of hvt-edge")
     parser.add_argument(
         "--head", metavar="NAME", help=f"what its outputs mean, as of hvt-edge: {', '.join(HEAD_NAMES)}"
     )
     parser.add_argument(
         "--labels", type=Path, metavar="FILE", help="class names of the detector, as of hvt-edge"
     )
-    parser.add_argument(
-        "--size",
-        default="1280x720",
-        metavar="WxH",
-        help="what the detector is given: pictures are fitted into it",
-    )
+    option(parser, "--size", help="what the detector is given: pictures are fitted into it")
     parser.add_argument("--tiles", default="off", help="as of hvt-edge: off, auto or CxR")
     parser.add_argument(
         "--confidence",
         type=float,
         help="least confidence of what is written and counted (default: the detector's own, else 0.25)",
     )
-    parser.add_argument("--classes", default="", metavar="NAME,…", help="of YOLO labels without classes.txt")
-    parser.add_argument(
-        "--labelled",
-        default="",
-        metavar="KIND,…",
-        help="kinds that the set labels, such as vehicle; boxes of others count neither way (default: all it names)",
-    )
+    option(parser, "--classes")
+    option(parser, "--labelled")
     parser.add_argument(
         "--vehicles-as-one", action="store_true", help="car, van, truck and bus are one class"
     )
-    parser.add_argument("--provider", default="cpu", help="what runs the network, as of hvt-edge")
+    option(parser, "--provider", help="what runs the network, as of hvt-edge")
     parser.add_argument("--threads", type=int, default=2, help="of the network")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Detect on all pictures; write detections.csv, and score.json and two sheets where there are labels."""
-    try:
+    with writing(arguments.out):
         return _detect(arguments)
-    except OSError as error:
-        raise UserError(f"--out {arguments.out} cannot be written ({error.strerror}): name another") from None
 
 
 def _detect(arguments: argparse.Namespace) -> int:
@@ -101,7 +88,7 @@ def _detect(arguments: argparse.Namespace) -> int:
         confidence = default_confidence(arguments.detector)
     if not _LEAST_CONFIDENCE <= confidence <= 1:
         raise UserError(f"--confidence is {confidence}, must be from {_LEAST_CONFIDENCE} to 1")
-    names = _list(arguments.classes)
+    names = names_of(arguments.classes)
     pictures = [one for place in arguments.pictures for one in find_pictures(place, classes=names or None)]
     detector = tiled(
         open_detector(
@@ -115,7 +102,7 @@ def _detect(arguments: argparse.Namespace) -> int:
         arguments.tiles,
     )
     word: _Word = as_one if arguments.vehicles_as_one else kind_of
-    classes = _counted(pictures, _list(arguments.labelled), word)
+    classes = _counted(pictures, names_of(arguments.labelled), word)
     reads = [*arguments.pictures, *(one.path for one in pictures)]
     for written in ("detections.csv", "score.json", "false-alarms.png", "misses.png"):
         check_not_read(arguments.out / written, reads, name="--out")
@@ -187,10 +174,6 @@ def _rows(path: Path, view: FrameView, confidence: float) -> list[tuple[Any, ...
     ]
 
 
-def _list(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
 def _counted(pictures: Sequence[LabelledPicture], labelled: Sequence[str], word: _Word) -> tuple[str, ...]:
     """The words that count: what ``--labelled`` names, else every class that the labels may use."""
     names = labelled or sorted({name for picture in pictures for name in picture.class_names})
@@ -220,17 +203,18 @@ def _write_sheets(
 
 def print_score(score: dict[str, Any]) -> None:
     """The table of one score on standard output."""
-    table = Table(title=f"{score['detector']} at confidence {score['confidence']:g}", title_justify="left")
-    for column in ("", "labels", "boxes", "precision", "recall", "F1", "AP50"):
-        table.add_column(column, justify="left" if not column else "right")
-    for name, one in [*score["by_class"].items(), ("all", score)]:
-        shares = (one[field] for field in ("precision", "recall", "f1", "ap50"))
-        cells = ("-" if value is None else f"{value:.3f}" for value in shares)
-        boxes = "-" if one["boxes"] is None else str(one["boxes"])
-        table.add_row(name, str(one["labels"]), boxes, *cells)
-    Console(highlight=False, markup=False).print(table)
+    heads = ("", "labels", "boxes", "precision", "recall", "F1", "AP50")
+    rows = (
+        (
+            *(name, str(one["labels"]), "-" if one["boxes"] is None else str(one["boxes"])),
+            *(decimals(one[field]) for field in ("precision", "recall", "f1", "ap50")),
+        )
+        for name, one in [*score["by_class"].items(), ("all", score)]
+    )
+    title = f"{score['detector']} at confidence {score['confidence']:g}"
+    print_columns(title, heads, rows, words=("",))
     error = score["calibration_error"]
     if "recall_only" in score:
         print("one target is labelled, all else that is in view is not: recall alone can be said")
         return
-    print("expected calibration error " + ("-" if error is None else f"{error:.3f}"))
+    print("expected calibration error " + decimals(error))

@@ -14,11 +14,11 @@ from hvt_study.commands.arguments import (
     add_accounting,
     add_plan_arguments,
     add_pool_arguments,
-    make_out,
     open_pool,
     open_sequences,
     study_plan,
 )
+from hvt_study.commands.output import make_out
 from hvt_study.commands.progress import RunProgress
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.matrix.earlier import check_parameters, staying

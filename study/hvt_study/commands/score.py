@@ -7,11 +7,10 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
 from hvt_common.units import parse_size
 from hvt_scene import Scene
+from hvt_study.commands.arguments import option
+from hvt_study.commands.output import print_columns
 from hvt_study.metrics.classes import ClassScore
 from hvt_study.metrics.track_table_score import read_tracks, read_truth, score
 
@@ -40,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="MOTChallenge ground truth: frame,id,x,y,w,h,1,class,visibility",
     )
     parser.add_argument("--classes", default=",".join(Scene.class_names), help="names of the truth's classes")
-    parser.add_argument("--size", default="1280x720", metavar="WxH", help="size of the base stream")
+    option(parser, "--size")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -59,15 +58,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print(columns: Sequence[tuple[str, ClassScore]]) -> None:
-    table = Table(title="What the ground knows, on every frame", title_justify="left", title_style="bold")
-    table.add_column("", style="cyan", no_wrap=True)
-    for name, _ in columns:
-        table.add_column(name, justify="right")
-    table.add_row("objects on all frames", *(f"{one.counts.labels}" for _, one in columns))
+    rows = [("objects on all frames", *(f"{one.counts.labels}" for _, one in columns))]
     for label, figure in _ROWS:
-        table.add_row(label, *(_shown(figure(one)) for _, one in columns))
-    Console(highlight=False, markup=False).print(table)
-
-
-def _shown(share: float) -> str:
-    return "-" if math.isnan(share) else f"{share:.3f}"
+        figures = [figure(one) for _, one in columns]
+        rows.append((label, *("-" if math.isnan(one) else f"{one:.3f}" for one in figures)))
+    heads = ("", *(name for name, _ in columns))
+    print_columns("What the ground knows, on every frame", heads, rows, words=("",))

@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
 
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector
 from hvt_common.units import parse_size
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.video import VideoSource
+from hvt_study.commands.output import make_out, print_columns, writing
 from hvt_study.matrix.sweep import COLUMNS, RawDetections, SweepRow, detect_clip, read_csv, sweep
 
 _ANY_SIZE = (64, 64)  # of base frames, which the sweep does not look at
@@ -125,23 +124,13 @@ def _own_rate(path: Path) -> float:
 
 
 def _print(rows: Sequence[SweepRow], *, raw: int, frames: int) -> None:
-    table = Table(title=f"{raw} raw detections on {frames} frames", title_justify="left", title_style="bold")
-    table.add_column("policy", style="cyan")
-    for name in COLUMNS[1:]:
-        table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(row.policy, str(row.selected), f"{row.ratio:.4f}", f"{row.frame_coverage:.4f}")
-    Console(highlight=False, markup=False).print(table)
+    cells = ((row.policy, str(row.selected), f"{row.ratio:.4f}", f"{row.frame_coverage:.4f}") for row in rows)
+    print_columns(f"{raw} raw detections on {frames} frames", COLUMNS, cells, words=("policy",))
 
 
 def _write(rows: Sequence[SweepRow], folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "sweep.csv").open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(COLUMNS)
-            writer.writerows(astuple(row) for row in rows)
-    except OSError as error:
-        raise UserError(
-            f"--out {folder} cannot be written ({error.strerror}): name a folder that can"
-        ) from None
+    path = make_out(folder, name="sweep.csv")
+    with writing(folder), path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows(astuple(row) for row in rows)

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
-from rich.table import Table
 
 from hvt_common.errors import UserError, named_path, needs_extra
 from hvt_common.inference.class_names import kind_of
@@ -26,7 +24,9 @@ from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 from hvt_common.values import Boxes, Image, View
 from hvt_edge.source.resample import Resizer
+from hvt_study.commands.arguments import names_of, option
 from hvt_study.commands.detect import detected
+from hvt_study.commands.output import decimals, print_columns
 from hvt_study.commands.progress import RunProgress
 from hvt_study.datasets.label_files import LOOKED_IN
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
@@ -88,11 +88,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="pictures to measure on in place of the last fifth of --data",
     )
     parser.add_argument("--start", default=EMBEDDED_DETECTOR, metavar="NAME|FILE", help="where to begin")
-    parser.add_argument("--out", type=Path, required=True, default=argparse.SUPPRESS, metavar="FILE.onnx")
-    parser.add_argument("--classes", default="", metavar="NAME,…", help="of YOLO labels without classes.txt")
-    parser.add_argument(
-        "--size", default="1280x720", metavar="WxH", help="of the base stream: pictures are fitted into it"
-    )
+    option(parser, "--out", metavar="FILE.onnx")
+    option(parser, "--classes")
+    option(parser, "--size", help="of the base stream: pictures are fitted into it")
     parser.add_argument("--minutes", type=float, default=45.0, help="end the training by then")
     parser.add_argument("--steps", type=int, default=1500, help="most steps, of 8 views each")
     parser.add_argument("--seed", type=int, default=1, help="of everything that is random")
@@ -107,7 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
         from hvt_train.pictures.real import HeldOut  # noqa: PLC0415
     size, start = _checked(arguments)
     out: Path = arguments.out
-    names = [word.strip() for word in arguments.classes.split(",") if word.strip()]
+    names = names_of(arguments.classes)
     data = [_labelled(uri, names) for uri in arguments.data]
     apart = [_labelled(uri, names) for uri in arguments.held_out]
     classes = _classes([picture for pictures in (*data, *apart) for picture in pictures])
@@ -327,25 +325,16 @@ def _confidence(path: Path) -> float:
 
 
 def _print(about: dict[str, Any]) -> None:
-    table = Table(
-        title=f"on {about['held_out']} held-out pictures, by which the best step was chosen",
-        title_justify="left",
-    )
-    table.add_column("")
-    table.add_column("labels", justify="right")
     fields = ("precision", "recall", "ap50")
-    for when in ("before", "after"):
-        for field in fields:
-            table.add_column(f"{when}: {field.replace('ap', 'AP')}", justify="right")
-    rows = {
-        name: [about[when]["by_class"].get(name, {}) for when in ("before", "after")]
-        for name in about["classes"]
-    }
-    for name, pair in rows.items():
-        cells = [one.get(field) for one in pair for field in fields]
-        shown = ("-" if value is None else f"{value:.3f}" for value in cells)
-        table.add_row(name, str(pair[1].get("labels", 0)), *shown)
-    Console(highlight=False, markup=False).print(table)
+    whens = ("before", "after")
+    heads = [f"{when}: {field.replace('ap', 'AP')}" for when in whens for field in fields]
+    rows = []
+    for name in about["classes"]:
+        pair = [about[when]["by_class"].get(name, {}) for when in whens]
+        labels = str(pair[1].get("labels", 0))
+        rows.append((name, labels, *(decimals(one.get(field)) for one in pair for field in fields)))
+    title = f"on {about['held_out']} held-out pictures, by which the best step was chosen"
+    print_columns(title, ("", "labels", *heads), rows, words=("",))
     error = about["after"].get("calibration_error")
     print(f"boxes are shown from confidence {about['after']['confidence']:g} on", end="")
     print("" if error is None else f"; expected calibration error {error:.3f}")

@@ -6,19 +6,17 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.arguments import (
     add_plan_arguments,
     add_pool_arguments,
-    make_out,
+    names_of,
     open_pool,
     open_sequences,
     study_plan,
 )
+from hvt_study.commands.output import make_out, print_columns, print_lines, writing
 from hvt_study.commands.progress import RunProgress
 from hvt_study.matrix.tune import Tuned, split, tunable, tune
 
@@ -51,8 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError(
             f"--seed {arguments.seed} is not accepted: give a whole number from 0 to {_HIGHEST_SEED}"
         )
-    names = [word.strip() for word in arguments.parameters.split(",") if word.strip()]
-    parameters = tunable(arguments.method, names)
+    parameters = tunable(arguments.method, names_of(arguments.parameters))
     plan = study_plan(arguments, open_sequences(arguments))
     if len(plan.still_codecs) > 1:
         raise UserError(
@@ -79,28 +76,26 @@ def run(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             on_trial=on_trial,
         )
-    try:
+    with writing(arguments.out):
         write_json(written, {**asdict(found), "held_out_gain": found.gain})
-    except OSError as error:
-        raise UserError(f"{written} cannot be written ({error.strerror}): name another --out") from None
     _print(found, written)
     return 0
 
 
 def _print(found: Tuned, written: Path) -> None:
-    console = Console(highlight=False, markup=False)
-    table = Table(title="held out: objects shown with their class, of all", title_justify="left", box=None)
-    for head in ("sequence", "regime", "default", "tuned", "kbps", "kbps"):
-        table.add_column(head, justify="left" if head in ("sequence", "regime") else "right")
-    for one in found.held_out:
-        rates = f"{one.default_bps / 1e3:.0f}", f"{one.tuned_bps / 1e3:.0f}"
-        table.add_row(one.sequence, one.regime, f"{one.default:.4f}", f"{one.tuned:.4f}", *rates)
-    console.print(table)
-    flags = ",".join(f"{name}={value:g}" for name, value in found.parameters.items())
-    console.print(
-        f"training {found.train_default:.4f} to {found.train_tuned:.4f}, held out {found.gain:+.4f}: "
-        f"--method {found.method} --tune {flags}"
+    rows = (
+        (
+            *(one.sequence, one.regime, f"{one.default:.4f}", f"{one.tuned:.4f}"),
+            *(f"{one.default_bps / 1e3:.0f}", f"{one.tuned_bps / 1e3:.0f}"),
+        )
+        for one in found.held_out
     )
-    console.print(
-        f"against video of the same bits: hvt-study run … --methods M0,{found.method} --tune {written}"
+    heads = ("sequence", "regime", "default", "tuned", "kbps", "kbps")
+    title = "held out: objects shown with their class, of all"
+    print_columns(title, heads, rows, words=("sequence", "regime"), gap=2)
+    flags = ",".join(f"{name}={value:g}" for name, value in found.parameters.items())
+    print_lines(
+        f"training {found.train_default:.4f} to {found.train_tuned:.4f}, held out {found.gain:+.4f}: "
+        f"--method {found.method} --tune {flags}",
+        f"against video of the same bits: hvt-study run … --methods M0,{found.method} --tune {written}",
     )
