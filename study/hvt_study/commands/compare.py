@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--methods", default=",".join(COMPARED))
     option(parser, "--out", help="compare.json, compare.png, and cache, where finished flights lie")
     size = "size of the base stream (default: 1280x720, or what the source fills of it)"
-    option(parser, "--size", default=None, help=size)
+    option(parser, "--size", default=argparse.SUPPRESS, help=size)
     option(parser, "--max-frames", default=300)
     add_pool_arguments(parser)
     parser.add_argument(
@@ -147,7 +147,7 @@ def _plan(arguments: argparse.Namespace) -> ComparePlan:
         rates_bps=parse_rates(arguments.rates),
         cache=(arguments.out / "cache").absolute(),
         methods=chosen_names(arguments.methods, COMPARED),
-        size=None if arguments.size is None else base_size(arguments.size),
+        size=base_size(arguments.size) if hasattr(arguments, "size") else None,
         max_frames=flown_frames(arguments.max_frames),
         labels=arguments.labels,
         classes=names_of(arguments.classes),

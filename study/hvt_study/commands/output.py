@@ -29,8 +29,8 @@ def print_columns(
 
     Without a ``gap`` between its columns it has a frame.
     """
-    look: dict[str, Any] = {"box": None, "padding": (0, gap, 0, 0), "pad_edge": False} if gap else {}
-    table = Table(title=title, title_justify="left", title_style="bold", caption=caption, **look)
+    frame: dict[str, Any] = {"box": None, "padding": (0, gap, 0, 0), "pad_edge": False} if gap else {}
+    table = Table(title=title, title_justify="left", title_style="bold", caption=caption, **frame)
     table.caption_justify = "left"
     for head in heads:
         word = head in words
