@@ -17,8 +17,15 @@ from hvt_study.commands.arguments import (
     option,
     parse_rates,
 )
-from hvt_study.commands.output import decimals, make_out, print_columns, print_lines, share, writing
-from hvt_study.commands.progress import RunProgress
+from hvt_study.commands.output import (
+    RunProgress,
+    decimals,
+    make_out,
+    print_columns,
+    print_lines,
+    share,
+    writing,
+)
 from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, CompareRow, compare
 from hvt_study.matrix.verdict import Verdict, verdicts
 from hvt_study.runs.methods import chosen_names

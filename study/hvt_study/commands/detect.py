@@ -23,8 +23,7 @@ from hvt_common.units import parse_size
 from hvt_common.values import Detections, Image, View
 from hvt_edge.source.resample import Resizer
 from hvt_study.commands.arguments import names_of, option
-from hvt_study.commands.output import decimals, make_out, print_columns, writing
-from hvt_study.commands.progress import RunProgress
+from hvt_study.commands.output import RunProgress, decimals, make_out, print_columns, writing
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
 from hvt_study.datasets.labels import inside_frame
 from hvt_study.metrics.detection import detection_score

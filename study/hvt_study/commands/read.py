@@ -8,8 +8,15 @@ from hvt_common.errors import UserError
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.arguments import base_size, flown_frames, option, parse_rates
-from hvt_study.commands.output import decimals, make_out, print_columns, print_lines, share, writing
-from hvt_study.commands.progress import RunProgress
+from hvt_study.commands.output import (
+    RunProgress,
+    decimals,
+    make_out,
+    print_columns,
+    print_lines,
+    share,
+    writing,
+)
 from hvt_study.reading.compared import READ_METHODS, ReadPlan, ReadResult, ReadRow, compare_codes
 from hvt_study.reading.sheet import write_sheet
 from hvt_study.runs.methods import chosen_names

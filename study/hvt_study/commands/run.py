@@ -18,8 +18,7 @@ from hvt_study.commands.arguments import (
     open_sequences,
     study_plan,
 )
-from hvt_study.commands.output import make_out
-from hvt_study.commands.progress import RunProgress
+from hvt_study.commands.output import RunProgress, make_out
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.matrix.earlier import check_parameters, staying
 from hvt_study.matrix.plan import StudyPlan, first_runs

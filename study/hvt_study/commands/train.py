@@ -26,8 +26,7 @@ from hvt_common.values import Boxes, Image, View
 from hvt_edge.source.resample import Resizer
 from hvt_study.commands.arguments import names_of, option
 from hvt_study.commands.detect import detected
-from hvt_study.commands.output import decimals, print_columns
-from hvt_study.commands.progress import RunProgress
+from hvt_study.commands.output import RunProgress, decimals, print_columns
 from hvt_study.datasets.label_files import LOOKED_IN
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
 from hvt_study.datasets.labels import IGNORED, FrameLabels, inside_frame

@@ -16,8 +16,7 @@ from hvt_study.commands.arguments import (
     open_sequences,
     study_plan,
 )
-from hvt_study.commands.output import make_out, print_columns, print_lines, writing
-from hvt_study.commands.progress import RunProgress
+from hvt_study.commands.output import RunProgress, make_out, print_columns, print_lines, writing
 from hvt_study.matrix.tune import Tuned, split, tunable, tune
 
 _MOST_TRIALS = 100_000

@@ -9,7 +9,7 @@ from collections import deque
 
 import pytest
 
-from hvt_study.commands.progress import RunProgress, time_left_s
+from hvt_study.commands.output import RunProgress, time_left_s
 from programs.processes import eventually
 
 
