@@ -14,6 +14,7 @@ import subprocess
 import sys
 import weakref
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol
@@ -130,25 +131,36 @@ class DemoSource(Source):
 
     def _request(self, *request: Any) -> None:
         assert self._drawing.stdin is not None, "it was opened with a pipe"
-        pickle.dump(request, self._drawing.stdin)
-        self._drawing.stdin.flush()
+        with _drawing_on():
+            pickle.dump(request, self._drawing.stdin)
+            self._drawing.stdin.flush()
         self._pictures_due += request[0] == "image"
 
     def _answer(self) -> Any:
         assert self._drawing.stdout is not None, "it was opened with a pipe"
-        return pickle.load(self._drawing.stdout)  # noqa: S301 - our own process
+        with _drawing_on():
+            return pickle.load(self._drawing.stdout)  # noqa: S301 - our own process
 
     def _picture(self) -> Image:
         assert self._drawing.stdout is not None, "it was opened with a pipe"
         picture = np.empty((self._size[1], self._size[0], 3), np.uint8)
-        if self._drawing.stdout.readinto(picture.data) != picture.nbytes:  # type: ignore[attr-defined]
-            raise UserError("--source demo: the process that draws the scene has ended")
+        with _drawing_on():
+            if self._drawing.stdout.readinto(picture.data) != picture.nbytes:  # type: ignore[attr-defined]
+                raise EOFError
         self._pictures_due -= 1
         return picture
 
     def _drop_pictures(self) -> None:
         while self._pictures_due:
             self._picture()
+
+
+@contextmanager
+def _drawing_on() -> Iterator[None]:
+    try:
+        yield
+    except (EOFError, BrokenPipeError):
+        raise UserError("--source demo: the process that draws the scene has ended") from None
 
 
 def _end(drawing: subprocess.Popen[bytes]) -> None:

@@ -28,9 +28,15 @@ _ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"}
 
 
 def sequence_files(folder: Path) -> list[Path]:
-    """The images of a folder in natural order (img2 before img10); hidden files and subfolders are not looked at."""
-    files = [file for file in folder.iterdir() if names_picture(file)]
-    return sorted((file for file in files if file.is_file()), key=lambda file: _natural(file.name))
+    """The images of a folder in natural order (img2 before img10); hidden files and subfolders are not looked at.
+
+    Raises `UserError` for a folder that may not be read.
+    """
+    try:
+        files = [file for file in folder.iterdir() if names_picture(file) and file.is_file()]
+    except OSError as error:
+        raise UserError(f"source folder {str(folder)!r} cannot be read ({error.strerror})") from None
+    return sorted(files, key=lambda file: _natural(file.name))
 
 
 def names_picture(file: Path) -> bool:

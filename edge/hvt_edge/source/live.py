@@ -115,12 +115,14 @@ class LiveSource(Source):
         grabber.open()
         try:
             first_size = self._first_size(grabber, size)
-        except SignalLost as error:
-            grabber.close()
-            raise NotYetError(f"source {grabber.name} opens but delivers no picture ({error})") from error
         except UserError:
             grabber.close()
             raise
+        except Exception as error:
+            grabber.close()
+            raise NotYetError(
+                f"source {grabber.name} opens but delivers no picture ({_reason(error)})"
+            ) from error
         self._resizer = Resizer(first_size, size, fit=fit, name=grabber.name)
         self.notes = () if grabber.notes is None else grabber.notes.taken()
         self.view = self._resizer.view
@@ -207,9 +209,8 @@ class LiveSource(Source):
     def _recover(self, error: Exception) -> None:
         # Open the grabber again, waiting twice as long after each failure; returns when it is open or we stop.
         while not self._stop.is_set():  # what stops because it is closed has not failed
-            reason = str(error) if isinstance(error, SignalLost) else reason_of(error)
             self._pause.failed(self._clock())
-            self._failures.failed(SOURCE_PART, f"{self._grabber.name} stopped ({reason})")
+            self._failures.failed(SOURCE_PART, f"{self._grabber.name} stopped ({_reason(error)})")
             if self._stop.wait(self._pause.pause_ns / SECOND_NS):
                 return
             try:
@@ -219,6 +220,11 @@ class LiveSource(Source):
             else:
                 self.restarts += 1
                 return
+
+
+def _reason(error: Exception) -> str:
+    # A driver or a decoder raises what it likes.
+    return str(error) if isinstance(error, SignalLost) else reason_of(error)
 
 
 @contextmanager

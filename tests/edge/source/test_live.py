@@ -6,10 +6,12 @@ import threading
 import time
 from functools import partial
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hvt_common.errors import NotYetError
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_edge.source import live
@@ -169,6 +171,19 @@ def test_an_error_that_nobody_expects_of_a_camera_costs_its_pictures_alone(monke
         "source: cam stopped (ValueError: no such layout); all else goes on, and it is tried again",
         "source: works again",
     ]
+
+
+def test_a_camera_whose_first_picture_fails_in_an_odd_way_is_waited_for():
+    """A camera that is still starting would end the start with a traceback, and nobody try again."""
+    camera = SimpleNamespace(name="cam", open=lambda: None, grab=lambda: Shot(broken), close=lambda: None)
+
+    def broken():
+        raise ValueError("no such layout")
+
+    with pytest.raises(
+        NotYetError, match=r"cam opens but delivers no picture \(ValueError: no such layout\)"
+    ):
+        LiveSource(camera, size=(64, 64), fps=25, fit="letterbox")
 
 
 def raising_pictures(grab):

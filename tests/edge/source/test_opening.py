@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import socket
+import subprocess
 import tempfile
 import threading
 import time
 from fractions import Fraction
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
+from unittest import mock
 
 import av
 import cv2
@@ -238,6 +241,13 @@ def test_another_size_among_images_is_fitted_into_the_first_ones(tmp_path):
     assert not frames[1].source_bgr[:, :50].any()
 
 
+def test_a_folder_that_may_not_be_read_is_said(tmp_path, monkeypatch):
+    """Another user's folder would be a traceback."""
+    denied = mock.Mock(side_effect=PermissionError(errno.EACCES, "Permission denied"))
+    monkeypatch.setattr(type(tmp_path), "iterdir", denied)
+    assert "cannot be read (Permission denied)" in refused(str(tmp_path))
+
+
 def test_hidden_files_are_not_frames(tmp_path):
     """A folder that came from a Mac would show its thumbnails."""
     cv2.imwrite(str(tmp_path / "1.png"), painted(1))
@@ -290,6 +300,21 @@ def test_the_demo_begins_anew_for_its_next_reader(tmp_path):
     assert len(whole) == 4
     assert all(np.array_equal(one, whole[0]) for one in first)
     assert not np.array_equal(whole[0], whole[3])
+
+
+def test_a_demo_that_nobody_draws_any_more_ends_with_a_sentence(monkeypatch):
+    """Where the system had no memory left for it, a traceback would tell of a broken pipe."""
+    drawn_by = []
+    popen = subprocess.Popen
+    monkeypatch.setattr(
+        subprocess, "Popen", lambda *args, **more: drawn_by.append(popen(*args, **more)) or drawn_by[0]
+    )
+    with open_source("demo", size=(64, 64), fps=5) as source:
+        drawn_by[0].kill()
+        drawn_by[0].wait()
+        for use in (lambda: next(source.frames(start_ns=0)), source.poses):
+            with pytest.raises(UserError, match="the process that draws the scene has ended"):
+                use()
 
 
 def test_the_demo_has_4k_when_told():
