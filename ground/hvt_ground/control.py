@@ -291,7 +291,7 @@ class RemoteEdge:
     def _why_late(self) -> str:
         alive = self._session.liveliness().get(self._keys.key(Channel.ALIVE), timeout=_ANSWER_S)
         if any(reply.ok is not None for reply in alive):
-            return "the budget or the link is full"
+            return "the link is full, or has lost it"
         return "the edge is not there any more: it has ended, or its link is down"
 
     def _commanded(self, command: str, arguments: Mapping[str, int | float | str]) -> ControlAnswer | None:

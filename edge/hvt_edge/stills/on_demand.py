@@ -48,6 +48,7 @@ _TRACKED_NS = 30_000_000_000
 """For so long after a request for tracks they are followed, where nothing else needs them."""
 _OUTCOMES = 64
 _ENDED = "the edge has ended"
+_AWAY = "no ground receives the video of this edge, and a closer look comes with it"
 
 
 class RequestedLine(Protocol):
@@ -56,6 +57,10 @@ class RequestedLine(Protocol):
     @property
     def total_bps(self) -> int:
         """The budget as it is now."""
+
+    @property
+    def away(self) -> bool:
+        """Whether nobody is there who takes the video: nothing is sent then."""
 
     def most_requested_bytes(self) -> int:
         """About the largest payload."""
@@ -124,6 +129,8 @@ class OnDemand:
         """Crop a still; return its number and frame index. Raises `RefusedError` with the reason."""
         if self._ended:
             raise RefusedError(_ENDED)
+        if self.line.away:
+            raise RefusedError(_AWAY)
         self._check_queue()
         frame = frame_for(request, self.ring)
         if request.track_id is not None:
@@ -247,9 +254,13 @@ class OnDemand:
         """It was given up: ``stale`` or ``ended``."""
         self.line.want_requested(None, now_ns=now_ns)
         waited_s = self.outbox.settings.max_on_demand_ns / SECOND_NS
-        busy = "the link was never free for it" if pending.link_busy else "the budget had no room for it"
+        why = "the budget had no room for it"
+        if pending.link_busy:
+            why = "the link was never free for it"
+        elif pending.ready is None:  # it was never its turn
+            why = "the keyframe that goes before it had no room"
         with self._lock:
-            self._note(pending.number, refusal=_ENDED if reason == "ended" else f"in {waited_s:g} s {busy}")
+            self._note(pending.number, refusal=_ENDED if reason == "ended" else f"in {waited_s:g} s {why}")
 
     def close(self) -> None:
         """No more is accepted."""

@@ -164,9 +164,12 @@ class Chooser:
 
     # Which stills go now
 
+    def expire_requested(self, now_ns: int) -> None:
+        """Give up those that grounds requested too long ago, whether or not any may go now."""
+        self._count_left(self.outbox.expire_on_demand(now_ns), now_ns=now_ns)
+
     def requested(self, *, now_ns: int, store: bool = False) -> Coded:
         """Yield coded stills that grounds requested, as `stills` does those of the method."""
-        self._count_left(self.outbox.expire_on_demand(now_ns), now_ns=now_ns)
         while isinstance(pending := self.outbox.on_demand, OnDemandStill) and self.on_demand is not None:
             sequence = self.outbox.sequence(store=store)
             still = self.on_demand.code(pending, now_ns=now_ns, sequence=sequence, paced=not store)

@@ -142,6 +142,7 @@ class StillStage:
 
     def send_requested(self, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Send those that grounds requested and may go now; the rest as of `send`. May run beside all else."""
+        self.chooser.expire_requested(now_ns)
         store = self.sender.offline
         held = not store and (self.keyframes.due(now_ns) if held is None else held)
         if held and self.keyframes.requested:

@@ -5,24 +5,29 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
+from contextlib import nullcontext
 from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import JpegCodec, StillCodec
 from hvt_edge.keyframes import Keyframes
+from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.on_demand_crop import OnDemandRequest
+from hvt_edge.stills.on_demand_crop import OnDemandRequest, RefusedError
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from media.base_coded import StandIn
@@ -274,6 +279,33 @@ def test_a_requested_still_goes_out_while_a_detection_takes_its_time():
             return super().detect(image_bgr)
 
     requested_beside(Rig(analyzer=make_analyzer(detector=Slow()), ring=FrameRing()), blocking)
+
+
+def test_a_requested_still_is_given_up_in_time_though_a_keyframe_goes_first_and_never_goes():
+    """Its requester would wait, and be told of nothing, where the ground had just left."""
+    rig = Rig(ring=FrameRing())
+    on_demand, now_ns = rig.stage.chooser.on_demand, FRAMES[0].capture_ns
+    assert on_demand is not None
+    rig.stage.capture(FRAMES[0])
+    number, _ = on_demand.request(OnDemandRequest(box_xywh_px=(40, 40, 96, 64)))
+    rig.keyframes.require(now_ns)
+    for second in range(12):
+        assert not rig.stage.send_requested(now_ns=now_ns + second * SECOND_NS)
+    with pytest.raises(RefusedError, match="in 10 s the keyframe that goes before it had no room"):
+        on_demand.outcome(number)
+
+
+def test_where_nobody_takes_the_video_a_request_is_refused_at_once():
+    """It was accepted, kept, and after 15 s a full budget was to blame."""
+    rig = Rig(ring=FrameRing())
+    rig.sender.pacer = Pacer(RateController(RateSettings(ceiling_bps=400_000, floor_bps=100_000)))
+    on_demand = rig.stage.chooser.on_demand
+    assert on_demand is not None
+    rig.stage.capture(FRAMES[0])
+    for there, taken in ((False, False), (True, True)):
+        rig.sender.pacer.link(there, now_ns=FRAMES[0].capture_ns)
+        with nullcontext() if taken else pytest.raises(RefusedError, match="no ground receives the video"):
+            on_demand.request(OnDemandRequest(box_xywh_px=(40, 40, 96, 64)))
 
 
 def test_a_requested_still_goes_out_while_an_automatic_one_is_coded_and_numbers_go_up():

@@ -362,6 +362,8 @@ MORE_ANSWERS = {
     },
     "edge/hvt_edge/stills/on_demand.py": {
         "the edge has ended",
+        "no ground receives the video of this edge, and a closer look comes with it",
+        "the keyframe that goes before it had no room",
         "in … s …",
         "the link was never free for it",
         "the budget had no room for it",
@@ -370,7 +372,7 @@ MORE_ANSWERS = {
     "ground/hvt_ground/control.py": {
         "edge … does not answer: is it flying, and does this link reach it?…",
         "the edge is not there any more: it has ended, or its link is down",
-        "the budget or the link is full",
+        "the link is full, or has lost it",
     },
 }
 """Those that are put into a name before, by the module that makes them."""

@@ -122,6 +122,7 @@ class Rig:
                 self.budget.record_base(size, now_ns=self.budget.earliest_ns(size, now_ns=now_ns, base=True))
             self.chooser.consider(seen, now_ns=self.now_ns, allowance_bytes=1000)
             sender = StillSender(self.outbox, maker=self.maker, transmitter=self.sender)
+            self.chooser.expire_requested(self.now_ns)
             for coded in self.chooser.requested(now_ns=self.now_ns):
                 sender.put(coded, now_ns=self.now_ns, store=False)
             allowance = sender.allowance(self.now_ns, paced=True)
