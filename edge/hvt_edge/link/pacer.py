@@ -308,7 +308,7 @@ class Pacer:
             return gave_up or (before is False and there and self.backoffs > 0)
 
     @property
-    def away(self) -> bool:
+    def link_down(self) -> bool:
         """Whether nobody is there who takes the video."""
         return self._linked is False
 

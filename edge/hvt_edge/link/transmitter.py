@@ -169,9 +169,9 @@ class Transmitter:
         return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
 
     @property
-    def away(self) -> bool:
+    def link_down(self) -> bool:
         """Whether nobody is there who takes the video."""
-        return self.pacer is not None and self.pacer.away
+        return self.pacer is not None and self.pacer.link_down
 
     def link_is_free(self, now_ns: int) -> bool:
         """Whether a still may go as far as the link is concerned."""

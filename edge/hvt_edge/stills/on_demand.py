@@ -48,7 +48,7 @@ _TRACKED_NS = 30_000_000_000
 """For so long after a request for tracks they are followed, where nothing else needs them."""
 _OUTCOMES = 64
 _ENDED = "the edge has ended"
-_AWAY = "no ground receives the video of this edge, and a closer look comes with it"
+_NO_GROUND = "no ground receives the video of this edge, and a closer look comes with it"
 
 
 class RequestedLine(Protocol):
@@ -59,7 +59,7 @@ class RequestedLine(Protocol):
         """The budget as it is now."""
 
     @property
-    def away(self) -> bool:
+    def link_down(self) -> bool:
         """Whether nobody is there who takes the video: nothing is sent then."""
 
     def most_requested_bytes(self) -> int:
@@ -129,8 +129,8 @@ class OnDemand:
         """Crop a still; return its number and frame index. Raises `RefusedError` with the reason."""
         if self._ended:
             raise RefusedError(_ENDED)
-        if self.line.away:
-            raise RefusedError(_AWAY)
+        if self.line.link_down:
+            raise RefusedError(_NO_GROUND)
         self._check_queue()
         frame = frame_for(request, self.ring)
         if request.track_id is not None:
