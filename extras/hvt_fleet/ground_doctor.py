@@ -17,7 +17,7 @@ from hvt_common.runtime.host_names import check_port
 from hvt_common.runtime.reporting import Finding, check_writable
 from hvt_fleet.checkup import check_clock, check_folder, check_link, print_findings, run_checks
 from hvt_ground.config import GroundConfig
-from hvt_ground.extras import all_extras, checked, config_class
+from hvt_ground.extras import checked, config_class, extras_of
 from hvt_ground.perception.models import Models
 
 _DESCRIPTION = (
@@ -38,7 +38,7 @@ def run(argv: Sequence[str]) -> int:
         "models": lambda: _models(config),
         "recordings": lambda: _recordings(config),
         "ports": lambda: _ports(config),
-        **dict(one for extra in all_extras() for one in extra.checks(config).items()),
+        **dict(one for extra in extras_of(config) for one in extra.checks(config).items()),
         "clock": check_clock,
         "link": lambda: check_link(config.link, _edges, other="edge"),
     }
@@ -63,7 +63,7 @@ def _models(config: GroundConfig) -> Finding:
 
 
 def _recordings(config: GroundConfig) -> Finding:
-    of_extras = (one for extra in all_extras() for one in extra.writes(config))
+    of_extras = (one for extra in extras_of(config) for one in extra.writes(config))
     named = {"--summary": config.summary, "--timing": config.timing, **dict(of_extras)}
     if config.tracks is not None and config.tracks.suffix == ".csv" and not config.tracks.is_dir():
         named["--tracks"] = config.tracks

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # ``--help`` is to load no numpy
 
 
 @dataclass(frozen=True)
-class GeoOptions:
+class GeoOptions(GroundConfig):
     """The settings of ``hvt-ground`` for it."""
 
     terrain: Path | None = Group("geolocation", rare=True).option(
@@ -25,14 +25,14 @@ class GeoOptions:
     )
 
 
-class GeoExtra(Extra):
+class GeoExtra(Extra[GeoOptions]):
     """Tracks stand on flat ground, or on ``--terrain``."""
 
     options = GeoOptions
 
-    def reads(self, config: GroundConfig) -> Iterable[Path]:
+    def reads(self, config: GeoOptions) -> Iterable[Path]:
         """The elevation model."""
-        return [config.terrain] if isinstance(config, GeoOptions) and config.terrain is not None else []
+        return [config.terrain] if config.terrain is not None else []
 
     def locators(self, terrain: Path | None) -> Callable[[str], Locator]:
         """One a flight.

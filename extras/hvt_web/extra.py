@@ -21,7 +21,7 @@ _HERE = "127.0.0.1:8080"
 
 
 @dataclass(frozen=True)
-class WebOptions:
+class WebOptions(GroundConfig):
     """The settings of ``hvt-ground`` for it."""
 
     web: str | None = _PAGE.option(
@@ -37,25 +37,25 @@ class WebOptions:
     )
 
 
-class WebExtra(Extra):
+class WebExtra(Extra[WebOptions]):
     """One page for all edges."""
 
     options = WebOptions
 
-    def check(self, config: GroundConfig) -> None:
+    def check(self, config: WebOptions) -> None:
         """Refuse a proxy without a page."""
-        if isinstance(config, WebOptions) and config.web_proxy is not None and config.web is None:
+        if config.web_proxy is not None and config.web is None:
             raise UserError(f"--web-proxy {config.web_proxy} is given without --web: give --web too")
 
-    def checks(self, config: GroundConfig) -> Mapping[str, Callable[[], Finding]]:
+    def checks(self, config: WebOptions) -> Mapping[str, Callable[[], Finding]]:
         """Whether it could be served."""
-        if not isinstance(config, WebOptions) or config.web is None:
+        if config.web is None:
             return {}
         return {"page": partial(_found, config.web)}
 
-    def serve(self, config: GroundConfig, *, clock: Callable[[], int], failures: Failures) -> Service | None:
+    def serve(self, config: WebOptions, *, clock: Callable[[], int], failures: Failures) -> Service | None:
         """Serve the page, encrypted by the keys of the link."""
-        if not isinstance(config, WebOptions) or config.web is None:
+        if config.web is None:
             return None
         with needs_extra("'hvt[web]'"):
             from hvt_web.server import WebPage  # noqa: PLC0415

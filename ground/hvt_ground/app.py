@@ -25,7 +25,7 @@ from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
-from hvt_ground.extras import Service, all_extras
+from hvt_ground.extras import Service, extras_of
 from hvt_ground.link.group import GroundGroup
 from hvt_ground.report.state import GroundState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary
@@ -111,7 +111,9 @@ class Ground:
                 )
                 stack.enter_context(server)
             settings = config.link
-            offered = (one.serve(config, clock=self._clock, failures=models.failures) for one in all_extras())
+            offered = (
+                one.serve(config, clock=self._clock, failures=models.failures) for one in extras_of(config)
+            )
             services = [stack.enter_context(one) for one in offered if one is not None]
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)

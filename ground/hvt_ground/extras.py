@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, make_dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.plug_ins import installed, loaded
@@ -28,6 +28,8 @@ if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no reco
     from hvt_ground.recordings.row import RecordingRow
     from hvt_ground.report.state import GroundState
     from hvt_ground.sinks import Outputs, SinkWriter
+
+Options = TypeVar("Options", bound=GroundConfig)
 
 _GROUP = "hvt.ground"
 _BROUGHT_BY = {
@@ -115,35 +117,35 @@ class Service:
         """End it."""
 
 
-class Extra:
-    """The parts that an extra may bring; each method gets the whole configuration, an instance of ``options`` too."""
+class Extra(Generic[Options]):
+    """The parts that an extra may bring; each method gets the whole configuration, an instance of ``options``."""
 
-    options: ClassVar[type]
-    """A frozen dataclass without slots whose fields are declared by `hvt_common.config.Group`."""
+    options: ClassVar[type[GroundConfig]]
+    """A frozen dataclass without slots whose further fields are declared by `hvt_common.config.Group`."""
     exports: ClassVar[Mapping[str, Callable[[Recorded, Path], None]]] = {}
     """Kinds of ``hvt-ground export``, each with its writer: a file that ends in the kind's name."""
 
-    def check(self, config: GroundConfig) -> None:
+    def check(self, config: Options) -> None:
         """Raise `UserError` where its settings contradict each other or the ground's."""
 
-    def reads(self, config: GroundConfig) -> Iterable[Path]:  # noqa: ARG002
+    def reads(self, config: Options) -> Iterable[Path]:  # noqa: ARG002
         """The files that it reads: no output may be one of them."""
         return ()
 
-    def writes(self, config: GroundConfig) -> Iterable[tuple[str, Path]]:  # noqa: ARG002
+    def writes(self, config: Options) -> Iterable[tuple[str, Path]]:  # noqa: ARG002
         """The files that it writes, each with the option that names it; no folders, no addresses."""
         return ()
 
-    def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
+    def check_outputs(self, config: Options, *, reads: Sequence[Path]) -> None:
         """Raise `UserError` if it could not write, or send, as requested."""
 
-    def checks(self, config: GroundConfig) -> Mapping[str, Callable[[], Finding]]:  # noqa: ARG002
+    def checks(self, config: Options) -> Mapping[str, Callable[[], Finding]]:  # noqa: ARG002
         """Its checks in ``hvt-ground doctor``, by name."""
         return {}
 
     def serve(
         self,
-        config: GroundConfig,  # noqa: ARG002
+        config: Options,  # noqa: ARG002
         *,
         clock: Callable[[], int],  # noqa: ARG002
         failures: Failures,  # noqa: ARG002
@@ -151,7 +153,7 @@ class Extra:
         """What it does for one whole run by the ground's ``clock``; `UserError` where it cannot."""
         return None
 
-    def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
+    def start(self, config: Options, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
         """Open the parts that all sessions share; return the function that opens the sinks of one, here none."""
         return lambda _flight: ()
 
@@ -161,16 +163,21 @@ class Extra:
 
 
 @cache
-def all_extras() -> tuple[Extra, ...]:
+def all_extras() -> tuple[Extra[Any], ...]:
     """Those that are installed, by name; `UserError` where one does not load."""
     return tuple(
-        cast("Extra", loaded(entry, lambda extra: extra(), what="extra"))
+        cast("Extra[Any]", loaded(entry, lambda extra: extra(), what="extra"))
         for _, (entry, *_) in sorted(installed(_GROUP).items())
     )
 
 
+def extras_of(config: GroundConfig) -> list[Extra[Any]]:
+    """Those whose settings the configuration has."""
+    return [extra for extra in all_extras() if isinstance(config, extra.options)]
+
+
 @cache
-def config_class(extras: tuple[Extra, ...] | None = None) -> type[GroundConfig]:
+def config_class(extras: tuple[Extra[Any], ...] | None = None) -> type[GroundConfig]:
     """`GroundConfig` with the settings of ``extras``, by default all; settings of absent ones are refused."""
     options = [extra.options for extra in (all_extras() if extras is None else extras)]
     whole = make_dataclass("GroundConfig", (), bases=(*options, GroundConfig), frozen=True)
@@ -194,6 +201,7 @@ def locators(terrain: Path | None) -> Callable[[str], Locator]:
 
 def checked(config: GroundConfig) -> GroundConfig:
     """Return the configuration, `UserError` where settings contradict, those of extras too."""
-    for extra in all_extras():
+    extras = extras_of(config)
+    for extra in extras:
         extra.check(config)
-    return check(config, files=[one for extra in all_extras() for one in extra.writes(config)])
+    return check(config, files=[one for extra in extras for one in extra.writes(config)])

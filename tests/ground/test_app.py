@@ -100,7 +100,7 @@ def test_a_group_learns_of_the_page_whatever_else_is_served(
 ) -> None:
     """With an index of recordings, too, an edge that another member serves would have no link to its page."""
     extras = (Brings(), Brings("https://base-a.example/"), Brings())
-    monkeypatch.setattr("hvt_ground.app.all_extras", lambda: extras)
+    monkeypatch.setattr("hvt_ground.app.extras_of", lambda _config: extras)
     run = Run(config(free_port, tmp_path, group="north"))
     try:
         with joined(f"tcp/127.0.0.1:{free_port}") as outsider:

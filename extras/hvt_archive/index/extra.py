@@ -29,7 +29,7 @@ _STORE = Group("retention of recordings")
 
 
 @dataclass(frozen=True)
-class IndexOptions:
+class IndexOptions(GroundConfig):
     """The settings of ``hvt-ground`` for it."""
 
     keep: tuple[Limit, ...] = _STORE.option(
@@ -44,15 +44,13 @@ class IndexOptions:
     )
 
 
-class IndexExtra(Extra):
+class IndexExtra(Extra[IndexOptions]):
     """The index of the folder of ``--record``, and its limits."""
 
     options = IndexOptions
 
-    def check(self, config: GroundConfig) -> None:
+    def check(self, config: IndexOptions) -> None:
         """Refuse limits that contradict, or that are of no folder."""
-        if not isinstance(config, IndexOptions):
-            return
         ages = [one for one in config.keep if one.seconds is not None]
         for same in (ages, [one for one in config.keep if one not in ages]):
             if len(same) > 1:
@@ -66,9 +64,9 @@ class IndexExtra(Extra):
                     f"{' is a file' if config.record else ''}: give --record FOLDER/"
                 )
 
-    def serve(self, config: GroundConfig, *, clock: Callable[[], int], failures: Failures) -> Service | None:  # noqa: ARG002
+    def serve(self, config: IndexOptions, *, clock: Callable[[], int], failures: Failures) -> Service | None:  # noqa: ARG002
         """Keep the index of a folder of recordings."""
-        if not isinstance(config, IndexOptions) or config.record_folder is None:
+        if config.record_folder is None:
             return None
         from hvt_archive.index.folder import RecordingsFolder  # noqa: PLC0415
         from hvt_archive.index.retention import Retention  # noqa: PLC0415

@@ -27,7 +27,7 @@ _END_S = 8.0
 
 
 @dataclass(frozen=True)
-class LogOptions:
+class LogOptions(GroundConfig):
     """The settings of ``hvt-ground`` for it."""
 
     log: Path | None = _LOG.option(
@@ -38,33 +38,33 @@ class LogOptions:
     )
 
 
-class LogExtra(Extra):
+class LogExtra(Extra[LogOptions]):
     """One log for all edges."""
 
     options = LogOptions
 
-    def check(self, config: GroundConfig) -> None:
+    def check(self, config: LogOptions) -> None:
         """Refuse a log without room for its messages."""
-        if isinstance(config, LogOptions) and config.log_size < LEAST_LOG_BYTES:
+        if config.log_size < LEAST_LOG_BYTES:
             raise UserError(
                 f"--log-size {config.log_size} bytes is not accepted: give at least {LEAST_LOG_BYTES // 10**6}MB"
             )
 
-    def writes(self, config: GroundConfig) -> Iterable[tuple[str, Path]]:
+    def writes(self, config: LogOptions) -> Iterable[tuple[str, Path]]:
         """The file that is named."""
-        if isinstance(config, LogOptions) and config.log is not None:
+        if config.log is not None:
             yield "--log", config.log
 
-    def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
+    def check_outputs(self, config: LogOptions, *, reads: Sequence[Path]) -> None:
         """Refuse a file that cannot be written."""
         from hvt_common.runtime.reporting import check_writable  # noqa: PLC0415
 
         for name, path in self.writes(config):
             check_writable(path, name=name, reads=reads)
 
-    def serve(self, config: GroundConfig, *, clock: Callable[[], int], failures: Failures) -> Service | None:  # noqa: ARG002
+    def serve(self, config: LogOptions, *, clock: Callable[[], int], failures: Failures) -> Service | None:  # noqa: ARG002
         """Log all that comes."""
-        if not isinstance(config, LogOptions) or config.log is None:
+        if config.log is None:
             return None
         return _Logging(config.log, most_bytes=config.log_size, failures=failures)
 

@@ -39,7 +39,7 @@ def _url(text: str, *, name: str) -> str:
 
 
 @dataclass(frozen=True)
-class CotOptions:
+class CotOptions(GroundConfig):
     """The settings of ``hvt-ground`` for it."""
 
     cot: tuple[str, ...] = _GATEWAYS.option(
@@ -54,23 +54,23 @@ class CotOptions:
     )
 
 
-class CotExtra(Extra):
+class CotExtra(Extra[CotOptions]):
     """A reporter a session, and a connection a target that all of them share."""
 
     options = CotOptions
 
-    def check(self, config: GroundConfig) -> None:
+    def check(self, config: CotOptions) -> None:
         """Refuse types without a target."""
-        if isinstance(config, CotOptions) and config.cot_types is not None and not config.cot:
+        if config.cot_types is not None and not config.cot:
             raise UserError(f"--cot-types {config.cot_types} is given without --cot: give --cot too")
 
-    def reads(self, config: GroundConfig) -> Iterable[Path]:
+    def reads(self, config: CotOptions) -> Iterable[Path]:
         """The table of types."""
-        return [config.cot_types] if isinstance(config, CotOptions) and config.cot_types is not None else []
+        return [config.cot_types] if config.cot_types is not None else []
 
-    def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:  # noqa: ARG002
+    def check_outputs(self, config: CotOptions, *, reads: Sequence[Path]) -> None:  # noqa: ARG002
         """Refuse types and certificates that cannot be used."""
-        if isinstance(config, CotOptions) and config.cot:
+        if config.cot:
             with needs_extra("'hvt[cot]'"):
                 from hvt_gateways.cot.connection import check_connection  # noqa: PLC0415 - who has none needs no pytak
                 from hvt_gateways.cot.type_table import read_types  # noqa: PLC0415
@@ -78,21 +78,19 @@ class CotExtra(Extra):
             for url in config.cot:
                 check_connection(url)
 
-    def checks(self, config: GroundConfig) -> Mapping[str, Callable[[], Finding]]:
+    def checks(self, config: CotOptions) -> Mapping[str, Callable[[], Finding]]:
         """Whether reports could be sent; not whether anybody is there, for who connects is shown to others."""
-        return (
-            {"reports": partial(self._found, config)} if isinstance(config, CotOptions) and config.cot else {}
-        )
+        return {"reports": partial(self._found, config)} if config.cot else {}
 
     def _found(self, config: CotOptions) -> Finding:
-        self.check_outputs(config, reads=())  # type: ignore[arg-type]
+        self.check_outputs(config, reads=())
         from hvt_common.runtime.reporting import Finding  # noqa: PLC0415
 
         return Finding("ok", f"to {', '.join(config.cot)}; types and certificates can be read")
 
-    def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:
+    def start(self, config: CotOptions, outputs: Outputs) -> OpenSinks:
         """Open the connections."""
-        if not isinstance(config, CotOptions) or not config.cot:
+        if not config.cot:
             return lambda _flight: ()
         self.check_outputs(config, reads=())
         from hvt_gateways.cot.connection import CotConnection  # noqa: PLC0415 - as above

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class McapOptions:
+class McapOptions(GroundConfig):
     """The settings of ``hvt-ground`` for it."""
 
     mcap: Path | None = Group("gateways").option(
@@ -28,17 +28,17 @@ class McapOptions:
     )
 
 
-class McapExtra(Extra):
+class McapExtra(Extra[McapOptions]):
     """One file a session."""
 
     options = McapOptions
 
-    def writes(self, config: GroundConfig) -> Iterable[tuple[str, Path]]:
+    def writes(self, config: McapOptions) -> Iterable[tuple[str, Path]]:
         """The file that is named."""
-        if isinstance(config, McapOptions) and config.mcap is not None and config.mcap.suffix == ".mcap":
+        if config.mcap is not None and config.mcap.suffix == ".mcap":
             yield "--mcap", config.mcap
 
-    def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
+    def check_outputs(self, config: McapOptions, *, reads: Sequence[Path]) -> None:
         """Refuse a file that cannot be written."""
         from hvt_common.runtime.reporting import check_writable  # noqa: PLC0415
 
@@ -46,9 +46,9 @@ class McapExtra(Extra):
             if not path.is_dir():
                 check_writable(path, name=name, reads=reads)
 
-    def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
+    def start(self, config: McapOptions, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
         """`UserError` where the package is missing."""
-        target = config.mcap if isinstance(config, McapOptions) else None
+        target = config.mcap
         if target is None:
             return lambda _flight: ()
         file = _file()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # what writes it opens PyAV, which settings alone do without
 
 
 @dataclass(frozen=True)
-class TransportStreamOptions:
+class TransportStreamOptions(GroundConfig):
     """The settings of ``hvt-ground`` for it."""
 
     ts: str | None = Group("gateways", rare=True).option(
@@ -36,29 +36,28 @@ def _export(recorded: Recorded, path: Path) -> None:
     write_recorded(recorded, path)
 
 
-class TransportStreamExtra(Extra):
+class TransportStreamExtra(Extra[TransportStreamOptions]):
     """A file or a live stream a session."""
 
     options = TransportStreamOptions
     exports = {"ts": _export}  # noqa: RUF012
 
-    def writes(self, config: GroundConfig) -> Iterable[tuple[str, Path]]:
+    def writes(self, config: TransportStreamOptions) -> Iterable[tuple[str, Path]]:
         """The file that is named."""
-        if isinstance(config, TransportStreamOptions) and config.ts is not None and "://" not in config.ts:
+        if config.ts is not None and "://" not in config.ts:
             path = named_path(config.ts, name="--ts")
             if path.suffix == ".ts":
                 yield "--ts", path
 
-    def check_outputs(self, config: GroundConfig, *, reads: Sequence[Path]) -> None:
+    def check_outputs(self, config: TransportStreamOptions, *, reads: Sequence[Path]) -> None:
         """Refuse a destination that cannot be written or sent to."""
-        if isinstance(config, TransportStreamOptions):
-            from hvt_gateways.transport_stream.destination import check_destination  # noqa: PLC0415
+        from hvt_gateways.transport_stream.destination import check_destination  # noqa: PLC0415
 
-            check_destination(config.ts, reads=reads)
+        check_destination(config.ts, reads=reads)
 
-    def start(self, config: GroundConfig, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
+    def start(self, config: TransportStreamOptions, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
         """Make the function that opens the stream of a session."""
-        if not isinstance(config, TransportStreamOptions) or config.ts is None:
+        if config.ts is None:
             return lambda _flight: ()
         from hvt_gateways.transport_stream.destination import Addresses, destination  # noqa: PLC0415
         from hvt_gateways.transport_stream.stream import live_stream, stream_file  # noqa: PLC0415

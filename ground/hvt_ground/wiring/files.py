@@ -10,7 +10,7 @@ from pathlib import Path
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.reporting import check_writable
 from hvt_ground.config import GroundConfig
-from hvt_ground.extras import all_extras
+from hvt_ground.extras import extras_of
 from hvt_ground.sinks.line_file import claim_name
 
 
@@ -21,9 +21,9 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
         *(config.zenoh_config,),
     )
     reads = [*reads, *(Path(one) for one in given if one is not None)]
-    for extra in all_extras():
+    for extra in extras_of(config):
         reads += extra.reads(config)
-    for extra in all_extras():
+    for extra in extras_of(config):
         extra.check_outputs(config, reads=reads)
     check_writable(config.summary, name="--summary", reads=reads)
     check_writable(config.timing, name="--timing", reads=reads)

@@ -17,7 +17,7 @@ from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.recordings import BacklogRecording
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Refinement
-from hvt_ground.extras import Flight, Service, all_extras, locators
+from hvt_ground.extras import Flight, Service, extras_of, locators
 from hvt_ground.perception.models import Models
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
@@ -74,7 +74,7 @@ class SessionFactory:
         self._locator_of = locators(getattr(config, "terrain", None))
         self._extras = [
             *(one.sinks for one in services),
-            *(extra.start(config, outputs) for extra in all_extras()),
+            *(extra.start(config, outputs) for extra in extras_of(config)),
         ]
         self._timing: QueuedSink[str] | None = None
         if config.timing is not None:
