@@ -251,6 +251,12 @@ def test_an_output_over_what_is_read(edge, here, flag, what):
     assert Path("read").read_text() == "by the edge"
 
 
+def test_a_source_that_is_a_link_to_itself(edge, here):
+    """A traceback of a RuntimeError would be the answer to a mistyped link."""
+    Path("loop").symlink_to("loop")
+    assert "source 'loop' does not exist" in edge("--source", "loop")
+
+
 @pytest.mark.parametrize("name", ["0.png", "2.JPG", "../pictures/1.png"])
 def test_an_output_among_the_pictures_of_the_source(edge, pictures, name):
     """A picture of the flight would be its summary, or the next flight show one that is none."""

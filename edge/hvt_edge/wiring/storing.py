@@ -35,7 +35,7 @@ def check_files(config: EdgeConfig) -> None:
         ("--truth", config.truth),
         ("--record-base", config.record_base),
     )
-    pictures = Path(config.source or "").resolve()
+    pictures = Path(os.path.realpath(config.source or ""))  # also of a link to itself
     for name, path in files:
         if path is not None and names_picture(path) and path.resolve().parent == pictures:
             raise UserError(

@@ -87,9 +87,9 @@ def open_video(
     """
     name, local = name_of(spec), is_local(spec)
     refusal = NotYetError if local and growing else UserError
-    if local and Path(spec).stat().st_size == 0 and not growing:
-        raise UserError(f"source {spec!r} is an empty file; accepted is a video file")
     try:
+        if local and Path(spec).stat().st_size == 0 and not growing:
+            raise UserError(f"source {spec!r} is an empty file; accepted is a video file")
         # By its own name a file may look like an address.
         where: Any = f"file:{spec}" if local else spec
         container = av.open(_GrowingFile(spec) if local and growing else where, timeout=(_OPEN_S, _READ_S))

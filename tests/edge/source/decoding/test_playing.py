@@ -430,6 +430,15 @@ def test_a_file_that_grows_is_followed(tmp_path, monkeypatch):
     assert sum(slept) < 2.5 * container.QUIET_S, "once where stamps are looked at, once at the end"
 
 
+def test_a_clip_that_goes_before_it_is_played_is_said(tmp_path):
+    """Whose stick was pulled while the edge waited for a ground would read a traceback."""
+    clip = write_numbered(tmp_path / "a.ts", 5)
+    with open_source(str(clip), size=lambda size: size, fps=30) as source:
+        clip.unlink()
+        with pytest.raises(UserError, match=r"can be read \(No such file or directory\)"):
+            next(source.frames(start_ns=0))
+
+
 def test_a_file_that_has_grown_says_how_to_follow_it(tmp_path, caplog):
     """It would end early, and nobody know why."""
     clip = write_numbered(tmp_path / "a.ts", 60, bf="0")
