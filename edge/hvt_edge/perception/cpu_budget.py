@@ -132,7 +132,7 @@ class CpuBudget:
         self._waits_ns = at_ns if self._waits_ns is None else self._waits_ns
         if at_ns > self._newest_ns:
             grown = (at_ns - self._newest_ns) / SECOND_NS / _BACK_S if self._newest_ns else 0.0
-            self._left = min(1.0, self._left * 2**grown)
+            self._left = 1.0 if grown > -math.log2(self._left) else self._left * 2**grown
             self._newest_ns = at_ns
         if lost > self._lost and at_ns - self._lost_ns >= _LOSS_NS:
             self._left, self._lost_ns = max(_LEAST_LEFT, self._left / 2), at_ns

@@ -110,6 +110,13 @@ def test_each_frame_that_video_loses_halves_the_budget_and_it_comes_back():
     assert len(once.fly(10).looked) - looked > quiet / 6 - 2, "it has come back"
 
 
+def test_a_camera_that_was_away_for_hours_goes_on():
+    """Its first frame would end the flight: two to the power of that pause is no number."""
+    budget = CpuBudget(fps=15, processors=4)
+    assert budget.admits_frame(1, lost=0, late=False)
+    assert budget.admits_frame(86_400 * SECOND_NS, lost=0, late=False)
+
+
 def test_where_video_loses_frames_all_the_time_boxes_still_move_twice_a_second():
     """Nothing at all would be listed on a board that is too slow for its video."""
     rig = Rig(processors=1, video=1.2).fly(40, loses=lambda _index: True)
