@@ -12,6 +12,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
 import pytest
 
 from lab.link.carriers.pipe import DATAGRAM_HEADER_BYTES, Pipe
@@ -302,27 +303,34 @@ def test_what_is_on_its_way_comes_by_time_and_is_bounded():
 
 @pytest.mark.realtime
 @pytest.mark.timeout(240)
-def test_edge_and_ground_fly_over_datagrams(tmp_path):
-    """With the kernel's packets only TCP would be flown."""
+@pytest.mark.parametrize(
+    ("carrier", "name", "transport"), [("tun", "burst-loss-udp", "udp"), ("netns", "steady-300k", "tcp")]
+)
+def test_edge_and_ground_fly_over_the_kernels_own_packets(tmp_path, carrier, name, transport):
+    """The relay's model would be kind where the real thing is not, and datagrams never be flown."""
     (tmp_path / "scene").mkdir()
     write_scene(tmp_path / "scene", frames=300)
     with tunnel(script((0, LinkState(1)))):
         pass  # or skipped
     outcome = run(
         Run(
-            scenario=load_scenario("burst-loss-udp"),
+            scenario=load_scenario(name),
             source=str(tmp_path / "scene"),
             folder=tmp_path / "flight",
             length="short",
-            carrier="tun",
+            carrier=carrier,
             edge_arguments=EDGE.split(),
             ground_arguments=["--detector", "motion", "--classifier", "none"],
         )
     )
     assert outcome.exit_codes == {"edge": 0, "ground": 0}, outcome.said
     assert not [text for text in outcome.said.values() if "Traceback" in text]
-    assert f"udp/{GROUND_HOST}" in outcome.said["ground"]
-    assert measures(outcome)["frame delay p50, ms"] >= 1e3 * outcome.script.at(0).delay_s > 0
+    assert f"{transport}/{GROUND_HOST}" in outcome.said["ground"]
+    found = measures(outcome)
+    assert found["frame delay p50, ms"] >= 1e3 * outcome.script.at(0).delay_s
+    if transport == "tcp":
+        assert (found["ledger difference, bytes"], found["decodable frames, %"]) == (0, 100)
+    assert not psutil.Process().children(recursive=True), "a night of runs would fill the machine"
 
 
 def _namespaces() -> str:
