@@ -82,7 +82,7 @@ def make_out(folder: Path, *, name: str) -> Path:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Within it, what cannot be written is a `UserError` that names ``--out``, and what cannot be read one of its own."""
+    """Within it, what cannot be written, or read, is a `UserError` that names ``--out``, or the file."""
     try:
         yield
     except (OSError, FlightError) as error:
