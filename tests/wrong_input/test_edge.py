@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -35,12 +36,15 @@ def test_no_source(refused):
     assert "demo" in sentence
 
 
-@pytest.mark.parametrize("source", ["nope.mp4", "ftp://host/clip.mp4"])
-def test_a_source_that_is_not_there(edge, source):
+@pytest.mark.parametrize(
+    ("source", "accepted"),
+    [("nope.mp4", "accepted is"), ("ftp://host/clip.mp4", "accepted is"), ("/dev/null", "/dev/videoN")],
+)
+def test_a_source_that_is_not_there(edge, source, accepted):
     """A typing mistake would be answered with FFmpeg's internals."""
     sentence = edge(source=source)
-    assert repr(source) in sentence
-    assert "accepted is" in sentence
+    assert source in sentence
+    assert accepted in sentence
 
 
 @pytest.mark.parametrize("content", [b"", b"no video, only words\n" * 50, b"\x00\x01\x02garbage" * 99])
@@ -65,13 +69,6 @@ def test_a_folder_of_pictures_that_cannot_be_read(edge, here):
     Path("broken").mkdir()
     Path("broken/1.jpg").write_bytes(b"\xff\xd8\xff nothing")
     assert "'broken'" in edge(source="broken")
-
-
-def test_a_device_that_is_no_camera(edge):
-    """The same for the wrong device."""
-    sentence = edge(source="/dev/null")
-    assert "/dev/null" in sentence
-    assert "/dev/videoN" in sentence
 
 
 # Where the camera is
@@ -158,70 +155,40 @@ def test_a_value_that_is_not_accepted(edge, flag, value, accepted):
     assert accepted in sentence
 
 
-def test_a_video_share_of_nothing(edge):
-    """A run without video would begin and show nothing."""
-    assert "--video-share 0" in edge("--video-share", "0")
-
-
-def test_a_budget_below_what_the_video_needs(edge):
-    """x265 would send what it likes and call it 10 kbps."""
-    sentence = edge("--size", "1280x720", "--budget", "10kbps")
-    assert "--budget 10 kbps" in sentence
-    assert "at least" in sentence
-    assert "--size" in sentence
-
-
-@pytest.mark.parametrize("regions", [("--roi-depth", "0.1"), ("--method", "R0")])
-def test_regions_for_an_encoder_that_takes_none(edge, regions):
-    """Who wants his tracks coded better would not learn that they are not."""
-    sentence = edge("--encoder", "hevc_nvenc", *regions)
-    assert "--roi-depth 0.1 needs x265" in sentence
-    assert "--encoder hevc_nvenc" in sentence
-
-
-def test_a_regime_and_a_budget(edge):
-    """One of the two would silently not count."""
-    sentence = edge("--regime", "low", "--budget", "1Mbps")
-    assert "--regime low" in sentence
-    assert "--budget" in sentence
-
-
-@pytest.mark.parametrize("window", ["0s", "10ms", "2min"])
-def test_a_window_that_no_budget_can_hold_over(edge, window):
-    """A window shorter than a frame would be held by nothing, or by everything."""
-    assert "--window" in edge("--window", window)
-
-
-@pytest.mark.parametrize("edge_id", ["UAV_1", "", "a" * 33, "a/b", "*", "dröne", "a b"])
-def test_an_edge_id_out_of_the_alphabet(edge, edge_id):
-    """Its keys would be other edges' keys, or nobody's."""
-    sentence = edge("--edge-id", edge_id)
-    assert "edge" in sentence
-    assert edge_id in sentence
-
-
-@pytest.mark.parametrize("words", [("--bogus",), ("stray",), ("--budgit", "1M"), ("--bud", "1M")])
-def test_a_flag_that_does_not_exist(edge, words):
-    """A misspelt setting would silently not count."""
-    sentence = edge(*words)
-    assert words[0] in sentence
-    assert "--help" in sentence
-
-
-def test_a_flag_without_its_value(edge):
-    """The next flag would be taken for the value."""
-    sentence = edge("--budget")
-    assert "--budget" in sentence
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--video-share 0", ["--video-share 0"]),
+        ("--size 1280x720 --budget 10kbps", ["--budget 10 kbps", "at least", "--size"]),
+        *(
+            (f"--encoder hevc_nvenc {regions}", ["--roi-depth 0.1 needs x265", "--encoder hevc_nvenc"])
+            for regions in ("--roi-depth 0.1", "--method R0")
+        ),
+        ("--regime low --budget 1Mbps", ["--regime low", "--budget"]),
+        *((f"--window {window}", ["--window"]) for window in ("0s", "10ms", "2min")),
+        *(
+            (f"--edge-id '{name}'", ["edge", name])
+            for name in ("UAV_1", "", "a" * 33, "a/b", "*", "dröne", "a b")
+        ),
+        *((words, [words.split()[0], "--help"]) for words in ("--bogus", "stray", "--budgit 1M", "--bud 1M")),
+        ("--budget", ["--budget"]),
+        ("--truth truth.txt --summary s.json --record-base b.mkv", ["--truth truth.txt", "demo"]),
+        *((f"--zenoh-config {file}", [file]) for file in ("missing.json5", "pictures")),
+        *(
+            (f"{flag} {endpoint}", [repr(endpoint), "PROTOCOL/HOST:PORT"])
+            for flag in ("--connect", "--listen")
+            for endpoint in ("here", "tcp/127.0.0.1", "tcp/127.0.0.1:0", "tcp/127.0.0.1:99999", "smoke/x:1")
+        ),
+        *((f"--listen tcp/{host}:7999", [host, "--insecure"]) for host in ("0.0.0.0", "[::]")),
+    ],
+)
+def test_words_that_cannot_be_meant_so(edge, words, told):
+    """What was asked for would silently not count, or never work; a typing error would open a door to all."""
+    sentence = edge(*shlex.split(words))
+    assert [one for one in told if one not in sentence] == []
 
 
 # Files
-
-
-def test_truth_of_a_clip(edge):
-    """An evaluation would run on a file that was never written."""
-    sentence = edge("--truth", "truth.txt", "--summary", "s.json", "--record-base", "b.mkv")
-    assert "--truth truth.txt" in sentence
-    assert "demo" in sentence
 
 
 @pytest.mark.parametrize("flag", ["--summary", "--record-base", "--truth"])
@@ -324,34 +291,6 @@ def test_a_zenoh_configuration_that_is_wrong(edge, here, text, told):
     """A link without the keys that the file should have given it."""
     Path("zenoh.json5").write_text(text)
     assert told in edge("--zenoh-config", "zenoh.json5")
-
-
-@pytest.mark.parametrize("file", ["missing.json5", "pictures"])
-def test_a_zenoh_configuration_that_cannot_be_read(edge, file):
-    """The same."""
-    assert file in edge("--zenoh-config", file)
-
-
-# The link
-
-
-@pytest.mark.parametrize("flag", ["--connect", "--listen"])
-@pytest.mark.parametrize(
-    "endpoint", ["here", "tcp/127.0.0.1", "tcp/127.0.0.1:0", "tcp/127.0.0.1:99999", "smoke/x:1"]
-)
-def test_an_endpoint_that_is_none(edge, flag, endpoint):
-    """The drone would wait for ever for a ground at no address."""
-    sentence = edge(flag, endpoint)
-    assert repr(endpoint) in sentence
-    assert "PROTOCOL/HOST:PORT" in sentence
-
-
-@pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:7999", "tcp/[::]:7999"])
-def test_an_open_door(edge, endpoint):
-    """Anybody on the network could watch, by mistake."""
-    sentence = edge("--listen", endpoint)
-    assert endpoint in sentence
-    assert "--insecure" in sentence
 
 
 def test_a_still_codec_that_does_not_work_here(edge, packages):
