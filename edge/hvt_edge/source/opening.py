@@ -99,6 +99,11 @@ def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
     if not _is_there(spec):
         kind = NotYetError if growing else UserError
         raise kind(f"source {shown(spec)!r} does not exist; accepted is {_ACCEPTED}")
+    if not (Path(spec).is_file() or Path(spec).is_dir()):  # it is looked at before it is played
+        raise UserError(
+            f"source {spec!r} is neither a file nor a folder; what a program writes into a pipe can be sent to "
+            "udp://127.0.0.1:PORT"
+        )
     if growing and Path(spec).is_file() and not Path(spec).stat().st_size:
         raise NotYetError(f"source {spec!r} is empty so far")
 

@@ -571,6 +571,14 @@ def test_a_missing_camera_is_one_sentence():
     assert "no video device" in refused(os.devnull)
 
 
+@pytest.mark.parametrize("growing", [False, True])
+def test_a_pipe_is_no_clip(tmp_path, growing):
+    """It was called an empty file, and with ``--follow`` waited for without a word."""
+    os.mkfifo(tmp_path / "a.ts")
+    with pytest.raises(UserError, match="is neither a file nor a folder"):
+        open_source(str(tmp_path / "a.ts"), size=(64, 64), fps=5, growing=growing)
+
+
 def test_a_clip_in_memory_is_no_camera():
     """/dev/shm is where a clip is put that no disk should slow down."""
     with tempfile.NamedTemporaryFile(dir="/dev/shm") as clip:
