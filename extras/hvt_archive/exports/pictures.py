@@ -14,6 +14,7 @@ from hvt_common.errors import UserError
 from hvt_common.units import utc_text
 from hvt_ground.events import Overlay
 from hvt_ground.recordings.contract import Recorded
+from hvt_ground.sinks.event_tables import plain_cells
 
 STILL_COLUMNS = ("file", "base_file", "frame_index", "capture_utc", "caption")
 """``base_file`` shows what the base stream had there, empty where the recording does not say; ``frame_index`` is
@@ -90,4 +91,5 @@ def write_stills(recorded: Recorded, folder: Path) -> None:
             for name, data in zip(names, (still.jpeg, still.base_jpeg), strict=True):
                 if name:
                     (folder / name).write_bytes(data)
-            writer.writerow((*names, still.frame_index, utc_text(still.capture_ns), still.caption))
+            row = (*names, still.frame_index, utc_text(still.capture_ns), still.caption)
+            writer.writerow(plain_cells(row))

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hvt_ground.recordings.contract import Recorded
-from hvt_ground.sinks.event_tables import TRACK_COLUMNS, track_rows
+from hvt_ground.sinks.event_tables import TRACK_COLUMNS, plain_cells, track_rows
 
 _BATCH_ROWS = 100_000
 _TYPES = {
@@ -31,7 +31,7 @@ def write_csv(recorded: Recorded, path: Path) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(TRACK_COLUMNS)
-        writer.writerows(_rows(recorded))
+        writer.writerows(map(plain_cells, _rows(recorded)))
 
 
 def write_parquet(recorded: Recorded, path: Path) -> None:

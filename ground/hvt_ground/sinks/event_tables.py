@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -40,6 +41,14 @@ STILL_COLUMNS = (
 """``frame_index`` is what the still shows and ``known_frame_index`` when it was known here, both from 0; ``x y w h``
 is where the whole picture lies in the base picture of ``frame_index``, base pixels."""
 
+_FORMULA = re.compile(r"[=@]|[+-](?!\d+(\.\d+)?$)")
+"""The beginning of a text that a spreadsheet computes."""
+
+
+def plain_cells(row: Iterable[object]) -> tuple[object, ...]:
+    """A row for CSV; before a name such as ``=1+1``, which may come from the wire, stands an apostrophe."""
+    return tuple(f"'{one}" if isinstance(one, str) and _FORMULA.match(one) else one for one in row)
+
 
 class _EventTable(SinkWriter[Event]):
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
@@ -48,7 +57,7 @@ class _EventTable(SinkWriter[Event]):
 
     def _append(self, *rows: tuple[object, ...]) -> None:
         text = io.StringIO(newline="")
-        csv.writer(text, lineterminator="\n").writerows(rows)
+        csv.writer(text, lineterminator="\n").writerows(map(plain_cells, rows))
         self._file.log(text.getvalue())
 
     def close(self, hurry: threading.Event | None = None) -> None:

@@ -87,3 +87,17 @@ def test_each_line_says_who_knows_of_the_track(tmp_path, origins, expected):
         ("4", "3", "car", "0"),
         ("4", "9", "bus", "1"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "cell"),
+    [('=HYPERLINK("x")', '\'=HYPERLINK("x")'), ("@SUM(1)", "'@SUM(1)"), ("-1+1", "'-1+1"), ("+-x", "'+-x")],
+)
+def test_a_class_that_a_spreadsheet_would_compute_is_text(tmp_path, name, cell):
+    """Names come from the wire: who opens the table would run what somebody on the link wrote."""
+    path = tmp_path / "tracks.csv"
+    table = TrackTable(path)
+    table.log(overlay(4, [[-9, 2, 11, 22]], base_classes=(name,), classes=("car - old",)))
+    table.close()
+    (row,) = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+    assert (row["x"], row["base_class"], row["class"]) == ("-9.0", cell, "car - old")
