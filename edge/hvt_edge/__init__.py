@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hvt_edge.library.pushed import open_edge as open  # noqa: A004 - of this package it is the first thing to do
+    from hvt_edge.library import open_edge as open  # noqa: A004 - of this package it is the first thing to do
 
 __all__ = ["open"]
 
@@ -16,7 +16,7 @@ __all__ = ["open"]
 def __getattr__(name: str) -> Any:
     """Only who uses it loads it."""
     if name == "open":
-        from hvt_edge.library.pushed import open_edge  # noqa: PLC0415
+        from hvt_edge.library import open_edge  # noqa: PLC0415
 
         return open_edge
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

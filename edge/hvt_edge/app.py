@@ -16,12 +16,12 @@ from hvt_common.inference.retried import RetriedDetector
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.failures import Awaited
-from hvt_common.runtime.health import health_server
 from hvt_common.runtime.log import START_LOGGER
+from hvt_common.runtime.plug_ins import health_server
 from hvt_common.runtime.process import give_back_holes, notify_systemd, with_lower_priority
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Frame, View
+from hvt_common.values import Frame
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.control.link_control import wait_for_ground
 from hvt_edge.link.publisher import EdgeLink
@@ -29,15 +29,14 @@ from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating import LoopClock
-from hvt_edge.report.state import Heartbeat, StateMaker, lacks
-from hvt_edge.report.status import StatusReporter, status_text, summary
+from hvt_edge.report.state import Heartbeat, lacks
+from hvt_edge.report.status import status_text, summary
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.source.live import SOURCE_PART, closing_on
 from hvt_edge.wiring import (
     Stages,
     as_the_camera_is,
-    build_stages,
     check_codecs,
     check_files,
     check_store,
@@ -133,7 +132,7 @@ class Edge:
             beginning = try_scene(config, source, detector=detector, clock=world.clock, stop=self._stop)
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             link = world.open_link(stack, config)
-            stages = build_stages(
+            stages = Stages(
                 stack,
                 config,
                 source=source,
@@ -142,6 +141,7 @@ class Edge:
                 link=link,
                 session_id=world.session_id,
                 ledger=self.ledger,
+                counts=self._counts,
                 inbox=world.inbox,
                 failures=self._failures,
                 clock=world.clock,
@@ -149,9 +149,7 @@ class Edge:
                 beginning=beginning,
                 headroom=headroom,
             )
-            heartbeat = Heartbeat(self._state_maker(stages, link, source.view), clock=world.clock)
-            self._heartbeat = heartbeat
-            status = self._status_reporter(stages, heartbeat)
+            self._heartbeat = stages.heartbeat
             link.listen(stages.answers)
             self._on_started()
             notify_systemd("READY=1")
@@ -162,30 +160,23 @@ class Edge:
                     wait_s=config.wait,
                     stop=self._stop,
                     note=line.note,
-                    turn=lambda: heartbeat.turn("waiting"),
+                    turn=lambda: stages.heartbeat.turn("waiting"),
                 )
             stages.operating.start(world.clock())
             try:
-                self._play(source, stages, link, status, heartbeat, line)
+                self._play(source, stages, link, line)
             except UserError as error:
                 if not self._counts.encoded:
                     raise
                 raise FlightError(str(error)) from error
             finally:
                 stages.stills.close()
-                self._say_goodbye(stages, link, status)
+                self._say_goodbye(stages, link)
         return self._summary(stages, link)
 
-    def _play(
-        self,
-        source: Source,
-        stages: Stages,
-        link: EdgeLink,
-        status: StatusReporter,
-        heartbeat: Heartbeat,
-        line: StatusLine,
-    ) -> None:
+    def _play(self, source: Source, stages: Stages, link: EdgeLink, line: StatusLine) -> None:
         next_status_ns = restarts = 0
+        heartbeat = stages.heartbeat
         self._counts.begin(source)
         with ExitStack() as stack:
             if source.live:
@@ -195,7 +186,7 @@ class Edge:
             for frame in source.steps(start_ns=stages.operating.now.started_ns):
                 if self._stop.is_set():
                     break
-                status.send_pending()
+                stages.status.send_pending()
                 if source.restarts != restarts:  # another picture than the last
                     restarts = source.restarts
                     stages.keyframes.require(self._loop_clock())
@@ -210,7 +201,7 @@ class Edge:
                     next_status_ns = now_ns + SECOND_NS
                     give_back_holes()
                     stages.stills.note_load(self._counts.cpu.now.taken, now_ns=now_ns)
-                    status.send("running")
+                    stages.status.send("running")
                     self._reached |= link.has_subscriber(Channel.BASE)
                     if heartbeat.state is not None:
                         line.show(status_text(heartbeat.state, paused_s=self._counts.paused_ns / SECOND_NS))
@@ -262,36 +253,6 @@ class Edge:
             has_viewer=partial(link.has_subscriber, Channel.BASE),
         )
 
-    def _state_maker(self, stages: Stages, link: EdgeLink, view: View) -> StateMaker:
-        return StateMaker(
-            self._config,
-            session_id=self._world.session_id,
-            view=view,
-            operating=stages.operating,
-            ledger=self.ledger,
-            counts=self._counts,
-            keyframes=stages.keyframes,
-            transmitter=stages.transmitter,
-            stills=stages.stills,
-            backlog=stages.backlog,
-            link=link,
-            inbox=self._world.inbox,
-            failures=self._failures,
-            clock=self._world.clock,
-            loop_clock=self._loop_clock,
-        )
-
-    def _status_reporter(self, stages: Stages, heartbeat: Heartbeat) -> StatusReporter:
-        return StatusReporter(
-            heartbeat=heartbeat,
-            operating=stages.operating,
-            session_id=self._world.session_id,
-            ledger=self.ledger,
-            transmitter=stages.transmitter,
-            failures=self._failures,
-            loop_clock=self._loop_clock,
-        )
-
     def _source_when_there(self) -> Source:
         # Wait for a camera that starts after us; `FlightError` where we are stopped before.
         awaited = Awaited(partial(self._world.open_source, self._config), SOURCE_PART, self._failures)
@@ -312,11 +273,11 @@ class Edge:
             lacks=lambda state: lacks(state, patience_s=_SILENT_S + 2 * frame_s),
         )
 
-    def _say_goodbye(self, stages: Stages, link: EdgeLink, status: StatusReporter) -> None:
+    def _say_goodbye(self, stages: Stages, link: EdgeLink) -> None:
         transmitter = stages.transmitter
         if stages.backlog is not None:
             stages.backlog.send_no_more()
-        status.send("ended")
+        stages.status.send("ended")
         self._reached |= link.has_subscriber(Channel.BASE)
         if link.has_ground():  # what is still in a queue would be lost with the session
             until_ns = self._world.clock() + round(_GOODBYE_S * SECOND_NS)

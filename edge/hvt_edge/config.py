@@ -38,9 +38,8 @@ from hvt_edge.operating import base_rate_bps
 from hvt_edge.profiles import PROFILES, REGIMES
 from hvt_edge.source.contract import check_shape
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
-from hvt_edge.video.encoder_settings import PRESETS, keyframe_total_bps, least_base_bps
+from hvt_edge.video.encoder_settings import PRESETS, SLOWEST, keyframe_total_bps, least_base_bps
 from hvt_edge.video.encoders.registry import PASSTHROUGH, X265, check_encoder
-from hvt_edge.video.preset import SLOWEST
 from hvt_edge.video.share import FIRST_SHARE
 
 DEFAULT_FPS = 15.0

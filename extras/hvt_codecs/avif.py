@@ -9,10 +9,9 @@ from __future__ import annotations
 import cv2
 
 from hvt_codecs.webp import lacks
+from hvt_common.protocol.messages.bits import BitReader
 from hvt_common.values import Image
-from hvt_common.video.still_codecs.bits import BitReader
-from hvt_common.video.still_codecs.contract import IntraCodec, StillError, on_ladder
-from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded
+from hvt_common.video.still_codecs.contract import IntraCodec, StillError, imdecoded, imencoded, on_ladder
 
 _QUALITY = ((1, 1), (5, 4), (20, 36), (35, 46), (50, 52.5), (65, 59), (80, 68), (90, 81), (97, 94), (100, 98))
 """(quality in percent, libavif's own), at equal Y-PSNR; libavif's 100 is lossless, which is another format."""

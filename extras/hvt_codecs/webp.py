@@ -5,8 +5,7 @@ from __future__ import annotations
 import cv2
 
 from hvt_common.values import Image
-from hvt_common.video.still_codecs.contract import IntraCodec, StillError, on_ladder
-from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded
+from hvt_common.video.still_codecs.contract import IntraCodec, StillError, imdecoded, imencoded, on_ladder
 
 _QUALITY = ((1, 1), (5, 2), (20, 17), (35, 36), (50, 52), (65, 71), (80, 82), (90, 90), (97, 98), (100, 100))
 """(quality in percent, WebP's own), at equal Y-PSNR; WebP has nothing as coarse as JPEG below 15."""

@@ -22,11 +22,11 @@ from hvt_common.transport.session import declare_publisher
 from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check, with_profile
-from hvt_edge.loop.cpu import Cores, CpuMeter, processors
+from hvt_edge.loop.counts import Cores, CpuMeter, processors
 from hvt_edge.source.contract import Source
 from hvt_edge.source.opening import shown
-from hvt_edge.video.encoders.contract import Encoder
-from hvt_edge.video.preset import PresetChoice, choose_preset, share_of
+from hvt_edge.video.encoder_settings import PresetChoice, choose_preset, share_of
+from hvt_edge.video.encoders.registry import Encoder
 from hvt_edge.wiring import (
     as_the_camera_is,
     check_codecs,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvt_common.video.annex_b import parameter_sets
+from hvt_common.video.hevc import parameter_sets
 from hvt_ground.events import VideoSample
 
 

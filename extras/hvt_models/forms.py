@@ -10,8 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvt_common.inference.heads.contract import Array, HeadOutput
-from hvt_common.inference.heads.decode import MOST_RELATIVE, Form, best, corners, rows_of, valid
+from hvt_common.inference.heads.contract import (
+    MOST_RELATIVE,
+    Array,
+    Form,
+    HeadOutput,
+    best,
+    corners,
+    rows_of,
+    valid,
+)
 from hvt_common.values import Boxes
 
 

@@ -1,4 +1,4 @@
-"""The heads of foreign exports, and the marks of each; see `hvt_common.inference.heads.kind`."""
+"""The heads of foreign exports, and the marks of each; see `hvt_common.inference.heads.choose`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from hvt_common.inference.heads.contract import Array
-from hvt_common.inference.heads.decode import MOST_RELATIVE, rows_of
-from hvt_common.inference.heads.kind import (
+from hvt_common.inference.heads.choose import (
     BGR_255,
     LEAST_COLUMNS,
     STRIDES,
@@ -17,12 +15,17 @@ from hvt_common.inference.heads.kind import (
     YOLOX_STRIDES,
     Kind,
     Match,
+    Trial,
+    anchor_count,
+    are_probabilities,
+    are_scores,
+    are_whole,
     is_raw,
     of_cells,
     tables,
 )
-from hvt_common.inference.heads.trial import Trial, anchor_count, are_probabilities, are_scores, are_whole
-from hvt_common.inference.preparation import Preparation
+from hvt_common.inference.heads.contract import MOST_RELATIVE, Array, rows_of
+from hvt_common.inference.letterbox import Preparation
 from hvt_models.forms import Corners, Dense, Listed, Parallel, PerQuery
 
 _ANCHORS_A_CELL = 3

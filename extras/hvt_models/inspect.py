@@ -13,9 +13,8 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import OnnxClassifier
 from hvt_common.inference.detect import OnnxDetector
-from hvt_common.inference.runtimes.ir_file import files_of, is_ir
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, Port, open_model
-from hvt_common.inference.runtimes.onnx_file import opset_versions
+from hvt_common.inference.runtimes.model_file import files_of, is_ir, opset_versions
 from hvt_models.heads import KINDS
 
 _ROUNDS = 9

@@ -15,7 +15,7 @@ from hvt_common.errors import FlightError
 from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import reason_of
-from hvt_common.runtime.health import health_server
+from hvt_common.runtime.plug_ins import health_server
 from hvt_common.runtime.process import give_back_holes, notify_systemd
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.transport.link_doctor import LinkWatch, link_doctor

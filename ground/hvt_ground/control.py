@@ -36,8 +36,7 @@ from hvt_common.protocol.messages import (
     WireError,
 )
 from hvt_common.transport.inbox import Inbox, Received
-from hvt_common.transport.link_doctor import control_unanswered
-from hvt_common.transport.rights import Rights
+from hvt_common.transport.link_doctor import Rights, control_unanswered
 from hvt_common.transport.session import open_session, query, subscribe
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_common.values import Image

@@ -7,7 +7,7 @@ from contextlib import ExitStack, suppress
 from unittest.mock import patch
 
 from hvt_common.protocol.messages import WireError, track_boxes
-from hvt_common.protocol.messages.exp_golomb import BitWriter
+from hvt_common.protocol.messages.bits import BitWriter
 from hvt_common.protocol.messages.range_coder import Context, Encoder, NumberContexts
 from hvt_common.protocol.messages.track_boxes import CodedTrack
 
@@ -131,20 +131,11 @@ def whole_pose(
     number: int, time_ms: int, place: Sequence[int], *, yaw: int | None = None, pitch: int = 0
 ) -> BitWriter:
     """A report that stands by itself: place, the camera where it has a yaw, and errors of 4."""
-    out = BitWriter()
-    out.plain(1, 1)
-    out.plain(number, 4)
-    out.plain(time_ms, 42)
-    out.plain(0b00100 if yaw is not None else 0, 5)
-    out.plain(place[0] + 900_000_000, 31)
-    out.plain(place[1] + 1_800_000_000, 32)
+    out = BitWriter().u(1, 1).u(number, 4).u(time_ms, 42).u(0b00100 if yaw is not None else 0, 5)
+    out.u(place[0] + 900_000_000, 31).u(place[1] + 1_800_000_000, 32)
     if yaw is not None:
-        out.plain(yaw, 12)
-        out.plain(pitch + 900, 11)
-        out.plain(1800, 12)
-    for _ in range(3):
-        out.plain(4, 5)
-    return out
+        out.u(yaw, 12).u(pitch + 900, 11).u(1800, 12)
+    return out.u(4, 5).u(4, 5).u(4, 5)
 
 
 def pose_changes(
@@ -156,14 +147,11 @@ def pose_changes(
     errors: int = 0,
 ) -> BitWriter:
     """A report that builds on the one before; ``time_ms`` later."""
-    out = BitWriter()
-    out.plain(0, 1)
-    out.plain(number, 4)
-    out.signed(time_ms - 1000, 4)
+    out = BitWriter().u(0, 1).u(number, 4).se(time_ms - 1000, 4)
     for change in place:
-        out.signed(change, 5)
+        out.se(change, 5)
     for change in camera:
-        out.signed(change, 3)
+        out.se(change, 3)
     for _ in range(3):
-        out.signed(errors, 0)
+        out.se(errors, 0)
     return out

@@ -16,7 +16,7 @@ from hvt_common.protocol.messages import (
     TrackStepEncoder,
     WireError,
 )
-from hvt_common.protocol.messages.exp_golomb import BitWriter
+from hvt_common.protocol.messages.bits import BitWriter
 from hvt_common.protocol.messages.track_boxes import CodedTrack, read_tracks
 from hvt_common.values import Orientation, Pose, Tracks
 from lab.conformance.scripted import Step, pose_changes, track_sessions, whole_pose, written
@@ -180,14 +180,14 @@ def poses() -> Iterator[dict[str, Any]]:
     holes = [reports[1], reports[0], *damaged, reports[1], reports[1], *reports[3:]]
     yield {"session": "holes, damage, and one that stands by itself", "reports": list(_read_poses(holes))}
     for name, scripts in _pose_scripts().items():
-        made = [PoseReport(session=9, send_ns=7, coded=one.finish()) for one in scripts]
+        made = [PoseReport(session=9, send_ns=7, coded=one.ended(stop="")) for one in scripts]
         yield {"session": name, "reports": list(_read_poses(made))}
 
 
 def _pose_scripts() -> dict[str, list[BitWriter]]:
     place = (481_370_000, -1_799_999_990)
     filled = whole_pose(0, 1000, place)
-    filled.plain(1, 3)  # in the bits that fill the last byte
+    filled.u(1, 3)  # in the bits that fill the last byte
     steep = [
         whole_pose(number, 1000 * number, place, yaw=0, pitch=pitch) for number, pitch in ((1, 900), (2, 901))
     ]

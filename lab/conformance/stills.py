@@ -17,10 +17,9 @@ import cv2
 import numpy as np
 
 from hvt_common.values import Image, View
-from hvt_common.video.exact_crop import exact_base_crop
+from hvt_common.video.base_crop import exact_base_crop
 from hvt_common.video.still_codecs import Parameters, still_codec, still_codec_names
-from hvt_common.video.still_codecs.av_still import decoded
-from hvt_common.video.still_codecs.h264_intra import split_payload
+from hvt_common.video.still_codecs.h264_intra import decoded, split_payload
 from hvt_common.video.still_codecs.h264_syntax import coded_slice, parameter_sets, verbatim_picture
 from hvt_common.video.still_codecs.yuv420 import Planar, padded_size, to_planar
 

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from functools import cache
 
 from hvt_common.protocol.messages import ControlRequest, Feedback, WireError
-from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.link.feedback import FeedbackInbox, PrimaryReceiver
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_ground.link.reassemble import REORDER_UNITS, Arrival, Reassembler
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import REQUESTS, feedback

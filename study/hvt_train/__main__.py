@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hvt_common.errors import UserError, exit_with_sentence, needs_extra
-from hvt_common.inference.runtimes.onnx_file import check_onnx_file
+from hvt_common.inference.runtimes.model_file import check_onnx_file
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
 from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
 from hvt_common.inference.store import embedded_models

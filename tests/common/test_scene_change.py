@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_common.scene_change import SceneChange
+from hvt_common.camera_motion import SceneChange
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import inspect
 import re
 
-from hvt_common.protocol.frame_account import FrameAccount
+from hvt_common.protocol.edge_words import FrameAccount
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failure
 from hvt_edge import app
 from hvt_edge.backlog.worker import StoreNumbers
-from hvt_edge.loop.cpu import Cores
+from hvt_edge.loop.counts import Cores
 from hvt_edge.report.status import in_vain, summary, table, title
 from programs.summary_page import unexplained
 

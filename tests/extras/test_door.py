@@ -15,7 +15,7 @@ from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.store import library_part
 from hvt_common.runtime.failures import Failures
-from hvt_common.runtime.health import health_server
+from hvt_common.runtime.plug_ins import health_server
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image as Pillow
 
 from hvt_common.values import View
-from hvt_common.video.exact_crop import exact_base_crop
+from hvt_common.video.base_crop import exact_base_crop
 from hvt_common.video.still_codecs import BaseMissingError, still_codec, still_codec_names
 from lab.conformance.mutants import MUTANTS, Mutant, built, survivors
 from lab.conformance.schema import PATH

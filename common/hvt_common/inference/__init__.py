@@ -1,9 +1,9 @@
 """Detectors and classifiers: others use `detect`, `tiles`, `classify`, `class_names`, `labels`, `nms`.
 
 `retried` opens a model again after a failure. `few_found` says when the embedded one finds little or does not know a
-view, `scale_search` finds the scale at which one promises most objects, `scores` what a model's file says of its
-classes and scores.
+view, `scale_search` finds the scale at which one promises most objects. `labels` also reads whether a model's scores
+are calibrated.
 
-`preparation` and `letterbox` are what a network sees of an image. The room `runtimes` runs a network, `heads` tells
+`letterbox` makes of an image what a network sees. The room `runtimes` runs a network, `heads` tells
 what its outputs mean, `store` gives paths of models; the extra `hvt_models` knows more models and merges several.
 """

@@ -30,10 +30,9 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import IMAGENET_NAMES
 from hvt_common.inference.labels import class_labels, first_synonym, read_labels
-from hvt_common.inference.letterbox import as_bgr
-from hvt_common.inference.preparation import Preparation, prepared_as
-from hvt_common.inference.runtimes.ir_file import is_ir
+from hvt_common.inference.letterbox import Preparation, as_bgr, prepared_as
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
+from hvt_common.inference.runtimes.model_file import is_ir
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Image, Posterior
 

@@ -14,16 +14,19 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import group_of
-from hvt_common.inference.heads.choose import HEAD_NAMES, check_head_name, choose_head
+from hvt_common.inference.heads.choose import HEAD_NAMES, Trial, check_head_name, choose_head, trial_pictures
 from hvt_common.inference.heads.contract import Head
-from hvt_common.inference.heads.trial import Trial, trial_pictures
-from hvt_common.inference.labels import KNOWN_LABELS, class_labels, read_labels
-from hvt_common.inference.letterbox import Letterboxer, as_bgr
+from hvt_common.inference.labels import (
+    KNOWN_LABELS,
+    USUAL_CONFIDENCE,
+    class_labels,
+    default_confidence,
+    read_labels,
+)
+from hvt_common.inference.letterbox import Letterboxer, Preparation, as_bgr, prepared_as
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
-from hvt_common.inference.preparation import Preparation, prepared_as
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
-from hvt_common.inference.scores import USUAL_CONFIDENCE, default_confidence
 from hvt_common.inference.store import MOTION, library_part, model_names, needed_part, parts_of, resolve_model
 from hvt_common.values import Detections, Image
 

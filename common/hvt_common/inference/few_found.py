@@ -15,8 +15,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from hvt_common.inference.labels import default_confidence
 from hvt_common.inference.letterbox import as_bgr
-from hvt_common.inference.scores import default_confidence
 from hvt_common.inference.store import EMBEDDED_DETECTOR, MOTION, library_part
 from hvt_common.values import Detections, Image
 

@@ -2,16 +2,94 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Self, cast
+from typing import Any, Self, cast
 
 import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.runtime.plug_ins import loaded, the_one
-from hvt_common.transport.rights import Rights
 from hvt_common.transport.zenoh_config import LinkSettings, configure
+
+
+@dataclass(frozen=True, slots=True)
+class Rights:
+    """The access control of our own Zenoh configuration, read as Zenoh reads it.
+
+    A subject is known by the common name of its certificate. Zenoh drops silently what is not allowed; with its own
+    rules a side can say so.
+    """
+
+    enabled: bool = False
+    default_allow: bool = True
+    rules: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """The rules by id."""
+    granted: tuple[tuple[frozenset[str] | None, tuple[str, ...]], ...] = ()
+    """For each policy: the names that it is for (None: anybody), and the ids of its rules."""
+
+    @classmethod
+    def of(cls, config: zenoh.Config) -> Rights:
+        """From a configuration that Zenoh has accepted."""
+        said = json.loads(config.get_json("access_control")) or {}
+        subjects = {one["id"]: _names(one) for one in said.get("subjects") or ()}
+        granted = tuple(
+            (subjects.get(subject, frozenset()), tuple(policy["rules"]))
+            for policy in said.get("policies") or ()
+            for subject in policy["subjects"]
+        )
+        return cls(
+            enabled=said.get("enabled") is True,
+            default_allow=said.get("default_permission") == "allow",
+            rules={one["id"]: one for one in said.get("rules") or ()},
+            granted=granted,
+        )
+
+    def knows(self, name: str) -> bool:
+        """Whether any rule is for this name."""
+        return not self.enabled or self.default_allow or bool(self._rules_for(name))
+
+    def allow(self, name: str, *, flow: str, message: str, key: str) -> bool:
+        """Whether the rules let this pass between us and that common name of a certificate.
+
+        ``flow`` is ``ingress`` from there or ``egress`` to there; ``message`` is Zenoh's word, such as ``put``,
+        ``query``, ``reply`` or ``declare_subscriber``.
+        """
+        if not self.enabled:
+            return True
+        requested = zenoh.KeyExpr(key)
+        said = {
+            rule["permission"]
+            for rule in self._rules_for(name)
+            if flow in (rule.get("flows") or (flow,))
+            and message in rule["messages"]
+            and any(zenoh.KeyExpr(one).includes(requested) for one in rule["key_exprs"])
+        }
+        return "deny" not in said and ("allow" in said or self.default_allow)
+
+    def allow_somebody(self, *, flow: str, message: str, key: str) -> bool:
+        """Whether the rules let this pass between us and anybody at all."""
+        names = {name for group, _ in self.granted for name in group or {""}}
+        return not self.enabled or any(
+            self.allow(name, flow=flow, message=message, key=key) for name in names or {""}
+        )
+
+    def _rules_for(self, name: str) -> list[Mapping[str, Any]]:
+        return [
+            self.rules[rule]
+            for names, rules in self.granted
+            if names is None or name in names
+            for rule in rules
+            if rule in self.rules
+        ]
+
+
+def _names(subject: Mapping[str, Any]) -> frozenset[str] | None:
+    names = subject.get("cert_common_names")
+    return None if names is None else frozenset(names)
+
 
 _GROUP = "hvt.link"
 

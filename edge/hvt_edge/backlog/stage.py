@@ -21,9 +21,8 @@ from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import FIRST_STORED, SEGMENT_NS, Entry
-from hvt_edge.backlog.intake import IntakeStill
 from hvt_edge.backlog.outage import SILENCE_NS, BaseInFlight, Outage
-from hvt_edge.backlog.worker import ChunkAllowance, StoreNumbers, StoreWorker
+from hvt_edge.backlog.worker import ChunkAllowance, IntakeStill, StoreNumbers, StoreWorker
 from hvt_edge.keyframes import Keyframes
 
 _STEADY_NS = 2 * SECOND_NS

@@ -7,16 +7,15 @@ import time
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 
-from hvt_common.protocol.frame_account import FrameGroup
+from hvt_common.protocol.edge_words import FrameGroup
 from hvt_common.protocol.messages import Feedback
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.keyframes import Keyframes
-from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.link.feedback import FeedbackInbox, PrimaryReceiver
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender

@@ -13,8 +13,8 @@ from collections import deque
 from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS
+from hvt_edge.link.feedback import Report
 from hvt_edge.link.rate_control import LeastDelay, Progress, RateController
-from hvt_edge.link.receivers import Report
 
 _MS = 1_000_000
 _MOST_BACKLOG_NS = 250 * _MS
@@ -157,7 +157,7 @@ class Flight:
 class Pacer:
     """Paces sending: bounds bytes in flight to the link's rate times 250 ms. Thread-safe; time is an argument.
 
-    Only the primary receiver's reports count (`hvt_edge.link.receivers`): the pace of a ground that is itself badly
+    Only the primary receiver's reports count (`hvt_edge.link.feedback`): the pace of a ground that is itself badly
     connected must not be everybody's.
     """
 

@@ -20,7 +20,7 @@ from hvt_common.protocol.messages import (
     WireError,
 )
 from hvt_common.runtime.failures import Failures, RetryPause
-from hvt_common.transport.flood import FloodWatch
+from hvt_common.transport.inbox import FloodWatch
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import TrackStepEncoder
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Tracks
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.analyzer import AnalyzedFrame
 
 _EARLY: Final = 0.95
@@ -32,28 +33,17 @@ class TrackReportSettings:
     """Capture time after which a step stands by itself: a lost one hurts no longer."""
 
 
-class TrackSender(Protocol):
-    """Sends steps: `hvt_edge.link.transmitter.Transmitter`."""
-
-    def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> bool:
-        """Send ``make(now_ns)``; False where the budget has no room for it beside the next frame."""
-        ...
-
-
 class TrackReporter:
     """Tells the ground of the tracks at decision steps."""
 
     def __init__(
-        self, sender: TrackSender, *, session_id: int, settings: TrackReportSettings = TrackReportSettings()
+        self, sender: Transmitter, *, session_id: int, settings: TrackReportSettings = TrackReportSettings()
     ) -> None:
         self._sender = sender
         self._settings = settings
         self._encoder = TrackStepEncoder(session_id=session_id, refresh_ns=settings.refresh_ns)
         self._last_ns: int | None = None
         self._last_bytes = 0
-        self.steps = 0
-        """Sent so far."""
-        self.boxes = 0
 
     def report(self, seen: AnalyzedFrame, *, now_ns: int) -> bool:
         """Send this step's tracks if it is a decision step and one is due; tell whether it was sent.
@@ -66,13 +56,13 @@ class TrackReporter:
         tracks = _fresh(seen.tracks, most_frames=self._settings.fresh_frames)
         encoder = copy(self._encoder)  # the next step builds on the last one that was sent
         step = encoder.encode(tracks, capture_ns=capture_ns)
-        if not self._sender.tracks(
-            lambda at_ns: replace(step, send_delay_ns=at_ns - capture_ns).pack(), now_ns=now_ns
+        if not self._sender.metadata(
+            Channel.TRACKS,
+            lambda at_ns: replace(step, send_delay_ns=at_ns - capture_ns).pack(),
+            now_ns=now_ns,
         ):
             return False
         self._encoder, self._last_ns, self._last_bytes = encoder, capture_ns, len(step.pack())
-        self.steps += 1
-        self.boxes += len(tracks)
         return True
 
     def _due(self, capture_ns: int) -> bool:

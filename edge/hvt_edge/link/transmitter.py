@@ -315,13 +315,34 @@ class Transmitter:
         )
         return line_bytes
 
-    def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> bool:
-        """Send the edge's own tracks of one decision step, where the next frame keeps its room; else False."""
-        return self._metadata(Channel.TRACKS, make, now_ns=now_ns)
-
-    def pose(self, make: Callable[[int], bytes], *, now_ns: int) -> bool:
-        """Send where the camera is, where the next frame keeps its room; else False."""
-        return self._metadata(Channel.POSE, make, now_ns=now_ns)
+    def metadata(
+        self,
+        channel: Channel,
+        make: Callable[[int], bytes],
+        *,
+        now_ns: int,
+        before_frames: bool = False,
+        last: bool = False,
+    ) -> bool:
+        """Send what belongs to neither stream where the next frame keeps its room; else False. See `status`."""
+        at_ns = now_ns
+        with self._lock:
+            if self._ended:
+                return False
+            self._ended = last
+            size_bytes = _GROWTH_BYTES + self._line_bytes(channel, make(now_ns), 0)
+            if last:
+                at_ns = self.budget.earliest_ns(size_bytes, now_ns=now_ns)
+            elif not self.budget.metadata_fits(size_bytes, now_ns=now_ns, before_frames=before_frames):
+                return False
+            payload = make(at_ns)
+            line_bytes = self._count(channel, Account.META, payload, b"", at_ns=at_ns)
+            self.budget.record_metadata(line_bytes, now_ns=at_ns)
+            if self.pacer is not None:
+                self.pacer.sent_other(line_bytes, now_ns=at_ns)
+        self.wait_until(at_ns)
+        self.outlet.put(channel, payload, encoding=DELIVERIES[channel].encoding)
+        return True
 
     def status(
         self, make: Callable[[int], Status], *, now_ns: int, before_frames: bool = False, last: bool = False
@@ -334,7 +355,7 @@ class Transmitter:
         ``last`` one go no stills and no tracks, whichever thread still has some: a ground that has all that it names
         closes the session.
         """
-        return self._metadata(
+        return self.metadata(
             Channel.STATUS,
             lambda at_ns: make(at_ns).pack(),
             now_ns=now_ns,
@@ -414,35 +435,6 @@ class Transmitter:
         assert outcome in ("sent", "deferred", "dropped")
         with self._lock:
             self.ledger.record_outcome(outcome, reason)  # type: ignore[arg-type]
-
-    def _metadata(
-        self,
-        channel: Channel,
-        make: Callable[[int], bytes],
-        *,
-        now_ns: int,
-        before_frames: bool = False,
-        last: bool = False,
-    ) -> bool:
-        # Send what belongs to neither stream, if there is room; only the ``last`` message waits for it.
-        at_ns = now_ns
-        with self._lock:
-            if self._ended:
-                return False
-            self._ended = last
-            size_bytes = _GROWTH_BYTES + self._line_bytes(channel, make(now_ns), 0)
-            if last:
-                at_ns = self.budget.earliest_ns(size_bytes, now_ns=now_ns)
-            elif not self.budget.metadata_fits(size_bytes, now_ns=now_ns, before_frames=before_frames):
-                return False
-            payload = make(at_ns)
-            line_bytes = self._count(channel, Account.META, payload, b"", at_ns=at_ns)
-            self.budget.record_metadata(line_bytes, now_ns=at_ns)
-            if self.pacer is not None:
-                self.pacer.sent_other(line_bytes, now_ns=at_ns)
-        self.wait_until(at_ns)
-        self.outlet.put(channel, payload, encoding=DELIVERIES[channel].encoding)
-        return True
 
     def _still_at_ns(self, envelope: StillEnvelope, now_ns: int) -> int:
         header_bytes = self._header_at(envelope, now_ns).size_bytes

@@ -10,11 +10,13 @@ from typing import Final, Protocol, cast
 
 from hvt_common.errors import UserError
 from hvt_common.geodesy import between
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import PoseEncoder
 from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
+from hvt_edge.link.transmitter import Transmitter
 
 _GROUP: Final = "hvt.poses"
 _FILE: Final = "file"
@@ -105,14 +107,6 @@ class PoseTable:
         """Nothing is open."""
 
 
-class PoseSender(Protocol):
-    """The receiver of reports: `hvt_edge.link.transmitter.Transmitter`."""
-
-    def pose(self, make: Callable[[int], bytes], *, now_ns: int) -> bool:
-        """Send ``make(now_ns)``; False where the budget has no room for it beside the next frame."""
-        ...
-
-
 @dataclass(eq=False)
 class PoseStage:
     """One step a frame, in the frame loop."""
@@ -120,7 +114,7 @@ class PoseStage:
     source: PoseSource
     _: KW_ONLY
     session_id: int
-    sender: PoseSender
+    sender: Transmitter
     failures: Failures
 
     def __post_init__(self) -> None:
@@ -143,7 +137,7 @@ class PoseStage:
             self.failures.failed(_PART, self.source.trouble)
             return
         self.failures.works(_PART)
-        if not self.sender.pose(lambda at_ns: make(at_ns).pack(), now_ns=now_ns):
+        if not self.sender.metadata(Channel.POSE, lambda at_ns: make(at_ns).pack(), now_ns=now_ns):
             self._due_ns = None  # the next frame tries again
             return
         self._encoder = encoder

@@ -1,6 +1,6 @@
 """The state of an edge at one moment, as one value.
 
-Made once a second (`StateMaker`). Status line, the wire's `Status`, metrics and ``hvt-edge status`` read from it what
+Made once a second (`Heartbeat`). Status line, the wire's `Status`, metrics and ``hvt-edge status`` read from it what
 they have in common, so that none of them says what another does not. What is not known is None, never 0.
 """
 
@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from hvt_common import __version__
 from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.frame_account import FrameAccount
+from hvt_common.protocol.edge_words import FrameAccount
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.protocol.messages import WIRE_VERSION
 from hvt_common.runtime.failures import FailedPart, Failures
@@ -28,8 +28,7 @@ from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.loop.counts import FrameCounts
-from hvt_edge.loop.cpu import Cores
+from hvt_edge.loop.counts import Cores, FrameCounts
 from hvt_edge.operating import Levers, LoopClock, Operating
 from hvt_edge.stills.stage import StillStage
 
@@ -231,8 +230,12 @@ def lacks(state: EdgeState, *, patience_s: float) -> str:
 
 
 @dataclass(eq=False)
-class StateMaker:
-    """Makes states, and remembers since when the link is as it is; in the frame loop."""
+class Heartbeat:
+    """The frame loop reports once a second that it turns: a state for watchers, a message for systemd's watchdog.
+
+    A long wait in the loop turns it meanwhile: a clip waits for its ground, a lost camera yields a step without a
+    frame each second. Only a loop that hangs reports nothing. ``clock`` is wall time, in lockstep too.
+    """
 
     config: EdgeConfig
     _: KW_ONLY
@@ -253,9 +256,23 @@ class StateMaker:
 
     def __post_init__(self) -> None:
         self._ground, self._since_ns = False, self.clock()
+        self._due_ns = 0
+        self.state: EdgeState | None = None
+        """The newest; None before the first. Any thread may read it."""
 
-    def make(self, phase: Phase) -> EdgeState:
-        """The state now."""
+    def beat(self, phase: Phase) -> EdgeState:
+        """Make a state now."""
+        self._due_ns = self.clock() + SECOND_NS
+        self.state = self._made(phase)
+        notify_systemd("WATCHDOG=1")
+        return self.state
+
+    def turn(self, phase: Phase) -> None:
+        """Make one if the last is a second old."""
+        if self.clock() >= self._due_ns:
+            self.beat(phase)
+
+    def _made(self, phase: Phase) -> EdgeState:
         config, counts, ledger, analyzer = self.config, self.counts, self.ledger, self.stills.analyzer
         counts.measure_cpu(perception_ns=analyzer.spent_ns)
         now_ns, now, cores = self.clock(), self.operating.now, counts.cpu.now
@@ -371,30 +388,3 @@ def _backlog(backlog: BacklogStage) -> BacklogState:
         evicted_stills=numbers.evicted_stills,
         evicted_segments=numbers.evicted_segments,
     )
-
-
-class Heartbeat:
-    """The frame loop reports once a second that it turns: a state for watchers, a message for systemd's watchdog.
-
-    A long wait in the loop turns it meanwhile: a clip waits for its ground, a lost camera yields a step without a
-    frame each second. Only a loop that hangs reports nothing. ``clock`` is wall time, in lockstep too.
-    """
-
-    def __init__(self, maker: StateMaker, *, clock: Callable[[], int]) -> None:
-        self._maker = maker
-        self._clock = clock
-        self._due_ns = 0
-        self.state: EdgeState | None = None
-        """The newest; None before the first. Any thread may read it."""
-
-    def beat(self, phase: Phase) -> EdgeState:
-        """Make a state now."""
-        self._due_ns = self._clock() + SECOND_NS
-        self.state = self._maker.make(phase)
-        notify_systemd("WATCHDOG=1")
-        return self.state
-
-    def turn(self, phase: Phase) -> None:
-        """Make one if the last is a second old."""
-        if self._clock() >= self._due_ns:
-            self.beat(phase)

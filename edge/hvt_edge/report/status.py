@@ -9,8 +9,7 @@ from typing import Any, Literal
 
 from hvt_common import __version__
 from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.edge_words import counts_text
-from hvt_common.protocol.frame_account import FrameAccount
+from hvt_common.protocol.edge_words import FrameAccount, counts_text
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import (
     BASE_CODEC,
@@ -21,14 +20,13 @@ from hvt_common.protocol.messages import (
     Status,
     fitted_text,
 )
-from hvt_common.runtime.failures import Failure, Failures
+from hvt_common.runtime.failures import Failure
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import View
 from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.config import EdgeConfig
-from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.loop.cpu import Cores
-from hvt_edge.operating import Levers, LoopClock, Operating
+from hvt_edge.loop.counts import Cores
+from hvt_edge.operating import Levers, Operating
 from hvt_edge.report.state import EdgeState, Heartbeat, LinkState
 
 _PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
@@ -87,19 +85,11 @@ class InfoReporter:
         return info.pack()
 
 
-@dataclass(eq=False, kw_only=True)
 class StatusReporter:
-    """Sends ``status`` and makes the status line, from the state that it has made; in the frame loop."""
+    """Sends ``status``, from the state that the heartbeat has made and the parts that it knows; in the frame loop."""
 
-    heartbeat: Heartbeat
-    operating: Operating
-    session_id: int
-    ledger: Ledger
-    transmitter: Transmitter
-    failures: Failures
-    loop_clock: LoopClock
-
-    def __post_init__(self) -> None:
+    def __init__(self, heartbeat: Heartbeat) -> None:
+        self._of = heartbeat
         self._sequence = 0
         self._pending: tuple[EdgeState, str] | None = None
         """The report of the newest second, not sent yet."""
@@ -110,19 +100,19 @@ class StatusReporter:
 
     def send(self, phase: Literal["running", "ended"]) -> None:
         """Make the report of this second, and send it as soon as it leaves video its room; the last one waits."""
-        state = self.heartbeat.beat(phase)
+        state = self._of.beat(phase)
         # Once: the transmitter makes a report twice, first for its size.
         self._pending = (state, self._levers_text(state.levers))
-        self._due_ns = self.loop_clock() if self._due_ns is None else self._due_ns
+        self._due_ns = self._of.loop_clock() if self._due_ns is None else self._due_ns
         self.send_pending(last=phase == "ended")
 
     def send_pending(self, *, last: bool = False) -> None:
         """Before each frame: a report that found no room is tried again."""
         if self._pending is None:
             return
-        (state, levers), now_ns = self._pending, self.loop_clock()
+        (state, levers), now_ns = self._pending, self._of.loop_clock()
         late = self._due_ns is not None and now_ns - self._due_ns >= _LATE_NS
-        if self.transmitter.status(
+        if self._of.transmitter.status(
             lambda at_ns: self._status(state, levers, at_ns), now_ns=now_ns, before_frames=late, last=last
         ):
             self._pending = self._due_ns = None
@@ -139,15 +129,15 @@ class StatusReporter:
 
     def _status(self, state: EdgeState, levers: str, at_ns: int) -> Status:
         # In lockstep no field depends on this machine's speed: the same input gives the same bytes.
-        account = self.ledger.summary(state.duration_s)
-        worst, frames, transmitter = account.worst_window_bps, state.frames, self.transmitter
+        account = self._of.ledger.summary(state.duration_s)
+        worst, frames, transmitter = account.worst_window_bps, state.frames, self._of.transmitter
         measured, reported_s = not state.lockstep, state.link.reported_s
         return Status(
-            session_id=self.session_id,
+            session_id=self._of.session_id,
             sequence=self._sequence,
             state=state.state,
             send_ns=at_ns,
-            media_ns=max(0, at_ns - self.operating.now.started_ns),
+            media_ns=max(0, at_ns - self._of.operating.now.started_ns),
             last_base_sequence=transmitter.base_sequence,
             last_still_sequence=transmitter.still_sequence,
             base_bytes=account.base_bytes,
@@ -189,7 +179,7 @@ class StatusReporter:
                     failed_ns=one.failed_ns,
                     working=one.working,
                 )
-                for one in self.failures.parts[:MOST_FAILED_PARTS]
+                for one in self._of.failures.parts[:MOST_FAILED_PARTS]
             ),
             levers=levers,
             frames=frames.account.as_counts(),

@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.values import Image
-from hvt_edge.source.decoding.levels import Stretch
-from hvt_edge.source.decoding.notes import Notes
+from hvt_edge.source.contract import Notes
+from hvt_edge.source.decoding.pictures import Stretch
 from hvt_edge.source.live import Shot, SignalLost
 
 _REQUESTED_SIZE = (1920, 1080)

@@ -16,16 +16,15 @@ from hvt_common.values import Fit, Frame
 from hvt_edge.source.camera_stream import (
     LONG_STEP_S,
     CameraDecoder,
+    CameraUnits,
     check_picture,
     check_stream,
     open_units,
     rate_of,
     without_jumps,
 )
-from hvt_edge.source.camera_units import CameraUnits
-from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit, Source
+from hvt_edge.source.contract import BaseSize, CameraStream, Notes, SeenUnit, Source
 from hvt_edge.source.decoding.container import name_of, open_video, said_rate, survey, without_stamps
-from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.decoding.timeline import Stamps
 from hvt_edge.source.resample import Resizer
 

@@ -1,7 +1,8 @@
-"""The contract of a source, and the sizes and rates that a base stream can have."""
+"""The contract of a source, what it notes of itself, and the sizes and rates that a base stream can have."""
 
 from __future__ import annotations
 
+import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -10,6 +11,7 @@ from itertools import pairwise
 from typing import Self
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.log import START_LOGGER
 from hvt_common.values import Frame, View
 
 BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
@@ -124,3 +126,25 @@ def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) 
         raise UserError(
             f"source-fps {source_fps:g} is impossible: accepted is above 0 and at most 1000 frames a second"
         )
+
+
+class Notes:
+    """Takes sentences; ``name`` is their subject, as it may be printed."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._said: list[str] = []
+        self._taken = False
+
+    def __call__(self, sentence: str) -> None:
+        """Keep it, each once; after `taken` it is logged at once."""
+        if sentence in self._said:
+            return
+        self._said.append(sentence)
+        if self._taken:
+            logging.getLogger(START_LOGGER).info("%s: %s", self._name, sentence)
+
+    def taken(self) -> tuple[str, ...]:
+        """All of them so far."""
+        self._taken = True
+        return tuple(self._said)

@@ -15,9 +15,8 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_common.values import Fit, Frame, Image
-from hvt_edge.source.contract import BaseSize, Source
-from hvt_edge.source.decoding.levels import Stretch
-from hvt_edge.source.decoding.notes import Notes
+from hvt_edge.source.contract import BaseSize, Notes, Source
+from hvt_edge.source.decoding.pictures import Stretch
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
 _log = logging.getLogger(__name__)

@@ -15,8 +15,8 @@ import av.error
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
 from hvt_common.units import SECOND_NS
+from hvt_edge.source.contract import Notes
 from hvt_edge.source.decoding.container import cause_of, choose_stream, is_local
-from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.live import Shot, SignalLost
 

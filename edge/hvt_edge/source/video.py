@@ -14,7 +14,7 @@ import av
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_common.values import Fit, Frame
-from hvt_edge.source.contract import BaseSize, Source
+from hvt_edge.source.contract import BaseSize, Notes, Source
 from hvt_edge.source.decoding.container import (
     decoded,
     duration_s,
@@ -25,7 +25,6 @@ from hvt_edge.source.decoding.container import (
     survey,
     without_stamps,
 )
-from hvt_edge.source.decoding.notes import Notes
 from hvt_edge.source.decoding.pictures import Pictures
 from hvt_edge.source.decoding.timeline import Stamps
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold

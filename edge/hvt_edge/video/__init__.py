@@ -1,6 +1,5 @@
-"""The base stream: `stage` takes a frame through `frame_decision` and `x265`, opened by `encoder_settings`.
+"""The base stream: `stage` decides whether a frame is coded, and by `x265`, opened by `encoder_settings`.
 
-`encoders` has others in place of x265; `passthrough` is the stage without one. `frame_skip` says
-which frames, `regions` where finer, `rate_model` and `share` at which rate, `preset` with how much time;
-`reconfigure` changes all that with a keyframe.
+`encoders` has others in place of x265; `passthrough` is the stage without one. `rate_model` says which frames,
+`share` at which rate; `reconfigure` changes all that with a keyframe.
 """

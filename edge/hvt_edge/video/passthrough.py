@@ -9,17 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 
-from hvt_common.protocol.frame_account import FrameGroup
+from hvt_common.protocol.edge_words import FrameGroup
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage, State
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.video.encoders.camera_rates import LeastLink
-from hvt_edge.video.encoders.passthrough import unit_of
-from hvt_edge.video.frame_decision import Action, FrameDecision
-from hvt_edge.video.stage import BaseStage, LocalCopy
+from hvt_edge.video.encoders.passthrough import LeastLink, unit_of
+from hvt_edge.video.stage import Action, BaseStage, FrameDecision, LocalCopy
 
 _PART = "passthrough"
 _PATIENCE_NS = SECOND_NS // 2

@@ -13,9 +13,8 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import Operating, base_rate_bps
 from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import Step
-from hvt_edge.video.encoder_settings import least_base_bps, most_keyframe_bytes
-from hvt_edge.video.encoders.contract import Encoder
-from hvt_edge.video.preset import PresetControl
+from hvt_edge.video.encoder_settings import PresetControl, least_base_bps, most_keyframe_bytes
+from hvt_edge.video.encoders.registry import Encoder
 from hvt_edge.video.share import FIRST_SHARE, Split
 
 _WORTH = 0.04

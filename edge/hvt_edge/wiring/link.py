@@ -17,8 +17,7 @@ from hvt_edge.operating import Operating
 from hvt_edge.perception.levers import LeverControl, LeverSettings
 from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder_settings import least_base_bps
-from hvt_edge.video.encoders.camera_rates import CameraRates, LeastLink, needed_bps
-from hvt_edge.video.encoders.passthrough import measure_camera
+from hvt_edge.video.encoders.passthrough import CameraRates, LeastLink, measure_camera, needed_bps
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.share import Split, SplitSettings
 from hvt_edge.wiring.stills import shows_details

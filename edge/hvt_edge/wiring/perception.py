@@ -16,14 +16,14 @@ from hvt_common.inference.detect import (
     warm_up,
 )
 from hvt_common.inference.few_found import ViewTrust
-from hvt_common.inference.retried import RetriedDetector
-from hvt_common.inference.scale_search import ScaleSearch
-from hvt_common.inference.scores import (
+from hvt_common.inference.labels import (
     declared_class_names,
     default_confidence,
     is_calibrated,
     uncalibrated,
 )
+from hvt_common.inference.retried import RetriedDetector
+from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
 from hvt_common.inference.tiles import detect_whole, searches_scale, tiled
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence

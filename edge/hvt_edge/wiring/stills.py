@@ -19,8 +19,7 @@ from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.base import Method, Step
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings
-from hvt_edge.stills.suppression import Gate, Suppression
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Gate, Suppression
 
 _TRIAL_PX = 48
 _LEAST_STILL_BYTES = 400

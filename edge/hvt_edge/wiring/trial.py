@@ -13,14 +13,12 @@ from hvt_common.runtime.log import START_LOGGER
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame, View
 from hvt_edge.config import EdgeConfig
-from hvt_edge.loop.cpu import processors
+from hvt_edge.loop.counts import processors
 from hvt_edge.perception.shadow import UNMEASURED, Shadow
 from hvt_edge.source.contract import Source
 from hvt_edge.stills.policy.registry import method
-from hvt_edge.video.encoder_settings import least_base_bps
-from hvt_edge.video.encoders.contract import Encoder
-from hvt_edge.video.encoders.registry import X265
-from hvt_edge.video.preset import PresetChoice, choose_preset, share_of
+from hvt_edge.video.encoder_settings import PresetChoice, choose_preset, least_base_bps, share_of
+from hvt_edge.video.encoders.registry import X265, Encoder
 from hvt_edge.video.share import FIRST_SHARE
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.link import SPARSE_SHARE, lever_settings

@@ -16,27 +16,35 @@ from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Fit, Frame, View
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, least_budget_bps
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
-from hvt_edge.loop.cpu import processors
+from hvt_edge.loop.counts import processors
 from hvt_edge.operating import Operating
 from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, shown
 from hvt_edge.video.encoder_settings import (
+    SLOWEST,
+    PresetControl,
     encoder_settings,
     keyframe_interval_s,
     keyframe_total_bps,
     payload_bps,
+    share_of,
     usual_keyframe_bytes,
 )
-from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
 from hvt_edge.video.encoders.qualification import allowed, headroom_of, run_frames
-from hvt_edge.video.encoders.registry import X265, open_encoder
-from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
-from hvt_edge.video.preset import SLOWEST, PresetControl, share_of
-from hvt_edge.video.rate_model import LEAST_SIDE_PX, PROMPT, SPARING, choose_base, most_decimation, sizes_of
+from hvt_edge.video.encoders.registry import X265, Encoder, open_encoder
+from hvt_edge.video.rate_model import (
+    LEAST_SIDE_PX,
+    PROMPT,
+    SPARING,
+    FrameSkip,
+    MeasuredFrameSkip,
+    choose_base,
+    most_decimation,
+    sizes_of,
+)
 from hvt_edge.video.reconfigure import OpenEncoder, ReconfigurationSettings
-from hvt_edge.video.regions import TrackRegions
-from hvt_edge.video.x265 import BaseEncoder
+from hvt_edge.video.x265 import BaseEncoder, TrackRegions
 
 _log = logging.getLogger(__name__)
 
@@ -325,7 +333,7 @@ def least_rate_bps(config: EdgeConfig, size: tuple[int, int]) -> int:
 
     Nobody can make a keyframe smaller than `keyframe_floor_bytes`. Were the rate taken below what one needs, none
     would go; nothing arrives then, and a rate that grows with what arrives never grows again. What a camera's own
-    units need is measured (`hvt_edge.video.encoders.camera_rates`).
+    units need is measured (`hvt_edge.video.encoders.passthrough`).
     """
     if config.passes_through:
         return config.min_budget_bps

@@ -15,8 +15,7 @@ from av.container import OutputContainer
 
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
-from hvt_common.video.annex_b import parameter_sets
-from hvt_common.video.hevc import BaseDecoder
+from hvt_common.video.hevc import BaseDecoder, parameter_sets
 from hvt_ground.events import Overlay, VideoSample
 from hvt_ground.recordings.contract import Recorded
 from hvt_ground.sinks.palette import class_colour

@@ -23,7 +23,7 @@ from hvt_archive.reading.drawn_layer import TRACK_COMPONENTS, DrawnLayer, of_fil
 from hvt_archive.reading.spool import Mapped, Spool, SpooledRows, Timed
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireError
-from hvt_common.video.annex_b import is_keyframe
+from hvt_common.video.hevc import is_keyframe
 from hvt_ground.events import Notice, Overlay, PoseUpdate, VideoSample
 from hvt_ground.poses import NOWHERE, Locator
 from hvt_ground.recordings.contract import Recorded, RecordedStill

@@ -14,7 +14,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import BaseHeader, Flags, PoseEncoder, RoiHeader
 from hvt_common.transport.inbox import Received
-from hvt_common.video.annex_b import parameter_sets
+from hvt_common.video.hevc import parameter_sets
 from hvt_ground.events import PoseUpdate, VideoSample
 from hvt_ground.recordings.contract import Recorded, RecordedStill
 

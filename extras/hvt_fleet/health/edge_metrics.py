@@ -7,7 +7,7 @@ from functools import partial
 
 from prometheus_client.core import Metric
 
-from hvt_common.protocol.frame_account import FRAME_GROUPS
+from hvt_common.protocol.edge_words import FRAME_GROUPS
 from hvt_common.units import SECOND_NS
 from hvt_edge.report.state import BacklogState, EdgeState
 from hvt_fleet.health import server

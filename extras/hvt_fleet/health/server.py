@@ -66,7 +66,7 @@ def serve(
     failures: Failures,
     lacks: Callable[[_State], str],
 ) -> HealthServer:
-    """See `hvt_common.runtime.health.health_server`; ``metrics_text(state)`` is for Prometheus."""
+    """See `hvt_common.runtime.plug_ins.health_server`; ``metrics_text(state)`` is for Prometheus."""
 
     def of_state(make: Callable[[_State], Answer]) -> Answer:
         state = newest()

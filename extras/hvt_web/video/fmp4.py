@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Literal
 
-from hvt_common.video.annex_b import nal_units
+from hvt_common.video.hevc import nal_units
 
 Codec = Literal["h264", "hevc"]
 

@@ -13,8 +13,8 @@ from typing import Self
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import FailingDetector, open_detector, warm_up
 from hvt_common.inference.few_found import FewFoundHint
+from hvt_common.inference.labels import default_confidence, is_calibrated, uncalibrated
 from hvt_common.inference.retried import RetriedClassifier, RetriedDetector
-from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.process import lower_priority

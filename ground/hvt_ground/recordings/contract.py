@@ -10,7 +10,7 @@ from functools import cached_property
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Info, RoiHeader
-from hvt_common.video.annex_b import parameter_sets
+from hvt_common.video.hevc import parameter_sets
 from hvt_ground.events import Notice, Overlay, PoseUpdate, VideoSample
 from hvt_ground.poses import Locator, PoseTrail
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from hvt_common import __version__
-from hvt_common.protocol.frame_account import FrameAccount
+from hvt_common.protocol.edge_words import FrameAccount
 from hvt_common.protocol.messages import WIRE_VERSION, Status
 from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.units import SECOND_NS

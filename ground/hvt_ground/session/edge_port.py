@@ -24,8 +24,7 @@ from hvt_common.protocol.messages import (
     UnknownVersionError,
     WireError,
 )
-from hvt_common.transport.flood import FloodWatch, TokenBucket
-from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.transport.inbox import FloodWatch, Inbox, Received, TokenBucket
 from hvt_common.transport.link_doctor import control_unanswered
 from hvt_common.transport.session import declare_publisher, query_later
 from hvt_common.units import SECOND_NS

@@ -24,8 +24,7 @@ from hvt_common.protocol.messages import (
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.runtime.log import log_fields
-from hvt_common.transport.flood import TokenBucket
-from hvt_common.transport.inbox import Received
+from hvt_common.transport.inbox import Received, TokenBucket
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.backlog.recordings import BacklogRecordings

@@ -28,8 +28,7 @@ from hvt_common.protocol.messages import (
     TrackStep,
     TrackStepDecoder,
 )
-from hvt_common.transport.flood import TokenBucket
-from hvt_common.transport.inbox import Received
+from hvt_common.transport.inbox import Received, TokenBucket
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder

@@ -17,8 +17,8 @@ import msgpack
 import numpy as np
 
 from hvt_common.inference.detect import OnnxDetector
-from hvt_common.inference.runtimes.ir_file import files_of
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
+from hvt_common.inference.runtimes.model_file import files_of
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Detections, Image
 from hvt_study.cache.code_digest import DETECTING, code_digest

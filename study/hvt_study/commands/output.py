@@ -82,16 +82,12 @@ def make_out(folder: Path, *, name: str) -> Path:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Within it, what cannot be written, or read, is a `UserError` that names ``--out``, or the file."""
+    """Within it, what cannot be written is a `UserError` that names ``--out``."""
     try:
         yield
     except (OSError, FlightError) as error:
         cause = error if isinstance(error, OSError) else error.__cause__
         why = cause.strerror if isinstance(cause, OSError) else error
-        if isinstance(error, OSError) and error.filename is not None:
-            named = Path(error.filename)
-            if not named.is_relative_to(folder):
-                raise UserError(f"{named} cannot be read ({why}): leave it out") from None
         raise UserError(f"--out {folder} cannot be written ({why}): name another") from None
 
 

@@ -16,8 +16,7 @@ import av
 from hvt_common import __version__
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import Classifier, open_classifier
-from hvt_common.inference.labels import first_synonym
-from hvt_common.inference.scores import default_confidence
+from hvt_common.inference.labels import default_confidence, first_synonym
 from hvt_common.inference.store import MOTION, resolve_model
 from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, NONE

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from hvt_common.config import load
-from hvt_common.inference.scores import default_confidence
+from hvt_common.inference.labels import default_confidence
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_edge.profiles import REGIMES

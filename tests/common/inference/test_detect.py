@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, detect_every, detect_still_every, open_detector
-from hvt_common.inference.heads.decode import YoloxCells
-from hvt_common.inference.heads.trial import anchor_count
-from hvt_common.inference.letterbox import Letterbox, Letterboxer, as_bgr
+from hvt_common.inference.heads.choose import anchor_count
+from hvt_common.inference.heads.contract import YoloxCells
+from hvt_common.inference.letterbox import Letterbox, Letterboxer, Preparation, as_bgr
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
-from hvt_common.inference.preparation import Preparation
 from hvt_common.inference.runtimes.model import open_model
 from hvt_models.detectors.motion import MotionDetector
 from hvt_models.forms import Dense, Listed

@@ -10,8 +10,8 @@ import pytest
 
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
+from hvt_common.inference.labels import default_confidence
 from hvt_common.inference.runtimes.model import open_model
-from hvt_common.inference.scores import default_confidence
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, embedded_models
 from hvt_common.values import iou
 from hvt_scene import Scene

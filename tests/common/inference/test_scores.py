@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
+from hvt_common.inference.labels import default_confidence, is_calibrated, uncalibrated
 from media.onnx_models import colour_detector
 
 

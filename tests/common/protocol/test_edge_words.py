@@ -6,8 +6,15 @@ import re
 from pathlib import Path
 from typing import get_args
 
-from hvt_common.protocol.edge_words import LEVER_WORDS, PART_WORDS, STILL_WORDS, counts_text, lever_sentences
-from hvt_common.protocol.frame_account import FRAME_GROUPS, FrameGroup
+from hvt_common.protocol.edge_words import (
+    FRAME_GROUPS,
+    LEVER_WORDS,
+    PART_WORDS,
+    STILL_WORDS,
+    FrameGroup,
+    counts_text,
+    lever_sentences,
+)
 from hvt_ground.perception.stills.match import Outcome
 
 ROOT = Path(__file__).parents[3]
@@ -17,10 +24,10 @@ EMITTED = (
     ("edge/hvt_edge", r'(?:on_outcome|record_outcome)\(\s*"\w+",\s*"(\w+)"'),
     ("edge/hvt_edge", r'on_outcome\([^)]*?else "\w+", "(\w+)"'),
     ("edge/hvt_edge/stills/policy", r'reason="(\w+)"'),
-    ("edge/hvt_edge/stills/suppression.py", r'return "(\w+)"'),
+    ("edge/hvt_edge/stills/scheduler.py", r'return "(\w+)"'),
     ("edge/hvt_edge/stills/outbox.py", r'_expire\([^"]*?"(\w+)"'),
     ("edge/hvt_edge/stills/outbox.py", r'^AGAIN = "(\w+)"'),
-    ("edge/hvt_edge/stills/on_demand_crop.py", r'^ON_DEMAND = "(\w+)"'),
+    ("edge/hvt_edge/stills/on_demand.py", r'^ON_DEMAND = "(\w+)"'),
     ("edge/hvt_edge/stills/maker.py", r"reason: Literal\[(.*)\]"),
     ("ground/hvt_ground/perception", r'(?:dropped|outcomes)\["([\w ]+)"\]'),
 )

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.protocol.messages import PoseDecoder, PoseEncoder, PoseReport, WireError
-from hvt_common.protocol.messages.exp_golomb import BitReader, BitWriter
+from hvt_common.protocol.messages.bits import BitReader, BitWriter
 from hvt_common.values import Orientation, Pose
 
 START_NS = 1_790_000_000_000_000_000
@@ -140,12 +140,12 @@ def test_any_bytes_are_a_pose_or_refused(messages):
 def test_numbers_come_back(numbers, plain):
     """The two sides would disagree about a code."""
     out = BitWriter()
-    out.plain(plain, 12)
+    out.u(plain, 12)
     for value, order in numbers:
-        out.signed(value, order)
-    bits = BitReader(out.finish())
-    assert bits.plain(12) == plain
-    assert [bits.signed(order) for _, order in numbers] == [value for value, _ in numbers]
+        out.se(value, order)
+    bits = BitReader(out.ended(stop=""))
+    assert bits.u(12) == plain
+    assert [bits.se(order) for _, order in numbers] == [value for value, _ in numbers]
     bits.finish()
 
 
@@ -154,5 +154,5 @@ def test_codes_are_those_of_the_standard():
     table = {0: "1", 1: "010", -1: "011", 2: "00100", -2: "00101", 3: "00110", -3: "00111"}
     for value, code in table.items():
         out = BitWriter()
-        out.signed(value, 0)
-        assert f"{int.from_bytes(out.finish(), 'big'):08b}" == code.ljust(8, "0")
+        out.se(value, 0)
+        assert f"{int.from_bytes(out.ended(stop=''), 'big'):08b}" == code.ljust(8, "0")

@@ -6,8 +6,7 @@ import pickle
 from dataclasses import replace
 
 from hvt_common.protocol.ledger import Account, Ledger
-from hvt_common.transport.flood import FloodWatch, TokenBucket
-from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.transport.inbox import FloodWatch, Inbox, Received, TokenBucket
 
 SECOND_NS = 1_000_000_000
 ITEM = Received("hvt/uav-1/base", b"x" * 100, b"", "", 0)

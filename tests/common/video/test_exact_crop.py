@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.values import Frame, View
-from hvt_common.video.base_crop import base_crop
-from hvt_common.video.exact_crop import exact_base_crop
+from hvt_common.video.base_crop import base_crop, exact_base_crop
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import psnr_y_db
 from hvt_edge.video.encoder_settings import EncoderSettings

@@ -12,8 +12,7 @@ from hvt_common.protocol.messages import Flags, RoiHeader, parse_backlog_still
 from hvt_common.values import AccessUnit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.backlog.entry import worth
-from hvt_edge.backlog.intake import IntakeStill
-from hvt_edge.backlog.worker import StoreWorker
+from hvt_edge.backlog.worker import IntakeStill, StoreWorker
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.wiring.storing import make_backlog
 from media.clips import START_NS

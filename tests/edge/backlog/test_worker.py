@@ -19,8 +19,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import Store
-from hvt_edge.backlog.intake import EndSegment, Intake
-from hvt_edge.backlog.worker import ChunkAllowance, StoreWorker
+from hvt_edge.backlog.worker import ChunkAllowance, EndSegment, Intake, StoreWorker
 from media.clips import START_NS
 from programs.processes import eventually
 from rigs.keeping import Rig

@@ -16,6 +16,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Feedback
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.feedback import PrimaryReceiver
 from hvt_edge.link.pacer import Flight, Pacer
 from hvt_edge.link.rate_control import (
     LeastDelay,
@@ -24,8 +25,7 @@ from hvt_edge.link.rate_control import (
     RateSettings,
     ReconfigurationTrigger,
 )
-from hvt_edge.link.receivers import PrimaryReceiver
-from hvt_edge.video.frame_skip import FrameSkip, LimitedFrameSkip
+from hvt_edge.video.rate_model import FrameSkip, LimitedFrameSkip
 from rigs.messages import counted, feedback
 
 MS = 1_000_000

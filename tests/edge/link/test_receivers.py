@@ -7,7 +7,7 @@ from collections import Counter
 
 import pytest
 
-from hvt_edge.link.receivers import PrimaryReceiver
+from hvt_edge.link.feedback import PrimaryReceiver
 from rigs.messages import feedback
 
 S = 1_000_000_000

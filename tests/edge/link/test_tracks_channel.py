@@ -34,7 +34,7 @@ class Line:
         self.full_ns: set[int] = set()
         """Times at which the budget has no room."""
 
-    def tracks(self, make, *, now_ns):
+    def metadata(self, _channel, make, *, now_ns):
         """Keeps what goes out."""
         if now_ns in self.full_ns:
             return False
@@ -49,7 +49,6 @@ def told(shown: list[AnalyzedFrame], **settings) -> list[TrackStep]:
     reporter = TrackReporter(line, session_id=77, settings=TrackReportSettings(**settings))
     for one in shown:
         reporter.report(one, now_ns=one.frame.capture_ns + 5_000_000)
-    assert reporter.steps == len(line.steps)
     return line.steps
 
 

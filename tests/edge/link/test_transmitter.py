@@ -17,9 +17,9 @@ from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import MAX_ALSO, BaseHeader, CaptureTimes, Flags, RoiHeader, Status
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, BudgetSettings, RollingBudget
+from hvt_edge.link.feedback import PrimaryReceiver
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_edge.video.encoder_settings import STATUS_BYTES, base_overhead_bps
 from rigs.messages import STATUS, feedback
 from rigs.world import Puts, make_transmitter
@@ -290,8 +290,7 @@ def test_what_is_no_frame_waits_for_nothing_and_leaves_the_next_frame_its_room(c
     def send(now_ns: int, **late: bool) -> bool:
         if channel is Channel.STATUS:
             return rig.sender.status(status, now_ns=now_ns, **late)
-        send_it = rig.sender.tracks if channel is Channel.TRACKS else rig.sender.pose
-        return send_it(lambda _at_ns: bytes(200), now_ns=now_ns)
+        return rig.sender.metadata(channel, lambda _at_ns: bytes(200), now_ns=now_ns)
 
     rig.sender.base(unit(0, 9_000, keyframe=True), now_ns=NOW_NS)
     assert not send(NOW_NS + 100)
@@ -408,7 +407,7 @@ def test_behind_the_last_report_goes_nothing():
     rig.sender.status(status, now_ns=NOW_NS, last=True)
     before = rig.ledger.line_bytes, len(rig.out.puts)
     rig.sender.still(rig.sender.envelope(still(sequence=1)), now_ns=NOW_NS)
-    rig.sender.tracks(lambda _at_ns: bytes(40), now_ns=NOW_NS)
+    rig.sender.metadata(Channel.TRACKS, lambda _at_ns: bytes(40), now_ns=NOW_NS)
     assert (rig.ledger.line_bytes, len(rig.out.puts)) == before
     assert rig.ledger.outcomes("sent") == {"utility": 1}
     assert rig.ledger.outcomes("dropped") == {"ended": 1}

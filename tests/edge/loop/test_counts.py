@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_common.protocol.frame_account import FRAME_GROUPS, FrameAccount
+from hvt_common.protocol.edge_words import FRAME_GROUPS, FrameAccount
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit
 from hvt_edge.keyframes import Keyframes
@@ -19,8 +19,8 @@ from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating import LoopClock
 from hvt_edge.perception.cpu_budget import CpuBudget
-from hvt_edge.video.frame_decision import Action, FrameDecision
-from hvt_edge.video.frame_skip import FrameSkip
+from hvt_edge.video.rate_model import FrameSkip
+from hvt_edge.video.stage import Action, FrameDecision
 from media.clips import framed, smooth_pictures
 from rigs.world import Puts, make_base_stage, make_transmitter
 

@@ -9,8 +9,7 @@ from collections import Counter
 
 import pytest
 
-from hvt_edge.loop.counts import FrameCounts
-from hvt_edge.loop.cpu import CpuMeter
+from hvt_edge.loop.counts import CpuMeter, FrameCounts
 
 
 def burn(seconds: float) -> None:

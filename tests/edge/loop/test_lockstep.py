@@ -15,7 +15,7 @@ from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.operating import LoopClock
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.frame_skip import FrameSkip
+from hvt_edge.video.rate_model import FrameSkip
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures
 from rigs.messages import counted, feedback

@@ -18,7 +18,7 @@ class Sent:
         self.messages: list[tuple[int, bytes]] = []
         self.full_ns = full_ns
 
-    def pose(self, make, *, now_ns):
+    def metadata(self, _channel, make, *, now_ns):
         """Take it at once, if there is room."""
         if now_ns in self.full_ns:
             return False

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from hvt_common.protocol.frame_account import FrameAccount
+from hvt_common.protocol.edge_words import FrameAccount
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import Status
 from hvt_common.runtime.failures import Failures
@@ -34,21 +34,19 @@ def test_numbers_that_a_report_cannot_say_end_no_flight():
         cores_needed=5000.0,
         cores_free=1.0,
     )
-    fields: dict[str, Any] = {
-        "heartbeat": SimpleNamespace(beat=lambda _phase: state),
-        "operating": SimpleNamespace(now=SimpleNamespace(started_ns=0)),
-        "transmitter": SimpleNamespace(
+    heartbeat: Any = SimpleNamespace(
+        beat=lambda _phase: state,
+        operating=SimpleNamespace(now=SimpleNamespace(started_ns=0)),
+        transmitter=SimpleNamespace(
             base_sequence=0,
             still_sequence=-1,
             status=lambda make, **_: sent.append(make(10**18).pack()) is None,
         ),
-    }
-    StatusReporter(
-        **fields,
         session_id=7,
         ledger=Ledger(window_ns=10**9),
         failures=Failures(lambda: 0),
         loop_clock=lambda: 0,
-    ).send("running")
+    )
+    StatusReporter(heartbeat).send("running")
     health = Status.parse(sent[0]).health
     assert (health.encode_ms, health.detect_ms, health.feedback_age_ms) == (60_000, 60_000, 2**32 - 1)

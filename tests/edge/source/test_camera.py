@@ -11,7 +11,7 @@ import pytest
 from hvt_common.runtime.clock import SteadyClock
 from hvt_edge.source import camera
 from hvt_edge.source.camera import CameraGrabber
-from hvt_edge.source.camera_clock import CameraClock
+from hvt_edge.source.live import CameraClock
 
 LEVELS = np.full((48, 64), 29_900, np.uint16)
 LEVELS[20:30, 20:30] = 30_200

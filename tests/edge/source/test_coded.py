@@ -14,10 +14,8 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_common.video.annex_b import nal_kind, nal_units, parameter_sets
-from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.source.camera_stream import CameraDecoder, rate_of, without_jumps
-from hvt_edge.source.camera_units import CameraUnits
+from hvt_common.video.hevc import BaseDecoder, nal_kind, nal_units, parameter_sets
+from hvt_edge.source.camera_stream import CameraDecoder, CameraUnits, rate_of, without_jumps
 from hvt_edge.source.coded_live import CodedLiveSource, CodedStreamGrabber
 from hvt_edge.source.contract import SeenUnit
 from hvt_edge.source.live import CameraPacket, Shot, SignalLost

@@ -15,8 +15,7 @@ from hvt_common.errors import NotYetError
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_edge.source import live
-from hvt_edge.source.camera_clock import CameraClock
-from hvt_edge.source.live import LiveSource, Shot, SignalLost
+from hvt_edge.source.live import CameraClock, LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.resample import Gate
 from programs.rtsp_camera import RtspCamera

@@ -20,8 +20,7 @@ from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxSettings, OutboxStill
 from hvt_edge.stills.policy.base import CostModel, Request, Step
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings
-from hvt_edge.stills.suppression import Gate, Suppression
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Gate, Suppression
 from media.base_coded import StandIn
 from media.clips import START_NS, hard_pictures
 from rigs.examples import tracks_of

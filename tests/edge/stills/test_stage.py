@@ -27,7 +27,7 @@ from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.on_demand_crop import OnDemandRequest, RefusedError
+from hvt_edge.stills.on_demand import OnDemandRequest, RefusedError
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from media.base_coded import StandIn
@@ -86,7 +86,7 @@ class Rig:
 
     def report(self, seen, *, now_ns) -> None:
         """Report the tracks, as the edge's reporter does."""
-        self.sender.tracks(lambda _at_ns: bytes([seen.frame.index]), now_ns=now_ns)
+        self.sender.metadata(Channel.TRACKS, lambda _at_ns: bytes([seen.frame.index]), now_ns=now_ns)
 
     def run(self, count: int = 30, *, start: int = 0) -> None:
         """Frame after frame, as the lockstep loop does."""

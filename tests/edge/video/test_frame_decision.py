@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 
 from hvt_edge.backlog.stage import State
-from hvt_edge.video.frame_decision import Action, FrameDecision, FrameInputs, decide
+from hvt_edge.video.stage import Action, FrameDecision, FrameInputs, decide
 
 LIVE, OFFLINE, RETURNING = State.LIVE, State.OFFLINE, State.RETURNING
 SKIP, HOLD = FrameDecision(Action.SKIP), FrameDecision(Action.HOLD)

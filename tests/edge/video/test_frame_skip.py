@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
-from hvt_edge.video.rate_model import PROMPT
+from hvt_edge.video.rate_model import PROMPT, FrameSkip, MeasuredFrameSkip
 
 
 def coded(frame_skip: FrameSkip, frames, *, keyframes=(), qp=40.0) -> list[int]:

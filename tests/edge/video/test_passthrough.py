@@ -18,8 +18,8 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.backlog.stage import State
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.source.opening import open_source
-from hvt_edge.video.frame_decision import Action, FrameDecision
 from hvt_edge.video.passthrough import PassthroughStage, UnitInputs, decide_unit
+from hvt_edge.video.stage import Action, FrameDecision
 from media.clips import START_NS, hard_pictures, smooth_pictures
 from media.hevc_camera import SIZE, write_clip
 from rigs import keeping

@@ -11,7 +11,7 @@ from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.operating import Operating
-from hvt_edge.video.preset import PresetControl, choose_preset, share_of
+from hvt_edge.video.encoder_settings import PresetControl, choose_preset, share_of
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.video import encoder_opener, reconfiguration_settings

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.values import Tracks
-from hvt_edge.video.regions import MOST_REGIONS, Region, TrackRegions
+from hvt_edge.video.x265 import MOST_REGIONS, Region, TrackRegions
 from rigs.examples import tracks_of
 
 SIZE = (640, 360)

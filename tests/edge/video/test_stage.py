@@ -20,9 +20,8 @@ from hvt_edge.config import EdgeConfig, least_budget_bps
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings
-from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
-from hvt_edge.video.regions import TrackRegions
-from hvt_edge.video.x265 import BaseEncoder, encoder_context
+from hvt_edge.video.rate_model import FrameSkip, MeasuredFrameSkip
+from hvt_edge.video.x265 import BaseEncoder, TrackRegions, encoder_context
 from media.clips import START_NS, framed, hard_pictures, smooth_pictures
 from rigs.flight import tracks_at
 from rigs.world import Puts, make_base_stage, make_transmitter

@@ -13,8 +13,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video.encoder_settings import PRESETS, EncoderSettings, keyframe_floor_bytes, minimum_bps
-from hvt_edge.video.regions import MOST_REGIONS, Region
-from hvt_edge.video.x265 import BaseEncoder
+from hvt_edge.video.x265 import MOST_REGIONS, BaseEncoder, Region
 from media.clips import framed, hard_pictures, smooth_pictures
 
 SIZE = (320, 192)

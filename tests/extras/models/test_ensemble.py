@@ -11,7 +11,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector
-from hvt_common.inference.scores import declared_class_names, default_confidence, is_calibrated
+from hvt_common.inference.labels import declared_class_names, default_confidence, is_calibrated
 from hvt_common.inference.store import parts_of
 from hvt_common.values import Detections, Image
 from hvt_models.detectors.ensemble import EnsembleDetector, on_scale_of

@@ -13,8 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hvt_common.protocol.edge_words import STILL_WORDS
-from hvt_common.protocol.frame_account import FrameAccount
+from hvt_common.protocol.edge_words import STILL_WORDS, FrameAccount
 from hvt_common.protocol.messages import FailedPart, Info, Status
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS

@@ -15,8 +15,8 @@ import pytest
 import hvt_edge
 import hvt_ground
 from hvt_common.errors import FlightError, UserError
-from hvt_edge.library import pushed
-from hvt_edge.library.pushed import PushedEdge
+from hvt_edge import library
+from hvt_edge.library import PushedEdge
 from hvt_ground.events import Overlay
 from hvt_ground.library import Picture, Received, _Events
 from media.recorded_feed import drawn_frames
@@ -130,7 +130,7 @@ def test_what_is_wrong_is_raised_where_the_program_can_see_it(tmp_path, monkeypa
 
 def test_a_program_that_pushes_again_after_a_pause_is_sent_at_once(monkeypatch):
     """Its video would stay dark for up to eight seconds after it is there again, as after a camera that is gone."""
-    monkeypatch.setattr(pushed, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(library, "PATIENCE_S", 0.1)
     frames = [np.full((96, 128, 3), 40 * index, np.uint8) for index in range(4)]
     with hvt_edge.open(
         connect="tcp/127.0.0.1:9", wait="0s", method="M0", store="0", preset="ultrafast", fps="10"
@@ -176,7 +176,7 @@ gc.callbacks.append(lambda *_: time.sleep(0.5))  # Python's end takes longer tha
 """
 
 
-@pytest.mark.parametrize("library", ["hvt_edge.library.pushed", "hvt_ground.library"])
+@pytest.mark.parametrize("library", ["hvt_edge.library", "hvt_ground.library"])
 def test_a_program_ends_while_zenoh_calls(library):
     """Python ends a thread that comes back from a callback as it finalizes, and Zenoh's library aborts."""
     endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 import hvt_edge.cli
-from hvt_common.video.annex_b import nal_kind, nal_units, parameter_sets
-from hvt_common.video.hevc import BaseDecoder
+from hvt_common.video.hevc import BaseDecoder, nal_kind, nal_units, parameter_sets
 from hvt_ground.control import EdgeClient, RefusedError
 from media.clips import hard_pictures, smooth_pictures
 from media.hevc_camera import SIZE, packets_of, pictures_of, write_clip

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import errno
 import json
 import resource
 from functools import cache
@@ -241,21 +240,6 @@ def test_a_full_disk_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
             resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
         assert said == f"hvt-study: --out {out} cannot be written (File too large): name another"
     assert json.loads((out / "score.json").read_text())["pictures"] == 1
-
-
-def test_a_folder_that_this_user_may_not_read_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It said that --out cannot be written, where nothing is wrong with it."""
-    folder = draw(tmp_path / "set", moments=1)
-
-    def closed(path: Path) -> None:
-        raise PermissionError(errno.EACCES, "Permission denied", str(path))
-
-    monkeypatch.setattr(Path, "iterdir", closed)
-    said = sentence(capsys, folder, "--out", tmp_path / "out")
-    assert said.startswith(f"hvt-study: {folder}")
-    assert said.endswith("cannot be read (Permission denied): leave it out")
 
 
 def test_a_name_with_brackets_is_shown_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hvt_common.inference.heads.trial import anchor_count
+from hvt_common.inference.heads.choose import anchor_count
 from hvt_common.inference.runtimes.model import open_model
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, embedded_models
 from hvt_train.__main__ import main

@@ -8,7 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from hvt_common.video.annex_b import nal_kind, nal_units
+from hvt_common.video.hevc import nal_kind, nal_units
 from media.clips import smooth_pictures
 
 SIZE = (320, 192)

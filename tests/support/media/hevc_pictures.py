@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvt_common.video.still_codecs.bits import BitWriter, escaped
+from hvt_common.protocol.messages.bits import BitWriter, escaped
 
 _CHROMA_QP_OFFSET = 2
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from hvt_common.protocol.frame_account import FRAME_GROUPS, FrameAccount
+from hvt_common.protocol.edge_words import FRAME_GROUPS, FrameAccount
 
 START_S = 60.0
 """How long a process may take to get going on a busy machine."""

@@ -15,7 +15,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-from hvt_common.video.annex_b import PARAMETER_SETS, nal_kind, nal_units
+from hvt_common.video.hevc import PARAMETER_SETS, nal_kind, nal_units
 
 SIZE = (320, 240)
 _FPS = 25

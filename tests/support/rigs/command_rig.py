@@ -23,9 +23,8 @@ from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.registry import method
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Suppression
 from hvt_edge.stills.stage import StillSender
-from hvt_edge.stills.suppression import Suppression
 from media.base_coded import StandIn
 from media.clips import START_NS
 from rigs.flight import tracks_at

@@ -34,8 +34,8 @@ from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_bytes, minimum_bps
-from hvt_edge.video.encoders.contract import Encoder
-from hvt_edge.video.frame_skip import LimitedFrameSkip
+from hvt_edge.video.encoders.registry import Encoder
+from hvt_edge.video.rate_model import LimitedFrameSkip
 from hvt_edge.wiring.link import make_budget, make_pacer
 from hvt_edge.wiring.video import first_decimation, make_encoder, make_frame_skip
 from rigs.kept import INFO
@@ -332,10 +332,16 @@ class LiveFlight:
         sender = self.transmitter
         if self.track_bytes:
             self._each(
-                SECOND_NS // 3, lambda: sender.tracks(lambda _: bytes(self.track_bytes), now_ns=self.now_ns)
+                SECOND_NS // 3,
+                lambda: sender.metadata(
+                    Channel.TRACKS, lambda _: bytes(self.track_bytes), now_ns=self.now_ns
+                ),
             )
         if self.pose_bytes:
-            self._each(SECOND_NS, lambda: sender.pose(lambda _: bytes(self.pose_bytes), now_ns=self.now_ns))
+            self._each(
+                SECOND_NS,
+                lambda: sender.metadata(Channel.POSE, lambda _: bytes(self.pose_bytes), now_ns=self.now_ns),
+            )
         self._each(_REPORT_NS, self._report)
         status_ns = _START_NS
         for bps, second in ((bps, second) for second, bps in self.commands):

@@ -27,7 +27,7 @@ from hvt_common.protocol.messages import (
     TrackStep,
 )
 from hvt_common.protocol.messages.fields import I63, U32, U64
-from hvt_edge.link.receivers import Report
+from hvt_edge.link.feedback import Report
 
 BASE = BaseHeader(
     session_id=0x1234567890ABCDEF,

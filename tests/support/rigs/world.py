@@ -23,9 +23,8 @@ from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.registry import method
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Suppression
 from hvt_edge.stills.stage import StillSender, StillStage
-from hvt_edge.stills.suppression import Suppression
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.wiring.video import make_encoder, reconfiguration_settings

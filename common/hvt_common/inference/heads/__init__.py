@@ -1,5 +1,5 @@
 """Heads read the outputs of detector networks: others use `choose`, `contract`; the extra `hvt_models` has most.
 
-`trial` holds what a network answered to a few pictures, `kind` the marks of a head, `decode` how its numbers become
-boxes.
+`choose` holds what a network answered to a few pictures, and the marks of a head and of the embedded detector's in
+it, `contract` how its numbers become boxes.
 """

@@ -2,11 +2,238 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
 from hvt_common.errors import UserError
-from hvt_common.inference.heads.contract import Head
-from hvt_common.inference.heads.kind import YOLOX, Kind, Match
-from hvt_common.inference.heads.trial import Trial
+from hvt_common.inference.heads.contract import (
+    MOST_RELATIVE,
+    Array,
+    Decoder,
+    Head,
+    YoloxCells,
+    cell_grid,
+    rows_of,
+)
+from hvt_common.inference.letterbox import Anchor, Preparation
 from hvt_common.inference.store import MISSING, library_part, needed_part
+
+if TYPE_CHECKING:  # the runtimes take a while to import, and a list of heads needs none
+    from hvt_common.inference.runtimes.model import Port
+
+_BLOCK_PX = 32
+_PADDING = -1
+_SCORE, _ANGLE = 0.05, 0.2
+"""On a grey picture the mean over all cells of a class is below the one, that of an angle above the other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """The answers of one network to `trial_pictures`."""
+
+    ports: Sequence[Port]
+    """Its outputs."""
+    runs: Sequence[Sequence[npt.NDArray[Any]]]
+    """For each picture, the outputs in the order of ``ports``."""
+    tops: Sequence[int]
+    """For each picture, its greatest value: 1 or 255; 0 if that says nothing."""
+    size: tuple[int, int]
+    """(width, height) of the network's input in the trial."""
+    metadata: Mapping[str, str]
+    names: int | None
+    """How many class names are known, from the metadata or a file of labels."""
+
+    def up_to(self, top: int) -> Trial:
+        """Without the pictures in the other range: there a network may say anything."""
+        these = [index for index, one in enumerate(self.tops) if one in (0, top)]
+        return replace(self, runs=[self.runs[i] for i in these], tops=[self.tops[i] for i in these])
+
+    def shape(self, index: int) -> tuple[int, ...]:
+        """The shape of an output for the first picture."""
+        return tuple(self.runs[0][index].shape)
+
+    def table(self, index: int) -> Array:
+        """(N, K) rows of an output of all pictures: its last axis, whatever stands before it."""
+        return np.concatenate(
+            [run[index].astype(np.float32).reshape(-1, run[index].shape[-1]) for run in self.runs]
+        )
+
+    def numbers(self, index: int) -> Array:
+        """(N,) all numbers of an output of all pictures."""
+        return np.concatenate([run[index].astype(np.float32).ravel() for run in self.runs])
+
+    def named(self, *words: str) -> tuple[int, ...]:
+        """The one output whose name is, or has, each word, in their order; () where one has none, or several."""
+        names = [port.name.lower().partition(":")[0] for port in self.ports]
+        found = [
+            [index for index, name in enumerate(names) if name == word]
+            or [index for index, name in enumerate(names) if word in name]
+            for word in words
+        ]
+        return tuple(one[0] for one in found) if all(len(one) == 1 for one in found) else ()
+
+    def whole(self, index: int) -> bool:
+        """Whether an output has whole numbers by its type."""
+        dtype = self.ports[index].dtype
+        return dtype is not None and bool(np.issubdtype(dtype, np.integer))
+
+    def has_angles(self, index: int, first: int, *, transposed: bool = False) -> bool:
+        """Whether the last column is no class as those from ``first`` on: on grey it alone has numbers."""
+        grey = self.runs[0][index].astype(np.float32).reshape(self.runs[0][index].shape[-2:])
+        means = (grey.T if transposed else grey)[:, first:].mean(axis=0)
+        return bool(len(means) > 1 and means[-1] > _ANGLE > _SCORE > means[:-1].max())
+
+    def relative(self, boxes: Array) -> bool:
+        """Whether there are boxes, and all are shares of the input."""
+        size = float(np.abs(boxes).max(initial=0))
+        return 0 < size <= MOST_RELATIVE
+
+
+def trial_pictures(size: tuple[int, int], dtype: np.dtype[Any]) -> list[tuple[npt.NDArray[Any], int]]:
+    """(1, 3, height, width) inputs: grey, and coloured blocks in both ranges that networks take, 0…1 and 0…255.
+
+    Each comes with its top, as of `Trial`. Grey alone says too little: a network that lists objects lists none there.
+    """
+    width, height = size
+    grid = np.random.default_rng(0).integers(0, 2, (3, -(-height // _BLOCK_PX), -(-width // _BLOCK_PX)))
+    blocks = grid.repeat(_BLOCK_PX, axis=1).repeat(_BLOCK_PX, axis=2)[None, :, :height, :width]
+    if dtype == np.uint8:
+        return [(np.full(blocks.shape, 114, dtype), 0), ((blocks * 255).astype(dtype), 0)]
+    grey = np.full(blocks.shape, 0.5, dtype)
+    return [(grey, 0), (blocks.astype(dtype), 1), ((blocks * 255).astype(dtype), 255)]
+
+
+def anchor_count(input_size: tuple[int, int], strides: Sequence[int]) -> int:
+    """Number of cells of all strides on an input of (width, height) pixels."""
+    return sum((input_size[0] // stride) * (input_size[1] // stride) for stride in strides)
+
+
+def are_probabilities(scores: Array) -> bool:
+    """Whether all lie in 0…1, give or take the rounding of half precision."""
+    return bool(np.isfinite(scores).all() and ((scores >= -0.01) & (scores <= 1.01)).all())
+
+
+def are_scores(numbers: Array) -> bool:
+    """Whether they are probabilities, or -1 as behind the end of a list."""
+    return are_probabilities(numbers[numbers != _PADDING])
+
+
+def are_whole(numbers: Array) -> bool:
+    """Whether all are whole numbers from -1 on, as classes are, and the padding behind them."""
+    return bool(
+        np.isfinite(numbers).all()
+        and (numbers >= -1.001).all()
+        and (abs(numbers - numbers.round()) < 1e-3).all()
+    )
+
+
+STRIDES: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32), (16, 32))
+YOLOX_STRIDES: tuple[tuple[int, ...], ...] = (*STRIDES[:2], (8, 16, 32, 12, 24, 48))
+LEAST_COLUMNS = 5
+BGR_255 = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """The outputs have the shape of a head."""
+
+    outputs: tuple[int, ...]
+    classes: int | None
+    decoder: Decoder
+    proof: str | None
+    """The evidence that excludes all other heads; None if the shape alone fits."""
+    possible: bool = True
+    """False where the values speak against it, and only the user can know better."""
+    by_name: bool = False
+    """The names of its outputs tell it, whatever other outputs there are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One head by its name, with the marks by which a network's outputs are known for it.
+
+    It *fits* where the outputs have its shape. It is *proven* where the values of the trial, the names of the outputs
+    or the number of class names leave no other: then `Match.proof` says what. With ``--head`` a fit is enough. In the
+    shapes A is the number of cells of all strides, which no number of classes or objects equals by accident.
+    """
+
+    text: str
+    """Whose it is, and the shape of its outputs."""
+    match: Callable[[Trial], Match | None]
+    anchor: Anchor
+    preparation: Preparation
+    suppresses: bool = True
+
+    def fits(self, trial: Trial) -> Match | None:
+        """Whether the outputs have its shape, judged by the pictures in the range of its pixels."""
+        return self.match(trial.up_to(255 if self.preparation.scale[0] == 1 else 1))
+
+    def head(self, name: str, match: Match, why: str) -> Head:
+        """The head that a match means."""
+        return Head(
+            name,
+            match.classes,
+            match.outputs,
+            self.anchor,
+            self.preparation,
+            self.suppresses,
+            match.decoder,
+            why,
+        )
+
+
+def tables(trial: Trial, columns: int | None = None) -> list[int]:
+    """Outputs (1, N, K), or (N, K) with so many columns."""
+    return [
+        index
+        for index in range(len(trial.ports))
+        for shape in [trial.shape(index)]
+        if (len(shape) == 3 and shape[0] == 1 and columns in (None, shape[2]))
+        or (len(shape) == 2 and columns is not None and shape[1] == columns)
+    ]
+
+
+def of_cells(
+    trial: Trial, strides: tuple[tuple[int, ...], ...] = STRIDES, *, times: int = 1
+) -> list[tuple[int, tuple[int, ...]]]:
+    """Outputs (1, A, K) with a row for each cell, and the strides of the cells."""
+    return [
+        (index, one)
+        for index in tables(trial)
+        for one in strides
+        if trial.shape(index)[1] == times * anchor_count(trial.size, one)
+        and trial.shape(index)[2] >= LEAST_COLUMNS
+    ]
+
+
+def is_raw(trial: Trial, index: int, strides: tuple[int, ...]) -> bool:
+    """Whether centres lie nearer to zero, counted in cells, than to their cells in pixels."""
+    grid, stride = cell_grid(trial.size, strides)
+    centres = rows_of(trial.runs[0][index].astype(np.float32))[:, :2]
+    if float(np.abs(centres).max(initial=0)) == 0:
+        return True
+    as_shares = np.abs(centres * np.array(trial.size, np.float32) / stride - grid - 0.5).mean()
+    as_pixels = np.abs(centres / stride - grid - 0.5).mean()
+    return bool(np.abs(centres).mean() <= min(as_shares, as_pixels))
+
+
+def _yolox(trial: Trial) -> Match | None:
+    for index, strides in of_cells(trial, YOLOX_STRIDES):
+        classes = trial.shape(index)[2] - 5
+        if classes < 1 or not are_probabilities(trial.table(index)[:, 4:]):
+            continue
+        raw = is_raw(trial, index, strides)
+        proof = "a row a cell, x and y counted from it" if raw else None
+        return Match((index,), classes, YoloxCells(strides), proof, possible=raw)
+    return None
+
+
+YOLOX = Kind("YOLOX, raw: (1, A, 5+C)", _yolox, "top-left", BGR_255)
+
 
 HEAD_NAMES = (
     "yolox",

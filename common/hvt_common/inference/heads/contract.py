@@ -1,16 +1,19 @@
-"""The contract of a head: which outputs it reads, how it wants its pixels, and boxes."""
+"""The contract of a head: which outputs it reads, how it wants its pixels, and the steps from its numbers to boxes.
+
+No form trusts a number: what is not finite, has no area, is no probability or names no class is left out. Raw YOLOX
+is here, as the embedded detector writes it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.inference.letterbox import Anchor
-from hvt_common.inference.preparation import Preparation
+from hvt_common.inference.letterbox import Anchor, Preparation
 from hvt_common.values import Boxes
 
 Array = npt.NDArray[np.float32]
@@ -61,3 +64,84 @@ class Head:
         """Decode all outputs of one run into boxes of at least this confidence."""
         used = [outputs[index].astype(np.float32, copy=False) for index in self.outputs]
         return self.decoder(used, confidence=confidence, input_size=input_size)
+
+
+MOST_RELATIVE = 1.5
+"""Boxes up to here are shares of the input: those of networks end at 1, or a little beyond."""
+
+Form = Literal["centre", "corners", "corners-yx"]
+"""Centre x, y, width, height; x1 y1 x2 y2; or y1 x1 y2 x2 as TensorFlow writes it."""
+
+_MAX_LOG_SIZE = 20.0  # e^20 strides: far outside every image, and still finite in float32
+_MOST_CLASSES = 1e6
+
+
+class YoloxCells:
+    """(1, A, 5+C): x, y relative to the cell and log w, log h in strides; objectness; scores.
+
+    ``strides`` are cell sizes in input pixels, in the order of the output.
+    """
+
+    def __init__(self, strides: tuple[int, ...]) -> None:
+        self._strides = strides
+        self._grid_size = (0, 0)
+        self._grid: Array
+        self._stride: Array
+
+    def __call__(
+        self, outputs: Sequence[Array], *, confidence: float, input_size: tuple[int, int]
+    ) -> HeadOutput:
+        """Score is objectness times the best class score."""
+        if self._grid_size != input_size:
+            self._grid, self._stride = cell_grid(input_size, self._strides)
+            self._grid_size = input_size
+        table = rows_of(outputs[0])
+        rows = np.flatnonzero(table[:, 4] >= confidence)
+        picked, grid, stride = table[rows], self._grid[rows], self._stride[rows]
+        scores, class_ids = best(picked[:, 5:], picked[:, 4])
+        centres = (picked[:, :2] + grid) * stride
+        sides = np.exp(np.minimum(picked[:, 2:4], _MAX_LOG_SIZE)) * stride
+        boxes = corners(np.hstack([centres, sides]), "centre")
+        return valid(boxes, scores, class_ids, confidence)
+
+
+def rows_of(output: Array) -> Array:
+    """(N, K) of (1, N, K) or (N, K)."""
+    return output[0] if output.ndim == 3 else output
+
+
+def cell_grid(input_size: tuple[int, int], strides: Sequence[int]) -> tuple[Array, Array]:
+    """(A, 2) cell indices x, y and (A, 1) strides in the order of the output: stride by stride, row by row."""
+    grids, sizes = [], []
+    for stride in strides:
+        rows, columns = np.indices((input_size[1] // stride, input_size[0] // stride), np.float32)
+        grids.append(np.stack([columns.ravel(), rows.ravel()], axis=1))
+        sizes.append(np.full((columns.size, 1), stride, np.float32))
+    return np.concatenate(grids), np.concatenate(sizes)
+
+
+def best(scores: Array, objectness: Array | None) -> tuple[Array, npt.NDArray[np.intp]]:
+    """(N,) best score of each row, times objectness, and (N,) its class."""
+    class_ids = scores.argmax(axis=1) if scores.shape[1] else np.zeros(len(scores), np.intp)
+    best = scores[np.arange(len(scores)), class_ids]
+    return (best if objectness is None else best * objectness), class_ids
+
+
+def corners(boxes: Array, form: Form) -> Boxes:
+    """(N, 4) x1 y1 x2 y2 of boxes in that form."""
+    if form == "centre":
+        half = boxes[:, 2:] / 2
+        return np.concatenate([boxes[:, :2] - half, boxes[:, :2] + half], axis=1)
+    return boxes[:, [1, 0, 3, 2]] if form == "corners-yx" else boxes
+
+
+def valid(boxes: Boxes, scores: Array, class_ids: npt.NDArray[Any], confidence: float) -> HeadOutput:
+    """Without boxes that are not finite, have no area or too little confidence; a broken number is no detection."""
+    valid = np.isfinite(boxes).all(axis=1) & (scores >= confidence) & (scores <= 1.01)
+    valid &= np.isfinite(class_ids) & (class_ids >= 0) & (class_ids < _MOST_CLASSES)
+    valid &= (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+    return HeadOutput(
+        boxes[valid].astype(np.float32, copy=False),
+        np.minimum(scores[valid], np.float32(1)),
+        np.rint(class_ids[valid]).astype(np.int32),
+    )

@@ -23,8 +23,13 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.inference.runtimes.ir_file import ir_metadata, is_ir
-from hvt_common.inference.runtimes.onnx_file import check_onnx_file, onnx_version, opset_versions
+from hvt_common.inference.runtimes.model_file import (
+    check_onnx_file,
+    ir_metadata,
+    is_ir,
+    onnx_version,
+    opset_versions,
+)
 from hvt_common.inference.runtimes.providers import (
     ONNXRUNTIME_PROVIDERS,
     OpenVinoCpu,

@@ -1,6 +1,6 @@
 """Every message of HVT as bytes, and back. docs/wire.md is the same for people of other languages.
 
-Who makes vectors of them reaches into `envelope`, `fields`, `exp_golomb`, `range_coder` and `track_boxes`.
+Who makes vectors of them reaches into `envelope`, `fields`, `bits`, `range_coder` and `track_boxes`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,6 @@ from hvt_common.protocol.messages.envelope import (
     PackedMessage,
     UnknownVersionError,
     kinds,
-    wire_version,
 )
 from hvt_common.protocol.messages.fields import WireError, fitted_text
 from hvt_common.protocol.messages.pose_report import PoseDecoder, PoseEncoder, PoseReport

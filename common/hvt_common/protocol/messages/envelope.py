@@ -190,19 +190,19 @@ def _packed(value: Any) -> bytes:
 
 def _unpack(data: bytes, name: str) -> list[Any]:
     # The array in ``data``, its version not checked. Sizes inside are bounded by the length of ``data`` itself.
-    try:
-        array = unpacked(data)
-    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
-        reason = str(error).strip() or type(error).__name__
-        raise WireError(f"{name} is not MessagePack: {reason:.80}") from None
+    array = unpacked(data, name)
     if type(array) is not list or not array or type(array[0]) is not int:
         raise WireError(f"{name} is not an array that begins with a version")
     return array
 
 
-def unpacked(data: bytes) -> Any:
-    """MessagePack of one value without extensions, each key of a map once; ValueError and its like for all else."""
-    return msgpack.unpackb(data, strict_map_key=True, max_ext_len=0, object_pairs_hook=_once)
+def unpacked(data: bytes, name: str) -> Any:
+    """MessagePack of one value without extensions, each key of a map once; `WireError` for all else."""
+    try:
+        return msgpack.unpackb(data, strict_map_key=True, max_ext_len=0, object_pairs_hook=_once)
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        reason = str(error).strip() or type(error).__name__
+        raise WireError(f"{name} is not MessagePack: {reason:.80}") from None
 
 
 def _once(pairs: list[tuple[str | bytes, Any]]) -> dict[str, Any]:
@@ -212,12 +212,6 @@ def _once(pairs: list[tuple[str | bytes, Any]]) -> dict[str, Any]:
     if any(type(key) is not str for key in found):
         raise ValueError("a map has a key that is no text")
     return found  # type: ignore[return-value]
-
-
-def wire_version(data: bytes) -> int:
-    """The schema version of a message whose bytes `Message.parse` has accepted."""
-    version: int = _unpack(data, "message")[0]
-    return version
 
 
 def from_values(message: type[_T], values: list[Any], version: int = WIRE_VERSION) -> _T:

@@ -306,9 +306,7 @@ class Box(TupleOf):
     empty: bool = True
 
     def decode(self, raw: Any) -> Any:
-        items = self._items(raw, self.length)
-        if len(items) != self.length:
-            raise WireError(f"{len(items)} numbers in place of {self.length}")
+        items = TupleOf.decode(self, raw)
         x1, y1, x2, y2 = items
         if x2 < x1 or y2 < y1:
             raise WireError(f"box {items} is inside out")
@@ -317,14 +315,7 @@ class Box(TupleOf):
         return items
 
     def schema(self) -> dict[str, Any]:
-        of = self.inner.schema()
-        return {
-            "type": "array",
-            "least": 4,
-            "most": 4,
-            "of": of,
-            "box": "may be empty" if self.empty else "never empty",
-        }
+        return TupleOf.schema(self) | {"box": "may be empty" if self.empty else "never empty"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
+from hvt_common.protocol.messages.bits import BitReader, BitWriter
 from hvt_common.protocol.messages.envelope import Message
-from hvt_common.protocol.messages.exp_golomb import BitReader, BitWriter
 from hvt_common.protocol.messages.fields import I63, U32, Blob, Int, WireError, wire_field
 from hvt_common.values import Orientation, Pose
 
@@ -190,7 +190,7 @@ class PoseDecoder:
         if report.coding != 1:
             raise WireError(f"a pose of coding {report.coding}, which is not known here")
         bits = BitReader(report.coded)
-        alone, number = bits.plain(1), bits.plain(4)
+        alone, number = bits.u(1), bits.u(4)
         step: tuple[int, ...] = (0, 0)
         if alone:
             sample = _read_whole(bits)
@@ -204,23 +204,20 @@ class PoseDecoder:
 
 
 def _whole(sample: _Sample, number: int) -> bytes:
-    out = BitWriter()
-    out.plain(1, 1)
-    out.plain(number, 4)
-    out.plain(sample.time_ms, _TIME_BITS)
+    out = BitWriter().u(1, 1).u(number, 4).u(sample.time_ms, _TIME_BITS)
     for there in sample.presence:
-        out.plain(int(there), 1)
+        out.u(int(there), 1)
     for kinds, values in zip(_GROUPS, (sample.place, *sample.parts, sample.errors), strict=True):
         for kind, value in zip(kinds, values or (), strict=False):
-            out.plain(value - kind.low, kind.bits)
-    return out.finish()
+            out.u(value - kind.low, kind.bits)
+    return out.ended(stop="")
 
 
 def _read_whole(bits: BitReader) -> _Sample:
-    time_ms = bits.plain(_TIME_BITS)
-    presence = [bool(bits.plain(1)) for _ in _PARTS]
+    time_ms = bits.u(_TIME_BITS)
+    presence = [bool(bits.u(1)) for _ in _PARTS]
     place, *parts, errors = (
-        tuple(kind.checked(bits.plain(kind.bits) + kind.low) for kind in kinds) if there else None
+        tuple(kind.checked(bits.u(kind.bits) + kind.low) for kind in kinds) if there else None
         for kinds, there in zip(_GROUPS, (True, *presence, True), strict=True)
     )
     assert place is not None, "only parts may be missing"
@@ -232,36 +229,34 @@ def _changes(
     sample: _Sample, number: int, *, last: _Sample, step: tuple[int, ...]
 ) -> tuple[bytes, tuple[int, ...]]:
     # The changes, as bytes; and the place's step, which the next report builds on.
-    out = BitWriter()
-    out.plain(0, 1)
-    out.plain(number, 4)
-    out.signed(sample.time_ms - last.time_ms - _ONE_SECOND_MS, _TIME_ORDER)
+    out = BitWriter().u(0, 1).u(number, 4)
+    out.se(sample.time_ms - last.time_ms - _ONE_SECOND_MS, _TIME_ORDER)
     stepped = tuple(
         kind.change(old, new) for kind, old, new in zip(_PLACE, last.place, sample.place, strict=True)
     )
     for kind, new, old in zip(_PLACE, stepped, step, strict=True):
-        out.signed(new - old, kind.order)
+        out.se(new - old, kind.order)
     for kinds, before, after in zip(
         _GROUPS[1:], (*last.parts, last.errors), (*sample.parts, sample.errors), strict=True
     ):
         for kind, old, new in zip(kinds, before or (), after or (), strict=False):
-            out.signed(kind.change(old, new), kind.order)
-    return out.finish(), stepped
+            out.se(kind.change(old, new), kind.order)
+    return out.ended(stop=""), stepped
 
 
 def _read_changes(
     bits: BitReader, *, last: _Sample, step: tuple[int, ...]
 ) -> tuple[_Sample, tuple[int, ...]]:
-    time_ms = last.time_ms + _ONE_SECOND_MS + bits.signed(_TIME_ORDER)
+    time_ms = last.time_ms + _ONE_SECOND_MS + bits.se(_TIME_ORDER)
     if not last.time_ms < time_ms < 1 << _TIME_BITS:
         raise WireError(f"a pose at {time_ms} ms follows one at {last.time_ms} ms")
-    stepped = tuple(old + bits.signed(kind.order) for kind, old in zip(_PLACE, step, strict=True))
+    stepped = tuple(old + bits.se(kind.order) for kind, old in zip(_PLACE, step, strict=True))
     place = tuple(
         kind.changed(old, change) for kind, old, change in zip(_PLACE, last.place, stepped, strict=True)
     )
     *parts, errors = (
         before
-        and tuple(kind.changed(old, bits.signed(kind.order)) for kind, old in zip(kinds, before, strict=True))
+        and tuple(kind.changed(old, bits.se(kind.order)) for kind, old in zip(kinds, before, strict=True))
         for kinds, before in zip(_GROUPS[1:], (*last.parts, last.errors), strict=True)
     )
     assert errors is not None, "only parts may be missing"

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from hvt_common.protocol.frame_account import FrameAccount
+from hvt_common.protocol.edge_words import FrameAccount
 from hvt_common.protocol.ledger import MOST_WINDOW_NS
 from hvt_common.protocol.messages.envelope import WIRE_VERSION, Message, Nested
 from hvt_common.protocol.messages.fields import (

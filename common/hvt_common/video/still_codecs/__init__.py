@@ -1,7 +1,7 @@
 """Still codecs behind one small contract (`contract.py`); docs/stills.md has the table of them.
 
-Those that no profile uses are the extra `hvt_codecs`. Who makes vectors of stills reaches into `av_still`,
-`h264_intra`, `h264_syntax` and `yuv420`; codecs reach into `contract`, `cv_still` and `bits`.
+Those that no profile uses are the extra `hvt_codecs`. Who makes vectors of stills reaches into
+`h264_intra`, `h264_syntax` and `yuv420`; codecs reach into `contract`.
 """
 
 from hvt_common.video.still_codecs.contract import (

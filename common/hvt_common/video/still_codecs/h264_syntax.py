@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hvt_common.video.annex_b import nal_units
-from hvt_common.video.still_codecs.bits import BitReader, BitWriter, escaped, unescaped
+from hvt_common.protocol.messages.bits import BitReader, BitWriter, escaped, unescaped
+from hvt_common.video.hevc import nal_units
 from hvt_common.video.still_codecs.yuv420 import BLOCK_PX, Planar
 
 CHROMA_QP_OFFSET = 4

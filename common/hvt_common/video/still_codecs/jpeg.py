@@ -7,8 +7,7 @@ import re
 import cv2
 
 from hvt_common.values import Image
-from hvt_common.video.still_codecs.contract import IntraCodec, StillError
-from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded
+from hvt_common.video.still_codecs.contract import IntraCodec, StillError, imdecoded, imencoded
 
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
 # Baseline and extended sequential Huffman. Progressive (C2) is refused: every scan runs over the whole picture, so

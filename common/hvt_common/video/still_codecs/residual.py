@@ -17,7 +17,6 @@ import zlib
 import numpy as np
 
 from hvt_common.values import Image
-from hvt_common.video.still_codecs.av_still import decoded, encoded
 from hvt_common.video.still_codecs.contract import (
     NO_PARAMETERS,
     BaseMissingError,
@@ -25,7 +24,7 @@ from hvt_common.video.still_codecs.contract import (
     Parameters,
     qp_of,
 )
-from hvt_common.video.still_codecs.h264_intra import split_payload, x264_options
+from hvt_common.video.still_codecs.h264_intra import decoded, encoded, split_payload, x264_options
 from hvt_common.video.still_codecs.h264_syntax import (
     cabac_data,
     coded_slice,

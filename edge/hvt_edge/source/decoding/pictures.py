@@ -1,21 +1,22 @@
-"""Decoded frames as a player shows them: deinterlaced, of square pixels, upright, in their colours."""
+"""Decoded frames as a player shows them: deinterlaced, of square pixels, upright, in their colours, heat as grey."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from typing import Any
 
 import av
 import av.error
 import numpy as np
+import numpy.typing as npt
 from av.filter import Graph
 from av.sidedata.sidedata import SideDataContainer
 from av.video.reformatter import ColorPrimaries, Colorspace, ColorTrc, Interpolation, VideoReformatter
 
 from hvt_common.values import Image
-from hvt_edge.source.decoding.levels import Stretch
-from hvt_edge.source.decoding.notes import Notes
+from hvt_edge.source.contract import Notes
 
 _UNTAGGED_SD_PX = 576
 """A picture that says no colour matrix is BT.601 with at most so many lines, else BT.709: as players take it."""
@@ -189,3 +190,62 @@ def _turned(picture: Image, turn: _Turn) -> Image:
     swap, mirror, flip = turn
     turned = np.swapaxes(picture, 0, 1) if swap else picture
     return turned[:: -1 if flip else 1, :: -1 if mirror else 1]
+
+
+_LOW_PCT, _HIGH_PCT = 0.5, 99.5
+_LEAST_SPAN = 64
+"""Sensor levels: a wall of one temperature is not to become noise from black to white."""
+_LEAST_DEGREES = 1.0
+"""The same of floating-point pictures, which are in degrees, or from 0 to 1."""
+_SETTLING_S = 3.0
+"""A warm body that comes in must not darken all else at once."""
+_LONGEST_S = 1.0
+_EACH = 4
+"""Each fourth pixel of each fourth row says enough."""
+
+
+class Stretch:
+    """A sensor's levels as eight bits: between their percentiles 0.5 and 99.5.
+
+    These follow the scene with a time constant of three seconds.
+
+    ``note`` is told the first levels.
+    """
+
+    def __init__(self, note: Callable[[str], None]) -> None:
+        self._note = note
+        self._range: tuple[float, float] | None = None
+        self._at_s = 0.0
+
+    def bgr(self, levels: npt.NDArray[Any], *, at_s: float, bits: int = 0) -> Image:
+        """(height, width) numbers as (height, width, 3) uint8; ``at_s`` is the picture's time in seconds.
+
+        What is not finite, as where a sensor saw nothing, is black. ``bits`` are those of the source, where the array
+        has more.
+        """
+        first, bits = self._range is None, bits or 8 * levels.itemsize
+        least: float = _LEAST_SPAN
+        if np.issubdtype(levels.dtype, np.floating):
+            seen = np.isfinite(levels)
+            levels = np.where(seen, levels, levels[seen].min() if seen.any() else 0)
+            least = _LEAST_DEGREES
+        low, high = self._settle(np.percentile(levels[::_EACH, ::_EACH], (_LOW_PCT, _HIGH_PCT)), at_s)
+        missing = max(0.0, least - (high - low)) / 2
+        low, high = low - missing, high + missing
+        if first:
+            self._note(
+                f"its {bits}-bit grey is a sensor's: levels {low:.5g} to {high:.5g} are stretched to black and "
+                f"white, the percentiles {_LOW_PCT} and {_HIGH_PCT}, which follow the scene slowly"
+            )
+        scaled = (levels.astype(np.float32) - np.float32(low)) * np.float32(255 / (high - low))
+        return np.repeat(np.clip(np.rint(scaled), 0, 255).astype(np.uint8)[:, :, None], 3, axis=2)
+
+    def _settle(self, found: npt.NDArray[np.float64], at_s: float) -> tuple[float, float]:
+        passed_s = min(_LONGEST_S, max(0.0, at_s - self._at_s))
+        self._at_s = at_s
+        if self._range is None:
+            self._range = float(found[0]), float(found[1])
+        share = 1 - math.exp(-passed_s / _SETTLING_S)
+        low, high = (old + share * (float(new) - old) for old, new in zip(self._range, found, strict=True))
+        self._range = low, high
+        return low, high

@@ -1,6 +1,5 @@
-"""Encoders beside x265: `registry` opens one by its name, `qualification` tries it at the start of a flight.
+"""Encoders beside x265: `registry` has their contract and names, `qualification` tries one before a flight.
 
-The `contract` is x265's own, and checks every unit of others. `hardware` has those of FFmpeg, a row of `registry`
-each. `passthrough` has none: it measures a camera that makes HEVC itself, and `camera_rates` sees
-that its units have room.
+`hardware` has those of FFmpeg, a row of `registry` each. `passthrough` has none: it measures a camera that makes HEVC
+itself, before the flight and in it, and sees that its units have room.
 """

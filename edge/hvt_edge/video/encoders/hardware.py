@@ -13,9 +13,8 @@ from av.video.reformatter import VideoReformatter
 from hvt_common.errors import UserError
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.encoders.contract import HardwareRow
-from hvt_edge.video.regions import Region
-from hvt_edge.video.x265 import encoder_context, mean_qp_of, yuv_picture
+from hvt_edge.video.encoders.registry import HardwareRow
+from hvt_edge.video.x265 import Region, encoder_context, mean_qp_of, yuv_picture
 
 _BT709, _LIMITED = 1, 1
 """Of ITU-T H.273, and of FFmpeg's AVColorRange."""

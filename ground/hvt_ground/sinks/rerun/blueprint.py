@@ -130,7 +130,7 @@ def session_chunk(title: str, facts: Mapping[str, str]) -> Chunk:
 
 
 def class_chunk(path: str, class_ids: Mapping[tuple[str, int], int]) -> Chunk:
-    """Names and colours of classes at levels of `BRIGHTNESS` for the boxes of ``path``; what is doubted has none.
+    """Names and colours of classes at levels of `BRIGHTNESS` for the boxes of ``path``.
 
     Written again when a class is new; the last one holds for the whole recording, so ids must not change.
     """
@@ -138,11 +138,7 @@ def class_chunk(path: str, class_ids: Mapping[tuple[str, int], int]) -> Chunk:
         path,
         rr.AnnotationContext(
             [
-                rr.AnnotationInfo(
-                    number,
-                    name,
-                    dimmed(GREY if path == DOUBTED else class_colour(name), share=BRIGHTNESS[level]),
-                )
+                rr.AnnotationInfo(number, name, dimmed(class_colour(name), share=BRIGHTNESS[level]))
                 for (name, level), number in class_ids.items()
             ]
         ),

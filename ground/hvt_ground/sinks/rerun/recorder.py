@@ -18,7 +18,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.units import bitrate_text
-from hvt_common.video.annex_b import parameter_sets
+from hvt_common.video.hevc import parameter_sets
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.contract import SinkWriter, is_stored
 from hvt_ground.sinks.palette import AMBER, GREY, VERMILLION, Rgb

@@ -17,7 +17,7 @@ from onnx import TensorProto, helper
 
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
-from hvt_common.inference.runtimes.onnx_file import MAX_MODEL_BYTES
+from hvt_common.inference.runtimes.model_file import MAX_MODEL_BYTES
 from hvt_common.runtime.process import with_lower_priority
 from media.onnx_models import colour_detector, constant_model
 

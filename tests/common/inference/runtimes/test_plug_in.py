@@ -11,7 +11,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector, warm_up
-from hvt_common.inference.scores import uncalibrated
+from hvt_common.inference.labels import uncalibrated
 from hvt_common.inference.tiles import tiled
 from hvt_models.command import main as models
 from hvt_study.cli import main as study

@@ -7,7 +7,7 @@ import pytest
 from hvt_common.units import SECOND_NS
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.operating import base_rate_bps
-from hvt_edge.video.encoders.camera_rates import FullestWindow, LeastLink, needed_bps
+from hvt_edge.video.encoders.passthrough import FullestWindow, LeastLink, needed_bps
 
 
 @pytest.mark.parametrize("share", [1.0, 0.85, 0.5])

@@ -16,7 +16,7 @@ import pytest
 import zenoh
 
 from hvt_common.errors import UserError
-from hvt_common.transport.rights import Rights
+from hvt_common.transport.link_doctor import Rights
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_fleet.link.certificate import KeyPair, TlsFiles

@@ -8,7 +8,7 @@ import pytest
 
 import hvt_ground.cli
 from hvt_archive.reading.recorded import read_recordings
-from hvt_common.video.annex_b import nal_units
+from hvt_common.video.hevc import nal_units
 from media.klv_reader import read_stream
 from rigs.drawn_flight import FRAMES, VIEW
 

@@ -18,8 +18,7 @@ from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose, View
-from hvt_common.video.annex_b import nal_units, parameter_sets
-from hvt_common.video.hevc import BaseDecoder
+from hvt_common.video.hevc import BaseDecoder, nal_units, parameter_sets
 from hvt_gateways.transport_stream.destination import Address, Addresses
 from hvt_gateways.transport_stream.stream import TransportStream, live_stream, stream_file
 from hvt_gateways.transport_stream.uas import Platform

@@ -20,9 +20,9 @@ from PIL import Image as Pillow
 
 from hvt_codecs.avif import av1_data, avif_file
 from hvt_common.protocol.messages import RoiHeader, WireError
+from hvt_common.protocol.messages.bits import BitWriter
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import StillError, still_codec, still_codec_names
-from hvt_common.video.still_codecs.bits import BitWriter
 from hvt_common.video.still_codecs.h264_syntax import parameter_sets
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder

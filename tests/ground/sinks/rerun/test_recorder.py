@@ -18,9 +18,8 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
-from hvt_ground.sinks.palette import GREY, class_colour
+from hvt_ground.sinks.palette import class_colour
 from hvt_ground.sinks.rerun import recorder as recorder_module
-from hvt_ground.sinks.rerun.blueprint import DOUBTED, REFINED, class_chunk
 from hvt_ground.sinks.rerun.live_view import LiveView, free_port, viewer_program
 from hvt_ground.sinks.rerun.overlays import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -534,15 +533,6 @@ def test_a_picture_fits_its_half_of_the_slot() -> None:
             assert right.x + size[0] * right.scale <= x2 + 0.01
             assert right.y >= y1 - 0.01
             assert right.y + size[1] * right.scale <= y2 + 0.01
-
-
-@pytest.mark.parametrize(("path", "colour"), [(REFINED, class_colour("bus")), (DOUBTED, GREY)])
-def test_what_is_doubted_has_no_class_s_colour(path: str, colour: tuple[int, int, int]) -> None:
-    """A planter that nobody takes for a bus would be blue as one, in the recording alone."""
-    (((one,),),) = class_chunk(path, {("bus", 2): 1}).to_record_batch().column(-1).to_pylist()
-    info = one["class_description"]["info"]
-    assert info["label"] == "bus", "what it would be is told to who asks"
-    assert [info["color"] >> shift & 255 for shift in (24, 16, 8)] == list(colour)
 
 
 def test_colours_tell_kinds_apart() -> None:
