@@ -80,7 +80,7 @@ class EdgePort:
         """Set while the edge's liveliness token is there."""
         self.used = threading.Event()
         """Set while there is more to this edge than messages under its name: a session that is open."""
-        self._unanswered = 0
+        self._unanswered = self._unusable = 0
         self._version_said = False
         self._session = session
         self._keys = EdgeKeys(edge)
@@ -120,7 +120,14 @@ class EdgePort:
                 self._say_version(error.between(f"edge {self.edge}", "this ground"))
                 return
             except WireError as error:
-                _log.warning("%s: its answer to info cannot be used: %s", self.edge, error)
+                self._unusable += 1
+                if self._unusable.bit_count() == 1:  # 1, 2, 4, 8 …: anybody may answer, as often as he likes
+                    _log.warning(
+                        "%s: its answer to info cannot be used (%d so far): %s",
+                        self.edge,
+                        self._unusable,
+                        error,
+                    )
                 return
             if info.session_id == session_id:
                 found.append((info, requested_ns, answered_ns))

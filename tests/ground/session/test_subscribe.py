@@ -148,6 +148,20 @@ def test_another_version_of_the_wire_is_said_once(link, caplog, version, said):
     assert warnings() == [said]
 
 
+def test_answers_that_are_none_do_not_fill_the_log(monkeypatch, caplog):
+    """Somebody who answers to info in an edge's name, a thousand times to each question, would fill the disk."""
+
+    def query_later(*_, on_answer, on_end, **__):
+        for _ in range(1000):
+            on_answer(b"nothing")
+        on_end()
+
+    monkeypatch.setattr("hvt_ground.session.edge_port.query_later", query_later)
+    port = EdgePort(None, "uav-1", clock=time.time_ns)  # type: ignore[arg-type]
+    assert port.query_info(7) is None
+    assert [record.args[1] for record in caplog.records] == [2**power for power in range(10)]
+
+
 def test_a_ground_says_which_stills_it_reads(link):
     """The edge would send what nobody here can show."""
     ground, outsider = link
