@@ -23,6 +23,8 @@ from typing import Self
 import zenoh
 
 from hvt_common.protocol.channels import GroupKeys
+from hvt_common.transport.inbox import TokenBucket
+from hvt_common.units import SECOND_NS
 
 _log = logging.getLogger(__name__)
 
@@ -34,6 +36,8 @@ _MOST_PAGE_BYTES = 512
 _ANSWER_S = 5.0
 _MOST_MEMBERS, _MOST_EDGES, _MOST_CLAIMS = 1024, 16384, 64
 """The last of one edge: tokens may be anybody's where there are no keys."""
+_BURST, _EVERY_NS = 60, SECOND_NS
+"""So many comings and goings are said at once, then one a second."""
 
 
 def owner_of(edge: str, members: Iterable[str]) -> str:
@@ -81,6 +85,7 @@ class GroundGroup:
         self._clock = clock
         self._began_s = clock()
         self._lock = threading.Lock()
+        self._lines = TokenBucket(burst=_BURST, every_ns=_EVERY_NS)
         self._members: set[str] = {self.member}
         self._claims: defaultdict[str, set[str]] = defaultdict(set)
         """By edge, the other members that claim it."""
@@ -212,6 +217,6 @@ class GroundGroup:
                 known.add(member)
             if edge is not None and not known:
                 del self._claims[edge]
-        if edge is None:
+        if edge is None and self._lines.take(round(self._clock() * SECOND_NS)):
             level = logging.INFO if there else logging.WARNING
             _log.log(level, "%s: %s %s", self.name, member, "takes part" if there else "is gone")

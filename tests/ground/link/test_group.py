@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from unittest.mock import MagicMock
 
 import pytest
 import zenoh
@@ -116,6 +117,18 @@ def test_a_page_is_asked_for_until_it_is_known(sessions):
         )
         for one in (*tokens, answers):
             one.undeclare()
+
+
+def test_who_comes_and_goes_without_end_does_not_fill_the_log(caplog):
+    """Anybody on an open link could fill the disk with the names of grounds that are none."""
+    caplog.set_level("INFO")
+    session = MagicMock()
+    GroundGroup(session, "north", member="base-a", clock=lambda: 1000.0)
+    on_token = session.liveliness().declare_subscriber.call_args.args[1]
+    for number in range(1000):
+        for kind in (zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE):
+            on_token(MagicMock(key_expr=GroupKeys("north").member(f"ghost-{number}"), kind=kind))
+    assert len(caplog.records) == 60
 
 
 def test_tokens_of_other_groups_and_nonsense_change_nothing(sessions):
