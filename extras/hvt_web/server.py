@@ -323,9 +323,15 @@ def _check_proxy(proxy: str, address: str, *, local: bool) -> None:
         raise UserError(f"--web-proxy {proxy!r} is not accepted: give a host, such as hvt.example.org")
 
 
+def _no_password() -> str:
+    # OpenSSL would wait for it at the terminal, for ever.
+    raise ssl.SSLError("the key is encrypted: a key without a password is needed")
+
+
 def _check_keys(certificate: Path, key: Path) -> None:
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:
-        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(certificate, key)
+        context.load_cert_chain(certificate, key, password=_no_password)
     except (OSError, ssl.SSLError) as error:
         raise UserError(
             f"--web cannot use the keys {certificate} and {key} ({error.strerror or error})"

@@ -15,6 +15,7 @@ from dataclasses import replace
 from itertools import count
 
 import pytest
+from cryptography.hazmat.primitives import serialization
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -257,6 +258,13 @@ def test_the_keys_of_the_link_encrypt_the_page(port, tmp_path, state_folder):
         connection.close()
     with pytest.raises(UserError, match="cannot use the keys"):
         WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=(tmp_path / "a", tmp_path / "b"))
+    plain = serialization.load_pem_private_key(keys[1].read_bytes(), password=None)
+    locked = serialization.BestAvailableEncryption(b"secret")
+    keys[1].write_bytes(
+        plain.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, locked)
+    )
+    with pytest.raises(UserError, match="the key is encrypted: a key without a password is needed"):
+        WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=keys)
 
 
 def test_a_viewer_commands_nothing(public, state_folder):
