@@ -13,8 +13,6 @@ from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
 from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
 from hvt_common.inference.store import embedded_models
 
-__all__ = ["main"]
-
 _PROGRAM = "python -m hvt_train"
 
 

@@ -17,17 +17,6 @@ from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import BASE_SIZE, HELD_OUT_SEED, Shot, coded, shoot
 
-__all__ = [
-    "CLEAN",
-    "DrawnResult",
-    "RealResult",
-    "average_precision",
-    "drawn_pictures",
-    "evaluate_drawn",
-    "evaluate_real",
-    "well_visible",
-]
-
 CLEAN = 0
 """The bitrate that stands for frames that were not coded."""
 _LEAST_VISIBLE = 0.3

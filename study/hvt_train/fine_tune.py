@@ -29,8 +29,6 @@ from hvt_train.pictures.pool import in_flight, save_picture, thin_kbps
 from hvt_train.pictures.real import HeldOut
 from hvt_train.pictures.views import ViewSettings
 
-__all__ = ["FineTuneSettings", "FineTuned", "fill_own", "fine_tune"]
-
 _CODED_SHARE = 0.65
 """Of the pictures that go through x265: what a detector on a thin base meets. The others stay as they are."""
 _PLAUSIBLE = (0.1, 10.0)

@@ -23,10 +23,7 @@ from onnx import compose, helper, numpy_helper, parser, version_converter
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES
 from hvt_common.inference.labels import metadata_labels
-from hvt_train.learning.halve import halve
-from hvt_train.learning.unfold import unfold_stem
-
-__all__ = ["PREFIX", "join"]
+from hvt_train.learning.halve import halve, unfold_stem
 
 PREFIX = "street_"
 """Of all names of YOLOX-nano's part."""

@@ -40,8 +40,6 @@ from hvt_train.pictures.pool import PoolPlan, fill_pool
 from hvt_train.pictures.real import HeldOut, fill_real, held_out_pictures
 from hvt_train.pictures.views import ViewSettings
 
-__all__ = ["run_recipe"]
-
 _VALIDATION = range(100, 104)
 """Held-out scenes by which the best weights are chosen; ``eval`` measures on others."""
 

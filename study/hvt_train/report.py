@@ -21,8 +21,6 @@ from hvt_train.evaluate import (
 )
 from hvt_train.pictures.crops import held_out_crops
 
-__all__ = ["EVALUATION_FIRST", "print_drawn", "print_real", "print_speed"]
-
 EVALUATION_FIRST = 200
 """First held-out scene of ``eval``; those from 0 on were looked at in development, 100 to 103 chose the weights."""
 

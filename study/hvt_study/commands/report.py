@@ -8,8 +8,7 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
 from hvt_study.commands.arguments import add_accounting
-from hvt_study.report.join import join_studies
-from hvt_study.report.write import write_report
+from hvt_study.report.write import join_studies, write_report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -18,8 +18,7 @@ from hvt_edge.video.encoder_settings import VBV_S, EncoderSettings, keyframe_flo
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.peers.dds_line import Line, header_bps
-from hvt_study.peers.dds_regions import Blocks, block_grid, pasted
-from hvt_study.peers.dds_request import RegionRequest
+from hvt_study.peers.dds_regions import Blocks, RegionRequest, block_grid, pasted
 from hvt_study.peers.dds_settings import DdsSettings
 
 _KEYFRAME_DEBT_S = 10

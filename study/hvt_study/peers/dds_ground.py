@@ -20,8 +20,14 @@ from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.peers.dds_edge import most_stored
 from hvt_study.peers.dds_line import Line
-from hvt_study.peers.dds_regions import Blocks, combined, pasted, requested_blocks, requested_boxes
-from hvt_study.peers.dds_request import RegionRequest
+from hvt_study.peers.dds_regions import (
+    Blocks,
+    RegionRequest,
+    combined,
+    pasted,
+    requested_blocks,
+    requested_boxes,
+)
 from hvt_study.peers.dds_settings import DdsSettings
 
 

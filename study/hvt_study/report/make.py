@@ -9,15 +9,15 @@ from hvt_study.report.answer import DECIDES, REFERENCES, answer, forests
 from hvt_study.report.data.arms import RunRow, Setting, counts, sequence_of, settings
 from hvt_study.report.data.captions import time_of
 from hvt_study.report.data.document import Part, Report, Section, Table
-from hvt_study.report.data.equal_quality import equal_quality
 from hvt_study.report.data.intervals import ENOUGH
-from hvt_study.report.data.pairs import pairs
+from hvt_study.report.data.pairs import equal_quality, pairs
 from hvt_study.report.example.choice import Example
 from hvt_study.report.figures.curve_figures import codec_figure, utility_figure
 from hvt_study.report.figures.example_figures import crop_pictures, timeline_figure
 from hvt_study.report.figures.pair_figures import equal_figures
 from hvt_study.report.tables.appendix_tables import failed_table, metrics_table
 from hvt_study.report.tables.arm_tables import (
+    matrix_table,
     named_table,
     pilot_table,
     proxy_table,
@@ -25,7 +25,6 @@ from hvt_study.report.tables.arm_tables import (
     size_table,
     spent_table,
 )
-from hvt_study.report.tables.matrix_table import matrix_table
 from hvt_study.report.tables.pair_tables import differences_table, equal_table
 from hvt_study.runs.spec import table_of
 

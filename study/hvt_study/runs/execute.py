@@ -17,11 +17,10 @@ from hvt_study.runs.columns import COLUMNS
 from hvt_study.runs.match_total import first_budget, match, within
 from hvt_study.runs.materials import Materials, open_materials
 from hvt_study.runs.methods import METHODS
-from hvt_study.runs.paths import located
 from hvt_study.runs.run_context import RunContext, open_run_context
 from hvt_study.runs.run_settings import dry_run_bps, edge_flags, flown, settings
 from hvt_study.runs.scoring import figures
-from hvt_study.runs.spec import RunSpec
+from hvt_study.runs.spec import RunSpec, located
 from hvt_study.runs.video_shape import VideoShape, competing_sizes, search_shape
 
 RunRow = dict[str, Any]

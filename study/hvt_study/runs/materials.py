@@ -23,10 +23,9 @@ from hvt_ground.config import DETECTOR, NONE
 from hvt_study.cache.cached_detector import CachedDetector
 from hvt_study.cache.code_digest import flight_code
 from hvt_study.cache.results import file_digest
-from hvt_study.datasets.class_map import ClassMap
+from hvt_study.datasets.class_map import ClassMap, joint_classes
 from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.sequence import Sequence, content_hash
-from hvt_study.runs.joint_classes import joint_classes
 from hvt_study.runs.spec import ModelChoice, RunSpec
 
 _PACKAGES = (

@@ -15,8 +15,6 @@ from hvt_common.inference.detect import Detector
 from hvt_common.values import Image, iou
 from hvt_train.pictures.real import HeldOut
 
-__all__ = ["NONE", "Calibration", "fit_calibration", "fit_temperature"]
-
 _LEAST_IOU = 0.5
 _EPSILON = 1e-4
 

@@ -18,8 +18,6 @@ from hvt_train.learning.loop import LoopSettings, Loss, train
 from hvt_train.learning.start import load_onnx
 from hvt_train.pictures.crops import CROP_SIDE, CropSource
 
-__all__ = ["MEAN", "SCALE", "ClassifierNet", "export_classifier", "train_classifier"]
-
 MEAN, SCALE = 115.0, 1 / 60
 """Network value = (pixel - MEAN) * SCALE on all channels; also written into the file's metadata."""
 

@@ -6,8 +6,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["STRIDES", "DetectorNet", "ExportedDetector"]
-
 STRIDES = (8, 16, 32)
 _HEAD = 64
 """Width of every head."""

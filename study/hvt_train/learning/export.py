@@ -15,8 +15,6 @@ from torch import nn
 
 from hvt_train.learning.halve import halve
 
-__all__ = ["export_onnx", "metadata"]
-
 _OPSET = 17
 
 

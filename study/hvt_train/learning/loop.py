@@ -14,8 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Average", "LoopSettings", "Loss", "train"]
-
 Loss = tuple[Tensor, dict[str, float]]
 
 

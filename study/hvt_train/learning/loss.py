@@ -17,8 +17,6 @@ from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.learning.detector import STRIDES
 from hvt_train.pictures.real import LARGE_VEHICLE
 
-__all__ = ["Targets", "detector_loss"]
-
 _RANGES = ((0.0, 110.0), (22.0, 240.0), (70.0, 1e6))
 """Longer sides in pixels for which a stride may answer."""
 _FAR = 1e4

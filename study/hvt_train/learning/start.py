@@ -12,9 +12,7 @@ from onnx import numpy_helper
 from torch import Tensor, nn
 
 from hvt_train.learning.detector import DetectorNet
-from hvt_train.learning.unfold import unfolded
-
-__all__ = ["load_onnx"]
+from hvt_train.learning.halve import unfolded
 
 
 def load_onnx(net: nn.Module, path: Path, images: Tensor, *, rows: Sequence[int] | None = None) -> None:

@@ -21,9 +21,6 @@ from hvt_train.learning.loss import Targets, detector_loss
 from hvt_train.learning.start import load_onnx
 from hvt_train.pictures.views import View, ViewSettings, ViewSource
 
-__all__ = ["Batch", "batch_of", "export_detector", "loss_of", "train_detector"]
-
-
 _LIKE = {"van": "car", "motor": "motorcycle", "pedestrian": "person"}
 """What of COCO's classes comes closest."""
 

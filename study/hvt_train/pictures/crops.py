@@ -20,18 +20,6 @@ from hvt_train.pictures.pool import HELD_OUT_SEED, SOURCE_SIZE, TRAIN_SEED, Shot
 from hvt_train.pictures.real import SETS, held_out_labelled
 from hvt_train.pictures.views import degrade, read_picture
 
-__all__ = [
-    "CROP_SIDE",
-    "CropSource",
-    "Crops",
-    "collect_crops",
-    "held_out_crops",
-    "held_out_real_crops",
-    "pool_crops",
-    "real_crops",
-    "scene_crops",
-]
-
 CROP_SIDE = 96
 """Pixels of the classifier's square input."""
 _MARGIN = 0.45

@@ -21,8 +21,6 @@ from hvt_train.pictures.solids import (
     random_paint,
 )
 
-__all__ = ["make_solid"]
-
 _Rng = np.random.Generator
 
 

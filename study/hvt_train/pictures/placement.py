@@ -12,8 +12,6 @@ from hvt_train.pictures.fleet import make_solid
 from hvt_train.pictures.solids import Part, Solid
 from hvt_train.pictures.surfaces import Surface
 
-__all__ = ["Thing", "settle"]
-
 _Rng = np.random.Generator
 
 

@@ -20,8 +20,6 @@ from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.placement import Thing, settle
 from hvt_train.pictures.surfaces import Surface, paint_surface
 
-__all__ = ["Picture", "draw_place"]
-
 _Rng = np.random.Generator
 _SHIFT = 4
 

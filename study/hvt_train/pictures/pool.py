@@ -23,22 +23,6 @@ from hvt_edge.video.x265 import BaseEncoder
 from hvt_scene import Appearance, Scene
 from hvt_train.pictures.places import Picture, draw_place
 
-__all__ = [
-    "BASE_SIZE",
-    "HELD_OUT_SEED",
-    "SOURCE_SIZE",
-    "TRAIN_SEED",
-    "PoolPlan",
-    "Shot",
-    "coded",
-    "fill_pool",
-    "in_flight",
-    "save_picture",
-    "shoot",
-    "thin_kbps",
-    "through_x265",
-]
-
 TRAIN_SEED = 1000
 HELD_OUT_SEED = 900_000
 SOURCE_SIZE = (1920, 1080)

@@ -14,22 +14,6 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-__all__ = [
-    "TYRES",
-    "Colour",
-    "Part",
-    "Points",
-    "Solid",
-    "add_bonnet_lines",
-    "add_cabin",
-    "add_mirrors",
-    "chamfered",
-    "lit",
-    "make_body",
-    "random_glass",
-    "random_paint",
-]
-
 _Rng = np.random.Generator
 Points = npt.NDArray[np.float64]
 Colour = tuple[float, float, float]

@@ -10,8 +10,6 @@ import numpy.typing as npt
 
 from hvt_common.values import Image
 
-__all__ = ["Surface", "paint_surface"]
-
 _Rng = np.random.Generator
 _Floats = npt.NDArray[np.float64]
 _SHIFT = 4

@@ -13,8 +13,6 @@ import numpy.typing as npt
 from hvt_common.values import Boxes, Image
 from hvt_train.pictures.places import Picture
 
-__all__ = ["View", "ViewSettings", "ViewSource", "degrade", "read_picture"]
-
 _Rng = np.random.Generator
 _FILL = 114
 _DAMAGE = {

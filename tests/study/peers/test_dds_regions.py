@@ -10,6 +10,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_common.values import Detections
 from hvt_study.peers.dds_regions import (
+    RegionRequest,
     combined,
     merged,
     pasted,
@@ -17,7 +18,6 @@ from hvt_study.peers.dds_regions import (
     requested_blocks,
     requested_boxes,
 )
-from hvt_study.peers.dds_request import RegionRequest
 from hvt_study.peers.dds_settings import DdsSettings
 
 SIZE = (320, 192)

@@ -30,8 +30,7 @@ from hvt_study.flights.flight_ground import SharedModels
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.report.data.arms import Arm, settings
 from hvt_study.report.data.document import Drawing, Pictures
-from hvt_study.report.data.equal_quality import equal_quality, needed_bps
-from hvt_study.report.data.pairs import pairs
+from hvt_study.report.data.pairs import equal_quality, needed_bps, pairs
 from hvt_study.report.data.table_file import read_results, write_results
 from hvt_study.report.example.choice import (
     CropExample,
@@ -46,11 +45,9 @@ from hvt_study.report.example.fly_again import example_of
 from hvt_study.report.example.store import load_example, save_example
 from hvt_study.report.make import make_report
 from hvt_study.report.pages.render import html_page
-from hvt_study.report.tables.appendix_tables import failed_table
-from hvt_study.report.tables.arm_tables import named_table, spent_table
-from hvt_study.report.tables.matrix_table import matrix_table
+from hvt_study.report.tables.appendix_tables import failed_table, sweep_table
+from hvt_study.report.tables.arm_tables import matrix_table, named_table, spent_table
 from hvt_study.report.tables.pair_tables import differences_table
-from hvt_study.report.tables.sweep_table import sweep_table
 from hvt_study.report.write import write_report
 from hvt_study.runs.columns import COLUMNS
 from hvt_study.runs.run_context import RunContext

@@ -14,8 +14,7 @@ from hvt_common.errors import UserError
 from hvt_study import cli
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.report.data.arms import Arm, settings
-from hvt_study.report.data.equal_quality import EqualQuality
-from hvt_study.report.data.pairs import pairs
+from hvt_study.report.data.pairs import EqualQuality, pairs
 from hvt_study.report.data.table_file import write_results
 from hvt_study.report.example.choice import CropExample, Example, Timeline, choose_run
 from hvt_study.report.figures.curve_figures import codec_figure, utility_figure
@@ -24,10 +23,9 @@ from hvt_study.report.figures.example_figures import crop_pictures
 from hvt_study.report.figures.pair_figures import difference_figures
 from hvt_study.report.make import make_report
 from hvt_study.report.pages.render import inline_svg
-from hvt_study.report.tables.appendix_tables import failed_table, metrics_table
+from hvt_study.report.tables.appendix_tables import failed_table, metrics_table, sweep_table
 from hvt_study.report.tables.arm_tables import named_table, proxy_table, seen_table, size_table, spent_table
 from hvt_study.report.tables.pair_tables import differences_table, equal_table
-from hvt_study.report.tables.sweep_table import sweep_table
 from hvt_study.report.write import write_report
 from hvt_study.runs.methods import METHODS
 from studies.study_rows import column, row, study, to_m5

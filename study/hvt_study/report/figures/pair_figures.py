@@ -14,9 +14,8 @@ from matplotlib.figure import Figure
 from hvt_study.report.data.arms import Arm, Setting
 from hvt_study.report.data.captions import INTERVALS, under
 from hvt_study.report.data.document import Drawing
-from hvt_study.report.data.equal_quality import EqualQuality
 from hvt_study.report.data.metric_names import METRICS
-from hvt_study.report.data.pairs import Pair
+from hvt_study.report.data.pairs import EqualQuality, Pair
 from hvt_study.report.figures.drawing import GREY, INK, drawn, mark_of, plain_axes, style_of
 
 _ROW_IN = 0.19

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from hvt_study.report.data.arms import Setting, values
 from hvt_study.report.data.captions import INTERVALS, under
 from hvt_study.report.data.document import Cell, Head, Table, breaks_between, words
-from hvt_study.report.data.equal_quality import EqualQuality
 from hvt_study.report.data.intervals import ENOUGH
 from hvt_study.report.data.metric_names import METRICS, NOTHING, definition, written
-from hvt_study.report.data.pairs import Pair
+from hvt_study.report.data.pairs import EqualQuality, Pair
 
 _COMPARED = (
     *("named_f1", "false_per_frame", "map_50", "map_50_95", "f1", "top1", "top1_all", "macro_f1"),

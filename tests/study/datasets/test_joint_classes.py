@@ -6,8 +6,8 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, VISDRONE_NAMES
+from hvt_study.datasets.class_map import joint_classes
 from hvt_study.metrics.classes import class_score
-from hvt_study.runs.joint_classes import joint_classes
 from studies.metric_frames import labels, square, view
 
 UAVDT = ("bus", "car", "truck")
