@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import time
 
-from lab.link.carriers.sides import EDGE_HOST, GROUND_HOST, Sides, command
+from lab.link.carriers.sides import EDGE_HOST, GROUND_HOST, Sides, UnavailableError, command
 from lab.link.timeline import LinkState, Script
+
+__all__ = ["GROUND_HOST", "Namespaces", "UnavailableError"]
 
 _TBF_BURST_BYTES = 3200
 _RULE = ("INPUT", "-i")

@@ -25,7 +25,7 @@ from hvt_edge.source.resample import Resizer
 from hvt_study.commands.arguments import names_of, option
 from hvt_study.commands.output import RunProgress, decimals, make_out, print_columns, writing
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
-from hvt_study.datasets.labels import inside_frame
+from hvt_study.datasets.labels import FrameLabels, inside_frame
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.judged import Judged, judged
@@ -106,24 +106,17 @@ def _detect(arguments: argparse.Namespace) -> int:
     for written in ("detections.csv", "score.json", "false-alarms.png", "misses.png"):
         check_not_read(arguments.out / written, reads, name="--out")
         make_out(arguments.out, name=written)
-    paths, frames, skipped = [], [], 0
+    paths, frames, seen = [], [], 0
     with (arguments.out / "detections.csv").open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)
         table.writerow(_COLUMNS)
-        for picture, image, view in _progress(pictures, detector, size):
-            if image is None:
-                skipped += 1
-                print(f"{picture.unreadable}; skipped", file=sys.stderr)
-                continue
+        for picture, image, labels in readable(pictures, "pictures"):
+            seen += 1
+            view = detected(detector, image, size)
             table.writerows(_rows(picture.path, view, confidence))
-            labels = picture.read((image.shape[1], image.shape[0]))
             if labels is not None:
                 paths.append(picture.path)
                 frames.append((labels, view))
-    for sentence in doubts_of(pictures):
-        print(sentence, file=sys.stderr)
-    if skipped:
-        print(f"{skipped} of {len(pictures)} pictures skipped", file=sys.stderr)
     if frames:
         recall_only = any(picture.one_target for picture in pictures)
         used = judged(above(frames, confidence), word=word, classes=classes)
@@ -131,7 +124,7 @@ def _detect(arguments: argparse.Namespace) -> int:
             "detector": arguments.detector,
             "confidence": confidence,
             "pictures": len(frames),
-            "skipped": skipped,
+            "skipped": len(pictures) - seen,
             **picture_score(
                 used, detection_score(frames, word=word, classes=classes), recall_only=recall_only
             ),
@@ -139,18 +132,28 @@ def _detect(arguments: argparse.Namespace) -> int:
         (arguments.out / "score.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
         _write_sheets(arguments.out, paths, used, classes=classes, recall_only=recall_only)
         print_score(about)
-    print(f"{arguments.out}: {len(pictures) - skipped} pictures, {len(frames)} of them labelled")
-    return 0 if len(pictures) > skipped else 2
+    print(f"{arguments.out}: {seen} pictures, {len(frames)} of them labelled")
+    return 0 if seen else 2
 
 
-def _progress(
-    pictures: Sequence[LabelledPicture], detector: Detector, size: tuple[int, int]
-) -> Iterator[tuple[LabelledPicture, Image | None, FrameView]]:
-    with RunProgress("pictures") as progress:
+def readable(
+    pictures: Sequence[LabelledPicture], what: str
+) -> Iterator[tuple[LabelledPicture, Image, FrameLabels | None]]:
+    """Those that can be read, with their labels; the others, and what is wrong with labels, are said on stderr."""
+    skipped = 0
+    with RunProgress(what) as progress:
         for number, picture in enumerate(pictures, start=1):
             image = read_image(picture.path, picture.labelled_size)
-            yield picture, image, FrameView() if image is None else detected(detector, image, size)
+            if image is None:
+                skipped += 1
+                print(f"{picture.unreadable}; skipped", file=sys.stderr)
+            else:
+                yield picture, image, picture.read((image.shape[1], image.shape[0]))
             progress.update(number, len(pictures))
+    for sentence in doubts_of(pictures):
+        print(sentence, file=sys.stderr)
+    if skipped:
+        print(f"{skipped} of {len(pictures)} pictures skipped", file=sys.stderr)
 
 
 def detected(detector: Detector, image: Image, size: tuple[int, int]) -> FrameView:

@@ -25,10 +25,10 @@ from hvt_common.units import parse_size
 from hvt_common.values import Boxes, Image, View
 from hvt_edge.source.resample import Resizer
 from hvt_study.commands.arguments import names_of, option
-from hvt_study.commands.detect import detected
+from hvt_study.commands.detect import detected, readable
 from hvt_study.commands.output import RunProgress, decimals, print_columns
 from hvt_study.datasets.label_files import LOOKED_IN
-from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
+from hvt_study.datasets.labelled_pictures import LabelledPicture, find_pictures, read_image
 from hvt_study.datasets.labels import IGNORED, FrameLabels, inside_frame
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.frames import LabelledFrame
@@ -229,22 +229,10 @@ def _classes(pictures: Sequence[LabelledPicture]) -> list[str]:
 
 def _read(pictures: Sequence[LabelledPicture]) -> list[_Own]:
     """Every picture and label once, so that what is wrong is said at the start."""
-    read, skipped = [], 0
-    with RunProgress("pictures read") as progress:
-        for number, picture in enumerate(pictures, start=1):
-            image = read_image(picture.path, picture.labelled_size)
-            progress.update(number, len(pictures))
-            if image is None:
-                skipped += 1
-                print(f"{picture.unreadable}; skipped", file=sys.stderr)
-                continue
-            labels = picture.read((image.shape[1], image.shape[0]))
-            assert labels is not None, "only labelled ones are here"
-            read.append(_Own(picture.path, labels, picture.labelled_size))
-    for sentence in doubts_of(pictures):
-        print(sentence, file=sys.stderr)
-    if skipped:
-        print(f"{skipped} of {len(pictures)} pictures skipped", file=sys.stderr)
+    read = []
+    for picture, _, labels in readable(pictures, "pictures read"):
+        assert labels is not None, "only labelled ones are here"
+        read.append(_Own(picture.path, labels, picture.labelled_size))
     return read
 
 

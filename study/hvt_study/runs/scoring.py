@@ -34,6 +34,17 @@ _SAYS_OF_ONE = {
 """What labels of one target can say: of the rest of the list nobody knows whether it is right."""
 
 
+_OPINIONS = {
+    "confidence_base": "confidence_base",
+    "confidence_refined": "confidence_still",
+    "confidence_gain": "gain",
+    "positive_rate": "positive_rate",
+    "change_rate": "change_rate",
+    "entropy_gain_nats": "entropy_gain_nats",
+}
+"""Column to field of a `ProxyScore`."""
+
+
 def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:
     """Every metric column of `hvt_study.runs.columns.COLUMNS`; None where a run has none."""
     labelled = _labelled(report, context)
@@ -152,22 +163,10 @@ def _delays(report: FlightReport) -> dict[str, Any]:
 
 def _proxies(report: FlightReport) -> dict[str, Any]:
     said = proxies(refined_objects(report.lists))
-    return {
-        "confidence_base": said.every.confidence_base,
-        "confidence_refined": said.every.confidence_still,
-        "confidence_gain": said.every.gain,
-        "positive_rate": said.every.positive_rate,
-        "change_rate": said.every.change_rate,
-        "entropy_gain_nats": said.every.entropy_gain_nats,
-        "proxy_pairs": said.every.pairs,
-        "small_confidence_base": said.small.confidence_base,
-        "small_confidence_refined": said.small.confidence_still,
-        "small_confidence_gain": said.small.gain,
-        "small_positive_rate": said.small.positive_rate,
-        "small_change_rate": said.small.change_rate,
-        "small_entropy_gain_nats": said.small.entropy_gain_nats,
-        "small_pairs": said.small.pairs,
-    }
+    found: dict[str, Any] = {"proxy_pairs": said.every.pairs, "small_pairs": said.small.pairs}
+    for prefix, one in (("", said.every), ("small_", said.small)):
+        found |= {f"{prefix}{column}": getattr(one, field) for column, field in _OPINIONS.items()}
+    return found
 
 
 def _plain(value: Any) -> Any:

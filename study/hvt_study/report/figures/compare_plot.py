@@ -9,19 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hvt_study.matrix.compare import COMPARED, CompareResult, CompareRow
+from hvt_study.report.figures.drawing import mark_of, plain_axes, rate_axis, style_of
 
-# Okabe and Ito's palette, told apart by every kind of colour vision; markers and dashes tell the rest apart in grey.
-STYLES = {
-    "M0": ("#000000", "o", "--"),
-    "M0-fps": ("#000000", "s", "-"),
-    "M0-best": ("#009E73", "P", "-"),
-    "R0": ("#56B4E9", "^", "-"),
-    "M5-jpeg": ("#E69F00", "v", "--"),
-    "M5-residual": ("#E69F00", "D", "-"),
-    "tracks": ("#CC79A7", "<", "-"),
-    "M6": ("#D55E00", "*", "-"),
-    "auto": ("#009E73", "P", "-"),
-}
 _MEASURES = (("named_f1", "named F1 of the list"), ("false_per_frame", "false objects a frame"))
 _ONE_TARGET = (("recall", "share of its time at which the target is found"), ("gaps", "gaps"))
 _DPI = 200
@@ -49,7 +38,6 @@ def plot(result: CompareResult, path: Path) -> None:
 
 
 def _draw(axes: Axes, rows: Sequence[CompareRow], *, measure: str) -> None:
-    axes.set_xscale("log")
     for name in COMPARED:
         points = sorted(
             (row["total_bps"] / 1e3, value)
@@ -58,20 +46,14 @@ def _draw(axes: Axes, rows: Sequence[CompareRow], *, measure: str) -> None:
         )
         if not points:
             continue
-        colour, marker, dashes = STYLES[name]
+        style = style_of(name)
         axes.plot(
-            [x for x, _ in points],
-            [y for _, y in points],
-            color=colour,
-            marker=marker,
-            linestyle=dashes,
-            markersize=10 if marker == "*" else 6,
-            linewidth=1.6,
+            *zip(*points, strict=True),
+            color=style.colour,
+            marker=style.marker,
+            linestyle=style.dashes,
+            markersize=1.4 * mark_of(style),
             label=name,
         )
-    marks = sorted({row["rate_kbps"] for row in rows})
-    axes.set_xticks(marks, [f"{mark:g}" for mark in marks])
-    axes.minorticks_off()
-    axes.grid(visible=True, color="#dddddd", linewidth=0.6)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    rate_axis(axes, [row["rate_kbps"] for row in rows])
+    plain_axes(axes)

@@ -77,7 +77,10 @@ _STYLES: Mapping[str, Style] = MappingProxyType(
         "M3": Style(PALETTE["blue"], "D", "-."),
         "M4": Style(PALETTE["orange"], "^", ":"),
         "M5": Style(PALETTE["orange"], "D", "-"),
+        "M5-jpeg": Style(PALETTE["orange"], "v", "--"),
+        "M5-residual": Style(PALETTE["orange"], "D", "-"),
         "M6": Style(PALETTE["vermillion"], "*", "-"),
+        "auto": Style(PALETTE["blue"], "X", "-"),
         # No triangle to the left or right: in figures of bits arrows say where a curve ends.
         "tracks": Style(PALETTE["purple"], "p", "-"),
         "permissive": Style(PALETTE["purple"], "s", ":"),

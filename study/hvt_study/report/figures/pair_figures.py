@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hvt_study.report.data.arms import Arm, Setting
+from hvt_study.report.data.arms import Setting
 from hvt_study.report.data.captions import INTERVALS, under
 from hvt_study.report.data.document import Drawing
 from hvt_study.report.data.metric_names import METRICS
 from hvt_study.report.data.pairs import EqualQuality, Pair
 from hvt_study.report.figures.drawing import GREY, INK, drawn, mark_of, plain_axes, style_of
 
+_One = TypeVar("_One", Pair, EqualQuality)
 _ROW_IN = 0.19
 _DOT = 9.0
 _LEFT, _RIGHT = r"$\leftarrow$", r"$\rightarrow$"
@@ -56,66 +57,86 @@ def _of_regime(name: str, regime: str, regimes: Sequence[str]) -> str:
 
 def _differences(setting: Setting, found: Sequence[Pair], *, name: str, column: str) -> Drawing:
     """Of one regime."""
-    arms = list(dict.fromkeys(pair.arm for pair in found))
-    references = list(dict.fromkeys(pair.reference for pair in found))
-
-    def paint(figure: Figure) -> None:
-        panels = figure.subplots(1, len(references), squeeze=False, sharex=True, sharey=True)[0]
-        for axes, reference in zip(panels, references, strict=True):
-            for pair in (one for one in found if one.reference == reference):
-                _draw_gap(axes, pair, column, row=arms.index(pair.arm))
-            axes.axvline(0, color=INK, linewidth=0.7)
-            axes.set_title(f"against {reference}")
-            _row_axis(axes, arms)
-        figure.supxlabel(f"difference in {METRICS[column].title} at the same bits", fontsize=8)
-
-    return drawn(
-        name,
-        paint,
-        height_in=0.9 + _ROW_IN * len(arms),
+    title = METRICS[column].title
+    return _forest(
+        setting,
+        found,
+        name=name,
+        draw=lambda axes, pair, row: _draw_gap(axes, pair, column, row=row),
+        finish=lambda axes, reference: axes.set_title(f"against {reference}"),
+        even=0,
+        label=f"difference in {title} at the same bits",
         caption=(
-            f"Paired differences in {METRICS[column].title} at matched totals, {setting.name}, {arms[0].regime}: "
+            f"Paired differences in {title} at matched totals, {setting.name}, {found[0].arm.regime}: "
             f"mean and {INTERVALS}; small dots are sequences. To the right of the line the method shows more than "
-            f"video at the same bits. {under(setting)}"
+            "video at the same bits."
         ),
-        alternative=f"Forest plot of the difference in {METRICS[column].title} of each method to video",
+        alternative=f"Forest plot of the difference in {title} of each method to video",
     )
 
 
 def _ratios(setting: Setting, found: Sequence[EqualQuality], *, name: str, column: str) -> Drawing:
     """Of one regime."""
     read = [ratio for one in found for ratio in one.ratios if 0 < ratio < math.inf]
+    low, high = min(0.8, *read) / 1.15, max(1.25, *read) * 1.15
+
+    def finish(axes: Axes, reference: str) -> None:
+        axes.set_xscale("log")
+        axes.set_xlim(low / 1.08, high * 1.08)
+        marks = [mark for mark in _RATIO_MARKS if low <= mark <= high]
+        axes.set_xticks(marks, [f"{mark:g}" for mark in marks])
+        axes.minorticks_off()
+        axes.set_title(f"bits of {reference}")
+
+    title = METRICS[column].title
+    return _forest(
+        setting,
+        found,
+        name=name,
+        draw=lambda axes, one, row: _draw_ratios(axes, one, row=row, ends=(low, high)),
+        finish=finish,
+        even=1,
+        label=f"bits that video needs / bits of the method, at equal {title}",
+        caption=(
+            f"Bits at equal accuracy ({title}), {setting.name}, {found[0].arm.regime}: small dots are "
+            "sequences, the large mark is their median. An arrow to the right: no video that was flown shows as "
+            "much; to the left: the least video that was flown shows more; what lies beyond cannot be read."
+        ),
+        alternative="Ratio of the bits that video alone needs to those of each method",
+    )
+
+
+def _forest(
+    setting: Setting,
+    found: Sequence[_One],
+    *,
+    name: str,
+    draw: Callable[[Axes, _One, int], None],
+    finish: Callable[[Axes, str], object],
+    even: float,
+    label: str,
+    caption: str,
+    alternative: str,
+) -> Drawing:
+    """A panel a video-only method, a row an arm from the top, and a line where both sides are ``even``."""
     arms = list(dict.fromkeys(one.arm for one in found))
     references = list(dict.fromkeys(one.reference for one in found))
-    low, high = min(0.8, *read) / 1.15, max(1.25, *read) * 1.15
 
     def paint(figure: Figure) -> None:
         panels = figure.subplots(1, len(references), squeeze=False, sharex=True, sharey=True)[0]
         for axes, reference in zip(panels, references, strict=True):
-            axes.set_xscale("log")
             for one in (one for one in found if one.reference == reference):
-                _draw_ratios(axes, one, row=arms.index(one.arm), ends=(low, high))
-            axes.axvline(1, color=INK, linewidth=0.7)
-            axes.set_xlim(low / 1.08, high * 1.08)
-            _ratio_marks(axes, low, high)
-            axes.set_title(f"bits of {reference}")
-            _row_axis(axes, arms)
-        figure.supxlabel(
-            f"bits that video needs / bits of the method, at equal {METRICS[column].title}", fontsize=8
-        )
+                draw(axes, one, arms.index(one.arm))
+            axes.axvline(even, color=INK, linewidth=0.7)
+            finish(axes, reference)
+            axes.set_yticks(range(len(arms)), [arm.name for arm in arms])
+            axes.set_ylim(len(arms) - 0.4, -0.6)
+            plain_axes(axes, grid="x")
+        figure.supxlabel(label, fontsize=8)
 
-    return drawn(
-        name,
-        paint,
-        height_in=0.9 + _ROW_IN * len(arms),
-        caption=(
-            f"Bits at equal accuracy ({METRICS[column].title}), {setting.name}, {arms[0].regime}: small dots are "
-            "sequences, the large mark is their median. An arrow to the right: no video that was flown shows as "
-            "much; to the left: the least video that was flown shows more; what lies beyond cannot be read. "
-            f"{under(setting)}"
-        ),
-        alternative="Ratio of the bits that video alone needs to those of each method",
-    )
+    height_in = 0.9 + _ROW_IN * len(arms)
+    caption = f"{caption} {under(setting)}"
+    return drawn(name, paint, height_in=height_in, caption=caption, alternative=alternative)
 
 
 def _draw_gap(axes: Axes, pair: Pair, column: str, *, row: int) -> None:
@@ -153,16 +174,3 @@ def _draw_ratios(axes: Axes, one: EqualQuality, *, row: int, ends: tuple[float, 
     else:
         place, marker = (low, _LEFT) if middle == 0 else (high, _RIGHT)
         axes.plot([place], [row], color=style.colour, marker=marker, markersize=11, **_THIN)
-
-
-def _row_axis(axes: Axes, arms: Sequence[Arm]) -> None:
-    """A row an arm, from the top."""
-    axes.set_yticks(range(len(arms)), [arm.name for arm in arms])
-    axes.set_ylim(len(arms) - 0.4, -0.6)
-    plain_axes(axes, grid="x")
-
-
-def _ratio_marks(axes: Axes, low: float, high: float) -> None:
-    marks = [mark for mark in _RATIO_MARKS if low <= mark <= high]
-    axes.set_xticks(marks, [f"{mark:g}" for mark in marks])
-    axes.minorticks_off()
