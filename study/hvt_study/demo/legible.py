@@ -10,12 +10,12 @@ import numpy as np
 from hvt_common.values import Image
 from hvt_scene import CodeInView
 from hvt_study.demo.flown import Flown, FlownStill
-from hvt_study.reading.reader import CodeReader, code_crop
+from hvt_study.reading.observer import INSIDE_SHARE
+from hvt_study.reading.reader import CodeReader, code_crop, share_inside
 from hvt_study.reading.score import LEAST_VISIBLE, Code
 
 _PICTURES = 6
 """Of the base stream in which a code is read, spread over the time that it is whole in view: reading takes time."""
-_INSIDE_SHARE = 0.98
 _CONTEXT = 1.2
 """Around a code where somebody looks at it, in its longer sides."""
 
@@ -79,8 +79,7 @@ def stills_with_codes(
         place = np.array(still.place_base_px)
         for one in _whole(codes, views, still.frame):
             box = one.box_source_px * base_per_source
-            shared = np.clip(np.minimum(box[2:], place[2:]) - np.maximum(box[:2], place[:2]), 0, None).prod()
-            if shared >= _INSIDE_SHARE * (box[2:] - box[:2]).prod():
+            if share_inside(box, place) >= INSIDE_SHARE:
                 x1, y1, x2, y2 = box.tolist()
                 yield Shown(one.object_id, still, (x1, y1, x2, y2))
 

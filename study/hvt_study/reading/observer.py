@@ -19,7 +19,7 @@ from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.stills.composite import composite
 from hvt_ground.perception.stills.decode import DecodedStill, decode_still
 from hvt_scene import CodeInView
-from hvt_study.reading.reader import CodeReader, code_crop
+from hvt_study.reading.reader import CodeReader, code_crop, share_inside
 from hvt_study.reading.score import LEAST_VISIBLE, Code, Evidence
 
 Channel = Literal["base", "stills", "composite"]
@@ -30,7 +30,7 @@ _EVERY_FRAMES = 5
 """Of base pictures one in so many frames is read: three a second, as an operator would look at most."""
 _REMEMBERED = 45
 _MOST_PENDING = 64
-_INSIDE_SHARE = 0.98
+INSIDE_SHARE = 0.98
 """How much of a code has to lie in a still for the still to be read alone."""
 
 
@@ -108,7 +108,7 @@ class CodeObserver:
 
     def _read_still(self, still: DecodedStill, *, at_ns: int) -> None:
         codes = [
-            code for code in self._unread("stills", still.frame_index) if _share(code, still) >= _INSIDE_SHARE
+            code for code in self._unread("stills", still.frame_index) if _share(code, still) >= INSIDE_SHARE
         ]
         x1, y1, x2, _ = still.crop_source_px
         scale = still.image_bgr.shape[1] / (x2 - x1)
@@ -149,6 +149,4 @@ class CodeObserver:
 
 def _share(code: CodeInView, still: DecodedStill) -> float:
     """How much of a code's box a still shows, 0…1."""
-    box, crop = code.box_source_px, np.array(still.crop_source_px, np.float32)
-    shared = np.clip(np.minimum(box[2:], crop[2:]) - np.maximum(box[:2], crop[:2]), 0, None).prod()
-    return float(shared / (box[2:] - box[:2]).prod())
+    return share_inside(code.box_source_px, np.array(still.crop_source_px, np.float32))

@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from hvt_common.errors import needs_extra
 from hvt_common.values import Image
@@ -85,3 +86,9 @@ def _lying(crop: Image) -> tuple[Image, Image]:
     """The crop with its longer side across, and the same upside down."""
     flat = crop if crop.shape[1] >= crop.shape[0] else cv2.rotate(crop, cv2.ROTATE_90_CLOCKWISE)
     return np.asarray(flat, np.uint8), np.asarray(cv2.rotate(flat, cv2.ROTATE_180), np.uint8)
+
+
+def share_inside(box_px: npt.NDArray[Any], place_px: npt.NDArray[Any]) -> float:
+    """How much of a box lies in a place, both x1 y1 x2 y2, 0…1."""
+    low, high = np.maximum(box_px[:2], place_px[:2]), np.minimum(box_px[2:], place_px[2:])
+    return float(np.clip(high - low, 0, None).prod() / (box_px[2:] - box_px[:2]).prod())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Words
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -48,19 +49,9 @@ def open_clips(place: Path, options: Options) -> Mapping[str, Callable[[], Seque
 
 def _open_images(place: Path, images: Words[Path], options: Options) -> Sequence:
     fps = options.fps or NOMINAL_FPS
-    size = image_size(images[0])
     played = base_frame_count(len(images) / exact_rate(fps), fps=exact_rate(NOMINAL_FPS))
-    return Sequence(
-        name=place.name,
-        dataset="clips",
-        clip=Clip(str(place), size, max(1, played), source_fps=fps),
-        frame_count=len(images),
-        fps=fps,
-        source_size=size,
-        labels=None,
-        class_set=(),
-        files=(place,),
-    )
+    clip = Clip(str(place), image_size(images[0]), max(1, played), source_fps=fps)
+    return _unlabelled(place.name, place, clip, frame_count=len(images), fps=fps)
 
 
 def _open(name: str, path: Path, options: Options) -> Sequence:
@@ -68,15 +59,19 @@ def _open(name: str, path: Path, options: Options) -> Sequence:
     size, fps = source.view.source_size, source.source_fps
     count, shown = source.shown_frames()
     source.close()
+    clip = Clip(str(path), size, len(shown), source_fps=options.fps)
+    return replace(_unlabelled(name, path, clip, frame_count=count, fps=fps), source_frames=shown)
+
+
+def _unlabelled(name: str, place: Path, clip: Clip, *, frame_count: int, fps: float) -> Sequence:
     return Sequence(
         name=name,
         dataset="clips",
-        clip=Clip(str(path), size, len(shown), source_fps=options.fps),
-        frame_count=count,
+        clip=clip,
+        frame_count=frame_count,
         fps=fps,
-        source_size=size,
+        source_size=clip.source_size,
         labels=None,
         class_set=(),
-        files=(path,),
-        source_frames=shown,
+        files=(place,),
     )

@@ -36,7 +36,7 @@ from hvt_common.values import Boxes
 from hvt_study.datasets.annotation_rows import Rows, read_rows
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
-from hvt_study.datasets.layouts.options import Options
+from hvt_study.datasets.layouts.options import Options, missing_labels
 from hvt_study.datasets.sequence import Sequence
 
 _INFO = "seqinfo.ini"
@@ -205,10 +205,7 @@ def _images(folder: Path, info: Mapping[str, str]) -> ImageSequence:
 def _labels(folder: Path, info: Mapping[str, str], images: ImageSequence) -> TableLabels:
     truth = folder / _TRUTH
     if not truth.is_file():
-        raise UserError(
-            f"MOTChallenge sequence {folder} has no annotations {_TRUTH}: "
-            "add them, or ask for pictures alone with ?labels=none"
-        )
+        raise missing_labels(f"MOTChallenge sequence {folder}", _TRUTH)
     beside = _BESIDE_ON_MOT20 if info.get("name", folder.name).startswith("MOT20") else _BESIDE
     return TableLabels(
         mot_table, (truth, folder / "gt" / "labels.txt", images.size, beside), images.first_number

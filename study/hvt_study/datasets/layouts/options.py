@@ -55,6 +55,13 @@ def split_options(uri: str, place: str, *, accepted: Collection[str]) -> tuple[s
     return path, Options(**given)
 
 
+def missing_labels(whose: str, file: Path | str) -> UserError:
+    """Of a sequence or set, in words, whose annotations are not there."""
+    return UserError(
+        f"{whose} has no annotations {file}: add them, or ask for pictures alone with ?labels=none"
+    )
+
+
 def parse_numbers(uri: str, text: str) -> tuple[int, ...]:
     """``0-4`` or ``1,5`` or both, sorted, each once.
 

@@ -26,7 +26,7 @@ from hvt_common.errors import UserError
 from hvt_study.datasets.annotation_rows import read_rows
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
-from hvt_study.datasets.layouts.options import Options
+from hvt_study.datasets.layouts.options import Options, missing_labels
 from hvt_study.datasets.sequence import Sequence
 
 _FPS = 30.0
@@ -98,10 +98,7 @@ def _open(name: str, folder: Path, texts: Mapping[str, Path], options: Options) 
     if options.annotated:
         whole = texts.get(f"{name}_gt_whole.txt") or texts.get(f"{name}_gt.txt")
         if whole is None:
-            raise UserError(
-                f"UAVDT sequence {folder} has no annotations {name}_gt_whole.txt: "
-                "add them, or ask for pictures alone with ?labels=none"
-            )
+            raise missing_labels(f"UAVDT sequence {folder}", f"{name}_gt_whole.txt")
         ignore = texts.get(f"{name}_gt_ignore.txt", whole.with_name(f"{name}_gt_ignore.txt"))
         labels = TableLabels(uavdt_table, (whole, ignore, images.size), images.first_number)
     attributes = _attributes(texts.get(f"{name}_attr.txt"))

@@ -17,7 +17,7 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_study.datasets.label_table import TableLabels
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
-from hvt_study.datasets.layouts.options import Options
+from hvt_study.datasets.layouts.options import Options, missing_labels
 from hvt_study.datasets.sequence import Sequence
 from hvt_study.datasets.visdrone_rows import video_table
 
@@ -53,10 +53,7 @@ def _open(name: str, folder: Path, annotations: Path, options: Options) -> Seque
     labels = None
     if options.annotated:
         if not annotations.is_file():
-            raise UserError(
-                f"VisDrone sequence {folder} has no annotations {annotations}: "
-                "add them, or ask for pictures alone with ?labels=none"
-            )
+            raise missing_labels(f"VisDrone sequence {folder}", annotations)
         labels = TableLabels(video_table, (annotations, images.size), images.first_number)
         _check_frames(labels, annotations)
     return images.sequence(name=name, dataset="visdrone", fps=options.fps or _FPS, labels=labels)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from hvt_study.report.data.captions import time_of
+from hvt_study.report.data.document import Cell
 from hvt_study.report.data.intervals import Interval
 from hvt_study.runs.columns import COLUMNS, Column
 
@@ -45,3 +46,12 @@ def written(interval: Interval, metric: Column, *, sign: bool = False) -> tuple[
     if math.isnan(interval.low):
         return mean, ""
     return mean, f"[{number(interval.low, metric, sign=sign)}, {number(interval.high, metric, sign=sign)}]"
+
+
+def figure_cell(
+    interval: Interval, metric: Column, *, of: int, sign: bool = False, strong: bool = False
+) -> Cell:
+    """The mean; beneath it its interval, and how many sequences have the figure where some ``of`` them lack it."""
+    mean, span = written(interval, metric, sign=sign)
+    n = f"n = {interval.sequences}" if 0 < interval.sequences < of else ""
+    return Cell(mean, f"{span} {n}".strip(), strong=strong)

@@ -12,7 +12,7 @@ from hvt_study.report.data.arms import Arm, BySequence, Setting, values
 from hvt_study.report.data.captions import INTERVALS, same_sequences, under
 from hvt_study.report.data.document import Cell, Head, Table, breaks_between, words
 from hvt_study.report.data.intervals import interval_of, mean_of, median_of
-from hvt_study.report.data.metric_names import METRICS, NOTHING, definition, written
+from hvt_study.report.data.metric_names import METRICS, NOTHING, definition, figure_cell
 from hvt_study.runs.methods import METHODS
 
 _SPENT = (
@@ -111,10 +111,7 @@ def _mean_cell(runs: BySequence, column: str, *, interval: bool) -> Cell:
     """The mean over those sequences that have the figure; where some lack it, that is said beneath."""
     own, metric = values(runs, column), METRICS[column]
     take = median_of if metric.over == "median" else interval_of if interval else mean_of
-    found = take(own.values())
-    mean, span = written(found, metric)
-    n = f"n = {found.sequences}" if 0 < found.sequences < len(own) else ""
-    return Cell(mean, f"{span} {n}".strip())
+    return figure_cell(take(own.values()), metric, of=len(own))
 
 
 def matrix_table(setting: Setting, column: str) -> Table | None:
@@ -139,9 +136,7 @@ def matrix_table(setting: Setting, column: str) -> Table | None:
         cells = [Cell(method), Cell(codec or NOTHING), Cell(says)]
         for place in ((regime, method, codec) for regime in setting.regimes):
             interval = interval_of(figures[place])
-            mean, span = written(interval, metric)
-            n = f"n = {interval.sequences}" if 0 < interval.sequences < setting.sequences else ""
-            cells.append(Cell(mean, f"{span} {n}".strip(), strong=place in best))
+            cells.append(figure_cell(interval, metric, of=setting.sequences, strong=place in best))
         rows.append(tuple(cells))
     heads = words("method", "codec", "what it does")
     heads += tuple(Head(_budget(setting, name)) for name in setting.regimes)

@@ -9,7 +9,7 @@ from hvt_study.report.data.arms import Setting, values
 from hvt_study.report.data.captions import INTERVALS, under
 from hvt_study.report.data.document import Cell, Head, Table, breaks_between, words
 from hvt_study.report.data.intervals import ENOUGH
-from hvt_study.report.data.metric_names import METRICS, NOTHING, definition, written
+from hvt_study.report.data.metric_names import METRICS, NOTHING, definition, figure_cell
 from hvt_study.report.data.pairs import EqualQuality, Pair
 
 _COMPARED = (
@@ -103,9 +103,8 @@ def _mean_kbps(totals: dict[str, float], names: Sequence[str]) -> str:
 
 def _gap(pair: Pair, column: str) -> Cell:
     interval = pair.interval(column)
-    mean, span = written(interval, METRICS[column], sign=True)
-    n = f"n = {interval.sequences}" if 0 < interval.sequences < len(pair.names) else ""
-    return Cell(mean, f"{span} {n}".strip(), strong=interval.low > 0 or interval.high < 0)
+    sure = interval.low > 0 or interval.high < 0
+    return figure_cell(interval, METRICS[column], of=len(pair.names), sign=True, strong=sure)
 
 
 def _ahead(pair: Pair) -> str:
