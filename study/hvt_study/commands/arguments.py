@@ -194,6 +194,14 @@ def parse_rates(text: str) -> tuple[int, ...]:
     return tuple(sorted(rates))
 
 
+def check_whole(name: str, value: int, low: int, high: int | None = None) -> int:
+    """The value of an option; `UserError` where it is not in its range."""
+    if not low <= value <= (value if high is None else high):
+        most = "" if high is None else f" to {high}"
+        raise UserError(f"{name} {value} is not accepted: give a whole number from {low}{most}")
+    return value
+
+
 def names_of(text: str) -> tuple[str, ...]:
     """Names between commas."""
     return tuple(word.strip() for word in text.split(",") if word.strip())
@@ -227,10 +235,7 @@ def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequenc
     """What the arguments ask for, with these of `open_sequences`; `UserError` for what cannot be."""
     size = base_size(arguments.size)
     frames = flown_frames(getattr(arguments, "max_frames", None))
-    if arguments.detect_every < 1:
-        raise UserError(
-            f"--detect-every {arguments.detect_every} is not accepted: give a whole number from 1"
-        )
+    check_whole("--detect-every", arguments.detect_every, 1)
     codecs = tuple(dict.fromkeys(names_of(arguments.still_codecs)))
     for codec in codecs:
         still_codec(codec)
@@ -275,9 +280,7 @@ def jobs_of(arguments: argparse.Namespace) -> int:
     jobs: int = getattr(arguments, "jobs", os.cpu_count() or 1)
     if hasattr(arguments, "dask"):
         raise UserError(f"--jobs {jobs} has no say with --dask: give one of them")
-    if not 1 <= jobs <= _MOST_JOBS:
-        raise UserError(f"--jobs {jobs} is not accepted: give a whole number from 1 to {_MOST_JOBS}")
-    return jobs
+    return check_whole("--jobs", jobs, 1, _MOST_JOBS)
 
 
 def _cache(arguments: argparse.Namespace) -> Path:

@@ -15,6 +15,7 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.units import parse_size
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.video import VideoSource
+from hvt_study.commands.arguments import check_whole
 from hvt_study.commands.output import make_out, print_columns, writing
 from hvt_study.matrix.sweep import COLUMNS, RawDetections, SweepRow, detect_clip, read_csv, sweep
 
@@ -94,8 +95,7 @@ def _from_clip(arguments: argparse.Namespace) -> tuple[dict[int, RawDetections],
         raise UserError(f"--detector is missing: {arguments.source} is a clip, give FILE.onnx")
     said = {**_USUAL, **vars(arguments)}
     every = said["detect_every"]
-    if every < 1:
-        raise UserError(f"--detect-every {every} is not accepted: give a whole number from 1")
+    check_whole("--detect-every", every, 1)
     detector = open_detector(said["detector"], confidence=said["confidence"], nms_iou=said["nms_iou"])
     with open_source(str(arguments.source), size=_ANY_SIZE, fps=_own_rate(arguments.source)) as source:
         found = track(

@@ -11,6 +11,7 @@ from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.arguments import (
     add_plan_arguments,
     add_pool_arguments,
+    check_whole,
     names_of,
     open_pool,
     open_sequences,
@@ -40,14 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Search, print, write tune.json."""
-    if not 1 <= arguments.trials <= _MOST_TRIALS:
-        raise UserError(
-            f"--trials {arguments.trials} is not accepted: give a whole number from 1 to {_MOST_TRIALS}"
-        )
-    if not 0 <= arguments.seed <= _HIGHEST_SEED:
-        raise UserError(
-            f"--seed {arguments.seed} is not accepted: give a whole number from 0 to {_HIGHEST_SEED}"
-        )
+    check_whole("--trials", arguments.trials, 1, _MOST_TRIALS)
+    check_whole("--seed", arguments.seed, 0, _HIGHEST_SEED)
     parameters = tunable(arguments.method, names_of(arguments.parameters))
     plan = study_plan(arguments, open_sequences(arguments))
     if len(plan.still_codecs) > 1:

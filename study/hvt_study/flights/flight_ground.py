@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import FailingDetector
@@ -42,18 +42,6 @@ from hvt_study.serial_link import Arrival, SerialLink
 _MOST_RESULTS = 1024
 _RECEIVER = 1 << 40  # as many bytes on the wire as a random one
 _T = TypeVar("_T")
-
-
-class FlightObserver(Protocol):
-    """Is shown what a flight's ground has received, at the media time ``at_ns``; changes nothing."""
-
-    def picture(self, picture: DecodedFrame, *, at_ns: int) -> None:
-        """A base picture has arrived and been decoded."""
-        ...
-
-    def stills(self, stills: Sequence[ReceivedStill], *, at_ns: int) -> None:
-        """Stills have arrived; the base pictures that they build on may come later."""
-        ...
 
 
 class InlineExecutor(ThreadPoolExecutor):
@@ -119,7 +107,7 @@ class _Worker(LockstepWorker):
 class GroundSide:
     """Takes what arrives over ``link`` as time goes on; keeps the list of every frame, in source pixels.
 
-    ``info`` is the edge's, with the rate of frames as its frame rate; ``observer`` is shown what arrives.
+    ``info`` is the edge's, with the rate of frames as its frame rate.
     """
 
     def __init__(
@@ -129,19 +117,18 @@ class GroundSide:
         config: GroundConfig,
         models: Models,
         link: SerialLink[Received],
-        observer: FlightObserver | None = None,
     ) -> None:
         self._link = link
-        self._observer = observer
         self._info = info
         self._captures = CaptureTimes()
-        self._now_ns = info.started_ns
+        self.now_ns = info.started_ns
+        """Media time."""
         detector, classifier = models.take()
         shared = SharedModels(detector, classifier, config=config)
         self._session = GroundSession(
             info,
             pipeline_of=lambda emit: make_pipeline(config, shared, info=info, emit=self._observed_by(emit)),
-            clock=lambda: self._now_ns,
+            clock=lambda: self.now_ns,
             worker_of=self._make_worker,
         )
         self._watch = Watch(self._session.pipeline)
@@ -179,7 +166,7 @@ class GroundSide:
         """Take in what has arrived by now; None: all there is, to the end."""
         for arrival in self._link.arrived(now_ns):
             self._take_uncoded(until_ns=arrival.arrival_ns)
-            self._now_ns = arrival.arrival_ns
+            self.now_ns = arrival.arrival_ns
             self.arrivals.append(arrival)
             self._receive(arrival)
             self._answer(arrival)
@@ -196,20 +183,8 @@ class GroundSide:
             last = max(self.lists)
             self.lists[last] = self._record.complete(self.lists[last], lists=self.lists)
 
-    def _make_worker(self, analyze: Analyze, step: Step, read: Read) -> _Worker:
-        observer = self._observer
-
-        def analyze_observed(picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - as `Analyze` says
-            if observer is not None:
-                observer.picture(picture, at_ns=self._now_ns)
-            analyze(picture, hurry)
-
-        def read_observed(stills: Sequence[ReceivedStill]) -> None:
-            if observer is not None:
-                observer.stills(stills, at_ns=self._now_ns)
-            read(stills)
-
-        self._worker = _Worker(analyze_observed, step, read_observed, name=self._info.edge)
+    def _make_worker(self, analyze: Analyze, step: Step, read: Read) -> LockstepWorker:
+        self._worker = _Worker(analyze, step, read, name=self._info.edge)
         return self._worker
 
     def _receive(self, arrival: Arrival[Received]) -> None:
@@ -232,7 +207,7 @@ class GroundSide:
 
     def _answer(self, last: Arrival[Received]) -> None:
         """What the ground has to say goes back in the time that the newest message took to come."""
-        back_ns = self._now_ns + (last.arrival_ns - last.enter_ns)
+        back_ns = self.now_ns + (last.arrival_ns - last.enter_ns)
         results = self._session.take_results(_MOST_RESULTS)
         self._record.answers(results)
         for first in range(0, len(results), MAX_STILL_RESULTS):
@@ -249,7 +224,7 @@ class GroundSide:
             session_id=self._info.session_id,
             receiver_id=_RECEIVER,
             sequence=frames,
-            send_ns=self._now_ns,
+            send_ns=self.now_ns,
             last_frame_index=self._session.last_frame_index,
             base_messages=frames,
             base_bytes=self._session.ledger.base_bytes,
@@ -313,7 +288,7 @@ class GroundSide:
             if isinstance(event, Overlay):
                 self._note(event)
             elif isinstance(event, Refinement):
-                self._record.refinement(event, at_ns=self._now_ns)
+                self._record.refinement(event, at_ns=self.now_ns)
             emit(event)
 
         return tell

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Image
+from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
+from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
 from hvt_scene import CodeInView
 from hvt_study.cache.results import ResultCache, content_key
 from hvt_study.datasets.clip import NOMINAL_FPS
@@ -140,7 +142,7 @@ class Readings:
             )
             observers.append(observer)
             models = SharedModels(context.detector, context.classifier)
-            return GroundSide(info, config=plan.ground, models=models, link=link, observer=observer)
+            return _ReadGround(info, observer=observer, config=plan.ground, models=models, link=link)
 
         flight = Flight(plan, detector=context.edge_detector, make_ground=ground)
         flight.run()
@@ -162,6 +164,25 @@ class Readings:
         """All that decides a flight beside its settings."""
         context = self._context
         return context.content, context.sequence.clip_frames, software_versions(), self._reader.name
+
+
+class _ReadGround(GroundSide):
+    """Shows the observer what arrives."""
+
+    def __init__(self, info: Info, *, observer: CodeObserver, **named: Any) -> None:
+        self._observer = observer
+        super().__init__(info, **named)
+
+    def _make_worker(self, analyze: Analyze, step: Step, read: Read) -> LockstepWorker:
+        def analyze_observed(picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - as `Analyze` says
+            self._observer.picture(picture, at_ns=self.now_ns)
+            analyze(picture, hurry)
+
+        def read_observed(stills: Sequence[ReceivedStill]) -> None:
+            self._observer.stills(stills, at_ns=self.now_ns)
+            read(stills)
+
+        return super()._make_worker(analyze_observed, step, read_observed)
 
 
 # What the cache holds

@@ -35,7 +35,7 @@ INSIDE_SHARE = 0.98
 
 
 class CodeObserver:
-    """See `hvt_study.flights.flight_ground.FlightObserver`.
+    """Is shown what a flight's ground has received, at the media time ``at_ns``; changes nothing.
 
     Args:
         codes: what there is to read, by object.
