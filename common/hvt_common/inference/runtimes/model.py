@@ -1,6 +1,6 @@
 """Models, on onnxruntime or another runtime: the only file that imports onnxruntime.
 
-A model file comes from outside: `onnx_file` checks it first, and what it declares has bounds. It is read as ONNX
+A model file comes from outside: `model_file` checks it first, and what it declares has bounds. It is read as ONNX
 whatever its name ends in, and no custom operator library is registered. A model that another runtime will run is
 opened by onnxruntime first: that gives ports and metadata, and no runtime gets a file that onnxruntime refuses. An
 OpenVINO model (``.xml``) is run by OpenVINO alone.
