@@ -26,6 +26,7 @@ from hvt_edge.link.rate_control import (
     ReconfigurationTrigger,
 )
 from hvt_edge.video.rate_model import FrameSkip, LimitedFrameSkip
+from hvt_edge.wiring.link import make_pacer
 from rigs.messages import counted, feedback
 
 MS = 1_000_000
@@ -679,4 +680,4 @@ def test_a_floor_above_the_ceiling_is_refused():
         check(EdgeConfig(source="demo", budget=400_000, min_budget=500_000))
     assert check(EdgeConfig(source="demo", size=(320, 180), budget=80_000)).floor_bps == 80_000
     assert check(EdgeConfig(source="demo")).floor_bps == 100_000
-    assert not EdgeConfig(source="demo", pace="lockstep").adapts
+    assert make_pacer(EdgeConfig(source="demo", pace="lockstep"), None, (320, 180)) is None, "media time"
