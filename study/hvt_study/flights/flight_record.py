@@ -218,10 +218,10 @@ class FlightRecord:
         """What the classifier says of the base crop and of the still."""
         if self._classifier is None or event.base_crop_bgr is None or event.still_bgr is None:
             return None, None
-        also = (event.box_base_px,) if header.also else ()  # one of several has to be cut out
+        boxes = (event.box_base_px,) * (2 if header.also else 1)  # one of several has to be cut out
         crops = [
             object_crops(
-                DecodedStill(image, header.crop_source_px, event.box_base_px, header.frame_index, also),
+                DecodedStill(image, header.crop_source_px, boxes, header.frame_index),
                 view=self._view,
             )[0]
             for image in (event.base_crop_bgr, event.still_bgr)

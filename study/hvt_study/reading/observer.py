@@ -102,7 +102,7 @@ class CodeObserver:
             return
         except StillError:
             return
-        decoded = DecodedStill(image, still.header.crop_source_px, (0, 0, 0, 0), frame_index)
+        decoded = DecodedStill(image, still.header.crop_source_px, ((0, 0, 0, 0),), frame_index)
         self._read_still(decoded, at_ns=at_ns)
         self._read_composite(decoded, base_bgr, at_ns=at_ns)
 

@@ -196,7 +196,7 @@ def object_crops(still: DecodedStill, *, view: View) -> list[Image]:
 
     A still of one object is that picture already.
     """
-    if not still.also_boxes_base_px:
+    if len(still.boxes_base_px) == 1:
         return [still.image_bgr]
     height, width = still.image_bgr.shape[:2]
     x1, y1, x2, y2 = still.crop_source_px

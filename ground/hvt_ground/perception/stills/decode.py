@@ -33,15 +33,9 @@ class DecodedStill:
 
     image_bgr: Image
     crop_source_px: tuple[int, int, int, int]
-    box_base_px: Box
+    boxes_base_px: tuple[Box, ...]
+    """The lead object's box, then those of the others, in the order of the header's ``also``."""
     frame_index: int
-    also_boxes_base_px: tuple[Box, ...] = ()
-    """The boxes of its further objects, in the order of the header's ``also``."""
-
-    @property
-    def boxes_base_px(self) -> tuple[Box, ...]:
-        """The lead object's box, then those of the others."""
-        return (self.box_base_px, *self.also_boxes_base_px)
 
 
 def readable_codecs() -> tuple[str, ...]:

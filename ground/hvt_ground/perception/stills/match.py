@@ -87,13 +87,8 @@ class StillSeen:
         return self.event.still_sequence, self.part
 
 
-@dataclass(frozen=True, slots=True)
-class TrackMatch:
-    """The match of a still: row ``row`` of ``tracks``, or none (``tracks`` is None)."""
-
-    tracks: Tracks | None = None
-    row: int = -1
-    ambiguous: bool = False
+TrackMatch = tuple[Tracks, int] | Outcome
+"""The match of a still: a row of tracks, or why there is none."""
 
 
 class Matcher:
@@ -132,7 +127,7 @@ class Matcher:
         found = self._assign(groups, tracks, np.arange(len(tracks)), frame_index, class_names)
         known = tracks.ids
         for after in later:
-            left = [group for group in groups if found[group[0].key].tracks is None]
+            left = [group for group in groups if isinstance(found[group[0].key], str)]
             if not left:
                 break
             fresh = ~np.isin(after.ids, known) & (after.born_frames <= frame_index)
@@ -165,7 +160,7 @@ class Matcher:
     ) -> dict[tuple[int, int], TrackMatch]:
         # One to one among the tracks in ``rows``, by the key of each group's first; finds are remembered.
         heads = [group[0] for group in groups]
-        found = {head.key: TrackMatch() for head in heads}
+        found: dict[tuple[int, int], TrackMatch] = {head.key: "no track" for head in heads}
         if not heads or not len(rows):
             return found
         boxes = tracks.boxes_xyxy_px[rows]
@@ -175,9 +170,9 @@ class Matcher:
         for r, c in chosen.items():
             taken = [column for row, column in chosen.items() if row != r]
             if _ambiguous(preference[r], c, taken, boxes):
-                found[heads[r].key] = TrackMatch(ambiguous=True)
+                found[heads[r].key] = "ambiguous"
                 continue
-            found[heads[r].key] = TrackMatch(tracks, int(rows[c]))
+            found[heads[r].key] = tracks, int(rows[c])
             self._remember(heads[r].event.edge_track_id, int(tracks.ids[rows[c]]), frame_index)
         return found
 

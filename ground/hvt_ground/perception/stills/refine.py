@@ -185,14 +185,13 @@ class Refiner:
         newest = history.newest_tracked
         resolved: list[StillSeen] = []
         for still in sorted(held, key=lambda still: still.key):
-            candidate = found[still.key]
-            if candidate.tracks is not None:
-                resolved.append(self._apply(still, candidate.tracks, candidate.row))
+            match = found[still.key]
+            if not isinstance(match, str):
+                resolved.append(self._apply(still, *match))
             elif now_frame > self._held[still.key][1] or (
                 newest is not None and newest >= frame_index + self._confirm_frames
             ):
-                outcome: Outcome = "ambiguous" if candidate.ambiguous else "no track"
-                resolved.append(self._unmatched(still, outcome))
+                resolved.append(self._unmatched(still, match))
         return resolved
 
     def _resolve_untracked(

@@ -20,7 +20,7 @@ from hvt_ground.perception.stills.classify import ObjectReading, StillReader
 from hvt_ground.perception.stills.decode import Box, DecodedStill, ReceivedStill, decode_still, needs_base
 from hvt_ground.perception.stills.match import StillSeen
 from hvt_ground.perception.stills.refine import Refiner
-from hvt_ground.perception.stills.vocabulary import Vocabulary, Vote
+from hvt_ground.perception.stills.vocabulary import Vocabulary
 
 _log = logging.getLogger(__name__)
 
@@ -174,8 +174,8 @@ class StillStage:
             for track_id, _ in _shown(header):
                 self._answer(header, track_id, None)
             return None
-        boxes = [self._to_base(box) for _, box in _shown(header)]
-        return DecodedStill(image, header.crop_source_px, boxes[0], header.frame_index, tuple(boxes[1:]))
+        boxes = tuple(self._to_base(box) for _, box in _shown(header))
+        return DecodedStill(image, header.crop_source_px, boxes, header.frame_index)
 
     # From readings to tracks
 
@@ -193,23 +193,19 @@ class StillStage:
         shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
         for part, ((track_id, _), box, reading) in enumerate(shown):
             side_px = min(box[2] - box[0], box[3] - box[1]) / self._view.scale
-            vote = self._vote(reading, called=header.class_name, side_px=side_px)
-            self._answer(header, track_id, vote.posterior)
+            said, note = reading.posterior, ""
+            if said is not None:
+                said, note = self._vocabulary.vote(said, called=header.class_name, side_px=side_px)
+            self._answer(header, track_id, said)
             event = self._refinement(still, decoded, track_id, box, crop)
-            if vote.posterior is None:
+            if said is None:
                 self.outcomes["unread"] += 1
-                self._give_out(replace(event, unread=True, note=vote.note), now)
+                self._give_out(replace(event, unread=True, note=note), now)
                 continue
-            said = vote.posterior
             event = replace(event, class_after=said.class_name, confidence=said.confidence)
             seen = StillSeen(event, said, side_px, news, part, reading.box_base_px)
             for resolved in self._refiner.offer(seen, now_frame=now.frame_index):
                 self._resolved(resolved, now)
-
-    def _vote(self, reading: ObjectReading, *, called: str, side_px: float) -> Vote:
-        if reading.posterior is None:
-            return Vote(None)
-        return self._vocabulary.vote(reading.posterior, called=called, side_px=side_px)
 
     def _news(self, decoded: DecodedStill) -> float:
         # Pixels named twice were not seen twice; on a base near the source the track's many votes are worth more.

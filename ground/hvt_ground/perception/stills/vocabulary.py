@@ -17,7 +17,6 @@ its classes, is one class for detectors and classifier. A track that it wins is 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,17 +27,6 @@ from hvt_common.values import Posterior
 LEAST_SIDE_PX = 24
 """The shorter side of an object, source pixels, from which a network of ImageNet has a vote."""
 _SOME = 6
-
-
-@dataclass(frozen=True, slots=True)
-class Vote:
-    """A still's vote on an object."""
-
-    posterior: Posterior | None
-    """Over `Vocabulary.names`; its probabilities need not sum to 1, as several classes may mean one thing. None is no
-    vote."""
-    note: str = ""
-    """The classifier's name for it, if that means no class: ``waffle iron .31``."""
 
 
 class Vocabulary:
@@ -75,9 +63,11 @@ class Vocabulary:
         """Whether a class of ``names`` is nothing of mine."""
         return self.nothing is not None and name == self.names[self.nothing]
 
-    def vote(self, said: Posterior, *, called: str, side_px: float) -> Vote:
+    def vote(self, said: Posterior, *, called: str, side_px: float) -> tuple[Posterior | None, str]:
         """Translate the reader's answer; ``called`` is the edge's name of the object, ``side_px`` its shorter side.
 
+        The vote is over ``names``; its probabilities need not sum to 1, as several classes may mean one thing. Where
+        there is none (None), a note has the reader's name for what means no class: ``waffle iron .31``.
         `ValueError` if the answer does not have one probability for each of the reader's classes.
         """
         if said.probabilities.shape != (len(self._reader),):
@@ -89,7 +79,7 @@ class Vocabulary:
         cells = np.bincount(self._cells, weights=given)
         best = int(cells.argmax())
         if best == 0 or (self.coarse and side_px < LEAST_SIDE_PX):
-            return Vote(None, f"{said.class_name} .{min(99, round(100 * said.confidence)):02d}")
+            return None, f"{said.class_name} .{min(99, round(100 * said.confidence)):02d}"
         likelihoods = given @ self._means
         nothing = 0.0 if self.nothing is None else likelihoods[self.nothing]
         likelihoods[self._unspoken] = cells[0] + nothing
@@ -97,7 +87,7 @@ class Vocabulary:
         name = next((self.names[k] for k in meant if same_word(self.names[k], called)), self.names[meant[0]])
         sure = cells[cells > 0]
         entropy = max(0.0, -float((sure * np.log(sure)).sum()))
-        return Vote(Posterior(name, min(1.0, float(cells[best])), entropy, likelihoods.astype(np.float32)))
+        return Posterior(name, min(1.0, float(cells[best])), entropy, likelihoods.astype(np.float32)), ""
 
 
 def check_common(detector: str, detects: Sequence[str], classifier: str, says: Sequence[str]) -> None:

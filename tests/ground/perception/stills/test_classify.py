@@ -37,7 +37,7 @@ def decoded(
     width, height = size or (crop[2] - crop[0], crop[3] - crop[1])
     image = np.full((height, width, 3), colour, np.uint8)
     x1, y1, x2, y2 = VIEW.to_base(np.array([crop], np.float32))[0].tolist()
-    return DecodedStill(image, crop, (x1, y1, x2, y2), 0)
+    return DecodedStill(image, crop, ((x1, y1, x2, y2),), 0)
 
 
 class Bright:
@@ -131,7 +131,7 @@ def test_a_second_opinion_at_the_same_place_counts():
 def test_a_detection_speaks_for_one_object_only():
     """The car in front would give its class to the one that it hides."""
     near, behind = (100.0, 50.0, 120.0, 70.0), (108.0, 50.0, 128.0, 70.0)
-    still = dataclasses.replace(decoded((400, 200, 520, 280)), box_base_px=near, also_boxes_base_px=(behind,))
+    still = dataclasses.replace(decoded((400, 200, 520, 280)), boxes_base_px=(near, behind))
     ((lead, also),) = Redetection(Says((near, 0.6, 0)), view=VIEW).read([still], GREY).objects
     assert lead.posterior.class_name == "car"
     assert also == ObjectReading()
@@ -148,7 +148,7 @@ def test_what_nobody_named_inside_a_still_is_found():
         ((124, 40, 134, 60), 0.9, 0),  # mostly beside the still: the base shows it
         ((200, 50, 220, 70), 0.9, 0),  # elsewhere
     )
-    still = dataclasses.replace(decoded((396, 196, 516, 284)), box_base_px=named)
+    still = dataclasses.replace(decoded((396, 196, 516, 284)), boxes_base_px=(named,))
     found = Redetection(detector, view=VIEW).read([still], GREY).found
     assert found.boxes_xyxy_px.tolist() == [[121, 51, 127, 60]]
     assert found.class_ids.tolist() == [2]
@@ -167,21 +167,23 @@ def test_a_network_larger_than_the_base_gets_the_stills_detail(data, monkeypatch
     view = View.fitted(size, (640, 384), fit="letterbox")
     truth = detector.detect(source)
     base = composite(
-        np.zeros((384, 640, 3), np.uint8), [DecodedStill(source, (0, 0, *size), (0, 0, 1, 1), 0)], view=view
+        np.zeros((384, 640, 3), np.uint8),
+        [DecodedStill(source, (0, 0, *size), ((0, 0, 1, 1),), 0)],
+        view=view,
     )
     base = cv2.resize(cv2.resize(base, (160, 96), interpolation=cv2.INTER_AREA), (640, 384))
     stills = []
     for box in truth.boxes_xyxy_px[:12]:
         x1, y1, x2, y2 = np.clip(box + np.array([-8, -8, 8, 8]), 0, [*size, *size]).astype(int).tolist()
         place = tuple(view.to_base(box[None])[0].tolist())
-        stills.append(DecodedStill(source[y1:y2, x1:x2], (x1, y1, x2, y2), place, 0))
+        stills.append(DecodedStill(source[y1:y2, x1:x2], (x1, y1, x2, y2), (place,), 0))
     seen, detect = [], detector.detect
     monkeypatch.setattr(detector, "detect", lambda image_bgr: seen.append(image_bgr) or detect(image_bgr))
     readings = [reading for (reading,) in Redetection(detector, view=view).read(stills, base).objects]
     right = [
         reading.posterior is not None
         and reading.posterior.class_name == detector.class_names[class_id]
-        and iou(np.array([reading.box_base_px]), np.array([still.box_base_px]))[0, 0] > 0.75
+        and iou(np.array([reading.box_base_px]), np.array(still.boxes_base_px))[0, 0] > 0.75
         for reading, class_id, still in zip(readings, truth.class_ids, stills, strict=False)
     ]
     assert sum(right) >= 11
@@ -239,7 +241,7 @@ def test_the_crop_reader_shows_each_object_of_a_shared_still_by_itself(tmp_path)
     image = np.zeros((50, 100, 3), np.uint8)  # coded at half the size of its crop
     image[:, :50], image[:, 50:] = (0, 0, 255), (255, 0, 0)
     still = DecodedStill(
-        image, (400, 200, 600, 300), (102.0, 52.0, 123.0, 73.0), 0, ((127.0, 52.0, 148.0, 73.0),)
+        image, (400, 200, 600, 300), ((102.0, 52.0, 123.0, 73.0), (127.0, 52.0, 148.0, 73.0)), 0
     )
     ((lead, also),) = reader.read([still], None).objects
     assert (lead.posterior.class_name, also.posterior.class_name) == ("red", "blue")
@@ -252,7 +254,7 @@ def test_the_crop_reader_shows_each_object_of_a_shared_still_by_itself(tmp_path)
 def test_no_box_of_a_still_is_too_odd_to_cut(corners):
     """A header with a box outside its crop would end the ground."""
     boxes = [(min(a, c), min(b, d), max(a, c), max(b, d)) for a, b, c, d in corners]
-    still = DecodedStill(np.zeros((40, 60, 3), np.uint8), (400, 200, 460, 240), boxes[0], 0, tuple(boxes[1:]))
+    still = DecodedStill(np.zeros((40, 60, 3), np.uint8), (400, 200, 460, 240), tuple(boxes), 0)
     for crop in object_crops(still, view=VIEW):
         assert crop.shape[0] >= 1
         assert crop.shape[1] >= 1
@@ -260,7 +262,7 @@ def test_no_box_of_a_still_is_too_odd_to_cut(corners):
 
 def test_without_any_model_stills_have_no_name():
     """A ground without models would not start."""
-    both = dataclasses.replace(decoded((0, 0, 9, 9)), also_boxes_base_px=((0.0, 0.0, 1.0, 1.0),))
+    both = dataclasses.replace(decoded((0, 0, 9, 9)), boxes_base_px=((0.0, 0.0, 1.0, 1.0),) * 2)
     assert NoReader().read([decoded((0, 0, 9, 9)), both], GREY).objects == (
         (ObjectReading(),),
         (ObjectReading(), ObjectReading()),

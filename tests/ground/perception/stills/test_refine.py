@@ -52,7 +52,7 @@ def still(
     sequence, frame_index, box=A, *, edge=70, posterior=VAN, class_name="car", words=WORDS, side_px=20.0
 ):
     """A still of an edge track."""
-    posterior = words.vote(posterior, called=class_name, side_px=20.0).posterior
+    posterior = words.vote(posterior, called=class_name, side_px=20.0)[0]
     return seen(sequence, frame_index, posterior, box, edge=edge, class_name=class_name, side_px=side_px)
 
 
@@ -147,7 +147,7 @@ OTHER = still(1, 0, A_NEAR, edge=71)
 def rows(matcher, frame_index, boxes, *wanted):
     """The rows of the tracks that were found; -1 for none."""
     found = matcher.match(wanted, tracks(frame_index, boxes), later=(), class_names=DETECTOR)
-    return [found[want.key].row for want in wanted]
+    return [-1 if isinstance(one, str) else one[1] for one in (found[want.key] for want in wanted)]
 
 
 def test_a_track_is_another_edge_tracks_own_only_for_a_while():
