@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -23,6 +22,7 @@ from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.loop.counts import Cores, CpuMeter, processors
+from hvt_edge.perception.cpu_budget import most_cores
 from hvt_edge.source.contract import Source
 from hvt_edge.source.opening import shown
 from hvt_edge.video.encoder_settings import PresetChoice, choose_preset, share_of
@@ -185,16 +185,20 @@ class _Checks:
         meter.measure(scale=1.0, short=False)
         every = detect_every(config.detect_every, fps=self._source.fps)
         networks = 2 if config.measures else 1  # it looks at the source and at what the base shows of it
-        needed = fps * encode_s + self._source.fps * networks * self._detect_s / every
+        video, wanted = fps * encode_s, self._source.fps * networks * self._detect_s / every
+        perceives = min(wanted, most_cores(processors(), others=video))
         free = meter.now.free
         if meter.now == Cores():  # this system does not say
-            free = float(os.cpu_count() or 1)
+            free = processors()
         codes = f"{config.encoder} codes {most_fps:.0f} fps of {fps:g} here"
         if config.passes_through:
             codes = "the camera codes"
-        codes = "; ".join(filter(None, (codes, choice.says)))
-        found = f"about {needed:.1f} cores of {free:.1f} that are free; {codes}"
-        if needed > free or most_fps < fps:
+        rarer = (
+            f"objects are looked for less often: {wanted:.2g} cores are wanted" if perceives < wanted else ""
+        )
+        codes = "; ".join(filter(None, (codes, choice.says, rarer)))
+        found = f"about {video + perceives:.2g} cores of {free:.1f} that are free; {codes}"
+        if video > free or most_fps < fps:
             todo = "lower --fps or --size, or give --method M0; else frames are left out"
             return Finding("warning", found, todo)
         return Finding("ok", found)

@@ -105,6 +105,15 @@ class TrackerSettings:
         return self.track_confidence + 0.1 if self.new_confidence is None else self.new_confidence
 
 
+@dataclass(frozen=True, slots=True)
+class _Searched:
+    """What stood before a frame that is being searched, and the camera's steps to it and to those after it."""
+
+    table: TrackTable
+    before: int | None
+    steps: list[tuple[int, Affine | None]]
+
+
 def _check_range(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:  # also refuses NaN
         raise ValueError(f"{name} is {value}, must be from {low} to {high}")
@@ -119,8 +128,9 @@ class ByteTracker:
     """Tracks objects through consecutive frames of one camera at ``fps`` frames a second.
 
     Call `update` for a frame that was searched for objects and `predict` for one that was not, with rising frame
-    indices. Frames left out altogether are stepped over; 10 s without an update end all tracks. Detections whose
-    numbers are not finite, or whose box has no area, are left out.
+    indices; or `predict` with ``searched`` for one that is being searched, and `update_late` once that is done.
+    Frames left out altogether are stepped over; 10 s without an update end all tracks. Detections whose numbers are
+    not finite, or whose box has no area, are left out.
     Class ids must be small (an index into class names), not negative.
 
     A track is confirmed when the next update finds it again (with a detection every n-th frame: n frames after the
@@ -148,6 +158,7 @@ class ByteTracker:
         self._updated_index: int | None = None
         self._gaps: deque[int] = deque(maxlen=_LEAST_DETECTIONS)
         """Frames from one update to the next, of the last ones."""
+        self._searched: _Searched | None = None
         self._next_id = 1
         self.scene_began = -1
         """The newest frame that another scene began with, where the camera is followed; -1 before any."""
@@ -169,17 +180,37 @@ class ByteTracker:
         ``image_bgr`` is that frame; it is needed only to follow the camera's motion.
         A `ValueError` means that ``frame_index`` does not rise or that the class ids are negative.
         """
+        self._searched = None
+        self._check_rises(frame_index)
+        affine = self._step_of(image_bgr, frame_index, mark=True)
+        return self._update(detections, frame_index, affine)
+
+    def update_late(self, detections: Detections) -> Tracks:
+        """The tracks at the frame that `predict` last took as ``searched``, where this was found meanwhile.
+
+        All is from then on as if it had been found at once.
+        """
+        searched, self._searched = self._searched, None
+        if searched is None:
+            raise ValueError("no frame is being searched")
+        self._table, self._frame_index = searched.table, searched.before
+        (frame_index, affine), *later = searched.steps
+        listed = self._update(detections, frame_index, affine)
+        for at, step in later:
+            self._advance(at, step, hold_unconfirmed=False)
+            self._table.started[:] = False
+        return listed
+
+    def _update(self, detections: Detections, frame_index: int, affine: Affine | None) -> Tracks:
         seen = TrackerInput.of(detections, low_confidence=self._settings.low_confidence)
-        self._advance(frame_index, image_bgr, hold_unconfirmed=True)
-        first = self._updated_index is None or self.scene_began > self._updated_index
+        self._advance(frame_index, affine, hold_unconfirmed=True)
+        first = self._updated_index is None or self._updated_index < self.scene_began <= frame_index
         gap = 1 if self._updated_index is None else frame_index - self._updated_index
         self._gaps.append(gap)
         self._forget_stale(frame_index)
         self._widen_for(seen)
         match, free = self._match(seen, frame_index, growth=self._growth(frame_index))
         self._updated_index = frame_index
-        if self._camera is not None:
-            self._camera.mark()
         self._correct(seen, match, frame_index, gap=gap)
         retained = self._retire(match, frame_index)
         self._start(seen.take(free), frame_index, confirmed=first)
@@ -189,9 +220,18 @@ class ByteTracker:
             self._table.retain(retained)
         return self._listed(frame_index)
 
-    def predict(self, *, frame_index: int, image_bgr: Image | None = None) -> Tracks:
-        """The tracks at a frame without detection: those of the last update, moved on by the Kalman filter."""
-        self._advance(frame_index, image_bgr, hold_unconfirmed=False)
+    def predict(self, *, frame_index: int, image_bgr: Image | None = None, searched: bool = False) -> Tracks:
+        """The tracks at a frame without detection: those of the last update, moved on by the Kalman filter.
+
+        ``searched``: that frame is being searched, in place of one that was before.
+        """
+        self._check_rises(frame_index)
+        if searched:
+            self._searched = _Searched(self._table.copy(), self._frame_index, [])
+        affine = self._step_of(image_bgr, frame_index, mark=searched)
+        if self._searched is not None:
+            self._searched.steps.append((frame_index, affine))
+        self._advance(frame_index, affine, hold_unconfirmed=False)
         self._table.started[:] = False
         return self._listed(frame_index)
 
@@ -211,15 +251,23 @@ class ByteTracker:
         listed = self._listed(frame_index, states=states[:0] if ended else states)
         return replace(listed, started=np.zeros(len(listed), bool))
 
-    def _advance(self, frame_index: int, image_bgr: Image | None, *, hold_unconfirmed: bool) -> None:
+    def _check_rises(self, frame_index: int) -> None:
         if self._frame_index is not None and frame_index <= self._frame_index:
             raise ValueError(f"frame_index is {frame_index}, must be above the last one, {self._frame_index}")
+
+    def _step_of(self, image_bgr: Image | None, frame_index: int, *, mark: bool) -> Affine | None:
+        # The camera's step to this image; with ``mark`` `still` compares with it from now on.
+        camera = self._camera
+        self.camera_step = None if camera is None or image_bgr is None else camera.step(image_bgr)
+        if camera is not None and image_bgr is not None and camera.new_scene:
+            self.scene_began = frame_index
+        if camera is not None and mark:
+            camera.mark()
+        return self.camera_step
+
+    def _advance(self, frame_index: int, affine: Affine | None, *, hold_unconfirmed: bool) -> None:
         elapsed = 1 if self._frame_index is None else frame_index - self._frame_index
         self._frame_index = frame_index
-        affine = None if self._camera is None or image_bgr is None else self._camera.step(image_bgr)
-        self.camera_step = affine
-        if self._camera is not None and self._camera.new_scene:
-            self.scene_began = frame_index
         table = self._table
         if self.scene_began == frame_index or self._outdated(frame_index):
             table.retain(np.zeros(len(table), bool))

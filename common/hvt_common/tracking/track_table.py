@@ -108,6 +108,10 @@ class TrackTable:
             votes=votes,
         )
 
+    def copy(self) -> TrackTable:
+        """The same tracks, which change no more."""
+        return TrackTable(*(getattr(self, name).copy() for name in _COLUMNS))
+
     def retain(self, mask: _Mask) -> None:
         """Drop all tracks but the marked ones."""
         for name in _COLUMNS:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,6 +18,8 @@ from hvt_edge.source.contract import Source
 from hvt_edge.video.stage import Action, FrameDecision
 
 _STAT = Path("/proc/stat")
+_GROUPS = Path("/proc/self/cgroup")
+_TOP = Path("/sys/fs/cgroup")
 _MOST_SHORT = 600
 _IDLE = (3, 4)
 """Columns of idle and iowait in /proc/stat (proc(5)), counted without the name."""
@@ -61,7 +66,9 @@ class CpuMeter:
         wall_s, own_s = here.wall_s - last.wall_s, here.own_s - last.own_s
         others = max(0.0, here.busy_s - last.busy_s - own_s) / wall_s
         taken = own_s / wall_s
-        self.now = Cores(needed=taken * scale, free=max(0.0, processors() - others), taken=taken)
+        self.now = Cores(
+            needed=taken * scale, free=max(0.0, min(len(_cores()) - others, quota())), taken=taken
+        )
         if short:
             self._short = [*self._short[-_MOST_SHORT:], self.now]
 
@@ -72,9 +79,39 @@ class CpuMeter:
         return Cores(*(sum(column) / len(rows) for column in zip(*rows, strict=True)))
 
 
-def processors() -> int:
-    """Number of processors that this process may use."""
-    return len(_cores())
+def processors() -> float:
+    """Processors that this process may use: those it may run on, or less by the limit of its control group."""
+    return min(len(_cores()), quota())
+
+
+def quota(groups: Path = _GROUPS, top: Path = _TOP) -> float:
+    """Processors that a container or systemd gives this process: the least of its control group and those above.
+
+    Of version 1 or 2. In a container the group may be called otherwise than where it lies: the top counts as well.
+    """
+    limits = [math.inf]
+    with contextlib.suppress(OSError):
+        for line in groups.read_text(encoding="utf-8").splitlines():
+            number, controllers, path = line.split(":", 2)
+            if number == "0":
+                mounts, files = ["", "unified"], ["cpu.max"]
+            elif "cpu" in controllers.split(","):
+                mounts, files = ["cpu", controllers], ["cpu.cfs_quota_us", "cpu.cfs_period_us"]
+            else:
+                continue
+            group = Path(path.removeprefix("/"))
+            limits += [
+                _limit(top / mount / one, files) for mount in mounts for one in (group, *group.parents)
+            ]
+    return min(limits)
+
+
+def _limit(group: Path, files: Sequence[str]) -> float:
+    try:
+        given, period = " ".join((group / name).read_text(encoding="ascii") for name in files).split()
+        return float(given) / float(period) if float(given) > 0 else math.inf
+    except (OSError, ValueError):  # there is no such group, or it says "max"
+        return math.inf
 
 
 def _cores() -> set[int]:

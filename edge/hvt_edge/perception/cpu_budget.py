@@ -53,9 +53,9 @@ class Plan:
     compare_s: float = 0.0
 
 
-def most_cores(processors: float) -> float:
-    """Cores, of so many, that perception may take."""
-    return max(_LEAST_CORES, _SHARE * processors)
+def most_cores(processors: float, *, others: float = 0.0) -> float:
+    """Cores, of so many, that perception may take where the rest of this process takes ``others``."""
+    return min(max(_LEAST_CORES, _SHARE * processors), max(0.0, processors - others))
 
 
 def share_out(cores: float, costs: Mapping[Part, float], *, fps: float) -> Plan:
@@ -175,4 +175,4 @@ class CpuBudget:
             return
         perceived = (self._perceived_ns - before[1]) / (now_ns - before[0])
         others = max(0.0, cores - perceived)
-        self._cores = min(most_cores(self._processors), max(0.0, self._processors - others))
+        self._cores = most_cores(self._processors, others=others)

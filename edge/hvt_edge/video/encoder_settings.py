@@ -190,9 +190,9 @@ class PresetChoice:
     """One line for people; empty for the slowest, and for one that the user has chosen."""
 
 
-def share_of(cores: int) -> float:
+def share_of(cores: float) -> float:
     """Processors, of so many, that encoding may take."""
-    return max(_LEAST_CORES, _SHARE * cores)
+    return max(min(_LEAST_CORES, cores / 2), _SHARE * cores)
 
 
 def choose_preset(slowest_cores: float, *, most_cores: float) -> PresetChoice:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import wait
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -21,11 +23,11 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Boxes, Detections, Image, Tracks, View
 from hvt_common.video.hevc import YuvPicture
 from hvt_ground.events import Event, Overlay
+from hvt_ground.perception.detector_thread import Detection, DetectorThread
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import FusedTracks, Fusion
 from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import History, as_bgr
-from hvt_ground.perception.models import Turns
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner, ShownClasses
@@ -42,7 +44,9 @@ _PUT_OFF = 4
 """So many times the usual pause is the longest between two detections, where one is put off again and again."""
 
 _TURN_SHARE = 0.5
-"""Of the time to the next picture is waited for the detector, which other sessions use too."""
+"""Of the time to the next picture a list waits for the detector, which other sessions use too."""
+_LATE_NS = SECOND_NS
+"""Tracks are followed for so long while the next picture that was to be searched is; after that they are old."""
 
 _HISTORY_S = 3.0
 """Of pictures that residual stills may build on."""
@@ -81,7 +85,7 @@ class PipelineParts:
     fusion: Fusion
     path: CameraPath
     """The one that ``fusion`` moves boxes by."""
-    turns: Turns
+    detector_thread: DetectorThread
     """Of the sessions that share the detector."""
     trust: ViewTrust
     """Of the detector, in this session's video."""
@@ -89,8 +93,6 @@ class PipelineParts:
     """None where the detector's scores are no probabilities."""
     search: ScaleSearch | None = None
     """Of the detector, in this session's video; None where its scale is given."""
-    patient: bool = False
-    """Wait for a turn, however long: what is due is always detected, as lockstep needs it."""
 
 
 class NothingPerceived:
@@ -128,9 +130,11 @@ class Pipeline:
         self._detect_every, self._detect_still_every = detect_every, detect_still_every
         self._base_size = view.base_size
         self._frame_ns = SECOND_NS / fps
-        self._turn_s = None if parts.patient else _TURN_SHARE / fps
-        self._turn_key = object()
-        """Stands for this session among those that take turns, and keeps nothing of it alive."""
+        self._turn_s = _TURN_SHARE / fps
+        self._detection: Detection | None = None
+        """The picture that is searched, or waits for it."""
+        self._due_ns = 0
+        """When the one that was to be searched was captured, which another may have replaced."""
         self._farthest = round(_FARTHEST_S * fps)
         self._emit = emit
         gap_frames = max(1, round(_GAP_S * fps))
@@ -177,6 +181,11 @@ class Pipeline:
         return self.trust.unlike
 
     @property
+    def searching(self) -> bool:
+        """A picture is with the detector, or waits for it."""
+        return self._detection is not None and not self._detection.found.done()
+
+    @property
     def tracks(self) -> int:
         """Distinct tracks so far, whoever saw them."""
         return self._track_ids.count
@@ -211,18 +220,34 @@ class Pipeline:
         """The outcome of each object in the others."""
         return self._stills.outcomes
 
-    def analyze(self, picture: DecodedFrame, *, hurry: bool) -> None:
-        """Take the next frame; with ``hurry`` detection waits for a later one, but not for ever."""
+    def analyze(self, picture: DecodedFrame, *, hurry: bool, newer: threading.Event | None = None) -> None:
+        """Take the next frame; with ``hurry`` detection waits for a later one, but not for ever.
+
+        Once ``newer`` is set the list goes out without what the detector has not found yet: that is taken in with a
+        later frame, as if it had been known at once. Without, as in lockstep, what is due is waited for.
+        """
         index = picture.frame_index
         self._history.add_frame(index, picture.picture)
         image = as_bgr(picture.picture)
-        own = self._own = self._track(index, image, hurry=hurry)
+        own = self._own = self._track(picture, image, hurry=hurry, newer=newer)
         self._picture_ns = picture.capture_ns
         ahead = self._now.frame_index > index
         shown_at = (self._now.frame_index, self._now.capture_ns) if ahead else (index, picture.capture_ns)
         self._now = Progress(*shown_at, picture_index=index)
         self._parts.fusion.take_own(own)
-        self._show(own, picture.capture_ns)
+        late = self._detection is not None and picture.capture_ns - self._due_ns > _LATE_NS
+        self._show(own, picture.capture_ns, looked_ns=self._due_ns if late else None)
+
+    def take_late(self, newer: threading.Event | None) -> None:
+        """Take in what the detector is still at, where it is done before ``newer`` is set, though its list is out.
+
+        Stills would else find no tracks at the last pictures before a pause.
+        """
+        if newer is not None and self._detection is not None and self._is_found(self._detection, newer):
+            self._take_found(self._detection)
+            own = self._own = self._parts.tracker.extrapolated(frame_index=self._now.picture_index)
+            self._parts.fusion.take_own(own)
+            self._history.revise_tracks(self._parts.fusion.listed(own).tracks)
 
     def pass_over(self, index: int, capture_ns: int) -> None:
         """Take the next frame without its picture: its list goes on from the newest picture that was looked at.
@@ -284,38 +309,75 @@ class Pipeline:
 
         A ground goes on for days, and its edges come and go.
         """
+        if self._detection is not None:
+            self._detection.found.cancel()
         self._stills.end(self._now)
         self._history.clear()
 
     # The base stream
 
-    def _track(self, index: int, image: Image, *, hurry: bool) -> Tracks:
-        parts, last = self._parts, self._detected_frame
+    def _track(
+        self, picture: DecodedFrame, image: Image, *, hurry: bool, newer: threading.Event | None
+    ) -> Tracks:
+        parts, index = self._parts, picture.frame_index
+        if self._detection is not None and not self.searching:
+            self._take_found(self._detection)
+        begins = self._submits(picture, image, hurry=hurry)
+        own = parts.tracker.predict(frame_index=index, image_bgr=image, searched=begins)
+        if parts.tracker.scene_began == index:
+            parts.fusion.end_scene(index)
+        before, affine = self._now.picture_index, parts.tracker.camera_step
+        if before >= 0 and affine is not None:  # the tracker has followed it: it is not estimated twice
+            parts.path.add(affine, start=before, end=index)
+        if begins and self._detection is not None and self._is_found(self._detection, newer):
+            return self._take_found(self._detection)
+        return own
+
+    def _submits(self, picture: DecodedFrame, image: Image, *, hurry: bool) -> bool:
+        # Whether this picture is searched: begun here, or in place of one that has waited until now.
+        parts, last, index = self._parts, self._detected_frame, picture.frame_index
+        if self._detection is not None:
+            if not self._detection.replace(image):
+                return False
+            self._detected_frame = index
+            return True
         frames = None if last is None else index - last
         every = self._detect_every if parts.search is None else parts.search.interval(self._detect_every)
         due = frames is None or frames >= (_PUT_OFF if hurry else 1) * every
         if due and frames is not None and frames < self._detect_still_every:
             due = not parts.tracker.still
         due = due or (last is not None and parts.tracker.scene_began > last)
-        if due and parts.turns.take(self._turn_key, within_s=self._turn_s):
+        if due:
             self._detected_frame = index
+            self._due_ns = picture.capture_ns
             self.detections_run += 1
-            try:
-                found = parts.detector.detect(image) or Detections.none()
-                found = found if parts.search is None else parts.search.take(found, image)
-            finally:
-                parts.turns.release()
-            self.trust.take(found)
-            own = parts.tracker.update(found, frame_index=index, image_bgr=image)
-            self.objects_detected = int((own.seen_frames == index).sum())
-            self.tilt.take(self._vehicles(own), height_px=image.shape[0])
-        else:
-            own = parts.tracker.predict(frame_index=index, image_bgr=image)
-        if parts.tracker.scene_began == index:
-            parts.fusion.end_scene(index)
-        before, affine = self._now.picture_index, parts.tracker.camera_step
-        if before >= 0 and affine is not None:  # the tracker has followed it: it is not estimated twice
-            parts.path.add(affine, start=before, end=index)
+            self._detection = parts.detector_thread.submit(image, self._detect)
+        return due
+
+    def _is_found(self, detection: Detection, newer: threading.Event | None) -> bool:
+        # Whether the detector is done with this picture, before there is a ``newer`` one.
+        if newer is None or self._own is None:  # before the first there is nothing to list
+            return bool(wait([detection.found]).done)
+        detection.found.add_done_callback(lambda _: newer.set())
+        newer.wait(self._turn_s)
+        if not detection.queued:
+            newer.wait()
+        return detection.found.done()
+
+    def _detect(self, image: Image) -> Detections:
+        # In the detector's thread.
+        parts = self._parts
+        found = parts.detector.detect(image) or Detections.none()
+        return found if parts.search is None else parts.search.take(found, image)
+
+    def _take_found(self, detection: Detection) -> Tracks:
+        # What was found in the picture that was searched; our tracks there.
+        parts, self._detection = self._parts, None
+        found = detection.found.result()
+        self.trust.take(found)
+        own = parts.tracker.update_late(found)
+        self.objects_detected = int((own.seen_frames == own.frame_index).sum())
+        self.tilt.take(self._vehicles(own), height_px=self._base_size[1])
         return own
 
     def _vehicles(self, own: Tracks) -> Boxes:

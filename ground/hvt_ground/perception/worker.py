@@ -46,8 +46,8 @@ _STEP_LAG = 2
 may overtake it by microseconds: this is what makes the order the same in every run."""
 _AHEAD = 2
 
-Analyze = Callable[[DecodedFrame, bool], None]
-"""Called with a picture, and whether to hurry."""
+Analyze = Callable[[DecodedFrame, bool, threading.Event | None], None]
+"""Called with a picture, whether to hurry, and what is set once there is a newer one (None: all is waited for)."""
 Step = Callable[[Tracks, int], None]
 """Called with the edge's tracks at one frame, and that frame's capture time."""
 Read = Callable[[Sequence[ReceivedStill]], None]
@@ -179,6 +179,8 @@ class RealtimeWorker(PerceptionWorker):
         self._job_step_s = 0.0
         """When the last step of one was done."""
         self._wake = threading.Event()
+        self._newer = threading.Event()
+        """A picture has come since the one in hand was taken, or the thread is to end."""
         self._ending = threading.Event()
         self._given_up = threading.Event()
         self._in_hand = False
@@ -217,6 +219,7 @@ class RealtimeWorker(PerceptionWorker):
                 self._passed.append((oldest.frame_index, oldest.capture_ns))
                 self.untracked += 1
             self._pictures.append((picture, time.monotonic()))
+            self._newer.set()
         self._wake.set()
 
     def step(self, tracks: Tracks, capture_ns: int) -> None:
@@ -247,7 +250,9 @@ class RealtimeWorker(PerceptionWorker):
         self._ending.set()
         self._wake.set()
         self._thread.join(self._finish_s)
-        self._given_up.set()
+        with self._lock:
+            self._given_up.set()
+            self._newer.set()
         self._thread.join(self._leave_s)
         self.dropped["ended"] += len(self._stills)
         self.untracked += len(self._pictures)
@@ -312,12 +317,14 @@ class RealtimeWorker(PerceptionWorker):
             with self._lock:
                 picture, came_s = self._pictures.popleft()
                 newer = len(self._pictures) > 0
+                if not newer and not self._given_up.is_set():
+                    self._newer.clear()
                 late = newer and time.monotonic() - came_s > _OLDEST_S
                 self.untracked += late
             if late:
                 self._pass_over(picture.frame_index, picture.capture_ns)
             else:
-                self._analyze(picture, hurry or newer)
+                self._analyze(picture, hurry or newer, self._newer)
 
     def _do_jobs(self) -> None:
         # Do jobs that can wait, until something comes that cannot.
@@ -355,7 +362,7 @@ class LockstepWorker(PerceptionWorker):
         self._captures_ns.append(picture.capture_ns)
         self._take_steps(before=picture.frame_index - _STEP_LAG + 1)
         self._newest_frame = picture.frame_index
-        self._submit(self._worker.submit(self._analyze, picture, False))
+        self._submit(self._worker.submit(self._analyze, picture, False, None))
         known = [one for one in self._early if one.header.frame_index <= self._newest_frame]
         if known:
             self._early = [one for one in self._early if one.header.frame_index > self._newest_frame]

@@ -489,11 +489,17 @@ class GroundSession:
     # In the worker's thread
 
     @_perceives
-    def _analyze(self, picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - called by the worker only
-        self.pipeline.analyze(picture, hurry=hurry)
+    def _analyze(
+        self,
+        picture: DecodedFrame,
+        hurry: bool,  # noqa: FBT001 - called by the worker only
+        newer: threading.Event | None,
+    ) -> None:
+        self.pipeline.analyze(picture, hurry=hurry, newer=newer)
         self._analyzed = (picture.frame_index, self.pipeline.objects_detected)
         if picture.reference_ns is not None:
             self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
+        self.pipeline.take_late(newer)
         self._collect_results()
         if self.lockstep:
             self.report()

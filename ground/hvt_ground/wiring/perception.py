@@ -53,12 +53,10 @@ def make_pipeline(
         vocabulary=vocabulary,
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path, base_per_source=info.view.scale),
         path=path,
-        turns=models.turns,
+        detector_thread=models.detector_thread,
         trust=trust or make_trust(config),
         guesses=_guesses(models.facts, info),
         search=_scale_search(config, models.facts, detector, info),
-        # In lockstep the same input gives the same detections, however long they take.
-        patient=info.pace == "lockstep",
     )
     return Pipeline(
         parts,

@@ -29,7 +29,8 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.link.reassemble import Arrival as AccessUnitArrival
 from hvt_ground.link.receiver import BasePacket
-from hvt_ground.perception.models import ModelFacts, Turns
+from hvt_ground.perception.detector_thread import DetectorThread
+from hvt_ground.perception.models import ModelFacts
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
 from hvt_ground.session.session import GroundSession
@@ -58,7 +59,7 @@ class InlineExecutor(ThreadPoolExecutor):
 
 
 class SharedModels(Models):
-    """Models that are open already, of this configuration; flights of one process take turns with them."""
+    """Models that are open already, of this configuration; flights of one process share them."""
 
     def __init__(
         self,
@@ -69,7 +70,7 @@ class SharedModels(Models):
     ) -> None:
         self._shared = detector, classifier
         self.facts = ModelFacts.of(config or GroundConfig())
-        self.turns = Turns()
+        self.detector_thread = DetectorThread()
 
     def take(self) -> tuple[FailingDetector, Classifier | None]:
         """The same for every session."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -431,6 +432,29 @@ def test_looking_ahead_shows_what_prediction_would_and_changes_nothing(seed: int
     asked.predict(frame_index=200)
     with pytest.raises(ValueError, match="must not be below"):
         asked.extrapolated(frame_index=20 + ahead)
+
+
+@pytest.mark.parametrize("late", [0, 2, 4])
+def test_what_is_found_late_counts_as_if_it_had_been_found_at_once(late: int) -> None:
+    """Boxes of a slow detector would lie where objects were when it began."""
+    at_once, waited = (ByteTracker(TrackerSettings(camera_motion="flow"), fps=15) for _ in range(2))
+    picture = np.random.default_rng(late).integers(0, 255, (90, 160, 3), np.uint8)
+    for k, found in enumerate(scene(late, frames=20)):
+        image = np.roll(picture, 3 * k, axis=1)  # the camera pans
+        if k % 5 == 0:
+            at_once.update(found, frame_index=k, image_bgr=image)
+        else:
+            at_once.predict(frame_index=k, image_bgr=image)
+        waited.predict(frame_index=k, image_bgr=image, searched=k % 5 == 0)
+        if k % 5 == 0:
+            searched = found
+        if k % 5 == late:
+            assert waited.update_late(searched).frame_index == k - late
+            for name, column in asdict(at_once.extrapolated(frame_index=k)).items():
+                np.testing.assert_array_equal(getattr(waited.extrapolated(frame_index=k), name), column)
+            assert waited.still == at_once.still
+    with pytest.raises(ValueError, match="no frame is being searched"):
+        waited.update_late(Detections.none())
 
 
 def test_the_class_follows_the_votes() -> None:

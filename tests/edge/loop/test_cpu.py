@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import time
@@ -9,6 +10,7 @@ from collections import Counter
 
 import pytest
 
+from hvt_edge.loop import counts
 from hvt_edge.loop.counts import CpuMeter, FrameCounts
 
 
@@ -49,6 +51,44 @@ def test_a_core_that_another_process_takes_is_not_free():
     finally:
         os.sched_setaffinity(0, cores)
     assert meter.now.free < 0.3
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "processors"),
+    [
+        ("0::/", {"cpu.max": "50000 100000\n"}, 0.5),
+        ("0::/a.slice/x", {"a.slice/x/cpu.max": "max 100000", "a.slice/cpu.max": "30000 100000"}, 0.3),
+        (
+            "1:cpu:/docker/ab\n0::/docker/ab",
+            {"cpu/cpu.cfs_quota_us": "25000", "cpu/cpu.cfs_period_us": "100000"},
+            0.25,
+        ),
+        (
+            "4:cpu,cpuacct:/",
+            {"cpu,cpuacct/cpu.cfs_quota_us": "-1\n", "cpu,cpuacct/cpu.cfs_period_us": "100000\n"},
+            None,
+        ),
+        ("0::/", {"cpu.max": "max 100000"}, None),
+        ("4:memory:/x", {"cpu.max": "1000 100000"}, None),
+        (None, {}, None),
+    ],
+)
+def test_a_containers_limit_is_known(tmp_path, monkeypatch, groups, files, processors):
+    """Perception would take half of the host's processors, and video would have nothing left of half a one."""
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    if groups is not None:
+        (tmp_path / "groups").write_text(groups)
+    given = counts.quota(tmp_path / "groups", tmp_path)
+    assert given == (processors or math.inf)
+    monkeypatch.setattr(counts, "quota", lambda: given)
+    every = len(os.sched_getaffinity(0))
+    assert counts.processors() == (processors or every)
+    meter = CpuMeter()
+    burn(0.12)
+    meter.measure(scale=1.0, short=False)
+    assert meter.now.free <= (processors or every)
 
 
 def test_video_and_perception_count_by_what_each_took():

@@ -38,6 +38,11 @@ def test_a_machine_of_many_processors_need_not_give_up_quality():
     assert share_of(16) > 3
 
 
+def test_of_a_part_of_a_processor_encoding_takes_half():
+    """In a container that is given half of one nothing would be left to decode, track and send with."""
+    assert share_of(0.5) == 0.25
+
+
 class Clockwork:
     """A control of 15 frames a second whose encoder takes ``frame_ms`` for each; a keyframe each ten seconds."""
 

@@ -51,6 +51,18 @@ def test_all_is_well_where_a_ground_listens(tmp_path, capsys, scene):
     assert "cores" in found["processor"]["found"]
 
 
+def test_the_forecast_has_perception_within_what_video_leaves(capsys, monkeypatch, scene):
+    """On a board the doctor said three times what the flight then took, and that frames would be left out."""
+    monkeypatch.setattr("hvt_fleet.edge_doctor.processors", lambda: 2.0)
+    monkeypatch.setattr("hvt_fleet.edge_doctor.CpuMeter.measure", lambda *_, **__: None)
+    monkeypatch.setattr("hvt_fleet.edge_doctor.detect_every", lambda *_, **__: 1e-6)
+    _, findings = examined(capsys, "--source", str(scene), *CHEAP, "--connect", "tcp/127.0.0.1:9")
+    found = findings["processor"]
+    assert float(found["found"].split()[1]) <= 2
+    assert "objects are looked for less often" in found["found"]
+    assert found["state"] == "ok"
+
+
 def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
     """One fault after the other would take an afternoon in a field."""
     (tmp_path / "file").write_bytes(b"")

@@ -839,7 +839,7 @@ def test_a_worker_is_not_idle_while_it_analyzes():
     """Whoever waits for it would count what it has not made anything of yet."""
     began, may_end = threading.Event(), threading.Event()
 
-    def see(_picture, _hurry) -> None:
+    def see(_picture, _hurry, _newer) -> None:
         began.set()
         assert may_end.wait(60)
 
@@ -860,7 +860,7 @@ def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():
     """On a slow machine the stills of an outage would be acknowledged, and never shown."""
     done, pending, at_rest = [], [], []
 
-    def see(_picture, _hurry) -> None:
+    def see(_picture, _hurry, _newer) -> None:
         pending.pop()
         time.sleep(0.03)
         if len(done) < 3:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import cv2
@@ -16,7 +17,10 @@ from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import still_codec
 from hvt_ground.events import Notice, Overlay, Refinement
+from hvt_ground.perception.detector_thread import DetectorThread
+from hvt_ground.perception.history import as_bgr
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
+from programs.processes import eventually
 from rigs.flight import (
     CLASSES,
     Flight,
@@ -100,6 +104,110 @@ def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures
         assert one.track_ids.tolist() == [1]
         np.testing.assert_allclose(one.boxes_base_px[0], square_box(one.frame_index), atol=6)
         assert (one.classes, one.refined.tolist()) == (("car",), [False])
+
+
+def test_a_slow_detector_holds_no_list_up_and_its_boxes_lie_where_objects_are_now(pictures):
+    """Beside a browser lists came a second late, and the page showed none on the picture of now."""
+    taken, release, newer = threading.Semaphore(0), threading.Semaphore(0), threading.Event()
+
+    class Slow(RedSquares):
+        def detect(self, image_bgr):
+            taken.release()
+            assert release.acquire(timeout=20)
+            return super().detect(image_bgr)
+
+    rig, at_once = Rig(detect_every=5, detector=Slow()), Rig(detect_every=5)
+    release.release()  # before the first there is nothing to list
+    newer.set()  # there always is one
+    for picture in pictures:
+        rig.pipeline.analyze(picture, hurry=False, newer=newer)
+        at_once.pipeline.analyze(picture, hurry=False)
+        if picture.frame_index % 5 == 0:
+            assert taken.acquire(timeout=20), "else the next would take its place"
+        if picture.frame_index % 5 == 2 and picture.frame_index > 5:  # what began two pictures ago
+            release.release()
+            eventually(lambda: rig.pipeline.searching is False, within_s=20, what="it is found")
+    lists, expected = rig.of(Overlay), at_once.of(Overlay)
+    assert [one.frame_index for one in lists] == list(range(30))
+    assert {one.looked_ns for one in lists} == {None}
+    for one, right in zip(lists, expected, strict=True):
+        assert one.track_ids.tolist() == [1]
+        if one.frame_index < 5 or one.frame_index % 5 >= 3:
+            np.testing.assert_array_equal(one.boxes_base_px, right.boxes_base_px)
+            assert (one.classes, one.confidences.tolist()) == (right.classes, right.confidences.tolist())
+    assert rig.pipeline.objects_detected == 1
+
+
+def test_lists_of_a_detector_that_is_a_second_behind_are_old(pictures):
+    """Boxes that nobody has compared with a picture for so long would pass for seen."""
+    release, newer = threading.Semaphore(0), threading.Event()
+
+    class Hangs(NothingSeen):
+        def detect(self, image_bgr):
+            release.acquire(timeout=20)
+            return super().detect(image_bgr)
+
+    rig = Rig(detect_every=5, detector=Hangs())
+    release.release()
+    newer.set()
+    for picture in pictures[:25]:
+        rig.pipeline.analyze(picture, hurry=False, newer=newer)
+    due_ns = pictures[5].capture_ns
+    assert [one.looked_ns for one in rig.of(Overlay)] == [None] * 21 + [due_ns] * 4
+    release.release(100)
+
+
+def test_a_picture_that_waits_for_the_detector_gives_way_to_the_newest(pictures):
+    """Where many edges share it each would be searched in a picture that is seconds old."""
+    go, seen, newer = threading.Event(), [], threading.Event()
+
+    class Other(NothingSeen):
+        def detect(self, image_bgr):
+            assert go.wait(timeout=20)
+            return super().detect(image_bgr)
+
+    class Watched(NothingSeen):
+        def detect(self, image_bgr):
+            seen.append(image_bgr)
+            return super().detect(image_bgr)
+
+    thread = DetectorThread()
+    other = Rig(detect_every=5, detector=Other(), detector_thread=thread)
+    rig = Rig(detect_every=5, detector=Watched(), detector_thread=thread)
+    go.set()
+    newer.set()
+    for one in (other, rig):
+        one.pipeline.analyze(pictures[0], hurry=False, newer=newer)
+    go.clear()
+    other.pipeline.analyze(pictures[5], hurry=False, newer=newer)
+    for picture in pictures[5:9]:
+        rig.pipeline.analyze(picture, hurry=False, newer=newer)
+    go.set()
+    eventually(lambda: not rig.pipeline.searching, within_s=20, what="it is searched")
+    np.testing.assert_array_equal(seen, [as_bgr(pictures[index].picture) for index in (0, 8)])
+    assert rig.pipeline.detections_run == 2
+
+
+def test_what_is_found_after_the_list_is_out_counts_though_nothing_comes(pictures):
+    """After the last picture of a flight, or where the link pauses, stills would find no track at its frame."""
+    release, newer = threading.Semaphore(1), threading.Event()
+
+    class BlindAtLast(RedSquares):
+        def detect(self, image_bgr):
+            assert release.acquire(timeout=20)
+            return super().detect(image_bgr if rig.pipeline.detections_run == 1 else np.zeros_like(image_bgr))
+
+    rig = Rig(detect_every=5, detector=BlindAtLast())
+    rig.pipeline.analyze(pictures[0], hurry=False, newer=newer)
+    newer.set()
+    rig.pipeline.analyze(pictures[5], hurry=False, newer=newer)
+    rig.pipeline.take_late(newer)
+    assert (rig.pipeline.searching, rig.pipeline.objects_detected) == (True, 1)
+    newer.clear()
+    release.release()
+    rig.pipeline.take_late(newer)
+    assert (rig.pipeline.searching, rig.pipeline.objects_detected) == (False, 0)
+    assert len(rig.of(Overlay)) == 2
 
 
 def test_small_objects_are_looked_at_enlarged_and_less_often(pictures):

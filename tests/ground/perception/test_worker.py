@@ -43,7 +43,7 @@ class Rig:
         self.done: list[tuple[str, Any]] = []
         self.begun, self.go_on = threading.Event(), threading.Event()
         self.worker = RealtimeWorker(
-            lambda one, hurry: self._note("hurry" if hurry else "picture", one.frame_index),
+            lambda one, hurry, _newer: self._note("hurry" if hurry else "picture", one.frame_index),
             lambda tracks, _at_ns: self._note("step", tracks.frame_index),
             lambda stills: self._note("stills", [one.header.sequence for one in stills]),
             name="x",
@@ -119,7 +119,7 @@ def test_in_lockstep_a_pose_counts_from_the_same_frame_on_however_long_perceptio
     """The same flight received again would place the same tracks elsewhere."""
     done: list[Any] = []
 
-    def analyze(one: DecodedFrame, _hurry: object) -> None:
+    def analyze(one: DecodedFrame, _hurry: object, _newer: object) -> None:
         time.sleep(0.03 * slow)
         done.append(one.frame_index)
 

@@ -28,9 +28,9 @@ from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Detections, Image, Posterior, Tracks, View
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
+from hvt_ground.perception.detector_thread import DetectorThread
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
-from hvt_ground.perception.models import Turns
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import FrameReadings, ObjectReading
 from hvt_ground.perception.stills.decode import DecodedStill
@@ -137,6 +137,7 @@ def pipeline_of(
     wants_base: bool = False,
     trust: ViewTrust | None = None,
     search: ScaleSearch | None = None,
+    detector_thread: DetectorThread | None = None,
 ) -> Pipeline:
     """The perception pipeline of a session of this flight."""
     reader = reader or SameAnswer()
@@ -153,7 +154,7 @@ def pipeline_of(
         vocabulary=vocabulary,
         fusion=Fusion(fps=15, edge_classes=places, path=path),
         path=path,
-        turns=Turns(),
+        detector_thread=detector_thread or DetectorThread(),
         trust=trust or ViewTrust(MOTION, hence=""),
         search=search,
     )

@@ -72,6 +72,8 @@ class Entity:
     reported: Observation | None = None
     """The edge's newest box, or a still's if the edge has never listed it."""
     own_vote: Vote = field(default_factory=Vote)
+    voted_frame: int = -1
+    """The frame at which our detector last saw it."""
     edge_vote: Vote = field(default_factory=Vote)
     missed: int = 0
     """Steps in a row that have not listed it."""

@@ -155,7 +155,8 @@ class Fusion:
                 entity = self._add(Entity(own_id=own_id, born=int(own.born_frames[row])))
             entity.born = min(entity.born, int(own.born_frames[row]))
             entity.last_frame = max(entity.last_frame, own.frame_index)
-            if own.seen_frames[row] == own.frame_index:
+            if own.seen_frames[row] > entity.voted_frame:  # what was searched may be an earlier picture
+                entity.voted_frame = int(own.seen_frames[row])
                 entity.own_vote.update(int(own.class_ids[row]), float(own.confidences[row]))
         self._update(own, own.frame_index)
 

@@ -1,0 +1,74 @@
+"""Sessions that share a detector get it alike, and one at a time."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hvt_common.values import Detections
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.perception.detector_thread import DetectorThread
+from hvt_ground.perception.pipeline import DecodedFrame
+from hvt_ground.wiring import Models
+from hvt_ground.wiring.perception import make_pipeline
+from rigs.flight import Flight, NothingSeen
+
+PICTURE = np.zeros((192, 320, 3), np.uint8)
+
+
+def test_who_asks_often_starves_no_other():
+    """An edge of 100 frames a second would take the detector from those of 10, or have it beside them."""
+    thread, order, go = DetectorThread(), [], threading.Event()
+
+    def detect(name):
+        def run(_image):
+            assert go.wait(timeout=20)
+            order.append((name, threading.current_thread().name))
+            return Detections.none()
+
+        return run
+
+    begun = [thread.submit(PICTURE, detect(name)) for name in ("often", "seldom", "often")]
+    go.set()
+    begun[0].found.result(timeout=20)
+    begun.append(thread.submit(PICTURE, detect("now")))
+    for one in begun:
+        one.found.result(timeout=20)
+    assert order == [(name, "hvt-detector") for name in ("often", "seldom", "often", "now")]
+
+
+def test_a_picture_that_nobody_wants_any_more_is_not_searched_and_an_error_ends_no_other():
+    """A flight that ended would take the detector once more, and a broken picture all others' boxes."""
+    thread, go, ran = DetectorThread(), threading.Event(), []
+
+    def fails(_image):
+        assert go.wait(timeout=20)
+        raise OSError("broken")
+
+    def runs(_image):
+        ran.append(1)
+        return Detections.none()
+
+    first, gone, last = (thread.submit(PICTURE, detect) for detect in (fails, runs, runs))
+    gone.found.cancel()
+    go.set()
+    last.found.result(timeout=20)
+    assert isinstance(first.found.exception(), OSError)
+    assert ran == [1]
+
+
+@pytest.mark.parametrize(
+    ("tiles", "pace", "runs"),
+    [("auto", "realtime", 2), ("auto", "lockstep", 1), ("search", "lockstep", 2), ("off", "realtime", 1)],
+)
+def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, runs):
+    """Objects of a few pixels would have no box, or a study that is repeated other figures."""
+    models, network = Models(check(GroundConfig(classifier="none"))), NothingSeen()
+    models.take = lambda: (network, None)
+    config, info = check(GroundConfig(classifier="none", tiles=tiles)), replace(Flight(1).info(), pace=pace)
+    pipeline = make_pipeline(config, models, info=info, emit=lambda _: None)
+    pipeline.analyze(DecodedFrame(0, 0, 0, PICTURE), hurry=False)
+    assert network.runs == runs
