@@ -169,8 +169,6 @@ class Ground:
             for content, sinks in self._ended[edge]
         ]
 
-    # Before anything is received
-
     def _say_where(self, line: StatusLine, *, pages: Sequence[str], late: Collection[str]) -> None:
         config = self._config
         if config.connect:
@@ -180,10 +178,6 @@ class Ground:
             line.note(f"hvt-ground: {yet}listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
         for page in filter(None, pages):
             line.note(f"hvt-ground: watch at {page}")
-
-    # Who watches
-
-    # Serving
 
     def _serve(
         self,
