@@ -14,6 +14,7 @@ from hvt_ground.perception.detector_thread import DetectorThread
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.wiring import Models
 from hvt_ground.wiring.perception import make_pipeline
+from programs.processes import eventually
 from rigs.flight import Flight, NothingSeen
 
 PICTURE = np.zeros((192, 320, 3), np.uint8)
@@ -72,3 +73,6 @@ def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, run
     pipeline = make_pipeline(config, models, info=info, emit=lambda _: None)
     pipeline.analyze(DecodedFrame(0, 0, 0, PICTURE), hurry=False)
     assert network.runs == runs
+    eventually(
+        lambda: not models.loading, within_s=60, what="the models are loaded: no process ends meanwhile"
+    )
