@@ -25,7 +25,7 @@ from typing import NoReturn, Self, TypeVar
 T = TypeVar("T")
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_NICENESS = 11
+_LITTLE, _NICENESS = 5, 11
 """x265 sets its own workers to 10 (threadpool.cpp); far below them a network stands still beside other programs."""
 _SWITCH_S = 0.0005
 _ZENOH_CALLBACK = "(pyo3-closure)"
@@ -101,14 +101,15 @@ def _join_threads() -> None:
             thread.join(max(0.0, until_s - time.monotonic()))
 
 
-def lower_priority() -> None:
+def lower_priority(*, little: bool = False) -> None:
     """Let other threads go before the calling one, and before those that it starts; on Linux only.
 
+    ``little``: it still goes before those that are lowered whole, and before x265's.
     Encoding and decoding are what the operator sees move; detection and stills may come a little later.
     """
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LITTLE if little else _NICENESS)
 
 
 class NewThreads:

@@ -265,7 +265,7 @@ class RealtimeWorker(PerceptionWorker):
             raise error
 
     def _run(self) -> None:
-        lower_priority()
+        lower_priority(little=True)  # boxes follow the picture, detection follows them
         try:
             while not self._given_up.is_set():
                 self._wake.wait(0.2)

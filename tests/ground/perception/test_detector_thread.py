@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 from dataclasses import replace
 
@@ -12,6 +14,7 @@ from hvt_common.values import Detections
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.detector_thread import DetectorThread
 from hvt_ground.perception.pipeline import DecodedFrame
+from hvt_ground.perception.worker import RealtimeWorker
 from hvt_ground.wiring import Models
 from hvt_ground.wiring.perception import make_pipeline
 from programs.processes import eventually
@@ -39,6 +42,22 @@ def test_who_asks_often_starves_no_other():
     for one in begun:
         one.found.result(timeout=20)
     assert order == [(name, "hvt-detector") for name in ("often", "seldom", "often", "now")]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only there threads have priorities")
+def test_who_follows_tracks_goes_before_the_detector():
+    """On two cores lists waited for the processor as long as for the detector: boxes came a second late."""
+    nice = {}
+
+    def note(name, result=None):
+        nice[name] = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+        return result
+
+    DetectorThread().submit(PICTURE, lambda _: note("detector", Detections.none())).found.result(timeout=20)
+    worker = RealtimeWorker(lambda *_: note("worker"), lambda *_: None, lambda _: None, name="x")
+    worker.picture(DecodedFrame(0, 0, 0, PICTURE))
+    worker.close()
+    assert nice["worker"] < nice["detector"]
 
 
 def test_a_picture_that_nobody_wants_any_more_is_not_searched_and_an_error_ends_no_other():
