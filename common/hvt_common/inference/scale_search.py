@@ -3,8 +3,9 @@
 Of cars of five pixels a network that learnt them at twenty says next to nothing, and of the same picture enlarged
 nearly all. So now and then one quarter of the picture is looked at enlarged too. Where that promises far more objects
 (the sum of calibrated confidences is the expected number of true ones), the whole is looked at so from then on, part
-by part, until it promises no more than the whole alone. And each third picture is looked at reduced too, each one
-while there is something large: a network overlooks what fills a third of the picture. See docs/embedded-models.md.
+by part, until it promises no more than the whole alone. And where few objects are sure, each third picture is looked
+at reduced too, each one while there is something large: a network overlooks what fills a third of the picture. See
+docs/embedded-models.md.
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ _STILL_MORE: Final = 2.0
 _IN_VAIN: Final = 3
 """So many pictures in a row that promise less than `_STILL_MORE` times as much end it."""
 _REDUCED_EVERY: Final = 3
+_SURE: Final = 0.5
+_RIGHT: Final = 5
+"""So many sure objects that are not large say that the scale is right: reduced, planters between them are buses."""
 _RARER: Final = 3
 """Five runs in place of one are due so many times more rarely."""
 
@@ -52,7 +56,7 @@ class ScaleSearch:
         self._pictures = self._probes = self._in_vain = 0
         self._due, self._before = 1, 0.0
         self._large = True
-        """The picture before showed something large, or there was none."""
+        """The picture before surely showed something large, or there was none."""
         self.enlarged = False
         """Each picture is looked at in parts, enlarged."""
 
@@ -80,11 +84,13 @@ class ScaleSearch:
         return whole
 
     def _with_large(self, whole: Detections, image_bgr: Image) -> Detections:
-        found = whole
-        if self._large or self._pictures % _REDUCED_EVERY == 0:
-            found = with_large(whole, image_bgr, self._detected)
-        shown = found.boxes_xyxy_px[found.confidences >= self._confidence]
-        self._large = bool(are_large(shown, image_bgr).any())
+        sure = whole.boxes_xyxy_px[whole.confidences >= _SURE]
+        if (~are_large(sure, image_bgr)).sum() >= _RIGHT or not (
+            self._large or self._pictures % _REDUCED_EVERY == 0
+        ):
+            return whole
+        found = with_large(whole, image_bgr, self._detected)
+        self._large = bool(are_large(found.boxes_xyxy_px[found.confidences >= _SURE], image_bgr).any())
         return found
 
     def _probe(self, whole: Detections, image_bgr: Image, tile: Tile) -> None:

@@ -129,9 +129,10 @@ def test_a_large_object_is_found_reduced_and_its_parts_are_none(caplog):
     assert not search.enlarged
 
 
-def test_without_large_objects_each_third_picture_is_looked_at_reduced(caplog):
+def test_without_large_objects_each_third_picture_is_looked_at_reduced_and_none_where_enough_are_sure(caplog):
     """A drone far above would pay for what is never there."""
-    near, network = picture(200, 12), Squares()
-    search = ScaleSearch(network.detect, confidence=0.4)
-    assert {len(search.take(network.detect(near), near)) for _ in range(30)} == {200}
-    assert network.reduced == 1 + 10
+    for count, reduced in ((4, 1 + 10), (5, 0)):
+        near, network = picture(count, 12), Squares()
+        search = ScaleSearch(network.detect, confidence=0.4)
+        assert {len(search.take(network.detect(near), near)) for _ in range(30)} == {count}
+        assert network.reduced == reduced
