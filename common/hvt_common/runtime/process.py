@@ -108,8 +108,10 @@ def lower_priority(*, little: bool = False) -> None:
     Encoding and decoding are what the operator sees move; detection and stills may come a little later.
     """
     if sys.platform == "linux":
-        with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LITTLE if little else _NICENESS)
+        thread = threading.get_native_id()
+        own = os.getpriority(os.PRIO_PROCESS, thread)
+        with contextlib.suppress(OSError):  # under ``nice -n 19`` root would raise it
+            os.setpriority(os.PRIO_PROCESS, thread, max(own, _LITTLE if little else _NICENESS))
 
 
 class NewThreads:
