@@ -174,9 +174,9 @@ class _ReadGround(GroundSide):
         super().__init__(info, **named)
 
     def _make_worker(self, analyze: Analyze, step: Step, read: Read) -> LockstepWorker:
-        def analyze_observed(picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - as `Analyze` says
+        def analyze_observed(picture: DecodedFrame, *how: Any) -> None:
             self._observer.picture(picture, at_ns=self.now_ns)
-            analyze(picture, hurry)
+            analyze(picture, *how)
 
         def read_observed(stills: Sequence[ReceivedStill]) -> None:
             self._observer.stills(stills, at_ns=self.now_ns)

@@ -310,6 +310,7 @@ def test_a_demo_that_nobody_draws_any_more_ends_with_a_sentence(monkeypatch):
         subprocess, "Popen", lambda *args, **more: drawn_by.append(popen(*args, **more)) or drawn_by[0]
     )
     with open_source("demo", size=(64, 64), fps=5) as source:
+        assert isinstance(source, DemoSource)
         drawn_by[0].kill()
         drawn_by[0].wait()
         for use in (lambda: next(source.frames(start_ns=0)), source.poses):

@@ -83,7 +83,7 @@ def test_an_edge_that_nobody_wants_is_not_shown(drawn, tmp_path, capsys):
     words = ("--detector", "motion", "--classifier", "none", "--record", tmp_path, *SETTINGS)
     log = drawn.folder / "flight.hvtlog"
     assert hvt_ground.cli.main(["replay", *map(str, (log, "--edges", "other", *words))]) == 2
-    assert "no session" in capsys.readouterr().out
+    assert "no session" in capsys.readouterr().err
 
 
 def test_a_recording_holds_video_and_stills(drawn, tmp_path, capsys):
