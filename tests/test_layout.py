@@ -29,6 +29,12 @@ def modules() -> list[PurePosixPath]:
     return [PurePosixPath(one) for one in listed.stdout.split()]
 
 
+def test_nothing_is_kept_that_git_is_to_leave_out():
+    """What a merge tool left behind would be in every wheel."""
+    listed = ["git", "ls-files", "--cached", "--ignored", "--exclude-standard"]
+    assert subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=False).stdout == ""
+
+
 def test_every_room_of_packages_is_checked_and_seen_by_the_tests():
     """Calls of what lies in another room would be taken for calls of an unknown library."""
     seen = (ROOT / "tests" / "mypy.ini").read_text(encoding="utf-8")
