@@ -184,7 +184,7 @@ class LiveSource(Source):
                     self._take(shot, capture_ns, jitter_ns=camera_clock.jitter_ns)
                 except Exception as error:  # noqa: BLE001 - a driver or a decoder raises what it likes
                     self._recover(error)
-                    camera_clock = CameraClock()
+                    camera_clock.forget()
         finally:
             self._grabber.close()
             self._end()
@@ -255,7 +255,7 @@ _MOST_JITTER_NS = SECOND_NS // 4
 
 
 class CameraClock:
-    """Turns a camera's time stamps into this process's time; one for each time that the camera was opened.
+    """Turns a camera's time stamps into this process's time.
 
     A clock that is set as ours is (NTP) is taken at its word. Of any other only the differences count: the frame
     that came quickest is taken to have come at once. Times never go back: where they would, as when the camera first
@@ -263,12 +263,16 @@ class CameraClock:
     """
 
     def __init__(self) -> None:
+        self._last_ns = self._came_ns = 0
+        """Capture time of the newest frame, and when it came."""
+        self.forget()
+
+    def forget(self) -> None:
+        """The camera was opened again: what it says from now on may count from another time."""
         self._least_ns: int | None = None
         self._former_ns: int | None = None
         self._delay_ns: int | None = None
         self._since_ns = 0
-        self._last_ns = self._came_ns = 0
-        """Capture time of the newest frame, and when it came."""
         self._recent: deque[int] = deque(maxlen=_RECENT)
         """Delays of the newest frames."""
 

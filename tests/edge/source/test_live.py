@@ -88,6 +88,41 @@ def test_a_camera_that_says_its_time_late_stops_no_picture():
     assert times[-1][0] - times[-1][1] == 3 * SECOND_NS
 
 
+class SaysItsTimeLater:
+    """A camera that says no time until it is opened again, and then that each of its frames is four seconds old."""
+
+    name, notes = "cam", None
+
+    def __init__(self) -> None:
+        self.now_ns, self.given, self.ended = 1_000_000 * SECOND_NS, 0, threading.Event()
+
+    def open(self) -> None:
+        """It is open."""
+
+    restart = close = open  # noqa: A003 - the method above
+
+    def grab(self) -> Shot:
+        """Each fifth of a second; it goes away once, and after sixty for good."""
+        if self.given == 60:
+            self.ended.set()
+            raise SignalLost("it is gone")
+        self.given, self.now_ns = self.given + 1, self.now_ns + SECOND_NS // 5
+        if self.given == 10:
+            raise SignalLost("it went away")
+        at_ns = self.now_ns - 4 * SECOND_NS if self.given > 10 else None
+        return Shot(partial(np.zeros, (48, 64, 3), np.uint8), at_ns)
+
+
+def test_a_camera_that_was_away_and_says_other_times_stops_no_picture(quick):
+    """No frame would be due for four seconds, and units that are passed through would go back in time."""
+    camera = SaysItsTimeLater()
+    with LiveSource(camera, size=(64, 64), fps=25, fit="letterbox", clock=lambda: camera.now_ns) as source:
+        assert camera.ended.wait(60)
+        assert source.passed_over == 0
+        (*_, newest) = (next(source.steps(start_ns=0)) for _ in range(source.pending))
+    assert camera.now_ns - newest.capture_ns == 4 * SECOND_NS, "it has come to what the camera says"
+
+
 @pytest.mark.timeout(120)
 def test_a_camera_that_goes_away_is_told_of_and_comes_back(free_port, caplog, quick):
     """A loose cable would end the flight, or nobody learn why the picture stands still."""
