@@ -19,12 +19,11 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.values import Image
 from hvt_edge.source.contract import Notes
 from hvt_edge.source.decoding.pictures import Stretch
-from hvt_edge.source.live import Shot, SignalLost
+from hvt_edge.source.live import Shot, SignalLost, patience_s
 
 _REQUESTED_SIZE = (1920, 1080)
 """Requested of the camera, which takes the nearest it has. Stills live on the pixels beyond the base size."""
 
-_READ_MS = 2000
 _Y16 = cv2.VideoWriter.fourcc(*"Y16 ")
 
 
@@ -56,7 +55,7 @@ class CameraGrabber:
         number = re.fullmatch(r"video(\d+)", path.resolve().name)
         if number is None or not stat.S_ISCHR(path.stat().st_mode):
             raise UserError(f"camera {self.name} is no video device; accepted is /dev/videoN")
-        capture = opened_capture(int(number[1]))
+        capture = opened_capture(int(number[1]), read_s=patience_s(self._fps))
         if not capture.isOpened():
             kind = NotYetError if os.access(path, os.R_OK | os.W_OK) else UserError
             raise kind(f"camera {self.name} cannot be opened: it is no V4L2 camera, in use, or not permitted")
@@ -116,9 +115,10 @@ def _levels(raw: npt.NDArray[Any], shape: tuple[int, int]) -> npt.NDArray[np.uin
     return data[:count].view("<u2").astype(np.uint16, copy=False).reshape(shape)
 
 
-def opened_capture(number: int) -> cv2.VideoCapture:
+def opened_capture(number: int, *, read_s: float) -> cv2.VideoCapture:
     """The capture, opened or not, without OpenCV's own lines on stderr."""
-    timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
+    read_ms = round(1000 * read_s)
+    timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, read_ms]
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

@@ -27,10 +27,16 @@ _log = logging.getLogger(__name__)
 FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS
 _JOIN_S = 1.5
 IDLE_S = 1.0
+LEAST_PATIENCE_S, _MOST_PATIENCE_S = 2.0, 10.0
 _MOST_PENDING = 8
 """Frames of a burst that are kept."""
 SOURCE_PART = "source"
 """Its name as a failed part."""
+
+
+def patience_s(fps: float) -> float:
+    """Without anything for so long a camera is gone: for two frames of ``fps``, within bounds."""
+    return min(_MOST_PATIENCE_S, max(LEAST_PATIENCE_S, 2 / fps))
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from hvt_edge.source.contract import BaseSize, Source, check_shape
 from hvt_edge.source.decoding.container import is_local
 from hvt_edge.source.demo import DemoSource, is_demo
 from hvt_edge.source.folder import FolderSource
-from hvt_edge.source.live import LiveSource
+from hvt_edge.source.live import LiveSource, patience_s
 from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber, is_description
 from hvt_edge.source.video import VideoSource
 
@@ -67,7 +67,7 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     )
     scheme = "" if is_local(spec) else spec.partition("://")[0].lower()
     if scheme in LIVE_SCHEMES or (is_description(spec) and _is_there(spec)):
-        stream = CodedStreamGrabber(spec) if coded else StreamGrabber(spec)
+        stream = (CodedStreamGrabber if coded else StreamGrabber)(spec, read_s=patience_s(fps))
         stream.open()
         if isinstance(stream, CodedStreamGrabber) and not stream.holds_a_clip:
             return CodedLiveSource(

@@ -18,16 +18,16 @@ from hvt_common.units import SECOND_NS
 from hvt_edge.source.contract import Notes
 from hvt_edge.source.decoding.container import cause_of, choose_stream, is_local
 from hvt_edge.source.decoding.pictures import Pictures
-from hvt_edge.source.live import Shot, SignalLost
+from hvt_edge.source.live import LEAST_PATIENCE_S, Shot, SignalLost
 
 LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "udp", "rtp", "tcp", "srt"})
 
 _OPEN_S = 10.0
-_RESTART_S = 2.5
+_RESTART_S = 0.5
+"""Beside the wait for its first picture."""
 _UNDECODED_S = 10.0
-"""Without a picture, while something comes; where nothing does, `_READ_S` counts."""
+"""Without a picture, while something comes; where nothing does, `patience_s` counts."""
 _MOST_TIMES = 64
-_READ_S = 2.0  # also how long closing may take
 
 _NEVER = (
     *(av.error.HTTPUnauthorizedError, av.error.HTTPForbiddenError, av.error.HTTPBadRequestError),
@@ -49,14 +49,14 @@ _OPTIONS = {
 class StreamGrabber:
     """Decodes a stream as it arrives, without frame threading, which would hold frames back.
 
-    A password in ``url`` is never printed; ``open_s`` bounds the first opening.
+    A password in ``url`` is never printed; ``open_s`` bounds the first opening, ``read_s`` the wait for more.
     """
 
     notes: Notes | None = None
 
-    def __init__(self, url: str, *, open_s: float = _OPEN_S) -> None:
+    def __init__(self, url: str, *, open_s: float = _OPEN_S, read_s: float = LEAST_PATIENCE_S) -> None:
         self.name = redacted(url)
-        self._url, self._open_s = url, open_s
+        self._url, self._open_s, self._read_s = url, open_s, read_s
         self._container: Any = None
         self.notes = notes = Notes(self.name)
         self._choose = partial(choose_stream, note=notes)
@@ -77,7 +77,7 @@ class StreamGrabber:
         """Open again after `SignalLost`."""
         self.close()
         try:
-            self._start(_RESTART_S)
+            self._start(_RESTART_S + self._read_s)
         except UserError as error:
             raise SignalLost(str(error)) from error
 
@@ -85,6 +85,8 @@ class StreamGrabber:
         """The next frame, at most the read timeout from now."""
         try:
             shot = next(self._shots, None)
+        except av.error.ExitError as error:
+            raise SignalLost(f"nothing came for {self._read_s:.3g} s") from error
         except (av.error.FFmpegError, OSError) as error:
             raise SignalLost(cause_of(error)) from error
         if shot is None:
@@ -99,7 +101,7 @@ class StreamGrabber:
             self._container = None
 
     def _start(self, open_s: float) -> None:
-        container = _open(self._url, open_s=open_s)
+        container = _open(self._url, open_s=open_s, read_s=self._read_s)
         stream = self._choose(container)
         if stream is None:
             container.close()
@@ -178,8 +180,8 @@ def is_description(spec: str) -> bool:
     return spec.lower().endswith(".sdp") and is_local(spec)
 
 
-def _open(url: str, *, open_s: float) -> Any:
-    how: dict[str, Any] = {"options": _OPTIONS, "timeout": (open_s, _READ_S)}
+def _open(url: str, *, open_s: float, read_s: float) -> Any:
+    how: dict[str, Any] = {"options": _OPTIONS, "timeout": (open_s, read_s)}
     try:
         if is_description(url):
             how["options"] = {**_OPTIONS, "protocol_whitelist": "file,udp,rtp"}

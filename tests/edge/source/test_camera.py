@@ -52,8 +52,13 @@ class Thermal:
 
 
 def stand_in(monkeypatch, tmp_path, capture):
-    """The device that OpenCV opens."""
-    monkeypatch.setattr(camera, "opened_capture", lambda _number: capture)
+    """The device that OpenCV opens, where it may be as slow as is asked of it."""
+
+    def opened(_number, *, read_s):
+        assert read_s == 4, "two frames of half a frame a second"
+        return capture
+
+    monkeypatch.setattr(camera, "opened_capture", opened)
     monkeypatch.setattr(camera.stat, "S_ISCHR", lambda _mode: True)
     (tmp_path / "video0").touch()
 
@@ -62,7 +67,7 @@ def stand_in(monkeypatch, tmp_path, capture):
 def test_a_warm_body_is_seen_by_a_thermal_camera(monkeypatch, tmp_path, raw):
     """It would be one level of 255 above the rest: nobody sees it, and no network."""
     stand_in(monkeypatch, tmp_path, Thermal(raw))
-    grabber = CameraGrabber(str(tmp_path / "video0"), fps=9, clock=SteadyClock())
+    grabber = CameraGrabber(str(tmp_path / "video0"), fps=0.5, clock=SteadyClock())
     grabber.open()
     picture = grabber.grab().image()
     assert picture.shape == (48, 64, 3)
@@ -80,7 +85,7 @@ def test_a_clock_that_was_set_back_makes_no_picture_old(monkeypatch, tmp_path):
     )  # set back by three seconds since the start
     thermal = Thermal(LEVELS)
     stand_in(monkeypatch, tmp_path, thermal)
-    grabber = CameraGrabber(str(tmp_path / "video0"), fps=9, clock=clock)
+    grabber = CameraGrabber(str(tmp_path / "video0"), fps=0.5, clock=clock)
     grabber.open()
     taken_ns = clock()
     thermal.properties[cv2.CAP_PROP_POS_MSEC] = time.monotonic_ns() / 1e6

@@ -11,9 +11,11 @@ import av
 import numpy as np
 import pytest
 
+from hvt_common.errors import NotYetError
 from hvt_edge.source import stream
 from hvt_edge.source.coded_live import CodedStreamGrabber
 from hvt_edge.source.live import SignalLost
+from hvt_edge.source.opening import open_source
 from hvt_edge.source.stream import StreamGrabber
 
 
@@ -48,3 +50,29 @@ def test_a_camera_of_which_sound_alone_goes_on_has_stopped(monkeypatch, grabber)
     with pytest.raises(SignalLost, match="no picture"):
         all(iter(camera.grab, None))
     camera.close()
+
+
+@pytest.mark.parametrize("coded", [False, True])
+@pytest.mark.parametrize(("fps", "waits_s"), [(15, 2), (0.3, 20 / 3), (0.01, 10)])
+def test_a_camera_that_is_as_slow_as_was_asked_is_not_gone(monkeypatch, fps, waits_s, coded):
+    """One that gives a picture each three seconds would be opened again and again, and show nothing."""
+    waited = []
+
+    def away(_url, *, timeout, **_settings):
+        waited.append(timeout[1])
+        raise ConnectionRefusedError
+
+    monkeypatch.setattr(av, "open", away)
+    with pytest.raises(NotYetError):
+        open_source("tcp://camera", size=(320, 180), fps=fps, coded=coded)
+    assert waited == [pytest.approx(waits_s)]
+
+
+def test_a_slow_camera_has_time_for_its_picture_when_it_is_opened_again(monkeypatch):
+    """It would be lost for the flight after its first dropout."""
+    opened, film = [], av.open(film_that_stops())
+    monkeypatch.setattr(av, "open", lambda _url, *, timeout, **_settings: opened.append(timeout) or film)
+    camera = StreamGrabber("tcp://camera", read_s=7)
+    camera.restart()
+    camera.close()
+    assert opened[0][0] > opened[0][1] == 7
