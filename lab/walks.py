@@ -33,12 +33,12 @@ _MOST_S = 100.0
 
 # Functions: name and bound of their walk, the largest of each taken together.
 _WALKS = {
-    ("RealtimePace.step",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 33),
+    ("RealtimePace.step",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 34),
     ("StillStage.analyze",): ("a frame's objects at the edge", 24),
-    ("StillStage.send",): ("a still at the edge, from choosing to put", 35),
+    ("StillStage.send",): ("a still at the edge, from choosing to put", 36),
     ("commands.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
         "a command, from hvt-ground set-budget to the encoder",
-        37,
+        38,
     ),
     ("EdgeSessions.handle",): ("a message at the ground, received", 42),
     ("perception.make_pipeline",): ("a session's perception at the ground, made", 27),

@@ -9,6 +9,7 @@ from argparse import ArgumentParser
 import numpy as np
 import pytest
 
+from hvt_study.cache.results import read_whole
 from hvt_study.cli import main
 from hvt_study.commands import run as command
 from hvt_study.matrix.plan import StudyPlan, first_runs, parse_regimes
@@ -180,7 +181,7 @@ def test_damaged_entries_are_made_again(scene, done, tmp_path):
     after = entries(cache)
     assert after.keys() == before.keys()
     assert {path for path in after if after[path] != before[path]} <= set(broken)
-    assert all(path.read_bytes().partition(b"\n")[2] for path in broken[:2])
+    assert all(map(read_whole, broken[:2]))
 
 
 def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkeypatch):
