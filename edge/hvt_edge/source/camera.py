@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.errors import NotYetError, UserError
+from hvt_common.errors import NotYetError, UserError, named_path
 from hvt_common.values import Image
 from hvt_edge.source.contract import Notes
 from hvt_edge.source.decoding.pictures import Stretch
@@ -47,7 +47,7 @@ class CameraGrabber:
 
     def open(self) -> None:
         """Open the device. Raises `UserError` if it is missing, no camera, busy or not permitted."""
-        path = Path(self.name)
+        path = named_path(self.name, name="camera")
         if not path.exists():
             found = ", ".join(sorted(str(one) for one in Path("/dev").glob("video*"))) or "none"
             raise NotYetError(f"camera {self.name} does not exist; devices here: {found}")

@@ -99,7 +99,7 @@ def _check_there(spec: str, scheme: str, *, growing: bool) -> None:
     if not _is_there(spec):
         kind = NotYetError if growing else UserError
         raise kind(f"source {shown(spec)!r} does not exist; accepted is {_ACCEPTED}")
-    if not (Path(spec).is_file() or Path(spec).is_dir()):  # it is looked at before it is played
+    if not _is_played(spec):  # it is looked at before
         raise UserError(
             f"source {spec!r} is neither a file nor a folder; what a program writes into a pipe can be sent to "
             "udp://127.0.0.1:PORT"
@@ -115,12 +115,16 @@ def shown(spec: str) -> str:
 
 def _is_device(spec: str) -> bool:
     # A file or a folder there is one, as in /dev/shm.
-    return spec.startswith("/dev/") and not (Path(spec).is_file() or Path(spec).is_dir())
+    return spec.startswith("/dev/") and not _is_played(spec)
 
 
-def _is_there(spec: str) -> bool:
+def _is_played(spec: str) -> bool:
+    return _is_there(spec, Path.is_file) or _is_there(spec, Path.is_dir)
+
+
+def _is_there(spec: str, kind: Callable[[Path], bool] = Path.exists) -> bool:
     try:
-        return bool(spec) and Path(spec).exists()
+        return bool(spec) and kind(Path(spec))
     except (OSError, ValueError):  # too long for a name, or with a character that none has
         return False
 
@@ -130,7 +134,7 @@ def _check_coded(spec: str) -> None:
     kinds = (
         ("the drawn demo", is_demo(spec)),
         ("a device", _is_device(spec)),
-        ("a folder", Path(spec).is_dir()),
+        ("a folder", _is_there(spec, Path.is_dir)),
     )
     for kind, is_it in kinds:
         if is_it:

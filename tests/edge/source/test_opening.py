@@ -572,6 +572,13 @@ def test_a_missing_camera_is_one_sentence():
     assert "no video device" in refused(os.devnull)
 
 
+@pytest.mark.parametrize("coded", [False, True])
+def test_a_name_that_none_can_have_is_one_sentence(coded):
+    """A pasted text would end in a traceback."""
+    assert ("is a device" if coded else "cannot be looked at") in refused("/dev/" + "x" * 300, coded=coded)
+    assert "does not exist" in refused("x" * 300, coded=coded)
+
+
 @pytest.mark.parametrize("growing", [False, True])
 def test_a_pipe_is_no_clip(tmp_path, growing):
     """It was called an empty file, and with ``--follow`` waited for without a word."""
