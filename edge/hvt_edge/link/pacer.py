@@ -307,11 +307,6 @@ class Pacer:
             gave_up = there and self._reported_ns is not None and self._give_up(now_ns, self._reported_ns)
             return gave_up or (before is False and there and self.backoffs > 0)
 
-    @property
-    def link_down(self) -> bool:
-        """Whether nobody is there who takes the video."""
-        return self._linked is False
-
     # What may go
 
     def admits_base(self, now_ns: int, *, coding_ns: int = 0) -> bool:

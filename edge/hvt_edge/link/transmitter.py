@@ -168,11 +168,6 @@ class Transmitter:
         header_bytes = self._header_at(envelope, now_ns).size_bytes
         return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
 
-    @property
-    def link_down(self) -> bool:
-        """Whether nobody is there who takes the video."""
-        return self.pacer is not None and self.pacer.link_down
-
     def link_is_free(self, now_ns: int) -> bool:
         """Whether a still may go as far as the link is concerned."""
         return self.pacer is None or self.pacer.admits_still(now_ns)

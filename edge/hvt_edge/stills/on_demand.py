@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
@@ -170,7 +171,7 @@ _TRACKED_NS = 30_000_000_000
 """For so long after a request for tracks they are followed, where nothing else needs them."""
 _OUTCOMES = 64
 _ENDED = "the edge has ended"
-_NO_GROUND = "no ground receives the video of this edge, and a closer look comes with it"
+_OFFLINE = "no ground receives the video of this edge: until one does, stills are stored"
 
 
 @dataclass(slots=True, eq=False)
@@ -201,6 +202,8 @@ class OnDemand:
     view: View
     class_names: tuple[str, ...]
     line: Transmitter
+    offline: Callable[[], bool] = lambda: False
+    """Whether stills are stored, and none goes out."""
 
     def __post_init__(self) -> None:
         self._maker = replace(
@@ -227,8 +230,8 @@ class OnDemand:
         """Crop a still; return its number and frame index. Raises `RefusedError` with the reason."""
         if self._ended:
             raise RefusedError(_ENDED)
-        if self.line.link_down:
-            raise RefusedError(_NO_GROUND)
+        if self.offline():
+            raise RefusedError(_OFFLINE)
         self._check_queue()
         frame = frame_for(request, self.ring)
         if request.track_id is not None:

@@ -142,6 +142,7 @@ class Stages:
             transmitter=self.transmitter,
             view=view,
             class_names=class_names,
+            offline=lambda: self.backlog is not None and self.backlog.offline,
             readable=still_readers.read,
             observe=self.reconfiguration.observe,
         )

@@ -83,12 +83,13 @@ def make_stills(
     transmitter: Transmitter,
     view: View,
     class_names: tuple[str, ...],
+    offline: Callable[[], bool],
     readable: Callable[[str], bool],
     observe: Callable[[Sequence[Candidate], Step], None],
 ) -> tuple[Chooser, OnDemand]:
     """Who chooses stills, with method, rules and maker; and the ring of source frames, who serves requested ones.
 
-    ``readable``: see `StillMaker`; ``observe``: see `Chooser`.
+    ``readable``: see `StillMaker`; ``observe``: see `Chooser`; ``offline``: see `OnDemand`.
     """
     codec = still_codec(config.still_codec)
     maker = StillMaker(
@@ -108,6 +109,7 @@ def make_stills(
         view=view,
         class_names=class_names,
         line=transmitter,
+        offline=offline,
     )
     chooser = Chooser(
         make_method(config, view),

@@ -295,17 +295,18 @@ def test_a_requested_still_is_given_up_in_time_though_a_keyframe_goes_first_and_
         on_demand.outcome(number)
 
 
-def test_where_nobody_takes_the_video_a_request_is_refused_at_once():
-    """It was accepted, kept, and after 15 s a full budget was to blame."""
+@pytest.mark.parametrize("offline", [True, False], ids=["stored", "sent"])
+def test_where_nobody_takes_the_video_a_request_is_refused_if_stills_are_stored(offline):
+    """It was accepted and kept. But one who reads stills alone, of an edge that stores nothing, has it at once."""
     rig = Rig(ring=FrameRing())
     rig.sender.pacer = Pacer(RateController(RateSettings(ceiling_bps=400_000, floor_bps=100_000)))
+    rig.sender.pacer.link(there=False, now_ns=FRAMES[0].capture_ns)
     on_demand = rig.stage.chooser.on_demand
     assert on_demand is not None
+    on_demand.offline = lambda: offline
     rig.stage.capture(FRAMES[0])
-    for there, taken in ((False, False), (True, True)):
-        rig.sender.pacer.link(there, now_ns=FRAMES[0].capture_ns)
-        with nullcontext() if taken else pytest.raises(RefusedError, match="no ground receives the video"):
-            on_demand.request(OnDemandRequest(box_xywh_px=(40, 40, 96, 64)))
+    with pytest.raises(RefusedError, match="stills are stored") if offline else nullcontext():
+        on_demand.request(OnDemandRequest(box_xywh_px=(40, 40, 96, 64)))
 
 
 def test_a_requested_still_goes_out_while_an_automatic_one_is_coded_and_numbers_go_up():

@@ -362,7 +362,7 @@ MORE_ANSWERS = {
     },
     "edge/hvt_edge/stills/on_demand.py": {
         "the edge has ended",
-        "no ground receives the video of this edge, and a closer look comes with it",
+        "no ground receives the video of this edge: until one does, stills are stored",
         "the keyframe that goes before it had no room",
         "in … s …",
         "the link was never free for it",
