@@ -7,6 +7,7 @@ Those that wait go in the order of asking: who asks seldom is searched as often 
 from __future__ import annotations
 
 import threading
+import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
 from queue import SimpleQueue
@@ -50,10 +51,10 @@ class Detection:
 
 
 class DetectorThread:
-    """Of one detector."""
+    """Of one detector. The thread ends when nobody holds this any more."""
 
     def __init__(self) -> None:
-        self._queue: SimpleQueue[Detection] = SimpleQueue()
+        self._queue: SimpleQueue[Detection | None] = SimpleQueue()
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
 
@@ -63,11 +64,16 @@ class DetectorThread:
         self._queue.put(detection)
         with self._lock:
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="hvt-detector", daemon=True)
+                self._thread = threading.Thread(
+                    target=_run, args=(self._queue,), name="hvt-detector", daemon=True
+                )
                 self._thread.start()
+                weakref.finalize(self, self._queue.put, None)
         return detection
 
-    def _run(self) -> None:
-        lower_priority()
-        while True:
-            self._queue.get().run()
+
+def _run(queue: SimpleQueue[Detection | None]) -> None:
+    lower_priority()
+    while (detection := queue.get()) is not None:
+        detection.run()
+        del detection  # its session holds the thread's owner
