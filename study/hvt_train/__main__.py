@@ -99,7 +99,8 @@ def _join(arguments: argparse.Namespace) -> int:
 
 
 def _curve(arguments: argparse.Namespace) -> int:
-    from hvt_train.curve import draw_curve  # noqa: PLC0415
+    with needs_extra("'hvt[study]'"):
+        from hvt_train.curve import draw_curve  # noqa: PLC0415
 
     if not arguments.log.is_file():
         raise UserError(f"{arguments.log} does not exist; the log of a training run is expected")

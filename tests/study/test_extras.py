@@ -62,6 +62,7 @@ def done(tmp_path, module, words, without):
             "hvt_study.cli", ("report", "out"), ("jinja2",), "hvt[study]", marks=pytest.mark.nightly
         ),
         ("hvt_study.cli", ("read", "demo:codes", "--out", "out"), ("rapidocr",), "hvt[reading]"),
+        ("hvt_train", ("curve", "log.jsonl", "--out", "out.svg"), ("matplotlib",), "hvt[study]"),
         pytest.param(
             "hvt_study.cli",
             ("score", "a.csv", "--truth", "gt.txt"),

@@ -236,7 +236,7 @@ def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequenc
     size = base_size(arguments.size)
     frames = flown_frames(getattr(arguments, "max_frames", None))
     check_whole("--detect-every", arguments.detect_every, 1)
-    codecs = tuple(dict.fromkeys(names_of(arguments.still_codecs)))
+    codecs = tuple(dict.fromkeys(names_of(arguments.still_codecs) or ("",)))
     for codec in codecs:
         still_codec(codec)
     plan = StudyPlan(

@@ -152,7 +152,7 @@ def _is_coco(path: Path) -> bool:
 def yaml_folders(path: Path) -> list[Path]:
     """Where the pictures of a YOLO set are: its ``path``, else beside it, else in ``train``, ``val`` and ``test``."""
     said = _read_yaml(path)
-    root = path.parent / _words(said.get("path", "."))[0]
+    root = path.parent.joinpath(*_words(said.get("path", ()))[:1])
     if root != path.parent and root.is_dir():
         return [root]
     named = [word for part in ("train", "val", "test") for word in _words(said.get(part, ()))]

@@ -109,6 +109,7 @@ def test_one_line_is_for_plan_and_run(tmp_path, capsys):
     assert re.search(r"hours with 3 processes[ │]+0\.\d{4} \((less than 1 s|\d+ (s|minutes))\)", told)
     for more, wanted in (
         (("--jobs", "0"), "--jobs 0"),
+        (("--still-codecs", ","), "still codec '' is not known"),
         (("--dask", "tcp://127.0.0.1:1"), "--jobs 3 has no say with --dask"),
         (("--tune", "M6:again=2"), "--tune of M6 has no say: it is not among --methods M0,M5"),
         (("--matched-to", "M0"), "--matched-to 'M0' is not known: choose from M5"),

@@ -435,6 +435,7 @@ def test_labels_of_another_kind_are_not_passed_over(tmp_path: Path, name: str, c
         "path: ../data\ntrain: images/train\nval: images/val\n",
         "path: {data}  # here\nval: images/val\n",
         "val: {data}/images/val\ntest: nowhere\n",
+        "path: []\nval: {data}/images/val\n",
     ],
 )
 def test_a_yaml_may_lie_elsewhere_than_its_pictures(tmp_path: Path, said: str) -> None:
