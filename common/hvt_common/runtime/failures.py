@@ -120,9 +120,10 @@ class RetryPause:
         """From the newest failure to the next try; 0 before the first."""
         return self._pause_ns
 
-    def failed(self, now_ns: int) -> None:
-        """It failed, at the start or after it had worked for a while."""
-        steady = now_ns - self._failed_ns > self._pause_ns + _STEADY_PAUSES * self._first_ns
+    def failed(self, now_ns: int, *, again: bool = False) -> None:
+        """It failed, at the start or after it had worked for a while; ``again``: it has not, the try was long."""
+        worked_ns = 0 if again else now_ns - self._failed_ns - self._pause_ns
+        steady = worked_ns > _STEADY_PAUSES * self._first_ns
         self._pause_ns = self._first_ns if steady else min(2 * self._pause_ns, self._longest_ns)
         self._pause_ns = max(self._first_ns, self._pause_ns)
         self._failed_ns = now_ns
@@ -167,8 +168,8 @@ class Retried(Generic[_Part]):
                     self.part = self._open_part()
                 answer = use(self.part)
             except Exception as error:  # noqa: BLE001 - a runtime raises what it likes
+                self._pause.failed(self._clock(), again=self._failed)
                 self._failed = True
-                self._pause.failed(self._clock())
                 self._failures.failed(self._name, reason_of(error))
                 return None
             if self._failed:
@@ -213,7 +214,7 @@ class Awaited(Generic[_Part]):
             part = self._open_part()
         except NotYetError as error:
             self.error = error
-            self._pause.failed(self._clock())
+            self._pause.failed(self._clock(), again=True)
             self._failures.failed(self._name, reason_of(error))
             return None
         self._failures.works(self._name)

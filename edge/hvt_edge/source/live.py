@@ -212,15 +212,16 @@ class LiveSource(Source):
 
     def _recover(self, error: Exception) -> None:
         # Open the grabber again, waiting twice as long after each failure; returns when it is open or we stop.
+        again = False
         while not self._stop.is_set():  # what stops because it is closed has not failed
-            self._pause.failed(self._clock())
+            self._pause.failed(self._clock(), again=again)
             self._failures.failed(SOURCE_PART, f"{self._grabber.name} stopped ({_reason(error)})")
             if self._stop.wait(self._pause.pause_ns / SECOND_NS):
                 return
             try:
                 self._grabber.restart()
-            except Exception as again:  # noqa: BLE001 - see above
-                error = again
+            except Exception as later:  # noqa: BLE001 - see above
+                error, again = later, True
             else:
                 self.restarts += 1
                 return

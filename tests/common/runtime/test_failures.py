@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.runtime.failures import Failures, Retried, RetryPause
 from hvt_common.units import SECOND_NS
 
 
@@ -66,3 +66,23 @@ def test_pauses_grow_to_their_limit_and_begin_anew_after_a_steady_time():
             "a camera that drops each 11 s would be dark for 8 of them"
         )
         now_ns += pause.pause_ns
+
+
+def test_a_part_that_takes_long_to_fail_has_not_worked_meanwhile():
+    """A network that its runtime compiles for twenty seconds, and then refuses, would burn a core for the flight."""
+    clock, opened = Time(), []
+
+    def opening() -> None:
+        opened.append(clock.now_ns)
+        if len(opened) > 1:
+            clock.now_ns += 20 * SECOND_NS
+            raise OSError("refused")
+
+    def failing(_part: None) -> None:
+        raise OSError("failed")
+
+    detector = Retried(opening, "detector", Failures(clock), clock=clock)
+    while clock.now_ns < 700 * SECOND_NS:
+        detector.run(failing)
+        clock.now_ns += SECOND_NS
+    assert 8 <= len(opened) <= 13

@@ -140,7 +140,6 @@ def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
     # Imported for who opens one: names alone are checked at each start.
     from hvt_edge.video.encoders.hardware import HardwareEncoder  # noqa: PLC0415
     from hvt_edge.video.encoders.passthrough import Passthrough  # noqa: PLC0415
-    from hvt_edge.video.encoders.registry import CheckedEncoder  # noqa: PLC0415
     from hvt_edge.video.x265 import BaseEncoder  # noqa: PLC0415
 
     if name == X265:
