@@ -184,6 +184,8 @@ class OnDemandStill(OutboxStill):
     """What the base shows of its frame; gone once it is coded."""
     ready: Still | None = None
     """Coded, and not gone yet."""
+    behind: bool = False
+    """Another was pending when it was requested."""
     link_busy: bool = False
     """The budget had room for it, and the link had not, when that was last tried."""
 
@@ -246,6 +248,7 @@ class OnDemand:
             pending = OnDemandStill(
                 job, None, float("inf"), None, number=number, quality_pct=quality_pct, base=frame.base
             )
+            pending.behind = self.outbox.on_demand is not None
             self.outbox.offer_on_demand(pending)
             self._next_number += 1
             self._note(number)
@@ -358,6 +361,8 @@ class OnDemand:
         why = "the budget had no room for it"
         if pending.link_busy:
             why = "the link was never free for it"
+        elif pending.ready is None and pending.behind:
+            why = "those that were requested before it had not gone"
         elif pending.ready is None:  # it was never its turn
             why = "the keyframe that goes before it had no room"
         with self._lock:

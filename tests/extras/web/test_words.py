@@ -364,6 +364,7 @@ MORE_ANSWERS = {
         "the edge has ended",
         "no ground receives the video of this edge: until one does, stills are stored",
         "the keyframe that goes before it had no room",
+        "those that were requested before it had not gone",
         "in … s …",
         "the link was never free for it",
         "the budget had no room for it",
