@@ -56,7 +56,7 @@ def outcome(
         ground=ground,
         samples={"edge": [Sample(BEGAN_S + i, 100 + i / 3600, 20, 9) for i in range(600)]},
         exit_codes={"edge": 0, "ground": None},
-        said={},
+        said={"edge": "flying", "ground": "Traceback (most recent call last):"},
     )
 
 
@@ -119,6 +119,7 @@ def test_accounts_and_processes():
     assert found["unheard of"]["holds"] is False
     assert found["edge, exit code"]["holds"] is True
     assert found["ground, exit code"]["holds"] is False
+    assert (found["edge, tracebacks"]["holds"], found["ground, tracebacks"]["holds"]) == (True, False)
     assert found["edge, memory slope MB/h"]["value"] == pytest.approx(1.0, abs=0.01)
     json.dumps(list(found.values()), allow_nan=False)
 

@@ -31,6 +31,7 @@ ALWAYS: Mapping[str, str] = {
     for name in ("edge", "ground")
     for what, bar in {
         "exit code": "== 0",
+        "tracebacks": "== 0",
         "descriptors more at the end": "<= 0",
         "threads more at the end": "<= 0",
     }.items()
@@ -293,6 +294,7 @@ def _processes(outcome: Outcome) -> dict[str, float | int | None]:
     found: dict[str, float | int | None] = {
         f"{name}, exit code": code for name, code in outcome.exit_codes.items()
     }
+    found |= {f"{name}, tracebacks": said.count("Traceback") for name, said in outcome.said.items()}
     for name, samples in outcome.samples.items():
         found[f"{name}, peak memory MB"] = max((one.resident_mb for one in samples), default=None)
         if len(samples) > 1 and samples[-1].at_s - samples[0].at_s >= _LEAST_SLOPE_S:
