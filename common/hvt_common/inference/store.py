@@ -124,8 +124,8 @@ def resolve_model(
     store = store if store is not None else _store()
     if store is not None and spec in store.entries:
         return store.verified(spec)
-    if Path(spec).is_file():
-        return Path(spec)
+    if (path := named_path(spec, name=role)).is_file():
+        return path
     names = [*words, *embedded, *(() if store is None else store.entries)]
     near = "".join(f" (did you mean {name}?)" for name in difflib.get_close_matches(spec, names, n=1))
     more = f"; of other names, {MISSING}" if store is None else ""

@@ -369,6 +369,8 @@ def test_what_is_no_detector_is_refused_in_one_sentence(tmp_path: Path) -> None:
         UserError, match=r"detector 'yolo' is not known .*give one of motion, .*or an ONNX file"
     ):
         open_detector("yolo")
+    with pytest.raises(UserError, match=r"detector 'y+' cannot be looked at"):  # a traceback
+        open_detector("y" * 300)
 
 
 @pytest.mark.parametrize(
