@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -13,13 +14,15 @@ from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
 from hvt_study.datasets.clip import Clip
-from hvt_study.flights.flight import FlightPlan, coded_frames, fly
+from hvt_study.flights.flight import Flight, FlightPlan, coded_frames, fly
 from hvt_study.flights.flight_ground import SharedModels
+from hvt_study.reading.flight import _ReadGround
 from media.clips import smooth_pictures
 from rigs.flight import SIZE, RedSquares, grainy_pictures, square_box
 from studies.metric_frames import list_f1
 
 FRAMES = 46
+STILLS = ("--method", "M5", "--cooldown", "0s", "--budget", "120kbps", "--still-codec", "residual")
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +42,17 @@ def rough_clip(tmp_path_factory):
     return Clip("drawn", SIZE, FRAMES, path)
 
 
-def flown(clip, *flags, link_bps=200_000, detector=None, ground_detector=None):
+def planned(clip, *flags, link_bps=200_000):
     width, height = SIZE
     base = ["--source", "drawn", "--pace", "lockstep", "--size", f"{width}x{height}"]
     base += ["--budget", "200kbps", "--preset", "ultrafast"]
     edge, _ = load(EdgeConfig, [*base, *flags], program="hvt-edge", description="")
     ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
-    plan = FlightPlan(clip, check_edge(edge), ground, link_bps)
+    return FlightPlan(clip, check_edge(edge), ground, link_bps)
+
+
+def flown(clip, *flags, link_bps=200_000, detector=None, ground_detector=None):
+    plan = planned(clip, *flags, link_bps=link_bps)
     return fly(plan, detector=detector or RedSquares(), models=SharedModels(ground_detector or RedSquares()))
 
 
@@ -107,11 +114,24 @@ def test_a_thin_link_delivers_late(clip):
     assert thin.link.worst_queue_bytes > wide.link.worst_queue_bytes
 
 
+def test_who_reads_a_flight_sees_all_of_it_and_changes_nothing(rough_clip):
+    """`hvt-study read` would end in a traceback, or tell of another flight than the one that is compared."""
+    plan, observer = planned(rough_clip, *STILLS), MagicMock()
+    parts = {"config": plan.ground, "models": SharedModels(RedSquares()), "observer": observer}
+    flight = Flight(
+        plan, detector=RedSquares(), make_ground=lambda info, link: _ReadGround(info, link=link, **parts)
+    )
+    flight.run()
+    report = flight.report(saved_cpu_s=0)
+    assert report.digest == flown(rough_clip, *STILLS).digest
+    assert observer.picture.call_count == report.messages["base"]
+    stills = [still for call in observer.stills.call_args_list for still in call.args[0]]
+    assert len(stills) == report.messages["roi"] > 0
+
+
 def test_stills_cross_and_are_counted(rough_clip):
     """Without them the comparison would be of video with video."""
-    report = flown(
-        rough_clip, "--method", "M5", "--cooldown", "0s", "--budget", "120kbps", "--still-codec", "residual"
-    )
+    report = flown(rough_clip, *STILLS)
     assert report.messages["roi"] > 0
     assert sum(report.account.outcomes["sent"].values()) == report.messages["roi"]
     assert report.bps("roi") == report.account.roi_bps
