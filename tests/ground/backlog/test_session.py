@@ -33,7 +33,6 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import FIRST_TRACK_ID, BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
 from hvt_ground.backlog.session_backlog import LateStills
-from hvt_ground.events import Overlay
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job, RealtimeWorker
@@ -48,7 +47,7 @@ from hvt_ground.sinks.rerun.still_places import SLOTS
 from programs.rrd import Recording
 from programs.small_disk import small_disk
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
-from rigs.examples import seen
+from rigs.examples import overlay, seen
 from rigs.flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from rigs.handled import WatchedInbox, check, end
 
@@ -399,13 +398,8 @@ def test_a_still_names_its_own_track_and_no_guess_beside_it():
     bus = Posterior("bus", 0.9, 0.3, np.array([0.1, 0.9], np.float32))
     late.take(replace(seen(0, 5, bus, (0.0, 0.0, 20.0, 20.0), edge=1).event, stored=True))
     boxes = np.array([(0, 0, 20, 20), (50, 50, 60, 60), (80, 80, 90, 90)], np.float32)
-    overlay = Overlay(
-        *(5, 0, np.arange(1, 4), boxes, ("car",) * 3, ("car",) * 3, np.full(3, 0.4, np.float32)),
-        refined=np.zeros(3, np.bool_),
-        stored=True,
-        doubted=np.array([True, True, False]),
-    )
-    *_, shown = late.named(overlay)
+    doubted = np.array([True, True, False])
+    *_, shown = late.named(overlay(5, boxes, stored=True, doubted=doubted))
     assert shown.words == ("bus", "something", "car")
 
 
