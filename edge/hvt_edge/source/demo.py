@@ -159,7 +159,7 @@ class DemoSource(Source):
 def _drawing_on() -> Iterator[None]:
     try:
         yield
-    except (EOFError, BrokenPipeError):
+    except (EOFError, BrokenPipeError, pickle.UnpicklingError):
         raise UserError("--source demo: the process that draws the scene has ended") from None
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import io
 import logging
 import os
+import pickle
 import socket
 import subprocess
 import tempfile
@@ -13,6 +15,7 @@ import time
 from fractions import Fraction
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
+from types import SimpleNamespace
 from unittest import mock
 
 import av
@@ -316,6 +319,16 @@ def test_a_demo_that_nobody_draws_any_more_ends_with_a_sentence(monkeypatch):
         for use in (lambda: next(source.frames(start_ns=0)), source.poses):
             with pytest.raises(UserError, match="the process that draws the scene has ended"):
                 use()
+
+
+def test_a_demo_that_was_killed_in_the_midst_of_an_answer_ends_with_a_sentence(monkeypatch):
+    """Half of what it had to say would be a traceback of pickle's."""
+    half = io.BytesIO(pickle.dumps(((3840, 2160), ("car",) * 100, 10.0))[:-9])
+    killed = SimpleNamespace(
+        stdin=io.BytesIO(), stdout=half, kill=lambda: None, communicate=lambda **_timeout: None
+    )
+    monkeypatch.setattr(subprocess, "Popen", lambda *_args, **_more: killed)
+    assert "the process that draws the scene has ended" in refused("demo")
 
 
 def test_the_demo_has_4k_when_told():
