@@ -235,8 +235,7 @@ class Pipeline:
         shown_at = (self._now.frame_index, self._now.capture_ns) if ahead else (index, picture.capture_ns)
         self._now = Progress(*shown_at, picture_index=index)
         self._parts.fusion.take_own(own)
-        late = self._detection is not None and picture.capture_ns - self._due_ns > _LATE_NS
-        self._show(own, picture.capture_ns, looked_ns=self._due_ns if late else None)
+        self._show(own, picture.capture_ns, looked_ns=self._looked_ns(picture.capture_ns))
 
     def take_late(self, newer: threading.Event | None) -> None:
         """Take in what the detector is still at, where it is done before ``newer`` is set, though its list is out.
@@ -256,7 +255,12 @@ class Pipeline:
         """
         if index > self._now.frame_index and self._own is not None:
             self._now = Progress(index, capture_ns, self._now.picture_index)
-            self._show(self._own_at(index), capture_ns, looked_ns=self._picture_ns)
+            looked_ns = self._looked_ns(capture_ns)
+            self._show(
+                self._own_at(index),
+                capture_ns,
+                looked_ns=self._picture_ns if looked_ns is None else looked_ns,
+            )
 
     def edge_step(self, step: Tracks, *, capture_ns: int | None = None) -> None:
         """Take what the edge's tracker listed at one frame: ids and class ids the edge's, boxes in base pixels.
@@ -401,6 +405,11 @@ class Pipeline:
             return replace(ahead, boxes_xyxy_px=moved.astype(np.float32))
         before = self._parts.fusion.own_at(frame_index)
         return Tracks.none(frame_index) if before is None else replace(before, frame_index=frame_index)
+
+    def _looked_ns(self, capture_ns: int) -> int | None:
+        # When the picture that the detector is behind with was captured; None where it is not far behind that list.
+        late = self._detection is not None and capture_ns - self._due_ns > _LATE_NS
+        return self._due_ns if late else None
 
     def _capture_ns(self, frame_index: int) -> int:
         return self._picture_ns + round((frame_index - self._now.picture_index) * self._frame_ns)
