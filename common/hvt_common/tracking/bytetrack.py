@@ -230,7 +230,10 @@ class ByteTracker:
             self._searched = _Searched(self._table.copy(), self._frame_index, [])
         affine = self._step_of(image_bgr, frame_index, mark=searched)
         if self._searched is not None:
-            self._searched.steps.append((frame_index, affine))
+            steps = self._searched.steps
+            steps.append((frame_index, affine))
+            if frame_index - steps[0][0] > self._longest_frames + 1:
+                del steps[1:-1]  # whatever is found, all tracks will have ended
         self._advance(frame_index, affine, hold_unconfirmed=False)
         self._table.started[:] = False
         return self._listed(frame_index)

@@ -133,6 +133,8 @@ class Pipeline:
         self._turn_s = _TURN_SHARE / fps
         self._detection: Detection | None = None
         """The picture that is searched, or waits for it."""
+        self._watched: Detection | None = None
+        """The newest one whose end wakes up who waits for it."""
         self._due_ns = 0
         """When the one that was to be searched was captured, which another may have replaced."""
         self._farthest = round(_FARTHEST_S * fps)
@@ -362,7 +364,9 @@ class Pipeline:
         # Whether the detector is done with this picture, before there is a ``newer`` one.
         if newer is None or self._own is None:  # before the first there is nothing to list
             return bool(wait([detection.found]).done)
-        detection.found.add_done_callback(lambda _: newer.set())
+        if self._watched is not detection:  # one that hangs is asked for with each picture
+            self._watched = detection
+            detection.found.add_done_callback(lambda _: newer.set())
         newer.wait(self._turn_s)
         if not detection.queued:
             newer.wait()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import asdict
 from pathlib import Path
 
@@ -455,6 +456,23 @@ def test_what_is_found_late_counts_as_if_it_had_been_found_at_once(late: int) ->
             assert waited.still == at_once.still
     with pytest.raises(ValueError, match="no frame is being searched"):
         waited.update_late(Detections.none())
+
+
+def test_a_detector_that_hangs_takes_no_more_memory_with_each_frame() -> None:
+    """A ground that shows video for days would keep a step of each frame since."""
+    hanging, at_once = (ByteTracker(fps=15) for _ in range(2))
+    at_once.update(seen((0, 0, 40, 40)), frame_index=0)
+    hanging.predict(frame_index=0, searched=True)
+    tracemalloc.start()
+    try:
+        for k in range(1, 4000):
+            hanging.predict(frame_index=k)
+        assert tracemalloc.get_traced_memory()[0] < 50_000
+    finally:
+        tracemalloc.stop()
+    at_once.predict(frame_index=3999)
+    assert hanging.update_late(seen((0, 0, 40, 40))).ids.tolist() == [1]
+    assert len(hanging.extrapolated(frame_index=3999)) == len(at_once.extrapolated(frame_index=3999)) == 0
 
 
 def test_the_class_follows_the_votes() -> None:
