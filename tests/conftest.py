@@ -70,7 +70,9 @@ def _process_as_found() -> Iterator[None]:
     """A program that a test calls in this process takes signals, log and hooks for itself: the next finds its own."""
     signals = {one: signal.getsignal(one) for one in STOP_SIGNALS}
     hooks = sys.excepthook, threading.excepthook
+    priority = os.getpriority(os.PRIO_PROCESS, 0)
     yield
+    assert os.getpriority(os.PRIO_PROCESS, 0) == priority, "all tests after it would give way"
     sys.excepthook, threading.excepthook = hooks
     for one, handler in signals.items():
         signal.signal(one, handler)

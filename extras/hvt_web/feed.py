@@ -10,7 +10,6 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.edge_words import counts_text, lever_sentences, part_words, still_words
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import FailedPart
-from hvt_common.runtime.process import lower_priority
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_ground.events import Event, MessageTiming, Notice, Overlay, Refinement, VideoSample
 from hvt_ground.report.state import EdgeState, GroundState, SessionState
@@ -31,7 +30,6 @@ class SessionFeed(SinkWriter[Event]):
     """Writes one session of an edge to the page of it. ``clock`` is the ground's, Unix nanoseconds."""
 
     def __init__(self, info: Info, page: EdgePage, hub: Hub, *, clock: Callable[[], int]) -> None:
-        lower_priority()  # viewers never slow down what receives and records
         self._info = info
         self._page = page
         self._hub = hub

@@ -25,6 +25,7 @@ from hvt_common.errors import NotYetError, UserError, listening_trouble, may_com
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import Awaited, Failures, reason_of
 from hvt_common.runtime.host_names import host_and_port, is_loopback
+from hvt_common.runtime.process import lower_priority
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Refinement
 from hvt_ground.extras import Flight, Opening, Service
@@ -130,7 +131,14 @@ class WebPage(Service):
     def sinks(self, flight: Flight) -> Iterable[Opening]:
         """Show the session."""
         opens = self.feed(flight.info)
-        yield Opening(f"web page of {flight.info.edge}", opens, waits=False, longest_pause_s=_PAUSE_S)
+
+        def give_way_and_open() -> SessionFeed:
+            lower_priority()  # viewers never slow down what receives and records
+            return opens()
+
+        yield Opening(
+            f"web page of {flight.info.edge}", give_way_and_open, waits=False, longest_pause_s=_PAUSE_S
+        )
 
     def feed(self, info: Info) -> Callable[[], SessionFeed]:
         """Make the function that opens a sink for a session, in the sink's thread."""

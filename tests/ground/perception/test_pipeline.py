@@ -116,7 +116,7 @@ def test_a_slow_detector_holds_no_list_up_and_its_boxes_lie_where_objects_are_no
             assert release.acquire(timeout=20)
             return super().detect(image_bgr)
 
-    rig, at_once = Rig(detect_every=5, detector=Slow()), Rig(detect_every=5)
+    rig, at_once = Rig(detect_every=5, detector=Slow(), detector_thread=DetectorThread()), Rig(detect_every=5)
     release.release()  # before the first there is nothing to list
     newer.set()  # there always is one
     for picture in pictures:
@@ -147,7 +147,7 @@ def test_lists_of_a_detector_that_is_a_second_behind_are_old(pictures):
             release.acquire(timeout=20)
             return super().detect(image_bgr)
 
-    rig = Rig(detect_every=5, detector=Hangs())
+    rig = Rig(detect_every=5, detector=Hangs(), detector_thread=DetectorThread())
     release.release()
     newer.set()
     for picture in pictures[:24]:
@@ -198,7 +198,7 @@ def test_what_is_found_after_the_list_is_out_counts_though_nothing_comes(picture
             assert release.acquire(timeout=20)
             return super().detect(image_bgr if rig.pipeline.detections_run == 1 else np.zeros_like(image_bgr))
 
-    rig = Rig(detect_every=5, detector=BlindAtLast())
+    rig = Rig(detect_every=5, detector=BlindAtLast(), detector_thread=DetectorThread())
     rig.pipeline.analyze(pictures[0], hurry=False, newer=newer)
     newer.set()
     rig.pipeline.analyze(pictures[5], hurry=False, newer=newer)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -28,7 +28,7 @@ from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Detections, Image, Posterior, Tracks, View
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
-from hvt_ground.perception.detector_thread import DetectorThread
+from hvt_ground.perception.detector_thread import Detection, DetectorThread
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
@@ -126,6 +126,16 @@ class SameAnswer:
         return FrameReadings(tuple((reading,) * len(one.boxes_base_px) for one in stills), self.found)
 
 
+class DetectsAtOnce(DetectorThread):
+    """In the thread that asks, so that no list goes out without what its picture shows, however busy the machine."""
+
+    def submit(self, image: Image, detect: Callable[[Image], Detections]) -> Detection:
+        """Search it."""
+        detection = Detection(image, detect)
+        detection.run()
+        return detection
+
+
 def pipeline_of(
     emit,
     *,
@@ -154,7 +164,7 @@ def pipeline_of(
         vocabulary=vocabulary,
         fusion=Fusion(fps=15, edge_classes=places, path=path),
         path=path,
-        detector_thread=detector_thread or DetectorThread(),
+        detector_thread=detector_thread or DetectsAtOnce(),
         trust=trust or ViewTrust(MOTION, hence=""),
         search=search,
     )
