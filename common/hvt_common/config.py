@@ -23,6 +23,7 @@ from typing import Any, NoReturn, Protocol, TypeVar, cast
 import tomli_w
 
 from hvt_common.errors import UserError, absent, check_not_read, named_path
+from hvt_common.files import read_text
 from hvt_common.redaction import Redaction
 from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse_share, parse_size
 
@@ -193,7 +194,7 @@ def load(
     file = given.pop("config", None)
     values: dict[str, Any] = {}
     if file is not None:
-        values.update(_from_file(config_class, Path(file)))
+        values.update(_from_file(config_class, Path(_one(file, name="--config"))))
     for field in dataclasses.fields(config_class):  # type: ignore[arg-type]
         if field.name in given:
             values[field.name] = _value(field, given[field.name], name=_flag(field))
@@ -338,12 +339,11 @@ def _one(given: Any, *, name: str) -> str:
 def _from_file(config_class: type, file: Path) -> dict[str, Any]:
     fields = {field.name.replace("_", "-"): field for field in dataclasses.fields(config_class)}
     try:
-        table = tomllib.loads(file.read_text(encoding="utf-8"))
+        table = tomllib.loads(read_text(file))
     except FileNotFoundError:
         raise absent(file)(f"--config {file} does not exist: give a TOML file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise UserError(f"--config {file} cannot be read ({reason}): give a TOML file") from None
+    except OSError as error:
+        raise UserError(f"--config {file} cannot be read ({error.strerror}): give a TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"--config {file} is not valid TOML: {error}") from None
     values: dict[str, Any] = {}

@@ -48,6 +48,8 @@ _MOST_PORT = 65535
 
 _KEY = r"[\w.-]{0,32}(?:pass|pwd|pw|key|token|auth|secret|sig|user|cred|streamid|session|code)[\w.-]{0,32}"
 _PAIR = re.compile(rf"(?<![\w.-])({_KEY})=([^&\s\"'<>)\],;…]+)", re.IGNORECASE)
+_OPTION = re.compile(r"--[a-z-]+=")
+"""``--still-codec=webp`` is no pair: every ``webp`` in log and summary would be hidden."""
 _LEAST = 3
 """A secret of fewer characters would blot out half of every sentence; in an address it is hidden all the same."""
 _ANYWHERE = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{0,15}:[/\\]{1,4})(?:[^\n]*@|[^\s\"'@]*@)")
@@ -137,10 +139,10 @@ class Redaction:
 
 def _secrets(word: str) -> Iterable[str]:
     # The secret parts of a word, an address or ``--source=`` and one; of a typing error rather too much.
+    word = _OPTION.sub("", word)
     found = _BEGIN.search(word)
     if found is None and not _LIKELY.search(word) and not _PAIR.search(word):
         return
-    address = word.partition("=")[2] if word.startswith("--") else word
     body = word if found is None else word[found.end() :]
     user, at, _ = body.rpartition("@")
     if at:
@@ -148,7 +150,7 @@ def _secrets(word: str) -> Iterable[str]:
         yield from (user, password if colon else name)
     yield from (value for _, value in _PAIR.findall(body))
     # A library may take it apart at any of these; what of an address is shown need not be hidden.
-    shown = redacted(address)
+    shown = redacted(word)
     for part in re.split(r"[/?#&;@\[\]\\]", body):
         for one in (part, *part.split("=", 1)[1:], *part.split(":")):
             if one not in shown and (at or not _PLAIN.fullmatch(one)):

@@ -45,6 +45,7 @@ from hvt_edge.video.share import FIRST_SHARE
 DEFAULT_FPS = 15.0
 DEFAULT_SIZE = (1280, 720)
 _LEAST_WINDOW_S, _MOST_WINDOW_S = 0.5, MOST_WINDOW_NS / 1e9
+_LEAST_SHARE = 0.01
 _R0_DEPTH = 0.1
 _MIN_BUDGET_BPS = 100_000
 _STORE_BYTES = 200_000_000
@@ -499,8 +500,8 @@ def _with_rates(config: EdgeConfig) -> EdgeConfig:
     policy = method(config.method, **tuning(config.tune))
     share = regime.video_share if config.video_share is None else config.video_share
     share = 1.0 if policy.video_only else share
-    if not isinstance(share, str) and not 0 < share <= 1:
-        raise UserError(f"--video-share {share:g} leaves no base stream: give more than 0, at most 1")
+    if not isinstance(share, str) and not _LEAST_SHARE <= share <= 1:
+        raise UserError(f"--video-share {share:g} leaves no base stream: give {_LEAST_SHARE} to 1")
     depth = _R0_DEPTH if policy.name == "R0" and not config.roi_depth else config.roi_depth
     return replace(config, budget=config.budget or regime.budget_bps, video_share=share, roi_depth=depth)
 

@@ -162,10 +162,10 @@ class _MatroskaFile:
             self._file.close()
 
     def give_up(self) -> None:
-        """Close it as it is; one that holds no frame is removed."""
+        """Close it as it is; one that holds no frame is removed, unless it is a pipe or a device."""
         with contextlib.suppress(av.error.FFmpegError, OSError, ValueError):
             self.close()
-        if not self._count:
+        if not self._count and self.path.is_file():
             with contextlib.suppress(OSError):
                 self.path.unlink()
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError, named_path
+from hvt_common.files import read_text
 from hvt_models.manifest import (
     MAX_SIZE_BYTES,
     ModelEntry,
@@ -223,11 +224,11 @@ class Store:
     def _added(self) -> dict[str, ModelEntry]:
         file = self.folder / _ADDED
         try:
-            text = file.read_text(encoding="utf-8")
+            text = read_text(file)
         except (FileNotFoundError, NotADirectoryError):
             return {}
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"{file} cannot be read ({error})") from error
+        except OSError as error:
+            raise UserError(f"{file} cannot be read ({error.strerror})") from error
         return parse_manifest(text, origin=str(file))
 
     def _note(self, entry: ModelEntry) -> None:

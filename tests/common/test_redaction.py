@@ -207,3 +207,9 @@ def test_an_option_with_several_addresses_hides_no_host():
     redaction = Redaction([["tcp://127.0.0.1:18003", "udp://me:s3cret9@10.0.0.2:1"], ("a",), 5, None])
     assert redaction.text("CoT tcp://127.0.0.1:18003") == "CoT tcp://127.0.0.1:18003"
     assert "s3cret9" not in redaction.text("udp://me:s3cret9@10.0.0.2:1 and s3cret9")
+
+
+def test_the_values_of_our_own_options_are_no_secrets():
+    """``--still-codec=webp`` hid every webp, for ``code`` is in the name of the option."""
+    words = ["--still-codec=webp", "--encoder=x265", "--source=rtsp://u:Zq9Zq9@cam/x"]
+    assert Redaction(words).text("webp x265 Zq9Zq9") == "webp x265 …"

@@ -132,6 +132,8 @@ def test_a_budget_whose_window_holds_no_keyframe_is_refused_with_the_least_that_
         (["--regime", "low", "--budget", "1Mbps"], "--regime low already sets"),
         (["--regime", "low", "--video-share", "0.5"], "--regime low already sets"),
         (["--video-share", "0"], "--video-share 0 leaves no base stream"),
+        (["--video-share", "1e-320"], "leaves no base stream: give 0.01 to 1"),
+        (["--config=--"], "--config [] is not accepted"),
         (["--budget", "60kbps", "--size", "1280x720"], "give at least 118 kbps, lower --size or --fps"),
         (["--budget", "500kbps", "--video-share", "0.1", "--size", "1280x720"], "or raise --video-share 0.1"),
         (["--window", "10ms"], "--window 0.01s is not accepted"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import codecs
 import json
 import math
 import re
@@ -12,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from hvt_common.errors import UserError, absent
+from hvt_common.files import read_text
 from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
 from hvt_common.inference.runtimes.model_file import ir_metadata, is_ir, onnx_metadata
 from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
@@ -23,7 +23,6 @@ KNOWN_LABELS: Mapping[str, tuple[str, ...]] = {"coco": COCO_NAMES, "visdrone": V
 
 MAX_LABELS = 100_000
 MAX_LABEL_CHARS = 200
-_MAX_FILE_BYTES = 8 << 20
 _MAX_METADATA_CHARS = 1 << 20
 _NAME = re.compile(r"[\w .&'/+-]*[^\W\d_][\w .&'/+-]*")
 """Between commas or line ends, without brackets around."""
@@ -88,29 +87,15 @@ def first_synonym(label: str) -> str:
     return label.partition(",")[0].strip() or label
 
 
-def decoded(content: bytes) -> str:
-    """Text in UTF-8, or as its byte order mark says. Raises `UnicodeDecodeError` for anything else."""
-    wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    return content.decode("utf-16" if wide else "utf-8-sig")
-
-
 def _read_text(path: Path) -> str:
     if not path.is_file():
         state = "is not a file" if path.exists() else "does not exist"
         raise absent(path)(f"labels file {path} {state}; a text file with one class name a line is expected")
     try:
-        with path.open("rb") as file:
-            content = file.read(_MAX_FILE_BYTES + 1)
-        if len(content) > _MAX_FILE_BYTES:
-            raise UserError(
-                f"labels file {path} is larger than {_MAX_FILE_BYTES} bytes, which is what is accepted"
-            )
-        return decoded(content)
+        return read_text(path)
     except OSError as error:
-        raise UserError(f"labels file {path} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
         raise UserError(
-            f"labels file {path} is not UTF-8 text (byte {error.start}); one class name a line is expected"
+            f"labels file {path} cannot be read ({error.strerror}); one class name a line is expected"
         ) from error
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from hvt_common.errors import UserError, absent
+from hvt_common.files import read_text
 from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
 from hvt_common.runtime.host_names import is_loopback
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
-_MAX_CONFIG_BYTES = 1_000_000
 _MAX_LINKS = "transport/unicast/max_links"
 
 _DEFAULTS: Mapping[str, Any] = {
@@ -131,12 +131,9 @@ def _read_config(path: Path | None) -> tuple[zenoh.Config, dict[str, Any]]:
     if path is None:
         return zenoh.Config(), {}
     try:
-        if path.stat().st_size > _MAX_CONFIG_BYTES:
-            raise UserError(f"{path}: larger than {_MAX_CONFIG_BYTES} bytes, not a Zenoh configuration")
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise absent(path)(f"{path}: cannot read the Zenoh configuration: {reason}") from None
+        text = read_text(path)
+    except OSError as error:
+        raise absent(path)(f"{path}: cannot read the Zenoh configuration: {error.strerror}") from None
     try:
         said = json5.loads(text)
     except (ValueError, RecursionError) as error:

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any, Final
 
 from hvt_common.errors import UserError, absent
+from hvt_common.files import read_text
 from hvt_common.inference.class_names import kind_of
 
 _TYPE: Final = re.compile(r"[A-Za-z0-9]+(-[A-Za-z0-9]+)*")
 _MOST_TYPE: Final = 64
 _MOST_NAME: Final = 128
 _MOST_ROWS: Final = 10_000
-_MOST_BYTES: Final = 2**20
+_MOST_BYTES: Final = 1_000_000
 _TABLES: Final = ("classes", "platforms")
 _ANY: Final = "*"
 
@@ -61,14 +62,12 @@ def read_types(path: Path | None) -> TypeTable:
     if path is None:
         return table
     try:
-        with path.open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
-        if len(data) > _MOST_BYTES:
-            raise UserError(f"--cot-types {path} is larger than 1 MiB: give a table of types, TOML")
-        content = tomllib.loads(data.decode())
+        content = tomllib.loads(read_text(path, most=_MOST_BYTES))
     except OSError as error:
-        raise absent(path)(f"--cot-types {path} cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # no TOML, or no UTF-8
+        raise absent(path)(
+            f"--cot-types {path} cannot be read ({error.strerror}): give a table of types, TOML"
+        ) from None
+    except (ValueError, RecursionError) as error:
         raise UserError(f"--cot-types {path} is no TOML: {error}") from None
     return table.extended(_parsed(content, where=f"--cot-types {path}"))
 

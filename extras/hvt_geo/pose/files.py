@@ -23,8 +23,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from hvt_common.errors import UserError
+from hvt_common.files import decoded, read_bytes
 from hvt_common.geodesy import turned_deg
-from hvt_common.inference.labels import decoded
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
 from hvt_edge.loop.pose import MOST_GAP_S, PoseTable
@@ -85,9 +85,7 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
     if reader is None:
         raise UserError(f"pose file {path} is none of .csv, .srt (DJI) or .gpx")
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise UserError(f"pose file {path} is larger than {_MOST_BYTES // 10**6} MB")
-        text = _text(path.read_bytes())
+        text = _text(read_bytes(path, most=_MOST_BYTES))
     except OSError as error:
         raise UserError(f"pose file {path} cannot be read: {error.strerror}") from None
     try:

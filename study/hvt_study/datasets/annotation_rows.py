@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.inference.labels import decoded
+from hvt_common.files import MOST_TABLE_BYTES, read_text
 
 _log = logging.getLogger(__name__)
 
@@ -116,11 +116,9 @@ def read_rows(path: Path, *, columns: str, least: int, frames: bool = True, of_d
 
 def _text(path: Path) -> str:
     try:
-        return decoded(path.read_bytes())
-    except UnicodeDecodeError:
-        raise UserError(f"{path} is not a text file; accepted are lines of numbers") from None
+        return read_text(path, most=MOST_TABLE_BYTES)
     except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise UserError(f"{path} cannot be read ({error.strerror}); accepted are lines of numbers") from None
 
 
 def _numbers(lines: tuple[str, ...], count: int) -> npt.NDArray[np.float64]:

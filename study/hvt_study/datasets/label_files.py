@@ -24,8 +24,9 @@ from xml.etree import ElementTree as ET
 
 import yaml
 
+from hvt_common import files
 from hvt_common.errors import UserError
-from hvt_common.inference.labels import decoded, numbered_names, read_labels
+from hvt_common.inference.labels import numbered_names, read_labels
 from hvt_edge.source.folder import sequence_files
 
 LOOKED_IN = (
@@ -191,9 +192,9 @@ def _words(value: object) -> list[str]:
 def read_text(path: Path) -> str:
     """A text file; `UserError` where it cannot be read."""
     try:
-        return decoded(path.read_bytes())
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read as text: {error}") from None
+        return files.read_text(path, most=files.MOST_TABLE_BYTES)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror})") from None
 
 
 def _folders(root: Path, depth: int) -> list[Path]:
@@ -249,12 +250,12 @@ class VocFile:
 def read_voc(path: Path) -> VocFile:
     """Read a file; `UserError` where it is no such XML."""
     try:
-        content = path.read_bytes()
+        content = files.read_bytes(path)
         if b"<!ENTITY" in content.replace(b"\0", b""):  # in UTF-16 too
             raise UserError(f"{path} is not an XML of Pascal VOC (it has entities)")
         root = ET.fromstring(content)  # noqa: S314 - no entities; in the encoding that it says
     except OSError as error:
-        raise UserError(f"{path} cannot be read as text: {error}") from None
+        raise UserError(f"{path} cannot be read ({error.strerror})") from None
     except (ET.ParseError, ValueError, LookupError) as error:
         raise UserError(f"{path} is not an XML of Pascal VOC ({error})") from None
     sides = tuple(int(_number(root.findtext(f"size/{side}"))) for side in ("width", "height"))

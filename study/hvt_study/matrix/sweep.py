@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
+from hvt_common.files import MOST_TABLE_BYTES, read_text
 from hvt_common.inference.detect import Detector
 from hvt_edge.source.opening import Source
 from hvt_edge.stills.policy.selectors import SELECTORS, select
@@ -63,11 +65,11 @@ def read_csv(path: Path) -> dict[int, RawDetections]:
     """Read raw detections, columns ``frame,x1,y1,x2,y2,conf,class`` with a header, by frame in the file's order."""
     grouped: dict[int, list[tuple[list[float], float, str]]] = {}
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with io.StringIO(read_text(path, most=MOST_TABLE_BYTES), newline="") as file:
             for number, line in enumerate(_rows(file, path), start=2):
                 frame, box, confidence, name = _parsed(line, path=path, number=number)
                 grouped.setdefault(frame, []).append((box, confidence, name))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, csv.Error) as error:
         raise UserError(f"{path} cannot be read ({error}): give a CSV file of detections") from None
     return {
         frame: RawDetections(

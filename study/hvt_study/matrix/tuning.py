@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError
+from hvt_common.files import read_text
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
 from hvt_study.runs.methods import METHODS as FLOWN
 
@@ -54,7 +55,7 @@ def _from_words(word: str) -> tuple[str, dict[str, float]]:
 
 def _from_file(path: Path) -> tuple[str, dict[str, float]]:
     try:
-        found: Any = json.loads(path.read_text(encoding="utf-8"))
+        found: Any = json.loads(read_text(path))
         name, parameters = found["method"], found["parameters"]
         return str(name), {str(key): float(value) for key, value in parameters.items()}
     except OSError as error:

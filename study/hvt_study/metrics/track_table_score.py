@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hvt_common.errors import UserError
-from hvt_common.inference.labels import decoded
+from hvt_common.files import MOST_TABLE_BYTES, read_text
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.mot import read_truth_rows
 from hvt_study.metrics.classes import ClassScore, class_score
@@ -36,7 +36,7 @@ def read_tracks(path: Path, *, column: str = "class") -> dict[int, FrameView]:
     """
     rows: dict[int, tuple[list[list[float]], list[str]]] = defaultdict(lambda: ([], []))
     try:
-        with io.StringIO(decoded(path.read_bytes()), newline="") as file:
+        with io.StringIO(read_text(path, most=MOST_TABLE_BYTES), newline="") as file:
             for line in csv.DictReader(file):
                 x, y, w, h = (float(line[name]) for name in ("x", "y", "w", "h"))
                 frame = int(line["frame_index"]) + 1 if "frame_index" in line else int(line["frame"])

@@ -28,7 +28,7 @@ def test_one_name_a_line(tmp_path: Path) -> None:
         (b"\xff\x00car", "not UTF-8"),
         (b"car\x00\x01\n", "not text in line 1"),
         (b"a\n" * 100_001, "100001 lines"),
-        (b"a" * (9 << 20), "larger than"),
+        (b"a" * (17 << 20), "larger than"),
     ],
 )
 def test_a_file_that_holds_no_labels_is_refused(tmp_path: Path, content: bytes, words: str) -> None:

@@ -15,7 +15,7 @@ import av
 import numpy as np
 import pytest
 
-from hvt_archive.local_copy import LocalCopy
+from hvt_archive.local_copy import LocalCopy, _MatroskaFile
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
@@ -205,6 +205,17 @@ def test_a_card_that_hangs_costs_no_frame(tmp_path):
     assert sorted(took_s)[-10] < 0.05
     os.close(reader)  # which ends the write that hangs
     recorder.close()
+
+
+def test_a_pipe_that_takes_nothing_is_not_removed(tmp_path):
+    """As root the edge removed /dev/full, and every program after it filled a file of that name."""
+    pipe = tmp_path / "pipe.mkv"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    file = _MatroskaFile(pipe, pipe.open("wb", buffering=0))
+    os.close(reader)
+    file.give_up()
+    assert pipe.is_fifo()
 
 
 def test_a_killed_process_leaves_a_file_that_plays(tmp_path):

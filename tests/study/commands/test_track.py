@@ -164,7 +164,7 @@ def test_wrong_files_and_arguments_are_one_sentence(
     binary = tmp_path / "model.onnx"
     binary.write_bytes(b"\x08\x07\xff\xfe\x80")
     assert "none.txt cannot be read" in sentence(capsys, "track", tmp_path / "none.txt", "--out", out)
-    assert "is not a text file" in sentence(capsys, "track", binary, "--out", out)
+    assert "not UTF-8 text" in sentence(capsys, "track", binary, "--out", out)
     assert "cannot be read" in sentence(capsys, "track", tmp_path, "--out", out)
     assert "cannot be written" in sentence(capsys, "track", source, "--out", tmp_path / "no" / "out.txt")
     assert f"--out {source} is {source} itself" in sentence(capsys, "track", source, "--out", source)

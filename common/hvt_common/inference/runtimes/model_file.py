@@ -16,6 +16,7 @@ from types import MappingProxyType
 from xml.etree import ElementTree as ET
 
 from hvt_common.errors import UserError, absent
+from hvt_common.files import read_text
 
 MAX_MODEL_BYTES = 1 << 30
 """1 GiB: the largest detectors are a fifth of it, and protobuf itself stops at 2 GiB."""
@@ -262,8 +263,8 @@ def ir_metadata(path: Path) -> dict[str, str]:
 def _yaml_of_ultralytics(path: Path) -> dict[str, str]:
     # Plain keys, and the table of names as a literal; empty where there is no such file.
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines() if path.is_file() else []
-    except (OSError, UnicodeDecodeError):
+        lines = read_text(path).splitlines()
+    except OSError:
         return {}
     found: dict[str, str] = {}
     names: dict[int, str] = {}

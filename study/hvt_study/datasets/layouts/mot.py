@@ -31,7 +31,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.inference.labels import decoded, read_labels
+from hvt_common.files import read_text
+from hvt_common.inference.labels import read_labels
 from hvt_common.values import Boxes
 from hvt_study.datasets.annotation_rows import Rows, read_rows
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
@@ -216,9 +217,9 @@ def _info(path: Path) -> Mapping[str, str]:
     parser = configparser.ConfigParser(interpolation=None)
     parser.optionxform = str  # type: ignore[assignment, method-assign] # the documented way to keep case
     try:
-        parser.read_string(decoded(path.read_bytes()))
+        parser.read_string(read_text(path))
         return dict(parser["Sequence"])
-    except (configparser.Error, KeyError, OSError, UnicodeDecodeError):
+    except (configparser.Error, KeyError, OSError):
         raise UserError(f"{path} is not a sequence's description: expected is a section [Sequence]") from None
 
 

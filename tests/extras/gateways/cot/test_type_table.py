@@ -54,9 +54,9 @@ def test_rows_of_the_user_go_before_ours(tmp_path):
         (b"classes = 3\n", "[classes] is no table"),
         (b'[classes]\n"" = "a-u-G"\n', "a name has 1 to 128 characters"),
         (b"car: a-u-G\n", "is no TOML"),
-        (b"\xff\xfe", "is no TOML"),
+        (b"\xff\xff", "not UTF-8 text"),
         (b"x = " + b"[" * 100_000, "is no TOML"),
-        (b"#" * (2**20 + 1), "is larger than 1 MiB"),
+        (b"#" * (2**20 + 1), "larger than 1 MB"),
     ],
 )
 def test_a_wrong_table_is_refused_in_one_sentence(tmp_path, content, said):
@@ -73,5 +73,5 @@ def test_a_wrong_table_is_refused_in_one_sentence(tmp_path, content, said):
 
 def test_a_table_that_is_not_there(tmp_path):
     """A traceback would not name the option."""
-    with pytest.raises(UserError, match=r"--cot-types .* cannot be read: No such file"):
+    with pytest.raises(UserError, match=r"--cot-types .* cannot be read .No such file"):
         read_types(tmp_path / "nowhere.toml")

@@ -1,0 +1,36 @@
+"""Files that people name, read whole within a bound. A device that never ends is one that is too large."""
+
+from __future__ import annotations
+
+import codecs
+import errno
+import os
+from pathlib import Path
+
+MOST_BYTES = 16_000_000
+MOST_TABLE_BYTES = 1_000_000_000
+"""Of labels and annotations of a whole dataset."""
+
+
+def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
+    """All of a file. Raises `OSError`, also where it is larger than ``most``."""
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size or most  # that of a pipe or a device is 0
+        content = file.read(min(size, most) + 1)
+    if len(content) > most:
+        raise OSError(errno.EFBIG, f"larger than {most / 1e6:g} MB")
+    return content
+
+
+def read_text(path: Path, *, most: int = MOST_BYTES) -> str:
+    """The text of a file, as `decoded`. Raises `OSError`, also where it is no text."""
+    try:
+        return decoded(read_bytes(path, most=most))
+    except UnicodeDecodeError as error:
+        raise OSError(errno.EILSEQ, f"not UTF-8 text at byte {error.start}") from None
+
+
+def decoded(content: bytes) -> str:
+    """Text in UTF-8, or as its byte order mark says. Raises `UnicodeDecodeError` for anything else."""
+    wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    return content.decode("utf-16" if wide else "utf-8-sig")
