@@ -7,14 +7,15 @@ that none of them says what another does not. What is not known is None, never 0
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 from hvt_common import __version__
 from hvt_common.protocol.edge_words import FrameAccount
-from hvt_common.protocol.messages import WIRE_VERSION, Status
+from hvt_common.protocol.messages import WIRE_VERSION, Health, Status
 from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.units import SECOND_NS
+from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.events import Traffic
 from hvt_ground.link.group import Elsewhere, GroundGroup
 from hvt_ground.session.edge_sessions import EdgeSessions
@@ -43,81 +44,141 @@ class PoseState:
 
 
 @dataclass(frozen=True, slots=True)
+class _Moment:
+    session: GroundSession
+    backlog: EdgeBacklog
+    now_ns: int
+    traffic: Traffic | None
+    """None while no picture comes."""
+    health: Health | None
+    """None while no report comes."""
+    status: Status | None
+    """The newest, however old."""
+
+
+def _of(read: Callable[[_Moment], Any]) -> Any:
+    # A field, and how it is read.
+    return field(metadata={"read": read})
+
+
+def _live(read: Callable[[GroundSession, Traffic], Any]) -> Any:
+    return _of(lambda at: None if at.traffic is None else read(at.session, at.traffic))
+
+
+def _edge(read: Callable[[Health], Any]) -> Any:
+    return _of(lambda at: None if at.health is None else read(at.health))
+
+
+def _counted(read: Callable[[Status], Any]) -> Any:
+    return _of(lambda at: None if at.status is None else read(at.status))
+
+
+def _delay_ms(percent: int) -> Any:
+    return _live(lambda one, _: one.overlay_latency.percentile(percent) if one.knows_delay else None)
+
+
+def _picture_age_s(at: _Moment) -> float | None:
+    captured_ns = None if at.session.lockstep else at.session.newest_captured_ns
+    return None if captured_ns is None else max(0.0, (at.now_ns - captured_ns) / SECOND_NS)
+
+
+def _pose(at: _Moment) -> PoseState | None:
+    session, newest = at.session, at.session.poses.newest
+    if newest is None:
+        return None
+    age_ns = session.newest_capture_ns - newest.capture_ns
+    if not session.lockstep:  # the camera may be gone, and flies on
+        age_ns = at.now_ns - session.posed_ns(newest.capture_ns)
+    age_s = max(0.0, age_ns / SECOND_NS)
+    return PoseState(newest.latitude_deg, newest.longitude_deg, newest.height_m, age_s)
+
+
+def _failed_at_edge(at: _Moment) -> tuple[FailedPart, ...]:
+    since = {one: at.session.to_local_ns(since_ns) for one, since_ns in at.session.edge_failing.items()}
+    failed = () if at.status is None else (one for one in at.status.failed if one.part in since)
+    return tuple(FailedPart(one.part, one.reason, min(at.now_ns, since[one.part])) for one in failed)
+
+
+@dataclass(frozen=True, slots=True)
 class SessionState:
     """The session of an edge that is open."""
 
-    session: str
+    session: str = _of(lambda at: f"{at.session.info.session_id:016x}")
     """Its id, hexadecimal."""
-    software: str
+    software: str = _of(lambda at: at.session.info.software)
     """The edge's."""
-    method: str
-    levers: str
+    method: str = _of(lambda at: at.session.method)
+    levers: str = _of(lambda at: at.session.levers)
     """What ``--profile auto`` sends beside the video and why; empty without."""
-    lockstep: bool
-    duration_s: float
-    source_size: tuple[int, int]
-    base_size: tuple[int, int]
-    fps: float
-    budget_bps: int
+    lockstep: bool = _of(lambda at: at.session.lockstep)
+    duration_s: float = _of(lambda at: at.session.duration_s)
+    source_size: tuple[int, int] = _of(lambda at: at.session.info.source_size)
+    base_size: tuple[int, int] = _of(lambda at: at.session.info.base_size)
+    fps: float = _of(lambda at: at.session.info.fps)
+    budget_bps: int = _of(lambda at: at.session.budget_bps)
     """As it is now, like the method; what was commanded shows within half a minute."""
-    mean_bps: int
+    mean_bps: int = _of(lambda at: at.session.ledger.mean_bps(at.session.duration_s))
     """Over the session, all that crossed the line."""
-    total_bps: float | None
+    total_bps: float | None = _live(lambda _, now: now.total_bps)
     """Over the budget's window, like the two below; None while no picture comes, like all that is of now."""
-    budget_share: float | None
+    budget_share: float | None = _live(lambda one, now: now.total_bps / one.budget_bps)
     """What that is of the budget."""
-    base_bps: float | None
-    roi_bps: float | None
-    delay_p50_ms: float | None
+    base_bps: float | None = _live(lambda _, now: now.base_bps)
+    roi_bps: float | None = _live(lambda _, now: now.roi_bps)
+    delay_p50_ms: float | None = _delay_ms(50)
     """Capture to overlay over the session; None in lockstep, before the first, while no picture comes, and where the
     camera's clock cannot be right."""
-    delay_p95_ms: float | None
-    picture_age_s: float | None
+    delay_p95_ms: float | None = _delay_ms(95)
+    picture_age_s: float | None = _of(_picture_age_s)
     """Since the newest picture was captured, or came where the camera's clock cannot be right; None in lockstep."""
-    pose: PoseState | None
+    pose: PoseState | None = _of(_pose)  # noqa: RUF009 - a dataclass field, not a default
     """None where none ever came."""
-    frames_received: int
-    frames_decoded: int
-    frames_untracked: int
+    frames_received: int = _of(lambda at: at.session.frames_received)
+    frames_decoded: int = _of(lambda at: at.session.frames_decoded)
+    frames_untracked: int = _of(lambda at: at.session.worker.untracked)
     """Decoded, and passed over by detection and tracking for want of time."""
-    gaps: int
-    lost: int
+    gaps: int = _of(lambda at: at.session.counters.gaps)
+    lost: int = _of(lambda at: at.session.counters.lost)
     """Messages."""
-    corrupt: int
-    keyframe_requests: int
-    stills_received: int
-    stills_pending: int
+    corrupt: int = _of(lambda at: at.session.counters.corrupt)
+    keyframe_requests: int = _of(lambda at: at.session.counters.keyframe_requests)
+    stills_received: int = _of(lambda at: at.session.stills_received)
+    stills_pending: int = _of(
+        lambda at: at.session.worker.stills_queued + at.session.perceived.stills_pending
+    )
     """For their turn or their base frame."""
-    still_outcomes: Mapping[str, int]
+    still_outcomes: Mapping[str, int] = _of(lambda at: dict(at.session.perceived.outcomes))
     """What became of the objects in them."""
-    stills_not_sent: Mapping[str, int]
+    stills_not_sent: Mapping[str, int] = _of(lambda at: dict(at.session.not_sent))
     """Why candidates have no still: the edge's counts, by reason."""
-    tracks: int
-    tracks_refined: int
-    tracks_doubted: int | None
+    tracks: int = _of(lambda at: at.session.perceived.tracks)
+    tracks_refined: int = _of(lambda at: at.session.perceived.refined)
+    tracks_doubted: int | None = _live(lambda one, _: one.perceived.doubted)
     """Shown now, and nothing of what is looked for as stills have it; None while no picture comes."""
-    view_trust: float | None
+    view_trust: float | None = _live(lambda one, _: one.perceived.view_trust)
     """Mean confidence of what the ground's detector shows, 0…1; None for another than the embedded one, before there
     was enough, and while no picture comes."""
-    view_unlike: bool
+    view_unlike: bool = _of(lambda at: at.traffic is not None and at.session.perceived.view_unlike)
     """It is so low that the view is unlike what the detector knows: boxes are thin and unnamed."""
-    class_changes: int
-    detections: int
-    backlog_stills: int
+    class_changes: int = _of(lambda at: at.session.perceived.class_changes)
+    detections: int = _of(lambda at: at.session.perceived.detections_run)
+    backlog_stills: int = _of(lambda at: at.session.backlog.totals.stills)
     """That came after an outage; `backlog_video_s` likewise."""
-    backlog_video_s: float
-    backlog_working: int
+    backlog_video_s: float = _of(lambda at: at.session.backlog.totals.video_s)
+    backlog_working: int = _of(lambda at: at.backlog.working)
     """Objects of the backlog that have come and are not where they belong yet."""
-    edge_frames: FrameAccount | None
+    edge_frames: FrameAccount | None = _counted(  # noqa: RUF009 - likewise
+        lambda status: status.frame_account if status.frames else None
+    )
     """What became of each of the edge's source frames; None also where an earlier edge does not say."""
-    edge_frames_dropped: int | None
+    edge_frames_dropped: int | None = _counted(lambda status: status.health.frames_dropped)
     """At the edge before encoding, all; None before its first report, as all below."""
-    edge_frames_dropped_cpu: int | None
-    edge_encode_ms: float | None
-    """None where nothing was encoded, or no report comes, as the two below."""
-    edge_detect_ms: float | None
-    edge_still_queue: int | None
-    edge_failed: tuple[FailedPart, ...]
+    edge_frames_dropped_cpu: int | None = _counted(lambda status: status.health.frames_dropped_cpu)
+    edge_encode_ms: float | None = _edge(lambda health: health.encode_ms or None)
+    """None where nothing was encoded (on the wire 0), or no report comes, as the two below."""
+    edge_detect_ms: float | None = _edge(lambda health: health.detect_ms or None)
+    edge_still_queue: int | None = _edge(lambda health: health.still_queue)
+    edge_failed: tuple[FailedPart, ...] = _of(_failed_at_edge)
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,81 +317,8 @@ def _left_out(status: Status | None) -> int:
     return 0 if status is None else status.frame_account.groups.get("link", 0)
 
 
-def _pose(session: GroundSession, now_ns: int) -> PoseState | None:
-    newest = session.poses.newest
-    if newest is None:
-        return None
-    age_ns = session.newest_capture_ns - newest.capture_ns
-    if not session.lockstep:  # the camera may be gone, and flies on
-        age_ns = now_ns - session.posed_ns(newest.capture_ns)
-    age_s = max(0.0, age_ns / SECOND_NS)
-    return PoseState(newest.latitude_deg, newest.longitude_deg, newest.height_m, age_s)
-
-
 def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState, now_ns: int) -> SessionState:
-    info, pipeline, counters, status = session.info, session.perceived, session.counters, session.last_status
-    now: Traffic | None = None if link == "lost" else session.traffic(now_ns)
-    delayed = now is not None and session.knows_delay
-    captured_ns = None if session.lockstep else session.newest_captured_ns
-    counts, health = None if status is None else status.health, session.health(now_ns)
-    totals = session.backlog.totals
-    return SessionState(
-        session=f"{info.session_id:016x}",
-        software=info.software,
-        method=session.method,
-        levers=session.levers,
-        lockstep=session.lockstep,
-        duration_s=session.duration_s,
-        source_size=info.source_size,
-        base_size=info.base_size,
-        fps=info.fps,
-        budget_bps=session.budget_bps,
-        mean_bps=session.ledger.mean_bps(session.duration_s),
-        total_bps=None if now is None else now.total_bps,
-        budget_share=None if now is None else now.total_bps / session.budget_bps,
-        base_bps=None if now is None else now.base_bps,
-        roi_bps=None if now is None else now.roi_bps,
-        delay_p50_ms=session.overlay_latency.percentile(50) if delayed else None,
-        delay_p95_ms=session.overlay_latency.percentile(95) if delayed else None,
-        picture_age_s=None if captured_ns is None else max(0.0, (now_ns - captured_ns) / SECOND_NS),
-        pose=_pose(session, now_ns),
-        frames_received=session.frames_received,
-        frames_decoded=session.frames_decoded,
-        frames_untracked=session.frames_untracked,
-        gaps=counters.gaps,
-        lost=counters.lost,
-        corrupt=counters.corrupt,
-        keyframe_requests=counters.keyframe_requests,
-        stills_received=session.stills_received,
-        stills_pending=session.worker.stills_queued + pipeline.stills_pending,
-        still_outcomes=dict(pipeline.outcomes),
-        stills_not_sent=dict(session.not_sent),
-        tracks=pipeline.tracks,
-        tracks_refined=pipeline.refined,
-        tracks_doubted=None if now is None else pipeline.doubted,
-        view_trust=None if now is None else pipeline.view_trust,
-        view_unlike=now is not None and pipeline.view_unlike,
-        class_changes=pipeline.class_changes,
-        detections=pipeline.detections_run,
-        backlog_stills=totals.stills,
-        backlog_video_s=totals.video_s,
-        backlog_working=sessions.backlog.working,
-        edge_frames=None if status is None or not status.frames else status.frame_account,
-        edge_frames_dropped=None if counts is None else counts.frames_dropped,
-        edge_frames_dropped_cpu=None if counts is None else counts.frames_dropped_cpu,
-        # On the wire 0 is where nothing was measured.
-        edge_encode_ms=None if health is None else health.encode_ms or None,
-        edge_detect_ms=None if health is None else health.detect_ms or None,
-        edge_still_queue=None if health is None else health.still_queue,
-        edge_failed=()
-        if status is None
-        else tuple(
-            FailedPart(
-                one.part,
-                one.reason,
-                min(now_ns, session.to_local_ns(session.edge_failing.get(one.part, one.failed_ns))),
-            )
-            for one in status.failed
-            if not one.working
-        ),
-    )
+    traffic = None if link == "lost" else session.traffic(now_ns)
+    status, health = session.last_status, session.health(now_ns)
+    at = _Moment(session, sessions.backlog, now_ns, traffic, health, status)
+    return SessionState(**{one.name: one.metadata["read"](at) for one in fields(SessionState)})

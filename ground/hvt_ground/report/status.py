@@ -60,7 +60,7 @@ def summary(session: GroundSession) -> dict[str, Any]:
         "pace": info.pace,
         "frames": session.frames_received,
         "frames_decoded": session.frames_decoded,
-        "frames_untracked": session.frames_untracked,
+        "frames_untracked": session.worker.untracked,
         "edge_frames": None if status is None or not status.frames else status.frame_account.as_dict(),
         "duration_s": round(session.duration_s, 3),
         "base_bytes": account.base_bytes,

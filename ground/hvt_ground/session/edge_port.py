@@ -20,7 +20,6 @@ from hvt_common.protocol.messages import (
     Feedback,
     Info,
     InfoRequest,
-    StillResult,
     UnknownVersionError,
     WireError,
 )
@@ -29,7 +28,6 @@ from hvt_common.transport.link_doctor import control_unanswered
 from hvt_common.transport.session import declare_publisher, query_later
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
-from hvt_ground.link.statistics import LinkMeasurement
 
 _log = logging.getLogger(__name__)
 
@@ -44,9 +42,6 @@ _ANSWER_S = 1.0
 _MOST_ANSWERS, _MOST_ERRORS = 4, 16
 _UNANSWERED = 3
 """So many queries on control in a row without an answer are no accident."""
-
-_MOST_DELAY_MS = 3_600_000.0
-_MOST_OBJECTS = 65_535
 
 InfoAnswer = tuple[Info, int, int]
 """A session's facts with the times of asking and hearing, ns."""
@@ -248,44 +243,17 @@ class ReceiverReports:
         self._sequence = 0
         self._lock = threading.Lock()
 
-    def send(
-        self,
-        *,
-        session_id: int,
-        last_frame_index: int,
-        objects_detected: int,
-        base: tuple[int, int],
-        roi: tuple[int, int],
-        lost: int,
-        corrupt: int,
-        measured: LinkMeasurement,
-        stills: tuple[StillResult, ...],
-    ) -> None:
-        """Report on a session as it is now; ``base`` and ``roi`` are messages and bytes."""
-        delay_ms, (offset_ns, error_ns) = measured.delay_p50_ms, self.clock_offset.estimate or (0, -1)
+    def send(self, feedback_of: Callable[..., Feedback]) -> None:
+        """Report what ``feedback_of`` makes of the receiver's own fields: the time and what is of all sessions."""
         with self._lock:
-            feedback = Feedback(
-                session_id=session_id,
+            offset_ns, error_ns = self.clock_offset.estimate or (0, -1)
+            feedback = feedback_of(
                 receiver_id=self._receiver_id,
                 sequence=self._sequence,
                 send_ns=self._clock(),
-                last_frame_index=last_frame_index,
-                base_messages=base[0],
-                base_bytes=base[1],
-                roi_messages=roi[0],
-                roi_bytes=roi[1],
-                lost=lost,
-                corrupt=corrupt,
-                base_sequence=measured.base_sequence,
-                base_held_us=measured.base_held_us,
-                still_sequence=measured.still_sequence,
-                missing_stills=measured.missing_stills,
-                delay_p50_ms=-1.0 if delay_ms is None else min(delay_ms, _MOST_DELAY_MS),
                 clock_offset_ns=offset_ns,
                 clock_error_ns=error_ns,
-                stills=stills,
                 backlog=self._backlog.take_acknowledged_ranges(MAX_ACKNOWLEDGED_RANGES),
-                objects_detected=min(objects_detected, _MOST_OBJECTS),
             )
             self._sequence += 1
             self._publish(feedback)

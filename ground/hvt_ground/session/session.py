@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial, wraps
-from typing import Literal, ParamSpec
+from typing import Any, Literal, ParamSpec
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.clock_offset import ClockOffset
@@ -19,6 +19,7 @@ from hvt_common.protocol.messages import (
     BacklogHeader,
     BacklogKind,
     BaseHeader,
+    Feedback,
     Health,
     Info,
     PoseReport,
@@ -51,6 +52,7 @@ _ANEW_NS = 5 * SECOND_NS
 """What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""
 _LATELY_NS, _FRAMES_LATELY = 3 * SECOND_NS, 4
 """What came longer ago, and so many frames, says nothing of now."""
+_MOST_DELAY_MS, _MOST_OBJECTS = 3_600_000.0, 65_535
 _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""
 
@@ -116,7 +118,6 @@ class GroundSession:
         """What the reassembly counted in this session."""
         self._clock = clock
         self._reports = reports
-        self._report_lock = threading.Lock()
         self._statistics = ReceptionStatistics(lockstep=self.lockstep)
         self._decoder = BaseDecoder(size=info.base_size)
         self._step_decoder = TrackStepDecoder()
@@ -253,12 +254,12 @@ class GroundSession:
         self._status_ns = now_ns
         self._account.count(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
         self._account.time(Channel.STATUS, item, status, handled=True)
-        self.last_status = status
         self.edge_failing = {
             one.part: self.edge_failing.get(one.part, one.failed_ns)
             for one in status.failed
             if not one.working
         }
+        self.last_status = status
         self._note_stale(self.newest_capture_ns)
         before, now = ([one for one, _ in lever_decisions(says)] for says in (self.levers, status.levers))
         self.levers = status.levers or self.levers
@@ -406,11 +407,6 @@ class GroundSession:
         return all(received >= sent for received, sent in counted)
 
     @property
-    def frames_untracked(self) -> int:
-        """Frames that were decoded, and passed over by detection and tracking."""
-        return self.worker.untracked
-
-    @property
     def stills_dropped(self) -> Counter[str]:
         """Stills of which nothing was made, by reason."""
         return +(self.perceived.stills_dropped + self.worker.dropped)
@@ -438,21 +434,31 @@ class GroundSession:
 
     def report(self) -> None:
         """Report to the edge now."""
-        if self._reports is None:
-            return
-        with self._report_lock:
-            last_frame_index, objects_detected = self._analyzed
-            self._reports.send(
-                session_id=self.info.session_id,
-                last_frame_index=last_frame_index,
-                objects_detected=objects_detected,
-                base=(self.frames_received, self.ledger.base_bytes),
-                roi=(self.stills_received, self.ledger.roi_bytes),
-                lost=self.counters.lost,
-                corrupt=self.counters.corrupt,
-                measured=self._statistics.take(self._clock()),
-                stills=self.take_results(MAX_STILL_RESULTS),
-            )
+        if self._reports is not None:
+            self._reports.send(self._feedback)
+
+    def _feedback(self, *, send_ns: int, **of_receiver: Any) -> Feedback:
+        measured, (last_frame_index, objects_detected) = self._statistics.take(send_ns), self._analyzed
+        delay_ms = measured.delay_p50_ms
+        return Feedback(
+            session_id=self.info.session_id,
+            send_ns=send_ns,
+            last_frame_index=last_frame_index,
+            base_messages=self.frames_received,
+            base_bytes=self.ledger.base_bytes,
+            roi_messages=self.stills_received,
+            roi_bytes=self.ledger.roi_bytes,
+            lost=self.counters.lost,
+            corrupt=self.counters.corrupt,
+            base_sequence=measured.base_sequence,
+            base_held_us=measured.base_held_us,
+            still_sequence=measured.still_sequence,
+            missing_stills=measured.missing_stills,
+            delay_p50_ms=-1.0 if delay_ms is None else min(delay_ms, _MOST_DELAY_MS),
+            stills=self.take_results(MAX_STILL_RESULTS),
+            objects_detected=min(objects_detected, _MOST_OBJECTS),
+            **of_receiver,
+        )
 
     def take_results(self, most: int) -> tuple[StillResult, ...]:
         """Return and forget up to ``most`` results that the edge has not been sent yet."""

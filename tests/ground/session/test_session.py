@@ -479,7 +479,7 @@ def test_slow_detection_never_holds_up_decoding(flight):
         rig.settle()
     (session,) = rig.ended
     assert session.last_frame_index == 29, "the newest is tracked, whatever is left out"
-    assert session.frames_untracked
+    assert session.worker.untracked
 
 
 def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
