@@ -47,7 +47,8 @@ class EdgeBacklog:
         self._assembly = assembly or BacklogAssembly()
         self._lock = threading.Lock()
         self._infos: OrderedDict[int, Info] = OrderedDict()
-        self._working = 0
+        self.working = 0
+        """Received objects that are not delivered yet."""
         self._sessions = 0
         """Sessions that have ended: jobs still at work for one of them are ignored."""
 
@@ -55,11 +56,6 @@ class EdgeBacklog:
     def paths(self) -> Sequence[Path]:
         """Recordings of former sessions that were written."""
         return () if self._recordings is None else tuple(self._recordings.paths)
-
-    @property
-    def working(self) -> int:
-        """Number of received objects that are not delivered yet."""
-        return self._working
 
     @property
     def unreported(self) -> int:
@@ -99,7 +95,7 @@ class EdgeBacklog:
         with self._lock:
             self._learn(info)
             dropped = self._assembly.drop_handed()
-            self._working = 0
+            self.working = 0
             self._sessions += 1
         if dropped:
             _log.info("%s: %d objects of an outage were not worked off in time", self._edge, dropped)
@@ -113,7 +109,8 @@ class EdgeBacklog:
         try:
             content = backlog_content(key, whole, edge=self._edge)
         except WireError:
-            self._settle(key, usable=False)
+            with self._lock:
+                self._assembly.settle(key, usable=False)
             raise
         is_own = key[0] == own.info.session_id
         if isinstance(content, Info):
@@ -121,13 +118,14 @@ class EdgeBacklog:
                 self._learn(content)
                 self._assembly.settle(key, usable=True)
             return
-        destination = (
-            Destination(lambda: own if own.able() else None, _release_nothing)
-            if is_own
-            else self._former(self._infos[key[0]])
-        )
+        if is_own:  # it stays open as long as its worker
+            destination = Destination(lambda: own if own.able() else None, lambda _own: None)
+        else:
+            assert self._recordings is not None, "without, no chunk of another session is taken"
+            acquire = partial(self._recordings.acquire, self._infos[key[0]])
+            destination = Destination(acquire, self._recordings.release)
         with self._lock:
-            self._working += 1
+            self.working += 1
             done = partial(self._done, key, self._sessions)
         job: Job
         if isinstance(content, ReceivedStill):
@@ -136,32 +134,19 @@ class EdgeBacklog:
             job = VideoJob(content, destination, worker=worker, done=done)
         worker.submit(job)
 
-    def _former(self, info: Info) -> Destination:
-        recordings = self._recordings
-        assert recordings is not None, "without, no chunk of another session is taken"
-        return Destination(partial(recordings.acquire, info), recordings.release)
-
     def _done(self, key: ObjectKey, session: int, usable: bool | None) -> None:  # noqa: FBT001 - partial
         # A job has ended; None: its object was not taken.
         with self._lock:
             if session != self._sessions:
                 return
-            self._working -= 1
+            self.working -= 1
             if usable is None:
                 self._assembly.drop(key)
             else:
                 self._assembly.settle(key, usable=usable)
-
-    def _settle(self, key: ObjectKey, *, usable: bool) -> None:
-        with self._lock:
-            self._assembly.settle(key, usable=usable)
 
     def _learn(self, info: Info) -> None:
         self._infos[info.session_id] = info
         self._infos.move_to_end(info.session_id)
         if len(self._infos) > _MOST_INFOS:
             self._infos.popitem(last=False)
-
-
-def _release_nothing(_backlog: SessionBacklog) -> None:
-    """The open session stays open as long as its worker."""

@@ -16,7 +16,6 @@ from hvt_common.protocol.messages import Info
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Notice, Refinement
-from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.sinks import QueuedSink
 
 MOST_OPEN = 4
@@ -34,9 +33,13 @@ class BacklogRecording:
         self.users = 0
         """Jobs that have it in hand, or wait for it."""
         self.sink = sink
-        self._perception = perception
         self.backlog = SessionBacklog(
-            info, log=sink.log, perception=perception, read=self._read, able=sink.is_open, outputs=[sink]
+            info,
+            log=sink.log,
+            perception=perception,
+            read=lambda still: perception.read(still, emit=self._emit),
+            able=sink.is_open,
+            outputs=[sink],
         )
 
     def close(self) -> None:
@@ -46,9 +49,6 @@ class BacklogRecording:
             text = f"{totals.amount()} of this session arrived after it had ended"
             self.sink.log(Notice(*totals.first, "info", text))
         self.sink.close()
-
-    def _read(self, still: ReceivedStill) -> None:
-        self._perception.read(still, emit=self._emit)
 
     def _emit(self, event: Event) -> None:
         if isinstance(event, Refinement):

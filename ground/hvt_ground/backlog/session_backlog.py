@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -37,22 +38,14 @@ class BacklogTotals:
     first: tuple[int, int] | None = None
     """Frame index and capture time of the oldest of it."""
 
-    def add_still(self, frame_index: int, capture_ns: int) -> None:
-        """Count a still."""
-        self.stills += 1
-        self._note(frame_index, capture_ns)
-
-    def add_frame(self, frame_index: int, capture_ns: int, *, lasts_s: float) -> None:
-        """Count a frame."""
-        self.frames += 1
-        self.video_s += lasts_s
-        self._note(frame_index, capture_ns)
-
-    def take_back(self, *, stills: int, frames: int, video_s: float) -> None:
-        """Take back the counts of lost objects: they are sent again."""
-        self.stills -= stills
-        self.frames -= frames
-        self.video_s -= video_s
+    def add(
+        self, *, stills: int = 0, frames: int = 0, video_s: float = 0.0, at: tuple[int, int] | None = None
+    ) -> None:
+        """Count what came, or less than nothing where it was lost: it is sent again."""
+        self.stills += stills
+        self.frames += frames
+        self.video_s += video_s
+        self.first = min(filter(None, (self.first, at)), default=None)
 
     def amount(self) -> str:
         """``12 stills and 31 s of video``; empty where it is nothing."""
@@ -60,10 +53,6 @@ class BacklogTotals:
         if self.frames > 0:
             parts.append(f"{self.video_s:.{int(self.video_s < 1)}f} s of video")
         return " and ".join(parts)
-
-    def _note(self, frame_index: int, capture_ns: int) -> None:
-        if self.first is None or frame_index < self.first[0]:
-            self.first = frame_index, capture_ns
 
 
 class LateStills:
@@ -104,8 +93,7 @@ class LateStills:
             return
         classes = zip(overlay.classes, stills, strict=True)
         confidences = zip(overlay.confidences.tolist(), stills, strict=True)
-        guesses = [False] * len(tracks) if overlay.doubted is None else overlay.doubted.tolist()
-        doubts = zip(guesses, stills, strict=True)
+        doubts = zip(overlay.doubted.tolist(), stills, strict=True)
         yield replace(
             overlay,
             classes=tuple(still.class_after if still else name for name, still in classes),
@@ -168,9 +156,7 @@ class SessionBacklog:
         except Exception:
             self._stills.forget(header.sequence)
             raise
-        with self._lock:
-            for totals in (self.totals, self._news):
-                totals.add_still(header.frame_index, header.capture_ns)
+        self._count(stills=1, at=(header.frame_index, header.capture_ns))
 
     def receipt(self) -> Receipt:
         """The receipt of everything logged from now on: only written objects are acknowledged."""
@@ -179,17 +165,14 @@ class SessionBacklog:
     def lose_still(self, sequence: int) -> None:
         """A still that was read is lost on its way into the recording: it is new again."""
         self._stills.forget(sequence)
-        with self._lock:
-            for totals in (self.totals, self._news):
-                totals.take_back(stills=1, frames=0, video_s=0.0)
+        self._count(stills=-1)
 
     def lose_frames(self, lengths_s: Mapping[int, float]) -> None:
         """Frames that were shown are lost on their way into the recording: they are missing again."""
         with self._lock:
             for frame_index in lengths_s:
                 self._frames.discard(frame_index)
-            for totals in (self.totals, self._news):
-                totals.take_back(stills=0, frames=len(lengths_s), video_s=sum(lengths_s.values()))
+        self._count(frames=-len(lengths_s), video_s=-sum(lengths_s.values()))
 
     def note(self, still: Refinement) -> None:
         """Note the outcome of a still, for the boxes of its frame should it be a stored one."""
@@ -213,8 +196,7 @@ class SessionBacklog:
                 return None
             frames = 1 if after is None else unit.frame_index - after.frame_index
             lasts_s = min(frames / self.info.fps, _LONGEST_S)
-            for totals in (self.totals, self._news):
-                totals.add_frame(unit.frame_index, unit.capture_ns, lasts_s=lasts_s)
+        self._count(frames=1, video_s=lasts_s, at=(unit.frame_index, unit.capture_ns))
         self.log(VideoSample(unit.frame_index, unit.capture_ns, unit.data, unit.keyframe, stored=True))
         return lasts_s
 
@@ -236,6 +218,11 @@ class SessionBacklog:
                 stored=True,
             )
         )
+
+    def _count(self, **what: Any) -> None:
+        with self._lock:
+            for totals in (self.totals, self._news):
+                totals.add(**what)
 
     def take_news(self) -> BacklogTotals:
         """Return and forget the arrivals since the last call."""
