@@ -53,11 +53,6 @@ class PoseTrail:
         poses = self._poses
         return poses[-1] if poses else None
 
-    def age_s(self, capture_ns: int) -> float | None:
-        """The age of the newest pose at this moment; None without one."""
-        newest = self.newest
-        return None if newest is None else (capture_ns - newest.capture_ns) / SECOND_NS
-
     def at(self, capture_ns: int) -> Pose | None:
         """The pose of a moment; None where the nearest before it is stale.
 
@@ -195,14 +190,10 @@ class SessionPoses:
         """The last pose that came."""
         return self._trail.newest
 
-    def stale_s(self, capture_ns: int) -> float | None:
-        """The age of the newest pose where it is too old to use; None where it is not, or none ever came."""
-        age_s = self._trail.age_s(capture_ns)
-        return age_s if age_s is not None and age_s > STALE_S else None
-
     def turned_stale(self, capture_ns: int) -> bool | None:
         """True once when the pose has become stale, False once when there is one again, None otherwise."""
-        stale = self.stale_s(capture_ns) is not None
+        newest = self.newest
+        stale = newest is not None and capture_ns - newest.capture_ns > STALE_S * SECOND_NS
         if stale is self._stale:
             return None
         self._stale = stale

@@ -104,17 +104,23 @@ def comparison(edges: Sequence[str], *, base_size: tuple[int, int], fps: float) 
 
 def static_chunks(title: str, facts: Mapping[str, str], *, info: bytes) -> list[Chunk]:
     """All static chunks of a recording whose session panel shows ``title`` and ``facts``; ``info`` is the message."""
+    captioned = rr.Boxes2D.from_fields(radii=rr.Radius.ui_points(1.0), show_labels=True)
     message = [static_chunk(SESSION, rr.AnyValues(info=pa.array([info], pa.binary())))] if info else []
     return [
         *message,
         static_chunk(VIDEO, rr.VideoStream.from_fields(codec=rr.VideoCodec.H265)),
         static_chunk(TRACKS, _box_style(width=1.0, draw_order=10.0)),
-        static_chunk(REPORTED, _ellipse_style(width=1.0, draw_order=15.0)),
+        static_chunk(
+            REPORTED,
+            rr.Ellipses2D.from_fields(
+                line_radii=rr.Radius.ui_points(0.5), draw_order=15.0, show_labels=False
+            ),
+        ),
         static_chunk(REFINED, _box_style(width=2.0, draw_order=20.0)),
         static_chunk(DOUBTED, _box_style(width=0.6, draw_order=12.0)),
         static_chunk(LABELS, _text_style(points=0.0)),
         static_chunk(LEGEND, _text_style(points=4.0)),
-        *(static_chunk(f"{STILLS}/{slot}", _caption_style()) for slot in range(SLOTS)),
+        *(static_chunk(f"{STILLS}/{slot}", captioned) for slot in range(SLOTS)),
         static_chunk(MAP_CAMERA, rr.GeoPoints.from_fields(radii=rr.Radius.ui_points(7.0), colors=AMBER)),
         static_chunk(MAP_TRACKS, rr.GeoPoints.from_fields(radii=rr.Radius.ui_points(4.0))),
         static_chunk(BITRATE, _lines(_BITRATE)),
@@ -185,7 +191,8 @@ def _page(
 ) -> rrb.Horizontal:
     plots = _plots(root, clocked=clocked, top_kbps=top_kbps)
     left = rrb.Vertical(_videos(root, base_size, located=located), plots, row_shares=[2.9, 1.0])
-    right = rrb.Vertical(_gallery(root), _session(root), _events(root), row_shares=[2.3, 0.67, 0.93])
+    session = rrb.TextDocumentView(origin=f"{root}{SESSION}", name="Session")
+    right = rrb.Vertical(_gallery(root), session, _events(root), row_shares=[2.3, 0.67, 0.93])
     return rrb.Horizontal(left, right, column_shares=[1.72, 1.0], name=name)
 
 
@@ -249,10 +256,6 @@ def _plot(origin: str, name: str, axis_y: rrb.ScalarAxis | None = None) -> rrb.T
     return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=corner, axis_y=axis_y)
 
 
-def _session(root: str) -> rrb.TextDocumentView:
-    return rrb.TextDocumentView(origin=f"{root}{SESSION}", name="Session")
-
-
 def _events(root: str) -> rrb.TextLogView:
     return rrb.TextLogView(
         origin=f"{root}{EVENTS}",
@@ -269,16 +272,6 @@ def _box_style(*, width: float, draw_order: float) -> rr.Boxes2D:
 
 def _text_style(*, points: float) -> rr.Points2D:
     return rr.Points2D.from_fields(radii=rr.Radius.ui_points(points), draw_order=30.0, show_labels=True)
-
-
-def _ellipse_style(*, width: float, draw_order: float) -> rr.Ellipses2D:
-    return rr.Ellipses2D.from_fields(
-        line_radii=rr.Radius.ui_points(width / 2), draw_order=draw_order, show_labels=False
-    )
-
-
-def _caption_style() -> rr.Boxes2D:
-    return rr.Boxes2D.from_fields(radii=rr.Radius.ui_points(1.0), show_labels=True)
 
 
 def _lines(lines: tuple[tuple[str, tuple[int, int, int], float], ...]) -> rr.SeriesLines:

@@ -74,9 +74,5 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _main(argv: Sequence[str] | None = None) -> int:
-    return exit_with_sentence(main, program="hvt_ground.sinks.rerun.joined", argv=argv)
-
-
 if __name__ == "__main__":
-    raise SystemExit(_main())
+    raise SystemExit(exit_with_sentence(main, program="hvt_ground.sinks.rerun.joined", argv=None))

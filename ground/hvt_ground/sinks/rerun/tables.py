@@ -171,18 +171,11 @@ def _bytes(name: str, rows: Sequence[tuple[int, ...]]) -> Columns:
     return values.partition([len(row) for row in rows])
 
 
-def _points(rows: Sequence[npt.NDArray[np.float32]]) -> Columns:
-    return rr.Points2D.columns(positions=np.concatenate(rows)).partition([len(row) for row in rows])
-
-
-def _words(rows: Sequence[tuple[str, ...]]) -> Columns:
-    texts = pa.array(chain.from_iterable(rows), pa.utf8())
-    return rr.Points2D.columns(labels=texts).partition([len(row) for row in rows])
-
-
-def _inks(rows: Sequence[tuple[int, ...]]) -> Columns:
-    numbers = np.array(list(chain.from_iterable(rows)), np.uint16)
-    return rr.Points2D.columns(class_ids=numbers).partition([len(row) for row in rows])
+def _labels(**values: Sequence[Sequence[Any]]) -> Columns:
+    # One component of points, so many in each row.
+    ((name, rows),) = values.items()
+    columns = rr.Points2D.columns(**{name: list(chain.from_iterable(rows))})
+    return columns.partition([len(row) for row in rows])
 
 
 def _places(rows: Sequence[Placement]) -> rr.ComponentColumnList:
@@ -218,11 +211,6 @@ def _texts(rows: Sequence[LogText]) -> Columns:
     )
 
 
-def _lines(rows: Sequence[tuple[float, ...]]) -> Columns:
-    scalars = np.array(rows, np.float64).ravel()
-    return rr.Scalars.columns(scalars=scalars).partition([len(row) for row in rows])
-
-
 def _poses(rows: Sequence[npt.NDArray[np.float64]]) -> Columns:
     numbers = np.array(rows)
     values = rr.AnyValues.columns(pose=pa.array(numbers.ravel(), pa.float64()))
@@ -250,9 +238,9 @@ COLUMNS: dict[str, Callable[[Sequence[Any]], Columns]] = {
     "ellipses": lambda rows: _shapes(rr.Ellipses2D, rows),
     "identity of boxes": lambda rows: _identities(rr.Boxes2D, rows),
     "identity of ellipses": lambda rows: _identities(rr.Ellipses2D, rows),
-    "places": _points,
-    "words": _words,
-    "inks": _inks,
+    "places": lambda rows: _labels(positions=rows),
+    "words": lambda rows: _labels(labels=rows),
+    "inks": lambda rows: _labels(class_ids=rows),
     "confidences": lambda rows: _bytes("confidence_pct", rows),
     "origins": lambda rows: _bytes("origin", rows),
     "jpeg": lambda rows: rr.EncodedImage.columns(blob=list(rows)),
@@ -267,6 +255,6 @@ COLUMNS: dict[str, Callable[[Sequence[Any]], Columns]] = {
     "pose": _poses,
     "map points": _map_points,
     "text": _texts,
-    "lines": _lines,
+    "lines": lambda rows: rr.Scalars.columns(scalars=np.ravel(rows)).partition(list(map(len, rows))),
 }
 """Component of each value of a row, by name. ``patch``: a placed JPEG, or None, which takes it off."""
