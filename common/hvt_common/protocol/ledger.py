@@ -9,9 +9,9 @@ from __future__ import annotations
 from bisect import insort
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import Enum
-from typing import Literal
+from typing import Any, Literal
 
 StillOutcome = Literal["sent", "deferred", "dropped", "received"]
 
@@ -124,6 +124,11 @@ class LedgerSummary:
     worst_window_bps: WindowRates
     outcomes: Mapping[str, Mapping[str, int]]
     """For each outcome the number of stills by reason."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Bytes, rates and windows, for JSON."""
+        rates = asdict(self)
+        return {name: value for name, value in rates.items() if name.endswith(("_bytes", "_bps"))}
 
     @property
     def line_bytes(self) -> int:

@@ -30,10 +30,6 @@ from hvt_edge.operating import Levers, Operating
 from hvt_edge.report.state import EdgeState, Heartbeat, LinkState
 
 _PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
-_RATES = (
-    *("base_bytes", "roi_bytes", "backlog_bytes", "meta_bytes", "overhead_bytes"),
-    *("total_bps", "base_bps", "roi_bps"),
-)
 _MOST_MS, _MOST_AGE_MS, _MOST_CORES = 60_000.0, 2**32 - 1, 4096.0
 """The largest numbers that a report can say."""
 _LEVERS_REST = 10
@@ -254,10 +250,9 @@ def summary(
         "frames_dropped_cpu": frames.groups.get("processor", 0),
         "frames_unanalyzed": unanalyzed,
         "frame_account": frames.as_dict(),
-        **{name: getattr(account, name) for name in _RATES},
+        **account.as_dict(),
         "replies": ledger.replies,
         "reply_bytes": ledger.reply_bytes,
-        "worst_window_bps": asdict(account.worst_window_bps),
         "stills": stills,
         "cores_needed": round(cores.needed, 2),
         "cores_free": round(cores.free, 2),

@@ -50,7 +50,6 @@ def summary(session: GroundSession) -> dict[str, Any]:
     info, pipeline, counters = session.info, session.perceived, session.counters
     account = session.ledger.summary(session.duration_s)
     status = session.last_status
-    worst = account.worst_window_bps
     unread = pipeline.outcomes.get("unread", 0)
     backlog = session.backlog.totals
     return {
@@ -63,17 +62,9 @@ def summary(session: GroundSession) -> dict[str, Any]:
         "frames_untracked": session.worker.untracked,
         "edge_frames": None if status is None or not status.frames else status.frame_account.as_dict(),
         "duration_s": round(session.duration_s, 3),
-        "base_bytes": account.base_bytes,
-        "roi_bytes": account.roi_bytes,
-        "backlog_bytes": account.backlog_bytes,
-        "meta_bytes": account.meta_bytes,
-        "overhead_bytes": account.overhead_bytes,
-        "total_bps": account.total_bps,
-        "base_bps": account.base_bps,
-        "roi_bps": account.roi_bps,
+        **account.as_dict(),
         "budget_bps": info.budget_bps,
         "budget_base_bps": info.base_bps,
-        "worst_window_bps": {"base": worst.base, "roi": worst.roi, "total": worst.total},
         "stills": {
             "received": session.stills_received,
             "dropped": sum(session.stills_dropped.values()),
