@@ -98,16 +98,14 @@ class SessionFeed(SinkWriter[Event]):
         return text(kind, edge=self._info.edge, frame=item.frame_index, captured=captured_ms, **content)
 
     def _overlay(self, item: Overlay) -> str:
-        doubted = [False] * len(item.classes) if item.doubted is None else item.doubted.tolist()
-        sure = [False] * len(item.classes) if item.sure is None else item.sure.tolist()
         rows = zip(
             item.track_ids.tolist(),
             item.boxes_base_px.round(1).tolist(),
             item.classes,
             item.confidences.tolist(),
             item.refined.tolist(),
-            doubted,
-            sure,
+            item.doubted.tolist(),
+            item.sure.tolist(),
             strict=True,
         )
         tracks = [

@@ -6,7 +6,7 @@ are the two timelines of a recording.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -14,6 +14,11 @@ import numpy.typing as npt
 
 from hvt_common.protocol.messages import RoiHeader
 from hvt_common.values import Boxes, Image, Pose, View
+
+
+def _nowhere() -> npt.NDArray[np.bool_]:
+    return np.zeros(0, np.bool_)
+
 
 Origin = Literal["base", "edge", "edge+base", "still"]
 """Who knows of a track: the ground's own tracker on the base stream, the edge's report, both, or (``still``) nobody
@@ -77,31 +82,36 @@ class Overlay:
     refined: npt.NDArray[np.bool_]
     """(N,) True once a still has refined the track's class."""
     origins: tuple[Origin, ...] = ()
-    """N words; empty says ``base`` for all."""
+    """N words; by default ``base`` for all."""
     stored: bool = False
     """Whether the `VideoSample` was stored."""
-    doubted: npt.NDArray[np.bool_] | None = None
+    doubted: npt.NDArray[np.bool_] = field(default_factory=_nowhere)
     """(N,) True where stills say that it is nothing of mine, or it is a guess (`hvt_ground.perception.guesses`), as
-    all are in a view that the detector does not know; None is nowhere."""
-    sure: npt.NDArray[np.bool_] | None = None
-    """(N,) True where stills agree on the class with a calibrated probability above .9; None is nowhere."""
+    all are in a view that the detector does not know; by default nowhere."""
+    sure: npt.NDArray[np.bool_] = field(default_factory=_nowhere)
+    """(N,) True where stills agree on the class with a calibrated probability above .9; by default nowhere."""
     looked_ns: int | None = None
     """Capture time of the picture from which the list goes on, where its own was not looked at; None is its own."""
     places: Places | None = None
     """Their places on the ground; None without a pose."""
 
+    def __post_init__(self) -> None:
+        count = len(self.track_ids)
+        nowhere = np.zeros(count, np.bool_)
+        for name, usual in (("origins", ("base",) * count), ("doubted", nowhere), ("sure", nowhere)):
+            if not len(getattr(self, name)):
+                object.__setattr__(self, name, usual)
+
     @property
     def words(self) -> tuple[str, ...]:
         """N names for people: that of the class, or ``something`` where it is doubted."""
-        if self.doubted is None:
-            return self.classes
         pairs = zip(self.classes, self.doubted.tolist(), strict=True)
         return tuple("something" if doubt else name for name, doubt in pairs)
 
     @property
     def firm(self) -> npt.NDArray[np.bool_]:
         """(N,) True where a still has refined the class, and nothing doubts it: drawn thick."""
-        return self.refined if self.doubted is None else self.refined & ~self.doubted
+        return self.refined & ~self.doubted
 
 
 @dataclass(frozen=True, slots=True)

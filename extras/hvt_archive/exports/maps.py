@@ -154,7 +154,7 @@ def _tracks(recorded: Recorded) -> dict[int, _Track]:
             continue
         for row, track_id in enumerate(overlay.track_ids.tolist()):
             latitude, longitude = places.places_deg[row].tolist()
-            if math.isnan(latitude) or (overlay.doubted is not None and overlay.doubted[row]):
+            if math.isnan(latitude) or overlay.doubted[row]:
                 continue
             track = tracks[track_id]
             track.classes[overlay.classes[row]] += 1

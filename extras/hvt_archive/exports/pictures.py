@@ -58,7 +58,7 @@ def _annotations(
 ) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     for row, track_id in enumerate(overlay.track_ids.tolist()):
-        if overlay.doubted is not None and overlay.doubted[row]:
+        if overlay.doubted[row]:
             continue
         x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
         found.append(

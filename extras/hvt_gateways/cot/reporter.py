@@ -186,11 +186,11 @@ class SessionReporter(SinkWriter[Event]):
 
 def placed_tracks(overlay: Overlay) -> Iterator[PlacedTrack]:
     """The tracks that have a place, but those of which stills say that they are nothing of mine."""
-    places, doubted, sure = overlay.places, overlay.doubted, overlay.sure
+    places = overlay.places
     if places is None:
         return
     known = np.isfinite(places.places_deg).all(axis=1) & np.isfinite(places.ellipses[:, 0])
-    for row in np.flatnonzero(known if doubted is None else known & ~doubted).tolist():
+    for row in np.flatnonzero(known & ~overlay.doubted).tolist():
         latitude, longitude = places.places_deg[row].tolist()
         yield PlacedTrack(
             track_id=int(overlay.track_ids[row]),
@@ -200,7 +200,7 @@ def placed_tracks(overlay: Overlay) -> Iterator[PlacedTrack]:
             base_name=overlay.base_classes[row],
             confidence=float(overlay.confidences[row]),
             refined=bool(overlay.refined[row]),
-            sure=sure is not None and bool(sure[row]),
+            sure=bool(overlay.sure[row]),
         )
 
 

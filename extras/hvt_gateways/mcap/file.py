@@ -143,7 +143,6 @@ def _location(pose: Pose) -> LocationFix:
 
 def _annotations(overlay: Overlay) -> ImageAnnotations:
     """A frame around each track, with its id and class, and the rest as metadata of the frame."""
-    origins = overlay.origins or ("base",) * len(overlay.track_ids)
     firm, words = overlay.firm, overlay.words
     result = ImageAnnotations()
     for row, track_id in enumerate(overlay.track_ids.tolist()):
@@ -156,7 +155,7 @@ def _annotations(overlay: Overlay) -> ImageAnnotations:
             "base_class": overlay.base_classes[row],
             "confidence": f"{overlay.confidences[row]:.3f}",
             "refined": int(refined),
-            "origin": origins[row],
+            "origin": overlay.origins[row],
             "doubted": int(words[row] != name),
         }
         corners = _points(((x1, y1), (x2, y1), (x2, y2), (x1, y2)))

@@ -36,9 +36,7 @@ def vmti_local_set(
     Tracks that stills doubt are counted (item 5) but not reported (item 6), and so are those for which there is no
     room, the least sure ones.
     """
-    rows = np.arange(len(overlay.track_ids))
-    if overlay.doubted is not None:
-        rows = rows[~overlay.doubted]
+    rows = np.flatnonzero(~overlay.doubted)
     targets: dict[int, bytes] = {}
     left_bytes = MOST_BYTES
     for row in sorted(rows.tolist(), key=lambda one: -float(overlay.confidences[one])):

@@ -59,9 +59,9 @@ class FileAccount:
         """Count an event."""
         match event:
             case Overlay():
-                doubted = [False] * len(event.classes) if event.doubted is None else event.doubted.tolist()
-                for track, name, doubt in zip(event.track_ids.tolist(), event.classes, doubted, strict=True):
-                    if not doubt:
+                rows = zip(event.track_ids.tolist(), event.classes, event.doubted.tolist(), strict=True)
+                for track, name, doubted in rows:
+                    if not doubted:
                         self.track(track, name)
                 self.span(event.capture_ns)
             case Refinement():

@@ -104,7 +104,6 @@ class StillFiles(_EventTable):
 
 def track_rows(overlay: Overlay) -> Iterator[tuple[object, ...]]:
     """One row of `TRACK_COLUMNS` a track."""
-    origins = overlay.origins or ("base",) * len(overlay.track_ids)
     for row, track_id in enumerate(overlay.track_ids.tolist()):
         x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
         yield (
@@ -116,9 +115,9 @@ def track_rows(overlay: Overlay) -> Iterator[tuple[object, ...]]:
             overlay.base_classes[row],
             overlay.classes[row],
             int(overlay.refined[row]),
-            origins[row],
+            overlay.origins[row],
             int(overlay.stored),
-            0 if overlay.doubted is None else int(overlay.doubted[row]),
+            int(overlay.doubted[row]),
             *_place_texts(overlay.places, row),
         )
 

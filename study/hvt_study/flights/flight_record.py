@@ -182,7 +182,7 @@ class FlightRecord:
             confidences=overlay.confidences,
             classes_before=overlay.base_classes,
             confidences_before=tracks.confidences[rows].astype(np.float32),
-            origins=overlay.origins or ("base",) * len(overlay.classes),
+            origins=overlay.origins,
         )
 
     def detected(self, found: Detections, class_names: tuple[str, ...]) -> FrameView:

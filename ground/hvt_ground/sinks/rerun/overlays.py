@@ -233,7 +233,6 @@ def _held(screen: _Screen, overlay: Overlay) -> _Screen:
     corners = overlay.boxes_base_px
     boxes = np.hstack((corners[:, :2] + corners[:, 2:], corners[:, 2:] - corners[:, :2])) / 2
     percents = np.round(overlay.confidences * 100).astype(np.int64)
-    sure = np.zeros(len(percents), np.bool_) if overlay.sure is None else overlay.sure
     levels = np.where(percents < 50, _FAINT, _LIKELY)
     ids = overlay.track_ids.copy()
     result = _Screen(ids, (np.round(boxes * 2) / 2).astype(np.float32), percents.copy(), levels, screen.sides)
@@ -246,13 +245,12 @@ def _held(screen: _Screen, overlay: Overlay) -> _Screen:
     result.percents[new[near]] = screen.percents[old[near]]
     between = (percents[new] >= _FAINT_BELOW_PCT) & (percents[new] < _LIKELY_FROM_PCT)
     levels[new[between]] = np.minimum(screen.levels[old[between]], _LIKELY)
-    levels[sure] = _SURE
+    levels[overlay.sure] = _SURE
     return result
 
 
 def _layers(overlay: Overlay, screen: _Screen) -> Iterator[tuple[Layer, dict[str, Any]]]:
-    origins = overlay.origins or ("base",) * len(overlay.track_ids)
-    reported, doubted = _reported(overlay), _doubted(overlay)
+    reported, doubted = _reported(overlay), overlay.doubted
     of_layer: dict[Layer, npt.NDArray[np.bool_]] = {
         "tracks": ~overlay.refined & ~reported & ~doubted,
         "reported": ~overlay.refined & reported & ~doubted,
@@ -270,7 +268,7 @@ def _layers(overlay: Overlay, screen: _Screen) -> Iterator[tuple[Layer, dict[str
                 tuple(screen.levels[mask].tolist()),
             ),
             "confidences": tuple(screen.percents[mask].tolist()),
-            "origins": tuple(ORIGINS.index(origins[row]) for row in rows),
+            "origins": tuple(ORIGINS.index(overlay.origins[row]) for row in rows),
         }
         yield layer, components
 
@@ -292,24 +290,19 @@ def _movement_bytes(old: npt.NDArray[np.float32] | None, new: npt.NDArray[np.flo
 
 
 def _reported(overlay: Overlay) -> npt.NDArray[np.bool_]:
-    origins = overlay.origins or ("base",) * len(overlay.track_ids)
-    return np.array([origin in _REPORTED for origin in origins], np.bool_)
-
-
-def _doubted(overlay: Overlay) -> npt.NDArray[np.bool_]:
-    return np.zeros(len(overlay.track_ids), np.bool_) if overlay.doubted is None else overlay.doubted
+    return np.array([origin in _REPORTED for origin in overlay.origins], np.bool_)
 
 
 def _labels(overlay: Overlay, screen: _Screen, size: tuple[int, int], chosen: Container[int]) -> list[Label]:
     # Labels of the tracks that a still renamed or doubts, or that were chosen, as far as there is room.
-    doubted, reported = _doubted(overlay), _reported(overlay)
+    reported = _reported(overlay)
     words = []
     for row, track_id in enumerate(screen.ids.tolist()):
         renamed = overlay.base_classes[row] != overlay.classes[row]
         if not renamed and track_id not in chosen:
             continue
         mark = f" {REPORTED_MARK}" if reported[row] else ""
-        name = f"{overlay.base_classes[row]}?" if doubted[row] else overlay.classes[row]
+        name = f"{overlay.base_classes[row]}?" if overlay.doubted[row] else overlay.classes[row]
         certain = " ✓" if screen.levels[row] == _SURE else ""
         words.append(Word(row, f"{track_id} {name}{certain}{mark}"))
     centres, halves = screen.boxes[:, :2].astype(np.float64), screen.boxes[:, 2:].astype(np.float64)

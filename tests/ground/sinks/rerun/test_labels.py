@@ -108,7 +108,9 @@ def test_words_stand_where_a_still_renamed_or_doubts(tmp_path):
     boxes = read.boxes(0)
     assert {track: box.doubted for track, box in boxes.items()} == {1: False, 2: False, 3: True, 4: False}
     assert (boxes[3].class_before, boxes[3].class_after) == ("car", "other")
-    gone = recorded(tmp_path / "b.rrd", overlay(), overlay(1, classes=("car",) * 4, doubted=None))
+    gone = recorded(
+        tmp_path / "b.rrd", overlay(), overlay(1, classes=("car",) * 4, doubted=np.zeros(4, np.bool_))
+    )
     assert gone.words(1) == {}, "a word whose reason is gone is gone"
 
 
@@ -121,7 +123,9 @@ def test_what_is_not_sure_has_no_check_mark(tmp_path):
 def test_brightness_follows_the_probability(tmp_path):
     """A guess and a certainty would look alike."""
     read = recorded(
-        tmp_path / "a.rrd", overlay(), overlay(1, confidences=np.full(4, 0.7, np.float32), sure=None)
+        tmp_path / "a.rrd",
+        overlay(),
+        overlay(1, confidences=np.full(4, 0.7, np.float32), sure=np.zeros(4, np.bool_)),
     )
     unsure, sure = (ink(read, "/base/tracks", 0)[0], ink(read, "/base/refined", 0))
     assert unsure < ink(read, "/base/tracks", 1)[0] < sure[1]
