@@ -80,6 +80,11 @@ DELIVERIES: Mapping[Channel, Delivery] = MappingProxyType(
 """The one table. The encoding of `Channel.ROI` is that of the default codec; another still codec says its own."""
 
 
+def _check_name(name: str, what: str) -> None:
+    if _EDGE_ID.fullmatch(name) is None:
+        raise UserError(f"{what} {name!r} is not usable: 1 to 32 characters of a-z, 0-9 and '-' are accepted")
+
+
 @dataclass(frozen=True, slots=True)
 class EdgeKeys:
     """The keys of one edge. Raises UserError for an id outside ``[a-z0-9-]{1,32}``."""
@@ -87,10 +92,7 @@ class EdgeKeys:
     edge: str
 
     def __post_init__(self) -> None:
-        if _EDGE_ID.fullmatch(self.edge) is None:
-            raise UserError(
-                f"edge id {self.edge!r} is not usable: 1 to 32 characters of a-z, 0-9 and '-' are accepted"
-            )
+        _check_name(self.edge, "edge id")
 
     def key(self, channel: Channel) -> str:
         """The full key, such as ``hvt/uav-1/base``."""
@@ -104,10 +106,7 @@ class GroupKeys:
     group: str
 
     def __post_init__(self) -> None:
-        if _EDGE_ID.fullmatch(self.group) is None:
-            raise UserError(
-                f"group {self.group!r} is not usable: 1 to 32 characters of a-z, 0-9 and '-' are accepted"
-            )
+        _check_name(self.group, "group")
 
     @property
     def everything(self) -> str:

@@ -112,25 +112,21 @@ class RetryPause:
     def __init__(self, first_ns: int = SECOND_NS, longest_ns: int = 60 * SECOND_NS) -> None:
         self._first_ns = first_ns
         self._longest_ns = longest_ns
-        self._pause_ns = 0
-        self._failed_ns = 0
-
-    @property
-    def pause_ns(self) -> int:
+        self.pause_ns = 0
         """From the newest failure to the next try; 0 before the first."""
-        return self._pause_ns
+        self._failed_ns = 0
 
     def failed(self, now_ns: int, *, again: bool = False) -> None:
         """It failed, at the start or after it had worked for a while; ``again``: it has not, the try was long."""
-        worked_ns = 0 if again else now_ns - self._failed_ns - self._pause_ns
+        worked_ns = 0 if again else now_ns - self._failed_ns - self.pause_ns
         steady = worked_ns > _STEADY_PAUSES * self._first_ns
-        self._pause_ns = self._first_ns if steady else min(2 * self._pause_ns, self._longest_ns)
-        self._pause_ns = max(self._first_ns, self._pause_ns)
+        self.pause_ns = self._first_ns if steady else min(2 * self.pause_ns, self._longest_ns)
+        self.pause_ns = max(self._first_ns, self.pause_ns)
         self._failed_ns = now_ns
 
     def due(self, now_ns: int) -> bool:
         """Whether it may be tried."""
-        return now_ns - self._failed_ns >= self._pause_ns
+        return now_ns - self._failed_ns >= self.pause_ns
 
 
 class Retried(Generic[_Part]):

@@ -1,8 +1,9 @@
-"""Statistics in bounded memory, however long a run is: percentiles of a latency, and the number of distinct ids."""
+"""Statistics in bounded memory, however long a run is: percentiles of a latency, and sets of numbers."""
 
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Iterable
 
 import numpy as np
@@ -11,6 +12,7 @@ _LOWEST_MS = 0.01
 _HIGHEST_MS = 1e6
 _LOG_RATIO = math.log(1.01)
 _BINS = math.ceil(math.log(_HIGHEST_MS / _LOWEST_MS) / _LOG_RATIO) + 1
+_PAGE_BITS = 12
 
 
 class LatencyStats:
@@ -71,28 +73,41 @@ class LatencyStats:
         return min(max(centre_ms, self._min_ms), self._max_ms)
 
 
-class DistinctIds:
-    """Counts distinct ids that mostly grow, such as those of tracks and messages.
+class SequenceWindow:
+    """A set of numbers from 0, one bit each. What was missed long ago may still come, and is known to be new.
 
-    The newest ``remember`` of them are known one by one; older ones count as known.
+    At most ``pages`` stretches of 4096 numbers are stored, half a kilobyte each; beyond, the one longest unused is
+    forgotten. So forged numbers cost bounded memory, and do not make what is to come look as if it had been.
     """
 
-    def __init__(self, *, remember: int = 10_000) -> None:
-        self._remember = remember
-        self._known: set[int] = set()
-        self._floor: int | None = None
+    def __init__(self, *, pages: int = 4096) -> None:
+        self._most = pages
+        self._pages: OrderedDict[int, int] = OrderedDict()
+        """The one that was touched last stands last."""
         self.count = 0
 
-    def add(self, ids: Iterable[int]) -> int:
-        """Take ids; return how many of them are new."""
-        new = {one for one in ids if self._floor is None or one > self._floor} - self._known
-        self.count += len(new)
-        self._known |= new
-        if len(self._known) > 2 * self._remember:
-            ordered = sorted(self._known)
-            self._floor = ordered[-self._remember - 1]
-            self._known = set(ordered[-self._remember :])
-        return len(new)
+    def add(self, numbers: Iterable[int]) -> int:
+        """Take numbers; return how many of them are new."""
+        before = self.count
+        for number in numbers:
+            page, bit = number >> _PAGE_BITS, 1 << (number & (1 << _PAGE_BITS) - 1)
+            held = self._pages.get(page, 0)
+            self._pages[page] = held | bit
+            self._pages.move_to_end(page)
+            self.count += not held & bit
+            if len(self._pages) > self._most:
+                self._pages.popitem(last=False)
+        return self.count - before
+
+    def discard(self, number: int) -> None:
+        """Take a number out again."""
+        if number in self:
+            self._pages[number >> _PAGE_BITS] ^= 1 << (number & (1 << _PAGE_BITS) - 1)
+            self.count -= 1
+
+    def __contains__(self, number: int) -> bool:
+        """Whether it has been, as far as is remembered."""
+        return bool(self._pages.get(number >> _PAGE_BITS, 0) >> (number & (1 << _PAGE_BITS) - 1) & 1)
 
 
 def _bin(latency_ms: float) -> int:

@@ -99,7 +99,8 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
         # Never Zenoh's own default: a peer that listens on every address.
         _insert_endpoints(config, "listen", listen)
     effective = listen or file_listen
-    two = settings.role != "client" and (settings.links == 2 or _max_links(said) > 1)
+    several = settings.links == 2 or (isinstance(most := _value(said, _MAX_LINKS), int) and most > 1)
+    two = settings.role != "client" and several
     if connect:
         _insert_endpoints(config, "connect", _split(connect) if two else connect)
     if settings.links == 2 or (effective and not _mentions(said, _MAX_LINKS)):
@@ -110,7 +111,11 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
         # An edge that listens is served just as well. ("client" would wait at its start, deaf to Ctrl-C.)
         config.insert_json5("mode", '"router"')
     for endpoint in effective:
-        _check_reach(endpoint, allowed=settings.insecure or _has_keys(said, endpoint))
+        # With keys whoever connects must show a certificate.
+        keys = _value(said, "transport/link/tls/enable_mtls") is True and endpoint.startswith(
+            ("tls/", "quic/")
+        )
+        _check_reach(endpoint, allowed=settings.insecure or keys)
     return config, effective
 
 
@@ -181,11 +186,6 @@ def connect_endpoints(config: zenoh.Config) -> tuple[str, ...]:
     return _endpoints({"connect": {"endpoints": json.loads(config.get_json("connect/endpoints"))}}, "connect")
 
 
-def _max_links(said: dict[str, Any]) -> int:
-    value = _value(said, _MAX_LINKS)
-    return value if isinstance(value, int) else 1
-
-
 def _split(endpoints: tuple[str, ...]) -> tuple[str, ...]:
     # Each endpoint once for each range of priorities; one with metadata of its own, or no stream, stays as it is.
     split: list[str] = []
@@ -232,11 +232,6 @@ def _check_reach(endpoint: str, *, allowed: bool) -> None:
         f"listening on {endpoint} without keys would let anybody on its network watch and command: listen on "
         "127.0.0.1 or [::1], give certificates with enable_mtls in --zenoh-config, or accept it with --insecure"
     )
-
-
-def _has_keys(said: dict[str, Any], endpoint: str) -> bool:
-    # Whether whoever connects must show a certificate.
-    return _value(said, "transport/link/tls/enable_mtls") is True and endpoint.startswith(("tls/", "quic/"))
 
 
 def without_build_paths(text: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.scale_search import ScaleSearch
-from hvt_common.runtime.statistics import DistinctIds
+from hvt_common.runtime.statistics import SequenceWindow
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
@@ -96,7 +96,7 @@ class Analyzer:
         """Capture time of the newest picture that was searched for objects; None before the first."""
         self._coded_index: int | None = None
         self._coded_gap = 1
-        self._track_ids = DistinctIds()
+        self._track_ids = SequenceWindow()
         self.spent_ns = 0
         """Time to decode, detect and track so far."""
         self.frames = 0

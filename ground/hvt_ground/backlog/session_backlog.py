@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from hvt_common.protocol.messages import BacklogUnit, Info
+from hvt_common.runtime.statistics import SequenceWindow
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image, iou
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
-from hvt_ground.link.sequence_window import SequenceWindow, StillSequenceWindow
+from hvt_ground.link.statistics import StillSequenceWindow
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.sinks import QueuedSink, Receipt
 

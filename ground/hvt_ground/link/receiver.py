@@ -22,7 +22,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
-from hvt_ground.link.reassemble import Arrival, Reassembler, StreamCounters
+from hvt_ground.link.reassemble import Arrival, Reassembler
 
 _log = logging.getLogger(__name__)
 
@@ -102,7 +102,8 @@ class Receiver:
         self._edge = edge
         self._versions = versions
         self._clock = clock
-        self._reassembler: Reassembler = Reassembler()
+        self.stream = Reassembler()
+        """The base stream, over all sessions."""
         self._base_item: Received | None = None
         """The newest message of the base stream."""
         self._other: int | None = None
@@ -124,11 +125,6 @@ class Receiver:
         return self._damaged + self.of_other_versions
 
     @property
-    def counters(self) -> StreamCounters:
-        """The counts of the reassembly, over all sessions; a copy."""
-        return replace(self._reassembler.counters)
-
-    @property
     def silent_ns(self) -> int:
         """For how long nothing has come."""
         return time.monotonic_ns() - self._last_message_ns
@@ -145,7 +141,7 @@ class Receiver:
                 case BaseHeader():
                     self._captures.note(message)
                     self._base_item = item
-                    arrivals = self._reassembler.accept(message, item.payload, now_ns=at_ns)
+                    arrivals = self.stream.accept(message, item.payload, now_ns=at_ns)
                     return [_base_packet(arrival, item) for arrival in arrivals]
                 case RoiHeader():
                     otherwise_ns = item.received_ns - message.send_delay_ns
@@ -153,7 +149,7 @@ class Receiver:
             return [] if message is None else [Packet(message, item)]
         except WireError as error:
             if row is Channel.BASE:
-                self._reassembler.corrupt()
+                self.stream.corrupt()
             self.skip(str(row), error)
         return []
 
@@ -163,23 +159,15 @@ class Receiver:
         if item is None:
             return []
         at_ns = self._uptime.at(self._clock(), pending=pending)
-        return [_base_packet(arrival, item) for arrival in self._reassembler.overdue(now_ns=at_ns)]
+        return [_base_packet(arrival, item) for arrival in self.stream.overdue(now_ns=at_ns)]
 
     def take_keyframe_request(self, *, pending: bool) -> bool:
         """Whether to request a keyframe now, which is noted; ``pending``: messages wait to be received."""
         at_ns = self._uptime.at(self._clock(), pending=pending)
-        if self.silent_ns > _SILENT_NS or not self._reassembler.wants_keyframe(at_ns):
+        if self.silent_ns > _SILENT_NS or not self.stream.wants_keyframe(at_ns):
             return False
-        self._reassembler.keyframe_requested(at_ns)
+        self.stream.keyframe_requested(at_ns)
         return True
-
-    def wait_for_keyframe(self) -> None:
-        """The last unit could not be decoded, or its session is not open: go on with the next keyframe."""
-        self._reassembler.decoder_failed()
-
-    def disown(self) -> None:
-        """The session that came last is nobody's: go on with the next keyframe of any other."""
-        self._reassembler.disown()
 
     def hold(self, packet: Packet) -> None:
         """Hold a still, a pose, or the first report of a session: it may overtake the keyframe that begins it."""

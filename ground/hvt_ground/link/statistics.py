@@ -25,7 +25,7 @@ from hvt_common.protocol.messages import (
     Status,
     TrackStep,
 )
-from hvt_common.runtime.statistics import LatencyStats
+from hvt_common.runtime.statistics import LatencyStats, SequenceWindow
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, MessageTiming, Traffic
@@ -41,6 +41,10 @@ _LEAST_NS, _MOST_NS = 100 * _MS, 500 * _MS
 _RATE_OVER_NS = 2 * SECOND_NS
 _MOST_DELAYS = 256
 _HELD_US = 2**32 - 1
+_MOST_SENT = 512
+"""Stills whose second copy is still known for one: those of the last seconds."""
+_NEVER_NS = -(2**64)
+"""When a still was sent that has come with the backlog only."""
 _MISSED_NS = 6 * SECOND_NS
 """A still that has not come for so long does not come any more: reports need not name it for ever."""
 
@@ -163,6 +167,48 @@ class ReceptionStatistics:
     def _forget(self, now_ns: int) -> None:
         while self._sizes and (self._sizes[0][0] <= now_ns - _RATE_OVER_NS or len(self._sizes) > 4096):
             self._size_bytes -= self._sizes.popleft()[1]
+
+
+class StillSequenceWindow:
+    """The received stills: each is shown once, and counted as often as it crossed. Safe for threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._seen = SequenceWindow()
+        self._sent_ns: dict[int, int] = {}
+        """Sequence → when a still was sent of which no second copy has come."""
+
+    def is_new(self, sequence: int, *, send_ns: int) -> bool:
+        """Whether a still on ``roi`` has not come before."""
+        with self._lock:
+            if not self._seen.add([sequence]):
+                return False
+            self._sent_ns[sequence] = send_ns
+            while len(self._sent_ns) > _MOST_SENT:
+                del self._sent_ns[next(iter(self._sent_ns))]
+            return True
+
+    def is_copy(self, sequence: int, *, send_ns: int) -> bool:
+        """Whether one that is not new is the copy that the edge sent for want of an acknowledgement; once.
+
+        What bears the time of the first is a replay. Of one that came with the backlog, the first on ``roi`` is such
+        a copy.
+        """
+        with self._lock:
+            if send_ns <= self._sent_ns.get(sequence, send_ns):
+                return False
+            del self._sent_ns[sequence]
+            return True
+
+    def is_new_stored(self, sequence: int) -> bool:
+        """Whether a still of the backlog has not come before."""
+        return self.is_new(sequence, send_ns=_NEVER_NS)
+
+    def forget(self, sequence: int) -> None:
+        """One was lost on its way into a file: it is new when it comes again."""
+        with self._lock:
+            self._seen.discard(sequence)
+            self._sent_ns.pop(sequence, None)
 
 
 class CaptureClock:

@@ -17,7 +17,7 @@ from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.protocol.messages import StillResult
-from hvt_common.runtime.statistics import DistinctIds
+from hvt_common.runtime.statistics import SequenceWindow
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Boxes, Detections, Image, Tracks, View
@@ -161,7 +161,7 @@ class Pipeline:
         self._picture_ns = 0
         self._own: Tracks | None = None
         self._listed_frame = -1
-        self._track_ids = DistinctIds()
+        self._track_ids = SequenceWindow()
         self.detections_run = 0
         self.objects_detected = -1
         """Objects that the detector showed when it last looked; -1 before the first time."""

@@ -23,9 +23,9 @@ from hvt_ground.session.session import GroundSession
 
 LinkState = Literal["waiting", "up", "thin", "lost", "ended"]
 """``waiting`` for a keyframe to begin with; ``up``; ``thin``: the edge leaves frames out that the link does not
-carry; ``lost``: nothing has come for `LOST_S`; ``ended``: the edge said so, or stayed away."""
+carry; ``lost``: nothing has come for `LOST_NS`; ``ended``: the edge said so, or stayed away."""
 
-LOST_S = 3.0
+LOST_NS = 3 * SECOND_NS
 """A report comes once a second: nothing for so long is no accident."""
 _THIN_S = 5.0
 """So long after the last frame that the link did not carry it counts as thin."""
@@ -277,18 +277,21 @@ class StateMaker:
         )
 
     def _edge(self, edge: str, sessions: EdgeSessions, now_ns: int) -> EdgeState:
-        session = sessions.session  # it may end in its thread meanwhile
+        session, silent_ns = (
+            sessions.session,
+            sessions.receiver.silent_ns,
+        )  # it may end in its thread meanwhile
         link = self._link(edge, sessions, session, now_ns)
         before, since_ns = self._links.get(edge, (None, now_ns))
         if link != before:
-            since_ns = now_ns - round(sessions.silent_s * SECOND_NS) if link == "lost" else now_ns
+            since_ns = now_ns - silent_ns if link == "lost" else now_ns
             self._links[edge] = link, since_ns
         return EdgeState(
             edge=edge,
             link=link,
             link_since_ns=since_ns,
-            silent_s=sessions.silent_s,
-            unusable_messages=sessions.unusable,
+            silent_s=silent_ns / SECOND_NS,
+            unusable_messages=sessions.receiver.unusable,
             sessions_ended=sessions.ended,
             session=None if session is None else _session(session, sessions, link=link, now_ns=now_ns),
             failed=sessions.failures.now,
@@ -299,7 +302,7 @@ class StateMaker:
     ) -> LinkState:
         if session is None:
             return "ended" if sessions.ended else "waiting"
-        if sessions.silent_s > LOST_S and not session.lockstep:
+        if sessions.receiver.silent_ns > LOST_NS and not session.lockstep:
             return "lost"
         left_out = _left_out(session.last_status)
         key = f"{session.info.session_id:016x}"

@@ -130,7 +130,7 @@ def completed(
         "recordings": [str(path) for path in recordings],
         "recording_bytes": sum(path.stat().st_size for path in recordings if path.exists()),
         "missing_events": {sink.part: sink.missing for sink in queued if sink.missing},
-        "unusable_messages": sessions.unusable,
+        "unusable_messages": sessions.receiver.unusable,
         "backlog": content["backlog"] | {"recordings": [str(path) for path in sessions.backlog.paths]},
         "failed": [
             {

@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 from hvt_common import __version__
@@ -94,7 +95,7 @@ class EdgeSessions:
         self._reports = ReceiverReports(
             port.report, clock=self._clock, clock_offset=self._clock_offset, backlog=self.backlog
         )
-        self._receiver = Receiver(port.edge, clock=self._clock, versions=versions)
+        self.receiver = Receiver(port.edge, clock=self._clock, versions=versions)
         self._counted = StreamCounters()
         """When the session before ended."""
         self._ended_ns: int | None = None
@@ -114,16 +115,6 @@ class EdgeSessions:
         """Whether no session is open."""
         return self.session is None
 
-    @property
-    def unusable(self) -> int:
-        """Messages that were skipped: damaged, foreign, or of another version."""
-        return self._receiver.unusable
-
-    @property
-    def silent_s(self) -> float:
-        """For how long nothing has come."""
-        return self._receiver.silent_ns / SECOND_NS
-
     def work(self, item: Received | None, *, pending: bool) -> None:
         """Take one message, if there is one, and do what is due; ``pending``: more wait. It never raises."""
         try:
@@ -136,7 +127,7 @@ class EdgeSessions:
 
     def handle(self, item: Received) -> None:
         """Take one message; raises whatever goes wrong with it."""
-        for packet in self._receiver.receive(item):
+        for packet in self.receiver.receive(item):
             self._route(packet)
 
     def close(self) -> None:
@@ -151,10 +142,10 @@ class EdgeSessions:
 
     def housekeep(self, *, pending: bool) -> None:
         """Do what is due by now; raises whatever goes wrong with it."""
-        for packet in self._receiver.take_overdue(pending=pending):
+        for packet in self.receiver.take_overdue(pending=pending):
             self._route(packet)
         session, now_ns = self.session, time.monotonic_ns()
-        if self._pause.due(now_ns) and self._receiver.take_keyframe_request(pending=pending):
+        if self._pause.due(now_ns) and self.receiver.take_keyframe_request(pending=pending):
             self.port.request_keyframe()
             if session is not None:
                 session.note("warning", "the ground has asked for a keyframe")
@@ -162,8 +153,8 @@ class EdgeSessions:
             return
         if session.take_resumed():
             self.port.request_keyframe()
-        session.raise_error()
-        session.count(self._receiver.counters.since(self._counted))
+        session.worker.raise_error()
+        session.counters = self.receiver.stream.counters.since(self._counted)
         paused = self._backlog_ns is not None and now_ns - self._backlog_ns > _BACKLOG_PAUSE_NS
         if paused and not self.backlog.working:
             self._backlog_ns = None
@@ -174,7 +165,7 @@ class EdgeSessions:
             gone = self._ended_ns is None
             self._end_session()
             if gone:
-                self._receiver.wait_for_keyframe()  # should it come back, it starts with a keyframe
+                self.receiver.stream.decoder_failed()  # should it come back, it starts with a keyframe
 
     def _refresh_clock(self, session: GroundSession, now_ns: int) -> None:
         # Ask the edge for its time now and then; nothing waits for the answer.
@@ -193,11 +184,11 @@ class EdgeSessions:
     def _learn(self, answer: InfoAnswer) -> Info | None:
         info, requested_ns, answered_ns = answer
         if info.edge != self.port.edge:  # it names files and keys: another's name is nobody's
-            self._receiver.skip("info", WireError(f"the edge says that it is {info.edge!r:.40}"))
+            self.receiver.skip("info", WireError(f"the edge says that it is {info.edge!r:.40}"))
             return None
         if info.codec not in _BASE_CODECS:
             text = f"the edge sends video of {info.codec!r:.40}, and this ground reads {BASE_CODEC}"
-            self._receiver.skip("info", WireError(text))
+            self.receiver.skip("info", WireError(text))
             return None
         self._clock_offset.add(
             t0_ns=requested_ns, t1_ns=info.received_ns, t2_ns=info.answered_ns, t3_ns=answered_ns
@@ -221,17 +212,17 @@ class EdgeSessions:
                 if session is not None and header.is_of(session.info.session_id):
                     session.pose(header, item)
                 else:  # it may overtake the first keyframe of its session
-                    self._receiver.hold(packet)
+                    self.receiver.hold(packet)
             elif session is not None and header.session_id == session.info.session_id:
                 self._take(session, header, item)
             elif isinstance(header, Status) or (isinstance(header, RoiHeader) and session is None):
-                self._receiver.hold(packet)
+                self.receiver.hold(packet)
             elif isinstance(header, TrackStep) and session is None:
                 pass  # who joins between two keyframes gets some; the next ones say all of it again
             else:
-                self._receiver.skip_stranger(row, header.session_id)
+                self.receiver.skip_stranger(row, header.session_id)
         except WireError as error:
-            self._receiver.skip(row, error)
+            self.receiver.skip(row, error)
 
     def _take(self, session: GroundSession, header: RoiHeader | TrackStep | Status, item: Received) -> None:
         match header:
@@ -248,7 +239,7 @@ class EdgeSessions:
         arrival = packet.arrival
         session_id = arrival.header.session_id
         if arrival.duplicate and self.session is not None:
-            text = self._receiver.duplicate_notice(session_id, shown=self.session.info.session_id)
+            text = self.receiver.duplicate_notice(session_id, shown=self.session.info.session_id)
             if text is not None:
                 self.session.note("warning", text)
         begins = arrival.starts_session and not self._goes_on(packet)
@@ -256,7 +247,7 @@ class EdgeSessions:
             if self._pause.due(time.monotonic_ns()):
                 self._begin_session(session_id)
             if self.session is None:
-                self._receiver.wait_for_keyframe()  # the next keyframe is the next try
+                self.receiver.stream.decoder_failed()  # the next keyframe is the next try
         session = self.session
         if session is None or arrival.verdict not in ("decode", "skip"):
             return
@@ -266,7 +257,7 @@ class EdgeSessions:
             lost = "1 picture was" if arrival.lost_before == 1 else f"{arrival.lost_before} pictures were"
             session.note("warning", f"{lost} lost: the ground waits for a keyframe")
         if not session.base(packet):
-            self._receiver.wait_for_keyframe()
+            self.receiver.stream.decoder_failed()
 
     def _goes_on(self, packet: BasePacket) -> bool:
         # Whether the open session comes back from an interruption that was none of its own.
@@ -292,16 +283,16 @@ class EdgeSessions:
         info = next((info for _ in range(_INFO_TRIES) if (info := self._query_info(session_id))), None)
         shown = self.session
         if info is None and shown is not None and self._query_info(shown.info.session_id) is not None:
-            self._receiver.disown()
-            self._receiver.skip("base", WireError(f"the edge does not know of a session {session_id:016x}"))
+            self.receiver.stream.disown()
+            self.receiver.skip("base", WireError(f"the edge does not know of a session {session_id:016x}"))
             return
         self._end_session()
         if info is None:
-            self._receiver.skip("info", WireError("the edge does not say what its session is"))
+            self.receiver.skip("info", WireError("the edge does not say what its session is"))
             return
         if not self._beginnings.take(self._clock()):
             every_s = _EVERY_NS // SECOND_NS
-            self._receiver.skip(
+            self.receiver.skip(
                 "base", WireError(f"the edge begins sessions again and again: one in {every_s} s is shown")
             )
             return
@@ -310,7 +301,7 @@ class EdgeSessions:
         log_fields(session=f"{info.session_id:016x}")
         self.session = self._open_session(info, self._reports)
         self.failures.works(self._part)
-        for packet in self._receiver.take_held():
+        for packet in self.receiver.take_held():
             self._route(packet)
 
     def _end_session(self) -> None:
@@ -320,9 +311,8 @@ class EdgeSessions:
         if self._ended_ns is not None:
             self._ended_id = session.info.session_id
         self._ended_ns = None
-        counters = self._receiver.counters
-        session.count(counters.since(self._counted))
-        self._counted = counters
+        counters = self.receiver.stream.counters
+        session.counters, self._counted = counters.since(self._counted), replace(counters)
         self.ended += 1
         for step in (session.close, partial(self._report_end, session), partial(self._on_ended, session)):
             try:
@@ -343,7 +333,7 @@ class EdgeSessions:
         self._pause.failed(time.monotonic_ns())
         self._say_failed(error, self.session)
         self._end_session()
-        self._receiver.wait_for_keyframe()
+        self.receiver.stream.decoder_failed()
 
     def _say_failed(self, error: Exception, session: GroundSession | None) -> None:
         if session is not None:
@@ -355,7 +345,7 @@ class EdgeSessions:
 
     def _is_over(self, session: GroundSession, now_ns: int) -> bool:
         if self._ended_ns is None:
-            return not self.port.present.is_set() and self._receiver.silent_ns > self._patience_ns
+            return not self.port.present.is_set() and self.receiver.silent_ns > self._patience_ns
         whole = session.is_whole and not self.backlog.working
         return whole or now_ns - self._ended_ns > self._ended_patience_ns
 

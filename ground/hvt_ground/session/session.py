@@ -38,8 +38,7 @@ from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.receiver import BasePacket
-from hvt_ground.link.sequence_window import StillSequenceWindow
-from hvt_ground.link.statistics import CaptureClock, ReceptionStatistics, SessionAccount
+from hvt_ground.link.statistics import CaptureClock, ReceptionStatistics, SessionAccount, StillSequenceWindow
 from hvt_ground.perception.models import NotOpenError
 from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
@@ -285,10 +284,6 @@ class GroundSession:
         self.budget_bps, self.method = info.budget_bps, info.method
         self._account.budget_bps = info.budget_bps
 
-    def count(self, counters: StreamCounters) -> None:
-        """Note what the reassembly has counted in this session so far."""
-        self.counters = counters
-
     def report_backlog(self) -> None:
         """Say in the recording how much of the backlog has come since the last time."""
         news = self.backlog.take_news()
@@ -317,7 +312,7 @@ class GroundSession:
             finally:
                 if ended and self._pipeline is not None:
                     self._pipeline.end()
-        self.raise_error()
+        self.worker.raise_error()
 
     def _note_end(self) -> None:
         if self.failure:
@@ -420,10 +415,6 @@ class GroundSession:
         """Whether a recording goes on after a gap, and waits for a keyframe; True once."""
         resumed = [one.take_resumed() for one in self._queued]
         return any(resumed)
-
-    def raise_error(self) -> None:
-        """Raise what went wrong while analyzing."""
-        self.worker.raise_error()
 
     # Reports
 

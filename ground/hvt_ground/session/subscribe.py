@@ -95,8 +95,8 @@ class GroundLink:
 
     def put(self, item: Received) -> None:
         """Take a message from Zenoh's callback."""
-        parsed = parse_key(item.key)
-        port = self._port(item.key)
+        parsed = self._parsed(item.key)
+        port = None if parsed is None else self._port(parsed[0])
         if port is not None and parsed is not None:
             port.put(item, parsed[1])
 
@@ -126,7 +126,7 @@ class GroundLink:
         group.forget(except_for=known | self._leaving)
 
     def _begin(self, edge: str) -> None:
-        port = self._port(EdgeKeys(edge).key(Channel.ALIVE), alive=True)
+        port = self._port(edge, alive=True)
         if port is None:
             return
         if edge in self._alive:
@@ -155,12 +155,14 @@ class GroundLink:
         for one in self._subscribers.pop(edge):
             one.undeclare()  # type: ignore[no-untyped-call]
 
-    def _port(self, key: str, *, alive: bool = False) -> EdgePort | None:
+    def _parsed(self, key: str) -> tuple[str, Channel] | None:
         parsed = parse_key(key)
         if parsed is None or not matches(parsed[0], edges=self._edges):
             self.foreign += 1
             return None
-        edge = parsed[0]
+        return parsed
+
+    def _port(self, edge: str, *, alive: bool = False) -> EdgePort | None:
         with self._lock:
             port = self._ports.get(edge)
             if port is None:
@@ -202,34 +204,29 @@ class GroundLink:
 
     def _on_presence(self, sample: zenoh.Sample) -> None:
         key, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT  # these enums fail `is`
-        if self._group is not None:
-            self._note_shared(key, there=there)
+        parsed = self._parsed(key)
+        if parsed is None:
             return
-        if not there and (parsed := parse_key(key)) is not None:
-            self._unplaced.discard(parsed[0])
         try:
-            port = self._port(key, alive=there)
+            port = self._port_of_token(parsed[0], there=there)
         except Exception as error:  # noqa: BLE001 - for the edge's thread
             self._fail(key, error)
             return
         if port is not None:
             (port.present.set if there else port.present.clear)()
 
-    def _note_shared(self, key: str, *, there: bool) -> None:
+    def _port_of_token(self, edge: str, *, there: bool) -> EdgePort | None:
+        if self._group is None:
+            if not there:
+                self._unplaced.discard(edge)
+            return self._port(edge, alive=there)
         # It may be another's: there is a port for it only if it is served here.
-        parsed = parse_key(key)
-        if parsed is None or not matches(parsed[0], edges=self._edges):
-            self.foreign += 1
-            return
-        edge = parsed[0]
         with self._lock:
             if not there:
                 self._alive.discard(edge)
             elif len(self._alive) < _MOST_SHARED:
                 self._alive.add(edge)
-            port = self._ports.get(edge)
-        if port is not None:
-            (port.present.set if there else port.present.clear)()
+            return self._ports.get(edge)
 
     def _fail(self, key: str, error: Exception) -> None:
         # Hand over the error of a callback: to the edge's thread, which ends its session for it.

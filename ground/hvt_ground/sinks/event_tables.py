@@ -10,6 +10,7 @@ import io
 import re
 import threading
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import cv2
@@ -208,16 +209,5 @@ class SessionTiming:
             self._unread.clear()
 
     def _write(self, message: MessageTiming, *, handled_ns: int) -> None:
-        values = (
-            message.kind,
-            message.sequence,
-            message.frame_index,
-            message.capture_ns,
-            message.send_ns,
-            message.received_ns,
-            handled_ns,
-            message.line_bytes,
-            message.clock_offset_ns,
-            *self._whose,
-        )
+        values = (*astuple(replace(message, handled_ns=handled_ns)), *self._whose)
         self._table.log(",".join(map(str, values)) + "\n")

@@ -18,8 +18,8 @@ from hvt_common.protocol.messages import (
     WireError,
     pack_backlog_still,
 )
+from hvt_common.runtime.statistics import SequenceWindow
 from hvt_ground.backlog.assembly import BacklogAssembly, backlog_content
-from hvt_ground.link.sequence_window import SequenceWindow
 from hvt_ground.perception.stills.decode import ReceivedStill
 from rigs.backlog_chunks import info_object, still_object, video_object
 from rigs.flight import Flight

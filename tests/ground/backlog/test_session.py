@@ -547,7 +547,7 @@ def test_no_more_files_are_made_than_the_bound(flight, tmp_path):
         rig.put(*chunks(formers[2].session_id, "still", 0, stills[2]))
         said = {one.session_id for one in rig.acknowledged_ranges()}
         assert said == {former.session_id for former in formers[:2]}, "of the third nothing is taken"
-        assert rig.receiver.unusable >= 2
+        assert rig.receiver.receiver.unusable >= 2
         rig.put(*chunks(formers[0].session_id, "still", 1, still_object(formers[0], 0, 1)))
     assert len(list(tmp_path.glob("backlog-*"))) == 2
     assert len(Recording(tmp_path / "backlog-0.rrd").stills()) == 2, "what is open goes on"
@@ -598,14 +598,14 @@ def test_damaged_and_foreign_pieces_are_counted_and_skipped(flight, tmp_path):
     """One bad chunk would end the ground."""
     with Rig(tmp_path, flight) as rig:
         rig.put(*backlog(flight, "still", 0, still_object(flight, 1, 0)))  # no session is open yet
-        assert rig.receiver.unusable == 1
+        assert rig.receiver.receiver.unusable == 1
         rig.base(*range(5))
         item = backlog(flight, "still", 0, still_object(flight, 1, 0))[0]
         rig.put(Received(item.key, item.payload[:-1], item.attachment, item.encoding, 1))
         rig.put(Received(item.key, item.payload, b"\x93\x02", item.encoding, 1))
         rig.put(*backlog(flight, "still", 9, still_object(flight, 1, 0)))
         rig.put(*backlog(flight, "base", 2, b"no video"))
-        assert rig.receiver.unusable == 5
+        assert rig.receiver.receiver.unusable == 5
         assert {one.acknowledged_bytes for one in rig.acknowledged_ranges()} == {0}
         garbage = video_object(flight, range(65, 70))
         noise = garbage.replace(flight.units[66].data, bytes(len(flight.units[66].data)))

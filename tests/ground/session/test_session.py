@@ -169,7 +169,7 @@ def test_tracks_that_make_no_sense_are_counted_and_skipped():
         rig.settle()
         session = rig.receiver.session
         assert (session.steps_received, session.pipeline.steps_used) == (2, 1)
-        assert rig.receiver.unusable == 3
+        assert rig.receiver.receiver.unusable == 3
         rig.put(*bases(flight, *range(4, 10)), flight.status(base=10))
         rig.settle()
         assert session.last_frame_index == 9
@@ -228,7 +228,7 @@ def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
         session = rig.receiver.session
         assert (session.frames_received, session.frames_decoded, session.stills_received) == (3, 3, 1)
         assert session.ledger.messages(Account.META) == 1
-        assert rig.receiver.unusable == 3
+        assert rig.receiver.receiver.unusable == 3
         rig.put(broken)
         rig.settle()
         wait_for(lambda: rig.port.keyframe_requests >= 1)
@@ -355,7 +355,7 @@ def test_sessions_that_begin_again_and_again_are_bounded(flight):
             rig.settle()
             now_ns += 1_100_000_000
         assert len(rig.opened) == 39  # thirty at once, then one in five seconds
-        assert rig.receiver.unusable == 3
+        assert rig.receiver.receiver.unusable == 3
         rig.port.flight = flight
         now_ns += 5_000_000_000
         rig.put(*(replace(one, received_ns=now_ns) for one in bases(flight, *range(10))))
@@ -403,13 +403,13 @@ def test_a_still_that_comes_before_its_session_is_open_is_taken(flight):
         rig.port.flight = flight
         rig.put(flight.still(0, 0), other.still(0, 0))
         rig.settle()
-        assert rig.receiver.unusable == 0
+        assert rig.receiver.receiver.unusable == 0
         rig.put(*bases(flight, *range(6)))
         rig.settle()
         session = rig.receiver.session
         assert (session.stills_received, session.frames_received) == (1, 6)
         assert session.ledger.messages(Account.ROI) == 1
-        assert rig.receiver.unusable == 1, "the other one's"
+        assert rig.receiver.receiver.unusable == 1, "the other one's"
 
 
 def test_poses_that_come_before_their_session_is_open_are_taken(flight):
@@ -430,7 +430,7 @@ def test_poses_that_come_before_their_session_is_open_are_taken(flight):
         session = rig.receiver.session
         assert session.ledger.messages(Account.META) == 3
         assert session.poses.has_pose
-        assert rig.receiver.unusable == 0
+        assert rig.receiver.receiver.unusable == 0
 
 
 def test_a_lost_answer_does_not_lose_the_flight(flight):
