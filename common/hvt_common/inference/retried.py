@@ -9,7 +9,7 @@ from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
 from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.inference.tiles import detect_whole
-from hvt_common.runtime.failures import Failures, Retried, RetryPause
+from hvt_common.runtime.failures import Failures, Retried
 from hvt_common.values import Detections, Image, Posterior
 
 
@@ -23,9 +23,8 @@ class RetriedDetector(Retried[Detector]):
         *,
         clock: Callable[[], int] = time.monotonic_ns,
         hint: FewFoundHint | None = None,
-        pause: RetryPause | None = None,
     ) -> None:
-        super().__init__(open_part, "detector", failures, clock=clock, pause=pause)
+        super().__init__(open_part, "detector", failures, clock=clock)
         self._hint = hint
 
     @property

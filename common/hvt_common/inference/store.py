@@ -106,9 +106,7 @@ def parts_of(spec: str) -> tuple[str, ...]:
     return found
 
 
-def resolve_model(
-    spec: str, *, role: str = "model", words: Sequence[str] = (), store: ModelStore | None = None
-) -> Path:
+def resolve_model(spec: str, *, role: str = "model", words: Sequence[str] = ()) -> Path:
     """The file of a model that is named or that is a file already; a model of the cache is checked first.
 
     ``spec`` is a name, or a path: what has a folder or a suffix in it. The sentence of an error calls it ``role``
@@ -121,7 +119,7 @@ def resolve_model(
     embedded = embedded_models()
     if spec in embedded:
         return embedded[spec]
-    store = store if store is not None else _store()
+    store = _store()
     if store is not None and spec in store.entries:
         return store.verified(spec)
     if (path := named_path(spec, name=role)).is_file():

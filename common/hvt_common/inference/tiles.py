@@ -103,25 +103,23 @@ def tiled(detector: Detector, tiles: str) -> Detector:
     return TiledDetector(detector, grid=grid)
 
 
-def auto_grid(
-    source_size: tuple[int, int], detector: Detector, *, most_runs: int = MOST_RUNS, overlap: float = OVERLAP
-) -> Grid:
+def auto_grid(source_size: tuple[int, int], detector: Detector) -> Grid:
     """The smallest grid on which an object of 12 source pixels has 10 on the network's input.
 
-    Where no grid of fewer than ``most_runs`` tiles does, the one that comes nearest; (1, 1), which is no
+    Where no grid of fewer than `MOST_RUNS` tiles does, the one that comes nearest; (1, 1), which is no
     tiles at all, where the whole picture does. It depends on sizes alone.
     """
     if not isinstance(detector, _Sized):
         return 1, 1
     grids = [
         (columns, rows)
-        for columns in range(1, most_runs)
-        for rows in range(1, most_runs)
-        if columns * rows < most_runs
+        for columns in range(1, MOST_RUNS)
+        for rows in range(1, MOST_RUNS)
+        if columns * rows < MOST_RUNS
     ]
 
     def worth(grid: Grid) -> tuple[float, int]:
-        x1, y1, x2, y2 = tile_boxes(source_size, grid, overlap=overlap)[0]
+        x1, y1, x2, y2 = tile_boxes(source_size, grid)[0]
         width, height = detector.input_size((x2 - x1, y2 - y1))
         seen_px = min(width / (x2 - x1), height / (y2 - y1)) * _SMALL_PX
         # In half pixels: another two tiles for a tenth of a pixel are not worth their runs.
@@ -153,21 +151,12 @@ class TiledDetector:
     """Another detector on the whole picture and on ``grid`` overlapping tiles; itself a `Detector`.
 
     ``auto`` chooses the grid for each size of picture, see `auto_grid`. A grid of one's own is not bounded by
-    ``most_runs``. Boxes of two classes on one object (a car that is a truck too) become one, the more confident.
+    `MOST_RUNS`. Boxes of two classes on one object (a car that is a truck too) become one, the more confident.
     """
 
-    def __init__(
-        self,
-        detector: Detector,
-        *,
-        grid: Grid | Literal["auto"],
-        overlap: float = OVERLAP,
-        most_runs: int = MOST_RUNS,
-    ) -> None:
+    def __init__(self, detector: Detector, *, grid: Grid | Literal["auto"]) -> None:
         self._detector = detector
         self._grid: Grid | Literal["auto"] = grid
-        self._overlap = overlap
-        self._most_runs = most_runs
         self._auto: dict[tuple[int, int], Grid] = {}
 
     @property
@@ -180,11 +169,7 @@ class TiledDetector:
         if self._grid != "auto":
             return self._grid
         if source_size not in self._auto:
-            self._auto = {
-                source_size: auto_grid(
-                    source_size, self._detector, most_runs=self._most_runs, overlap=self._overlap
-                )
-            }
+            self._auto = {source_size: auto_grid(source_size, self._detector)}
         return self._auto[source_size]
 
     def detect_whole(self, image_bgr: Image) -> Detections:
@@ -194,7 +179,7 @@ class TiledDetector:
     def detect(self, image_bgr: Image) -> Detections:
         """Detections in the pixels of this image, best first; at most `MAX_DETECTIONS`."""
         grid = self.grid((image_bgr.shape[1], image_bgr.shape[0]))
-        tiles = tile_boxes((image_bgr.shape[1], image_bgr.shape[0]), grid, overlap=self._overlap)
+        tiles = tile_boxes((image_bgr.shape[1], image_bgr.shape[0]), grid)
         whole = self._detector.detect(image_bgr)
         return with_tiles(whole, image_bgr, tiles if grid != (1, 1) else (), self._detector.detect)
 

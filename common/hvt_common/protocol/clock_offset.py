@@ -9,6 +9,7 @@ from dataclasses import dataclass
 _DRIFT_PPM = 500
 """The most that two clocks drift apart (RFC 5905: NTP corrects 500 ppm)."""
 _ROUNDING_NS = 1_000_000
+_MOST_SAMPLES = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,10 +28,10 @@ class ClockOffset:
     set: those before the step are dropped. Safe for threads.
     """
 
-    def __init__(self, *, window_ns: int = 60_000_000_000, max_samples: int = 64) -> None:
-        """Samples older than ``window_ns`` before the newest are dropped, and the oldest beyond ``max_samples``."""
+    def __init__(self, *, window_ns: int = 60_000_000_000) -> None:
+        """Samples older than ``window_ns`` before the newest are dropped, and the oldest beyond `_MOST_SAMPLES`."""
         self._window_ns = window_ns
-        self._samples: deque[_Sample] = deque(maxlen=max_samples)
+        self._samples: deque[_Sample] = deque(maxlen=_MOST_SAMPLES)
         self._adding = threading.Lock()
         self._best: _Sample | None = None
 

@@ -40,7 +40,6 @@ _MOST_PENDING = _MOST_IN_WINDOW = 65_536
 _FRAMING_BYTES = 12
 _STANDARD_ENCODING_BYTES = 1
 _CUSTOM_ENCODING_BYTES = 4
-_TIMESTAMP_BYTES = 26
 _REPLY_BYTES = 36
 """More than a put: the numbers of query and replier, and the message that ends the query. Measured likewise."""
 STANDARD_ENCODINGS = frozenset(
@@ -69,7 +68,6 @@ def overhead_bytes(
     *,
     key: str,
     encoding: str = "",
-    timestamp: bool = False,
     reply: bool = False,
 ) -> int:
     """Bytes that one Zenoh message over TCP and IPv4 takes on the line beyond its payload and attachment.
@@ -86,8 +84,6 @@ def overhead_bytes(
         framing += _STANDARD_ENCODING_BYTES
     elif encoding:
         framing += _CUSTOM_ENCODING_BYTES + len(encoding)
-    if timestamp:
-        framing += _TIMESTAMP_BYTES
     if reply:
         framing += _REPLY_BYTES
     message = payload_bytes + attachment_bytes + framing

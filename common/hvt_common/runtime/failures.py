@@ -142,7 +142,6 @@ class Retried(Generic[_Part]):
         failures: Failures,
         *,
         clock: Callable[[], int] = time.monotonic_ns,
-        pause: RetryPause | None = None,
     ) -> None:
         self.part = open_part()
         """The one that is open, or that failed last."""
@@ -150,7 +149,7 @@ class Retried(Generic[_Part]):
         self._name = name
         self._failures = failures
         self._clock = clock
-        self._pause = pause or RetryPause()
+        self._pause = RetryPause()
         self._failed = False
         self._lock = threading.Lock()
 
@@ -187,12 +186,10 @@ class Awaited(Generic[_Part]):
         failures: Failures,
         *,
         longest_s: float = 5.0,
-        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._open_part = open_part
         self._name = name
         self._failures = failures
-        self._clock = clock
         self._pause = RetryPause(longest_ns=round(longest_s * SECOND_NS))
         self.error: UserError | None = None
         """Why it is not there."""
@@ -210,7 +207,7 @@ class Awaited(Generic[_Part]):
             part = self._open_part()
         except NotYetError as error:
             self.error = error
-            self._pause.failed(self._clock(), again=True)
+            self._pause.failed(time.monotonic_ns(), again=True)
             self._failures.failed(self._name, reason_of(error))
             return None
         self._failures.works(self._name)

@@ -161,18 +161,13 @@ def query(
     keys: EdgeKeys,
     question: bytes,
     timeout_s: float,
-    wanted: Callable[[bytes], bool] = lambda _answer: True,
 ) -> bytes | None:
-    """The first answer of a queryable channel that is ``wanted``; None when there is none in time.
-
-    Blocks for at most ``timeout_s``. Two edges of one id both answer.
-    """
+    """The first answer of a queryable channel; None when there is none in time, after ``timeout_s``."""
     replies = session.get(keys.key(channel), payload=question, timeout=timeout_s, **_query_options(channel))
     for reply in replies:
         if reply.ok is not None:
             data: bytes = reply.ok.payload.to_bytes()
-            if wanted(data):
-                return data
+            return data
     return None
 
 

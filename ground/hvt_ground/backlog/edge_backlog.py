@@ -39,12 +39,10 @@ class EdgeBacklog:
     ``recordings`` takes what is of another session; None refuses it.
     """
 
-    def __init__(
-        self, edge: str, *, recordings: BacklogRecordings | None, assembly: BacklogAssembly | None = None
-    ) -> None:
+    def __init__(self, edge: str, *, recordings: BacklogRecordings | None) -> None:
         self._edge = edge
         self._recordings = recordings
-        self._assembly = assembly or BacklogAssembly()
+        self._assembly = BacklogAssembly()
         self._lock = threading.Lock()
         self._infos: OrderedDict[int, Info] = OrderedDict()
         self.working = 0

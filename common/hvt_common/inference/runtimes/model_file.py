@@ -74,35 +74,32 @@ def check_onnx_file(path: Path) -> None:
 
 def opset_versions(path: Path) -> dict[str, int]:
     """The version of each operator set that a checked model imports, by domain; "" is ONNX itself."""
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        return dict(
-            _opset(data[begin:end])
-            for field, _, _, begin, end in _fields(data, 0, len(data))
-            if field == _OPSET_FIELD
-        )
+    return dict(_opset(data) for field, _, data in _top_fields(path) if field == _OPSET_FIELD)
 
 
 def onnx_version(path: Path) -> tuple[int, str]:
     """The version of the file format (IR version) of a checked model, and who wrote it."""
     version, producer = 0, ""
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        for field, _, value, begin, end in _fields(data, 0, len(data)):
-            if field == _VERSION_FIELD:
-                version = value
-            elif field in (_PRODUCER_FIELD, _PRODUCER_VERSION_FIELD):
-                producer = f"{producer} {data[begin:end][:80].decode(errors='replace')}".strip()
+    for field, value, data in _top_fields(path):
+        if field == _VERSION_FIELD:
+            version = value
+        elif field in (_PRODUCER_FIELD, _PRODUCER_VERSION_FIELD):
+            producer = f"{producer} {data[:80].decode(errors='replace')}".strip()
     return version, producer
 
 
 def onnx_metadata(path: Path) -> dict[str, str]:
     """The metadata that the exporter wrote into a model. Raises `UserError` as `check_onnx_file` does."""
     check_onnx_file(path)
+    return dict(_metadata_entry(data) for field, _, data in _top_fields(path) if field == _METADATA_FIELD)
+
+
+def _top_fields(path: Path) -> Iterator[tuple[int, int, bytes]]:
+    # Number, value (of a varint) and bytes of the fields of a checked model, but for the graph, which is large.
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        return dict(
-            _metadata_entry(data[begin:end])
-            for field, _, _, begin, end in _fields(data, 0, len(data))
-            if field == _METADATA_FIELD
-        )
+        for field, _, value, begin, end in _fields(data, 0, len(data)):
+            if field != _GRAPH_FIELD:
+                yield field, value, data[begin:end]
 
 
 def _check(path: Path, data: mmap.mmap) -> None:

@@ -30,16 +30,16 @@ _BACK = np.array([[65536, 116130, 0], [65536, -22554, -46802], [65536, 0, 91881]
 _GREY = 128
 
 
-def padded_size(size: tuple[int, int], *, least_px: int = BLOCK_PX) -> tuple[int, int]:
-    """(width, height) grown to whole blocks, and to ``least_px`` (a multiple of them) on each side."""
-    width, height = (max(least_px, -(-side // BLOCK_PX) * BLOCK_PX) for side in size)
+def padded_size(size: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) grown to whole blocks."""
+    width, height = (-(-side // BLOCK_PX) * BLOCK_PX for side in size)
     return width, height
 
 
-def to_planar(image_bgr: Image, *, least_px: int = BLOCK_PX) -> Planar:
+def to_planar(image_bgr: Image) -> Planar:
     """The picture in its `padded_size`. No sample is 0, so that H.264 can carry it verbatim without escapes."""
     height, width = image_bgr.shape[:2]
-    wide, high = padded_size((width, height), least_px=least_px)
+    wide, high = padded_size((width, height))
     # Repeated before the chroma is halved: a last odd column then counts twice, not with black.
     whole = cv2.copyMakeBorder(image_bgr, 0, high - height, 0, wide - width, cv2.BORDER_REPLICATE)
     samples = cv2.transform(whole.astype(np.float64), _FORWARD)

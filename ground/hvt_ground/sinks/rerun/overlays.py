@@ -45,7 +45,7 @@ _REPORTED: tuple[Origin, ...] = ("edge", "still")
 _BOX_BYTES = 16  # two centres and two half sizes, float32
 _ROW_BYTES = 40  # row id, two times, offsets
 _MOST_HOLES = 256
-_CONTINUES_S = 2.0
+_LEAST_S, _CONTINUES_S = 1.0, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,13 +177,13 @@ class BacklogOverlays:
     """Boxes in a hole that is filled later: what to write so that they end where the live stream goes on.
 
     A viewer shows the latest value before its time, so boxes in a hole would stand over what follows it. At the
-    first overlay after the hole all is therefore written once more. Holes shorter than ``least_s`` are none: the
+    first overlay after the hole all is therefore written once more. Holes shorter than a second are none: the
     base stream leaves out frames. Of one recording; not safe for threads.
     """
 
-    def __init__(self, size: tuple[int, int], *, fps: float, least_s: float = 1.0) -> None:
+    def __init__(self, size: tuple[int, int], *, fps: float) -> None:
         self._size = size
-        self._least = max(2, round(least_s * fps))
+        self._least = max(2, round(_LEAST_S * fps))
         self._continues = round(_CONTINUES_S * fps)
         self._newest: int | None = None
         self._holes: deque[_Hole] = deque([_Hole(-1, None)], maxlen=_MOST_HOLES)

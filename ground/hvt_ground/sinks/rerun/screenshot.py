@@ -21,16 +21,14 @@ from hvt_common.errors import UserError, check_not_read, exit_with_sentence
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.live_view import free_port, started_viewer
 
-_START_S = 30.0
+_START_S, _SETTLE_S = 30.0, 4.0
 _MENU_PX = 37
 
 
-def screenshot(
-    recording: Path, *, frame: int, out: Path, size: tuple[int, int] = (1920, 1080), settle_s: float = 4.0
-) -> None:
+def screenshot(recording: Path, *, frame: int, out: Path, size: tuple[int, int] = (1920, 1080)) -> None:
     """Open ``recording`` (.rrd) in a headless viewer, go to ``frame`` of its timeline, and write its screen as PNG.
 
-    ``size`` is the window's in pixels (the picture is lower by the menu bar); the viewer has ``settle_s`` to decode
+    ``size`` is the window's in pixels (the picture is lower by the menu bar); the viewer has four seconds to decode
     and lay out. Raises `UserError` where a file or a part that the viewer needs is missing, or the viewer does not
     start.
     """
@@ -48,14 +46,14 @@ def screenshot(
             environment={"XDG_RUNTIME_DIR": runtime},
         )
         try:
-            png = _picture(port, recording, frame=frame, settle_s=settle_s)
+            png = _picture(port, recording, frame=frame)
         finally:
             process.terminate()
             process.wait(timeout=10)
     out.write_bytes(_without_menu(png))
 
 
-def _picture(port: int, recording: Path, *, frame: int, settle_s: float) -> bytes:
+def _picture(port: int, recording: Path, *, frame: int) -> bytes:
     client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
     client.open(str(recording.resolve()))
     deadline = time.monotonic() + _START_S
@@ -64,7 +62,7 @@ def _picture(port: int, recording: Path, *, frame: int, settle_s: float) -> byte
             raise UserError(f"recording {recording} holds nothing that the viewer can show")
         time.sleep(0.1)
     client.set_time("frame", sequence=frame, play_state="paused")
-    time.sleep(settle_s)
+    time.sleep(_SETTLE_S)
     return client.take_screenshot()
 
 
