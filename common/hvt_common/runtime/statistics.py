@@ -1,10 +1,11 @@
-"""Statistics in bounded memory, however long a run is: percentiles of a latency, and sets of numbers."""
+"""Statistics in bounded memory, however long a run is: percentiles of a latency, sets of numbers, newest entries."""
 
 from __future__ import annotations
 
 import math
 from collections import OrderedDict
 from collections.abc import Iterable
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +14,9 @@ _HIGHEST_MS = 1e6
 _LOG_RATIO = math.log(1.01)
 _BINS = math.ceil(math.log(_HIGHEST_MS / _LOWEST_MS) / _LOG_RATIO) + 1
 _PAGE_BITS = 12
+
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
 
 
 class LatencyStats:
@@ -73,6 +77,29 @@ class LatencyStats:
         return min(max(centre_ms, self._min_ms), self._max_ms)
 
 
+class Newest(OrderedDict[_Key, _Value]):
+    """A table of at most ``most`` keys: one more, and the first goes, that was set before all others.
+
+    A key that is set again stays in its place (`move_to_end`).
+    """
+
+    def __init__(self, most: int) -> None:
+        super().__init__()
+        self._most = most
+
+    def __setitem__(self, key: _Key, value: _Value) -> None:
+        super().__setitem__(key, value)
+        if len(self) > self._most:
+            self.popitem(last=False)
+
+    def put(self, key: _Key, value: _Value) -> bool:
+        """Set the newest key; whether it was not there."""
+        new = key not in self
+        self[key] = value
+        self.move_to_end(key)
+        return new
+
+
 class SequenceWindow:
     """A set of numbers from 0, one bit each. What was missed long ago may still come, and is known to be new.
 
@@ -81,8 +108,7 @@ class SequenceWindow:
     """
 
     def __init__(self, *, pages: int = 4096) -> None:
-        self._most = pages
-        self._pages: OrderedDict[int, int] = OrderedDict()
+        self._pages: Newest[int, int] = Newest(pages)
         """The one that was touched last stands last."""
         self.count = 0
 
@@ -95,8 +121,6 @@ class SequenceWindow:
             self._pages[page] = held | bit
             self._pages.move_to_end(page)
             self.count += not held & bit
-            if len(self._pages) > self._most:
-                self._pages.popitem(last=False)
         return self.count - before
 
     def discard(self, number: int) -> None:

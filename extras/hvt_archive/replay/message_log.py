@@ -13,7 +13,6 @@ import os
 import struct
 import threading
 import zlib
-from collections import OrderedDict
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -24,6 +23,7 @@ import msgpack
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, READ_VERSIONS, Info, WireError
+from hvt_common.runtime.statistics import Newest
 from hvt_common.transport.inbox import Received
 from hvt_ground.sinks import SinkWriter
 from hvt_ground.sinks.line_file import check_there
@@ -48,7 +48,7 @@ class MessageLog(SinkWriter[Received]):
     def __init__(self, path: Path, *, most_bytes: int) -> None:
         self.path: Path = path
         self._most_bytes = most_bytes
-        self._answers: OrderedDict[str, bytes] = OrderedDict()
+        self._answers: Newest[str, bytes] = Newest(_MOST_EDGES)
         """The record of the last answer to ``info``, by key."""
         self._file = _created(path)
         try:
@@ -75,10 +75,7 @@ class MessageLog(SinkWriter[Received]):
         if self._file.tell() + len(record) > self._most_bytes // 2:
             self._begin_anew()
         if item.key.endswith(f"/{Channel.INFO}") and _is_info(item.payload):
-            self._answers[item.key] = record
-            self._answers.move_to_end(item.key)
-            if len(self._answers) > _MOST_EDGES:
-                self._answers.popitem(last=False)
+            self._answers.put(item.key, record)
         self._append(record)
 
     def _begin_anew(self) -> None:

@@ -14,6 +14,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from hvt_common.runtime.statistics import Newest
+
 _TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
 _LISTEN = "0A"
 _TIMES, _WITHIN_S = 3, 600.0
@@ -32,7 +34,7 @@ class Strangers:
         """Connections that are links, or were."""
         self._pending: set[str] = set()
         """Connections that are no links, or not yet."""
-        self._known: OrderedDict[str, None] = OrderedDict()
+        self._known: Newest[str, None] = Newest(_MOST_HOSTS)
         """Hosts that have had a link, the last ones."""
         self._refused: OrderedDict[str, list[float]] = OrderedDict()
         """Host → when its connections ended, the last ones."""
@@ -44,10 +46,7 @@ class Strangers:
             host, _, port = end.rpartition(":")
             if port.isdigit() and int(port) in self._ports:
                 continue  # our own end
-            self._known[host] = None
-            self._known.move_to_end(host)
-            if len(self._known) > _MOST_HOSTS:
-                self._known.popitem(last=False)
+            self._known.put(host, None)
 
     def check(self, links: Callable[[], Iterable[str]], now_s: float) -> list[str]:
         """Return the hosts to be named now; ``links`` gives the far ends of the links that stand."""

@@ -30,6 +30,7 @@ from hvt_common.protocol.messages import (
     parse_backlog_still,
     parse_backlog_units,
 )
+from hvt_common.runtime.statistics import Newest
 from hvt_ground.perception.stills.decode import ReceivedStill
 
 _MAX_UNREPORTED = 512
@@ -69,11 +70,10 @@ class BacklogAssembly:
             raise ValueError(f"bounds are too small: {max_objects=}, {max_bytes=}, {remember=}")
         self._max_objects = max_objects
         self._max_bytes = max_bytes
-        self._remember = remember
         self._open: OrderedDict[ObjectKey, _Open] = OrderedDict()
-        self._done: OrderedDict[ObjectKey, int] = OrderedDict()
-        self._refusals: OrderedDict[ObjectKey, int] = OrderedDict()
-        self._unreported: OrderedDict[ObjectKey, int] = OrderedDict()
+        self._done: Newest[ObjectKey, int] = Newest(remember)
+        self._refusals: Newest[ObjectKey, int] = Newest(_MAX_REFUSALS)
+        self._unreported: Newest[ObjectKey, int] = Newest(_MAX_UNREPORTED)
 
     @property
     def size_bytes(self) -> int:
@@ -129,7 +129,6 @@ class BacklogAssembly:
             self._finish(key, entry.total_bytes)
             return
         self._refusals[key] = times
-        _trim(self._refusals, _MAX_REFUSALS)
         self._report(key, 0)
 
     def drop(self, key: ObjectKey) -> None:
@@ -187,7 +186,6 @@ class BacklogAssembly:
         if key[1] != BacklogKind.INFO:  # one that was forgotten here has to come through again
             self._done[key] = total_bytes
             self._done.move_to_end(key)
-            _trim(self._done, self._remember)
         self._report(key, total_bytes)
 
     def _report_busy(self, key: ObjectKey, entry: _Open, total_bytes: int) -> None:
@@ -196,7 +194,6 @@ class BacklogAssembly:
 
     def _report(self, key: ObjectKey, acknowledged_bytes: int) -> None:
         self._unreported[key] = acknowledged_bytes
-        _trim(self._unreported, _MAX_UNREPORTED)
 
 
 def backlog_content(key: ObjectKey, data: bytes, *, edge: str) -> BacklogContent:
@@ -234,8 +231,3 @@ def _check(header: BacklogHeader, payload: bytes) -> None:
         )
     if header.kind == BacklogKind.INFO and (header.number or header.total_bytes > Info.MAX_BYTES):
         raise WireError("a chunk of a session's facts has a number, or is too long")
-
-
-def _trim(ring: OrderedDict[ObjectKey, int], most: int) -> None:
-    while len(ring) > most:
-        ring.popitem(last=False)

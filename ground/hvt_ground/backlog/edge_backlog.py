@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import OrderedDict
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,7 @@ from hvt_common.protocol.messages import (
     ObjectKey,
     WireError,
 )
+from hvt_common.runtime.statistics import Newest
 from hvt_ground.backlog.assembly import BacklogAssembly, backlog_content
 from hvt_ground.backlog.jobs import Destination, StillJob, VideoJob
 from hvt_ground.backlog.recordings import BacklogRecordings
@@ -44,7 +44,7 @@ class EdgeBacklog:
         self._recordings = recordings
         self._assembly = BacklogAssembly()
         self._lock = threading.Lock()
-        self._infos: OrderedDict[int, Info] = OrderedDict()
+        self._infos: Newest[int, Info] = Newest(_MOST_INFOS)
         self.working = 0
         """Received objects that are not delivered yet."""
         self._sessions = 0
@@ -91,7 +91,7 @@ class EdgeBacklog:
     def session_ended(self, info: Info) -> None:
         """The open session is closed: unprocessed objects were not acknowledged, and will come again."""
         with self._lock:
-            self._learn(info)
+            self._infos.put(info.session_id, info)
             dropped = self._assembly.drop_handed()
             self.working = 0
             self._sessions += 1
@@ -113,7 +113,7 @@ class EdgeBacklog:
         is_own = key[0] == own.info.session_id
         if isinstance(content, Info):
             with self._lock:
-                self._learn(content)
+                self._infos.put(content.session_id, content)
                 self._assembly.settle(key, usable=True)
             return
         if is_own:  # it stays open as long as its worker
@@ -142,9 +142,3 @@ class EdgeBacklog:
                 self._assembly.drop(key)
             else:
                 self._assembly.settle(key, usable=usable)
-
-    def _learn(self, info: Info) -> None:
-        self._infos[info.session_id] = info
-        self._infos.move_to_end(info.session_id)
-        if len(self._infos) > _MOST_INFOS:
-            self._infos.popitem(last=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hvt_common.protocol.messages import BacklogUnit, Info
-from hvt_common.runtime.statistics import SequenceWindow
+from hvt_common.runtime.statistics import Newest, SequenceWindow
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image, iou
 from hvt_common.video.hevc import BaseDecoder
@@ -63,9 +63,9 @@ class LateStills:
     """
 
     def __init__(self) -> None:
-        self._stills: OrderedDict[int, list[Refinement]] = OrderedDict()
+        self._stills: Newest[int, list[Refinement]] = Newest(_MOST_LATE)
         """Those of no track yet, by frame."""
-        self._named: OrderedDict[int, Refinement] = OrderedDict()
+        self._named: Newest[int, Refinement] = Newest(_MOST_LATE)
         """Stills by track."""
 
     def take(self, still: Refinement) -> None:
@@ -73,8 +73,6 @@ class LateStills:
         if still.stored and not still.unread and still.track_id is None:
             bare = replace(still, base_crop_bgr=None, still_bgr=None)  # the pictures are shown already
             self._stills.setdefault(still.frame_index, []).append(bare)
-            if len(self._stills) > _MOST_LATE:
-                self._stills.popitem(last=False)
 
     def named(self, overlay: Overlay) -> Iterator[Event]:
         """The overlay with the classes of the stills so far, after the refinements by the stills of its frame."""
@@ -86,8 +84,6 @@ class LateStills:
                 self._named[tracks[best]] = still
                 before = overlay.base_classes[best]
                 yield replace(still, track_id=tracks[best], class_before=before)
-        while len(self._named) > _MOST_LATE:
-            self._named.popitem(last=False)
         stills = [self._named.get(track) for track in tracks]
         if not any(stills):
             yield overlay

@@ -26,11 +26,11 @@ where nothing comes but old numbers that have not been here: somebody else has c
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from hvt_common.protocol.messages import BaseHeader
+from hvt_common.runtime.statistics import Newest
 
 Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
 """What to do with an access unit. skip: fresh, but a unit before it is lost, or no keyframe has come yet;
@@ -106,9 +106,13 @@ class Reassembler:
         self.counters = StreamCounters()
         self._session: int | None = None
         self._adopted_ns: int | None = None
-        self._left: OrderedDict[int | None, int] = OrderedDict()  # session id → the sequence it had reached
-        self._outsiders: OrderedDict[int | None, int] = OrderedDict()  # session id → when it first came
-        self._disowned: OrderedDict[int | None, None] = OrderedDict()
+        self._left: Newest[int | None, int] = Newest(
+            _REMEMBERED_SESSIONS
+        )  # session id → the sequence it had reached
+        self._outsiders: Newest[int | None, int] = Newest(
+            _REMEMBERED_SESSIONS
+        )  # session id → when it first came
+        self._disowned: Newest[int | None, None] = Newest(_REMEMBERED_SESSIONS)
         self._first = 0
         self._next = 0
         self._last_frame = -1
@@ -163,8 +167,6 @@ class Reassembler:
     def disown(self) -> None:
         """The session that was adopted last is nobody's: skip it, and go on with the next keyframe of any other."""
         self._disowned[self._session] = None
-        if len(self._disowned) > _REMEMBERED_SESSIONS:
-            self._disowned.popitem(last=False)
         self._held.clear()
         self._outsiders.clear()
         self._adopted_ns, self._synced, self._unshown = None, False, True
@@ -260,8 +262,6 @@ class Reassembler:
             return False
         since_ns = self._outsiders.setdefault(session_id, now_ns)
         self._outsiders.move_to_end(session_id)
-        if len(self._outsiders) > _REMEMBERED_SESSIONS:
-            self._outsiders.popitem(last=False)
         return self._progress_ns - since_ns > DUPLICATE_AFTER_NS
 
     def _accept_outsider(
@@ -296,8 +296,6 @@ class Reassembler:
         if self._adopted_ns is not None and header.session_id != self._session:
             self._left[self._session] = self._next
             self._left.move_to_end(self._session)
-            if len(self._left) > _REMEMBERED_SESSIONS:
-                self._left.popitem(last=False)
         self._left.pop(header.session_id, None)
         self._session, self._adopted_ns = header.session_id, now_ns
         self._outsiders.clear()

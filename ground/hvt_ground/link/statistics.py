@@ -25,7 +25,7 @@ from hvt_common.protocol.messages import (
     Status,
     TrackStep,
 )
-from hvt_common.runtime.statistics import LatencyStats, SequenceWindow
+from hvt_common.runtime.statistics import LatencyStats, Newest, SequenceWindow
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, MessageTiming, Traffic
@@ -73,7 +73,7 @@ class ReceptionStatistics:
         self._lockstep = lockstep
         self._base_sequence = self._still_sequence = -1
         self._from_start = False
-        self._missing: dict[int, int] = {}
+        self._missing: Newest[int, int] = Newest(MAX_MISSING_STILLS)
         """Sequence → when it was first missed."""
         self._arrived_ns = 0
         self._sizes: deque[tuple[int, int]] = deque()
@@ -137,12 +137,14 @@ class ReceptionStatistics:
             self._delays_ms.clear()
             self._news = False
             self._reported_ns = now_ns
+            for one in [one for one, at_ns in self._missing.items() if now_ns - at_ns > _MISSED_NS]:
+                del self._missing[one]
             held_us = max(0, now_ns - self._arrived_ns) // 1000 if self._base_sequence >= 0 else 0
             return LinkMeasurement(
                 base_sequence=self._base_sequence,
                 base_held_us=min(held_us, _HELD_US),
                 still_sequence=self._still_sequence,
-                missing_stills=self._missing_now(now_ns),
+                missing_stills=tuple(self._missing),
                 delay_p50_ms=statistics.median(delays) if delays else None,
             )
 
@@ -150,13 +152,8 @@ class ReceptionStatistics:
         # Of many, the newest count; what was sent before this ground was there is not missed.
         if self._still_sequence < 0 and not self._from_start:
             return
-        self._missing |= dict.fromkeys(range(max(first, end - MAX_MISSING_STILLS), end), at_ns)
-        while len(self._missing) > MAX_MISSING_STILLS:
-            del self._missing[next(iter(self._missing))]
-
-    def _missing_now(self, now_ns: int) -> tuple[int, ...]:
-        self._missing = {one: at_ns for one, at_ns in self._missing.items() if now_ns - at_ns <= _MISSED_NS}
-        return tuple(self._missing)
+        for one in range(max(first, end - MAX_MISSING_STILLS), end):
+            self._missing[one] = at_ns
 
     def _note(self, size_bytes: int, arrived_ns: int) -> None:
         self._sizes.append((arrived_ns, size_bytes))
@@ -175,7 +172,7 @@ class StillSequenceWindow:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._seen = SequenceWindow()
-        self._sent_ns: dict[int, int] = {}
+        self._sent_ns: Newest[int, int] = Newest(_MOST_SENT)
         """Sequence → when a still was sent of which no second copy has come."""
 
     def is_new(self, sequence: int, *, send_ns: int) -> bool:
@@ -184,8 +181,6 @@ class StillSequenceWindow:
             if not self._seen.add([sequence]):
                 return False
             self._sent_ns[sequence] = send_ns
-            while len(self._sent_ns) > _MOST_SENT:
-                del self._sent_ns[next(iter(self._sent_ns))]
             return True
 
     def is_copy(self, sequence: int, *, send_ns: int) -> bool:

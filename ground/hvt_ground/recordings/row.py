@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
+from hvt_common.runtime.statistics import Newest
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 
 _MOST_REMEMBERED = 4096
@@ -52,8 +51,8 @@ class FileAccount:
         self.end_ns: int | None = None
         self.stills = 0
         self.classes: dict[str, int] = {}
-        self._tracks: OrderedDict[tuple[int, str], None] = OrderedDict()
-        self._stills: OrderedDict[int, None] = OrderedDict()
+        self._tracks: Newest[tuple[int, str], None] = Newest(_MOST_REMEMBERED)
+        self._stills: Newest[int, None] = Newest(_MOST_REMEMBERED)
 
     def note(self, event: Event) -> None:
         """Count an event."""
@@ -78,19 +77,9 @@ class FileAccount:
 
     def track(self, track_id: int, name: str) -> None:
         """A track is shown as of that class."""
-        if _is_new(self._tracks, (track_id, name)):
+        if self._tracks.put((track_id, name), None):
             self.classes[name] = self.classes.get(name, 0) + 1
 
     def still(self, sequence: int) -> None:
         """A still of that number is in the file, for one object or several."""
-        self.stills += _is_new(self._stills, sequence)
-
-
-def _is_new(known: OrderedDict[Any, None], key: object) -> bool:
-    if key in known:
-        known.move_to_end(key)
-        return False
-    known[key] = None
-    if len(known) > _MOST_REMEMBERED:
-        known.popitem(last=False)
-    return True
+        self.stills += self._stills.put(sequence, None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntFlag
@@ -24,6 +23,7 @@ from hvt_common.protocol.messages.fields import (
     Word,
     wire_field,
 )
+from hvt_common.runtime.statistics import Newest
 
 MAX_ALSO = 15
 """How many further tracks one still may name."""
@@ -236,15 +236,12 @@ class CaptureTimes:
     """When the frames of ``base`` were captured: the header of a still leaves that out where its frame was sent."""
 
     def __init__(self) -> None:
-        self._known: OrderedDict[tuple[int, int], int] = OrderedDict()
+        self._known: Newest[tuple[int, int], int] = Newest(_MOST_CAPTURES)
         """Session and frame → capture time, the newest."""
 
     def note(self, header: BaseHeader) -> None:
         """A frame came, or was sent."""
-        key = header.session_id, header.frame_index
-        self._known[key] = header.capture_ns
-        if len(self._known) > _MOST_CAPTURES:
-            self._known.popitem(last=False)
+        self._known[header.session_id, header.frame_index] = header.capture_ns
 
     def knows(self, session_id: int, frame_index: int) -> bool:
         """Whether a still of this frame need not say it."""

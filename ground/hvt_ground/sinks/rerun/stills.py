@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from hvt_common.protocol.messages import RoiHeader
+from hvt_common.runtime.statistics import Newest
 from hvt_common.values import Image
 from hvt_ground.events import Overlay, Refinement
 from hvt_ground.sinks.palette import AMBER, GREY, class_colour
@@ -52,7 +52,7 @@ class StillRows:
         self._patches = Patches()
         self._pair_bytes = 0
         """Bytes of pairs beyond those that came over the link."""
-        self._pictured: OrderedDict[int, None] = OrderedDict()
+        self._pictured: Newest[int, None] = Newest(_REMEMBERED_STILLS)
 
     def refinement(self, refinement: Refinement) -> list[TableRow]:
         """The rows of a still; its pictures are written once, however many objects it shows."""
@@ -62,7 +62,7 @@ class StillRows:
         if refinement.doubted:
             colour = AMBER
         rows = [TableRow(names.EVENTS, "text", LogText(text, "INFO", colour), len(text))]
-        still = still_picture(refinement) if self._is_new(refinement.still_sequence) else None
+        still = still_picture(refinement) if self._pictured.put(refinement.still_sequence, None) else None
         if still is None:
             return rows
         self._size_limit.received_bytes += len(refinement.still)
@@ -89,14 +89,6 @@ class StillRows:
             elif self._size_limit.has(_MOVE_BYTES, ratio=PATCH_RATIO):
                 rows.append(TableRow(path, "place", moved.place, _MOVE_BYTES))
         return rows
-
-    def _is_new(self, still_sequence: int) -> bool:
-        if still_sequence in self._pictured:
-            return False
-        self._pictured[still_sequence] = None
-        if len(self._pictured) > _REMEMBERED_STILLS:
-            self._pictured.popitem(last=False)
-        return True
 
     def _pair(
         self, refinement: Refinement, base: Coded | None, still: Coded, *, changed: bool
