@@ -73,34 +73,25 @@ SIZE = SettingType("WxH", parse_size, lambda size: f"{size[0]}x{size[1]}")
 
 def integer(low: int, high: int, *, unit: str = "") -> SettingType:
     """A whole number within ``low … high``."""
-
-    def parse(text: str, *, name: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = low - 1
-        if not low <= value <= high:
-            raise UserError(
-                f"{name} {text!r} is not accepted: give a whole number from {low} to {high}{unit}"
-            )
-        return value
-
-    return SettingType("N", parse, int)
+    return _within(low, high, int, "N", f"a whole number from {low} to {high}{unit}")
 
 
 def number(low: float, high: float, *, unit: str = "") -> SettingType:
     """A finite number within ``low … high``."""
+    return _within(low, high, float, "X", f"a number from {low:g} to {high:g}{unit}")
 
+
+def _within(low: float, high: float, kind: type[int | float], metavar: str, accepted: str) -> SettingType:
     def parse(text: str, *, name: str) -> float:
         try:
-            value = float(text)
+            value: float = kind(text)
         except ValueError:
             value = float("nan")
         if not low <= value <= high:
-            raise UserError(f"{name} {text!r} is not accepted: give a number from {low:g} to {high:g}{unit}")
+            raise UserError(f"{name} {text!r} is not accepted: give {accepted}")
         return value
 
-    return SettingType("X", parse, float)
+    return SettingType(metavar, parse, kind)
 
 
 def choice(*accepted: str, elsewhere: Mapping[str, str] | None = None) -> SettingType:

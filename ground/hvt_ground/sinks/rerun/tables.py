@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import chain, pairwise
+from itertools import chain
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -93,41 +94,33 @@ class Table:
 
     path: str
     columns: str
-    _frames: list[int] = field(default_factory=list)
-    _capture_ns: list[int] = field(default_factory=list)
-    _values: list[Any] = field(default_factory=list)
+    _rows: list[tuple[int, int, Any]] = field(default_factory=list)
 
     def add(self, frame: int, capture_ns: int, value: Any) -> Chunk:
         """Gather a row; returns it as a chunk of its own, for the append log.
 
         Times come from the wire and are reckoned on from there: what no timestamp can hold is held at its end.
         """
-        self._frames.append(frame)
-        self._capture_ns.append(min(max(capture_ns, 0), _LATEST_NS))
-        self._values.append(value)
-        return self._chunk(slice(-1, None))
+        row = frame, min(max(capture_ns, 0), _LATEST_NS), value
+        self._rows.append(row)
+        return self._chunk([row])
 
     def __bool__(self) -> bool:
         """Whether there are rows since the last `take`."""
-        return bool(self._values)
+        return bool(self._rows)
 
     def take(self) -> Chunk:
-        """All rows since the last call as one chunk; there must be some."""
-        if any(one > other for one, other in pairwise(self._frames)):  # rows of a backlog come late
-            order = sorted(range(len(self._frames)), key=self._frames.__getitem__)
-            self._frames = [self._frames[place] for place in order]
-            self._capture_ns = [self._capture_ns[place] for place in order]
-            self._values = [self._values[place] for place in order]
-        chunk = self._chunk(slice(None))
-        self._frames, self._capture_ns, self._values = [], [], []
-        return chunk
+        """All rows since the last call as one chunk; there must be some. Those of a backlog have come late."""
+        rows, self._rows = sorted(self._rows, key=itemgetter(0)), []
+        return self._chunk(rows)
 
-    def _chunk(self, rows: slice) -> Chunk:
+    def _chunk(self, rows: Sequence[tuple[int, int, Any]]) -> Chunk:
+        frames, capture_ns, values = zip(*rows, strict=True)
         indexes = [
-            rr.TimeColumn("frame", sequence=self._frames[rows]),
-            rr.TimeColumn("capture_time", timestamp=np.array(self._capture_ns[rows], "datetime64[ns]")),
+            rr.TimeColumn("frame", sequence=frames),
+            rr.TimeColumn("capture_time", timestamp=np.array(capture_ns, "datetime64[ns]")),
         ]
-        return Chunk.from_columns(self.path, indexes, COLUMNS[self.columns](self._values[rows]))
+        return Chunk.from_columns(self.path, indexes, COLUMNS[self.columns](values))
 
 
 class SizeLimit:
