@@ -23,7 +23,7 @@ _WIDTH = 100
 _LINE_EVERY_S = 60
 _FIRST_LINE_S = 1.0
 """What cannot be done at all says so sooner."""
-_SOON_S = 30.0
+_SOON_S = 10.0
 """Nearer to the end seconds are not told: the last runs, which end as they will, are all of it."""
 _REMEMBERED = 64
 _LEAST = 4
@@ -165,7 +165,9 @@ class RunProgress:
         words = [f"{failed} failed"] if failed else []
         if left_s:
             amount = (
-                f"about {timedelta(seconds=round(left_s))}" if left_s >= _SOON_S else "less than a minute"
+                f"about {timedelta(seconds=round(left_s))}"
+                if left_s >= _SOON_S
+                else "less than half a minute"
             )
             words.append(f"{amount} left")
         return ", ".join(words)

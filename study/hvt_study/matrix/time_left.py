@@ -20,25 +20,25 @@ _NEWEST = 0.4
 
 
 class TimeLeft(Generic[_Run]):
-    """``runs``, in the order in which so many workers take them, with how many flights each is expected to take.
+    """``runs``, in the order in which so many workers take them, with how much work each is, 0 where others do it.
 
-    ``kinds`` are names of runs of which a flight takes about the same, the narrowest first: the first of which
+    ``kinds`` are names of runs of which the same work takes about as long, the narrowest first: the first of which
     something is known counts. The first run of each worker says nothing: what is done once, such as reading the clip,
     is done in it.
     """
 
     def __init__(
-        self, runs: Mapping[_Run, int], *, kinds: Mapping[_Run, tuple[str, ...]], workers: int, now_s: float
+        self, runs: Mapping[_Run, float], *, kinds: Mapping[_Run, tuple[str, ...]], workers: int, now_s: float
     ) -> None:
-        self._flights, self._kinds = dict(runs), kinds
+        self._work, self._kinds = dict(runs), kinds
         self._pending = list(runs)
         self._began: dict[_Run, tuple[float, int]] = {}
         """When, and how many flights were done by then."""
         for _ in range(workers):
             self._begin(now_s, 0)
         self._first = set(self._began)
-        self._flight_s: dict[str, float] = {}
-        """What a flight of a kind takes now."""
+        self._unit_s: dict[str, float] = {}
+        """What one of work takes now, by kind."""
         self._ended: Counter[str] = Counter()
         """Runs of a kind that count."""
 
@@ -47,20 +47,20 @@ class TimeLeft(Generic[_Run]):
         if run in self._pending:  # a worker took it out of turn
             self._pending.remove(run)
         began_s, flown_then = self._began.pop(run, (now_s, flown))
-        flights = self._flights.pop(run)
-        if flights and flown > flown_then and run not in self._first:  # else it was in the cache
-            self._learn(self._kinds[run], (now_s - began_s) / flights)
+        work = self._work.pop(run)
+        if work and flown > flown_then and run not in self._first:  # else it was in the cache
+            self._learn(self._kinds[run], (now_s - began_s) / work)
         self._begin(now_s, flown)
 
     def left_s(self, *, now_s: float) -> float | None:
         """Until the last has ended; None while of some kind nothing is known."""
         expected_s: dict[_Run, float] = {}
-        for run, flights in self._flights.items():
-            known_s = (self._flight_s[kind] for kind in self._kinds[run] if kind in self._flight_s)
-            flight_s = next(known_s, None) if flights else 0.0
-            if flight_s is None:
+        for run, work in self._work.items():
+            known_s = (self._unit_s[kind] for kind in self._kinds[run] if kind in self._unit_s)
+            unit_s = next(known_s, None) if work else 0.0
+            if unit_s is None:
                 return None
-            expected_s[run] = flight_s * flights
+            expected_s[run] = unit_s * work
         free_s = []
         for run, (began_s, _) in self._began.items():
             took_s = now_s - began_s
@@ -71,15 +71,15 @@ class TimeLeft(Generic[_Run]):
             heapq.heapreplace(free_s, free_s[0] + expected_s[run])
         return max(free_s, default=0.0)
 
-    def _learn(self, kinds: tuple[str, ...], flight_s: float) -> None:
-        known = dict(self._flight_s)
-        off = flight_s / known.get(kinds[0], flight_s)
+    def _learn(self, kinds: tuple[str, ...], unit_s: float) -> None:
+        known = dict(self._unit_s)
+        off = unit_s / known.get(kinds[0], unit_s)
         self._ended.update(kinds)
         for one in known.keys() - set(kinds):
-            self._flight_s[one] *= off**_NEWEST
+            self._unit_s[one] *= off**_NEWEST
         for one in kinds:
             newest = max(_NEWEST, 1 / self._ended[one])
-            self._flight_s[one] = known.get(one, flight_s) ** (1 - newest) * flight_s**newest
+            self._unit_s[one] = known.get(one, unit_s) ** (1 - newest) * unit_s**newest
 
     def _begin(self, now_s: float, flown: int) -> None:
         if self._pending:
