@@ -413,14 +413,14 @@ class RollingBudget:
         reserved = reserve * settings.still_bps * settings.window_ns / 8 / SECOND_NS
         return max(0, int(free - reserved))
 
-    def keyframe_fits(self, keyframe_bytes: int, *, now_ns: int) -> bool:
+    def keyframe_fits(self, keyframe_bytes: int, *, now_ns: int, awaited: bool = False) -> bool:
         """Tell whether a keyframe of this many line bytes, sent now, leaves every window within the total.
 
-        Where no base frame has gone out for a window, none but the keyframe is expected.
+        Where it is ``awaited``, or no base frame has gone out for a window, none but the keyframe is expected.
         """
         last_ns = self._last_base_ns
-        silent = last_ns is None or now_ns - last_ns > self._settings.window_ns
-        free = self._unspent(now_ns)[0][0] if silent else self._window_allowance(now_ns)
+        alone = awaited or last_ns is None or now_ns - last_ns > self._settings.window_ns
+        free = self._unspent(now_ns)[0][0] if alone else self._window_allowance(now_ns)
         return bool(free + self.base_step_bytes >= keyframe_bytes)
 
     def _record(self, line_bytes: int, now_ns: int) -> None:

@@ -420,10 +420,10 @@ class Transmitter:
         with self._lock:
             return 8 * SECOND_NS * line_bytes // self.budget.total_bps
 
-    def keyframe_fits(self, line_bytes: int, *, now_ns: int) -> bool:
-        """Tell whether a keyframe of so many line bytes leaves the budget whole."""
+    def keyframe_fits(self, line_bytes: int, *, now_ns: int, awaited: bool = False) -> bool:
+        """Tell whether a keyframe of so many line bytes leaves the budget whole (`RollingBudget.keyframe_fits`)."""
         with self._lock:
-            return self.budget.keyframe_fits(line_bytes, now_ns=now_ns)
+            return self.budget.keyframe_fits(line_bytes, now_ns=now_ns, awaited=awaited)
 
     def outcome(self, outcome: str, reason: str) -> None:
         """Note what became of a candidate: ``sent``, ``deferred`` or ``dropped``, and why."""

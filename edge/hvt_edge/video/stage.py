@@ -41,7 +41,7 @@ class FrameInputs:
     keyframe_due: bool
     """The plan wants its keyframe now: one is due, and it fits the budget's window or has waited long enough."""
     admitted: bool
-    """Pacer and budget have room for a frame now."""
+    """Pacer and budget have room for a frame now, and no keyframe that a ground waits for needs it."""
     yielded: bool = False
     """Its bytes go to a still that a ground requested."""
     link: State = State.LIVE
@@ -180,7 +180,8 @@ class BaseStage:
     def decide(self, frame: Frame, *, now_ns: int) -> FrameDecision:
         """Decide on this source frame; once for each, in order."""
         keyframe_bytes = self.keyframe_bytes(self._keyframe_bytes)
-        fits = self.transmitter.keyframe_fits(keyframe_bytes, now_ns=now_ns)
+        awaited = self.keyframes.awaited
+        fits = self.transmitter.keyframe_fits(keyframe_bytes, now_ns=now_ns, awaited=awaited)
         if not self.keyframes.requested:  # one of the schedule: a requested still goes before it
             fits = fits and not self.transmitter.yielding(now_ns)
         backlog, frame_bytes = self.backlog, self.transmitter.frame_bytes
@@ -191,7 +192,9 @@ class BaseStage:
         ):  # only at another rate is there one that can go
             keyframe_due = keyframe_due or not self.transmitter.window_holds(frame_bytes)
         line_bytes = keyframe_bytes if keyframe_due else frame_bytes
-        due, admitted = self._frame_skip.codes(frame.index), self.admits(now_ns, line_bytes, self._coding_ns)
+        makes_room = awaited and link is State.LIVE and not keyframe_due
+        due = self._frame_skip.codes(frame.index)
+        admitted = not makes_room and self.admits(now_ns, line_bytes, self._coding_ns)
         coded = due and admitted and not keyframe_due and link is State.LIVE
         decision = decide(
             FrameInputs(

@@ -14,7 +14,7 @@ from hvt_archive.local_copy import LocalCopy
 from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failures
-from hvt_common.values import Frame
+from hvt_common.values import AccessUnit, Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, least_budget_bps
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
@@ -274,3 +274,32 @@ def test_the_least_budget_that_is_accepted_holds_in_every_second_to_the_byte(siz
             stage.send(unit, decision, now_ns=frame.capture_ns)
     assert ledger.worst_window_bps.total <= total_bps
     assert len(kept.units) > 0.9 * len(pictures), "and there is a picture"
+
+
+class SizedEncoder:
+    """As many bytes as it is told to."""
+
+    mean_qp = 30.0
+
+    def encode(self, frame: Frame, *, keyframe: bool, regions: list[object]) -> AccessUnit:
+        """A keyframe is three frames large."""
+        assert not regions
+        return AccessUnit(frame.index, frame.capture_ns, bytes(20_000 if keyframe else 6_200), keyframe)
+
+
+def test_a_keyframe_that_a_ground_waits_for_has_the_room_of_the_frames_before_it():
+    """Video that fills its budget would keep it waiting for 0.6 s, with frames that the ground cannot show."""
+    keyframes, keyframe_at, picture = Keyframes(KeyframeSettings(interval_ns=0)), [], np.zeros((2, 2, 3))
+    transmitter = make_transmitter(Puts(), budget=(800_000, 790_000), lockstep=True)
+    stage = make_base_stage(SizedEncoder(), transmitter, keyframes=keyframes, first_keyframe_bytes=20_500)
+    for index in range(60):
+        now_ns = START_NS + index * SECOND_NS // 15
+        if index == 30:
+            assert keyframes.request(now_ns) is None
+        frame = Frame(index, now_ns, picture, picture)
+        decision = stage.decide(frame, now_ns=now_ns)
+        unit = stage.encode(frame, decision, now_ns=now_ns)
+        if unit is not None and stage.send(unit, decision, now_ns=now_ns) and unit.keyframe:
+            keyframe_at.append(index)
+    assert keyframe_at[0] == 0
+    assert keyframe_at[1] <= 33
