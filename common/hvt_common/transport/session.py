@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import zenoh
@@ -162,13 +163,29 @@ def query(
     question: bytes,
     timeout_s: float,
 ) -> bytes | None:
-    """The first answer of a queryable channel; None when there is none in time, after ``timeout_s``."""
-    replies = session.get(keys.key(channel), payload=question, timeout=timeout_s, **_query_options(channel))
-    for reply in replies:
-        if reply.ok is not None:
-            data: bytes = reply.ok.payload.to_bytes()
-            return data
-    return None
+    """The first answer of a queryable channel; None when there is none in time, after ``timeout_s``.
+
+    Over UDP a question or its answer may be lost: after half of the time it is asked once more, so what it asks for
+    must be safe to ask for twice.
+    """
+    found: SimpleQueue[bytes | None] = SimpleQueue()
+
+    def ask(within_s: float) -> None:
+        query_later(
+            session,
+            channel,
+            keys=keys,
+            question=question,
+            timeout_s=within_s,
+            on_answer=found.put,
+            on_end=lambda: found.put(None),
+        )
+
+    ask(timeout_s)
+    with suppress(Empty):
+        return found.get(timeout=timeout_s / 2)
+    ask(timeout_s / 2)
+    return found.get() or found.get()
 
 
 def query_later(

@@ -32,8 +32,10 @@ _log = logging.getLogger(__name__)
 _PUBLISHED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.POSE, Channel.BACKLOG, Channel.STATUS)
 _MOST_PER_S = 1000
 """Requests, or reports: a ground sends some ten a second."""
-_AGAIN_NS = {Channel.INFO: (2 * SECOND_NS,) * 2, Channel.FEEDBACK: (2 * SECOND_NS, 64 * SECOND_NS)}
-"""First and longest pause before it is declared anew: a ground asks within a fraction of it; some never report."""
+_AGAIN_NS = {Channel.INFO: (2 * SECOND_NS,) * 2}
+_AGAIN_NS |= dict.fromkeys((Channel.CONTROL, Channel.FEEDBACK), (2 * SECOND_NS, 64 * SECOND_NS))
+"""First and longest pause before it is declared anew: a ground asks for info within a fraction of it; some never
+command, some never report."""
 _NEEDED = (Channel.BASE, Channel.ROI, Channel.STATUS)
 """Channels that a ground subscribes to in any case; one that only shows the video may leave out the others."""
 
@@ -187,7 +189,7 @@ class EdgeListener:
         """Declare anew what a ground that is ``there`` does not use; call it about once a second.
 
         A declaration comes once: where UDP has lost it, the ground could ask nobody and show nothing of this flight,
-        or its reports would steer nothing. With ``info`` goes ``control``, which nobody need ask.
+        command nothing, or its reports would steer nothing.
         """
         now_ns = self.clock()
         if not there:
@@ -199,8 +201,6 @@ class EdgeListener:
                 continue
             if pause.pause_ns:
                 self._declare(channel)
-                if channel is Channel.INFO:
-                    self._declare(Channel.CONTROL)
             pause.failed(now_ns)
 
     def _declare(self, channel: Channel) -> None:
@@ -224,6 +224,7 @@ class EdgeListener:
         return self._answered(Channel.INFO, lambda: self.answers.info(self.clock()))
 
     def _on_control(self, query: bytes) -> bytes | None:
+        self._used.add(Channel.CONTROL)
         self._watch(Channel.CONTROL)
         try:
             request = ControlRequest.parse(query)

@@ -27,7 +27,7 @@ from hvt_edge.perception.crop import MIN_SIDE_PX, crop_box
 from hvt_edge.perception.frame_ring import FrameRing, RingFrame
 from hvt_edge.stills.crop_job import Alternative, CropJob, crop_of, inner_box, size_parameters
 from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.outbox import Outbox, OutboxStill
+from hvt_edge.stills.outbox import Outbox, OutboxStill, StillState
 from hvt_edge.stills.policy.base import CostModel
 from hvt_edge.stills.requested_coding import Capacity, CodedRequest, NothingCloser, code_requested
 
@@ -167,6 +167,8 @@ _PROMPT_SHARE = 0.6
 _MARGIN_BYTES = 64
 """By which a header may be longer than is estimated."""
 _MAX_PENDING = 4
+_AGAIN_NS = 2 * SECOND_NS
+"""For so long a ground waits for an answer, and asks again meanwhile."""
 _TRACKED_NS = 30_000_000_000
 """For so long after a request for tracks they are followed, where nothing else needs them."""
 _OUTCOMES = 64
@@ -188,6 +190,14 @@ class OnDemandStill(OutboxStill):
     """Another was pending when it was requested."""
     link_busy: bool = False
     """The budget had room for it, and the link had not, when that was last tried."""
+    asked: OnDemandRequest = OnDemandRequest()
+    frame_index: int = -1
+    capture_ns: int = 0
+
+    def repeats(self, request: OnDemandRequest, capture_ns: int) -> bool:
+        """Whether a request, for a frame of that time, is this one once more."""
+        near = abs(capture_ns - self.capture_ns) <= _AGAIN_NS
+        return request == self.asked and near and self.state is StillState.PENDING
 
 
 @dataclass(eq=False)
@@ -215,6 +225,7 @@ class OnDemand:
         self._outcomes: OrderedDict[int, tuple[str, str]] = OrderedDict()
         """Number → (why it was given up, what else is to be said of it), both empty at first; of the last ones."""
         self._next_number = 0
+        self._last: OnDemandStill | None = None
         self._tracks_requested_ns: int | None = None
         """Capture time of the newest frame then."""
         self._tracked = True
@@ -229,13 +240,20 @@ class OnDemand:
     # From any thread
 
     def request(self, request: OnDemandRequest) -> tuple[int, int]:
-        """Crop a still; return its number and frame index. Raises `RefusedError` with the reason."""
+        """Crop a still; return its number and frame index. Raises `RefusedError` with the reason.
+
+        The same request once more, while its still is pending, is that one: its answer may have been lost.
+        """
         if self._ended:
             raise RefusedError(_ENDED)
         if self.offline():
             raise RefusedError(_OFFLINE)
-        self._check_queue()
         frame = frame_for(request, self.ring)
+        with self._lock:
+            last = self._last
+            if last is not None and last.repeats(request, frame.capture_ns):
+                return last.number, last.frame_index
+        self._check_queue()
         if request.track_id is not None:
             self._want_tracks(frame.capture_ns)
         job = crop_job_for(request, frame, maker=self._maker, view=self.view, class_names=self.class_names)
@@ -246,10 +264,17 @@ class OnDemand:
             parameters = {**job.header.parameters, REQUEST_PARAMETER: number}
             job = replace(job, header=replace(job.header, parameters=parameters))
             pending = OnDemandStill(
-                job, None, float("inf"), None, number=number, quality_pct=quality_pct, base=frame.base
+                *(job, None, float("inf"), None),
+                number=number,
+                quality_pct=quality_pct,
+                base=frame.base,
+                asked=request,
+                frame_index=frame.frame_index,
+                capture_ns=frame.capture_ns,
             )
             pending.behind = self.outbox.on_demand is not None
             self.outbox.offer_on_demand(pending)
+            self._last = pending
             self._next_number += 1
             self._note(number)
         return number, frame.frame_index

@@ -498,3 +498,24 @@ def test_zenoh_still_calls_the_encodings_as_the_ledger_does():
     """The overhead formula gives 1 byte to encodings that Zenoh has a number for."""
     known = {str(value) for value in vars(zenoh.Encoding).values() if isinstance(value, zenoh.Encoding)}
     assert known >= STANDARD_ENCODINGS
+
+
+def test_a_question_that_is_lost_is_asked_once_more(monkeypatch):
+    """Over UDP one lost datagram would be told as a right that is missing, or as an edge that has gone."""
+    asked_s: list[float] = []
+    there = True
+
+    def later(*_args: object, timeout_s: float, on_answer, on_end, **_named: object) -> None:
+        asked_s.append(timeout_s)
+        if not there:
+            on_end()
+        elif len(asked_s) == 2:
+            on_answer(b"yes")
+
+    monkeypatch.setattr("hvt_common.transport.session.query_later", later)
+    told = {"keys": EdgeKeys("uav-1"), "question": b"", "timeout_s": 0.02}
+    assert query(None, Channel.CONTROL, **told) == b"yes"
+    assert asked_s == [0.02, 0.01]
+    there = False
+    assert query(None, Channel.CONTROL, **told) is None
+    assert len(asked_s) == 3, "nobody is there: who waits is told at once"

@@ -143,16 +143,28 @@ def test_too_many_are_refused():
     """A loop at a ground would fill the drone's memory."""
     rig = Rig("150kbps", share=0.9)
     rig.run(30)
-    answers = [rig.ask("still", quality=95) for _ in range(6)]
+    answers = [rig.ask("still", quality=90 + number) for number in range(6)]
     assert [one.accepted for one in answers] == [True] * 4 + [False] * 2
     assert "4 requested stills are pending already" in answers[-1].reason
+
+
+def test_a_request_whose_answer_was_lost_is_the_same_still():
+    """Over UDP each lost answer would cost the link a second still, and the video its frames."""
+    rig = Rig("150kbps", share=0.9)
+    rig.run(30)
+    first = rig.ask("still", track=5)
+    assert rig.ask("still", track=5) == first
+    assert rig.ask("still", track=5, quality=70).still_request == first.still_request + 1
+    rig.run(150)
+    assert len(rig.asked()) == 2
+    assert rig.ask("still", track=5).still_request == first.still_request + 2, "another look"
 
 
 def test_whoever_waits_can_ask_what_became_of_it():
     """A still that was given up would be waited for until the timeout, and nobody would know why."""
     rig = Rig("150kbps", share=0.9)
     rig.run(30)
-    first, second = rig.ask("still", track=5), rig.ask("still", track=5)
+    first, second = rig.ask("still", track=5), rig.ask("still")
     rig.run(4)
     assert rig.ask("still-outcome", ask=first.still_request).accepted, "sent or waiting"
     rig.chooser.close()
