@@ -42,6 +42,8 @@ BASE_ATTACHMENT_BYTES = 48
 """The largest `BaseHeader`."""
 _MEMORY_WINDOWS = 5
 """How many windows of the base's recent behaviour the forecast looks back on."""
+_LEFT_WINDOWS = 3
+"""Windows in which a camera that is passed through leaves a requested still its room, if ever."""
 _FORECASTS = 30
 """At how many moments of the coming window the forecast is made, at most: what it costs stays bounded."""
 _ROUNDING = 0.01
@@ -177,6 +179,8 @@ class RollingBudget:
         self._base_events: deque[tuple[int, int]] = deque()
         self._lent: deque[tuple[int, float]] = deque()
         """(time, bytes that a still took of what the base had left)."""
+        self._left: deque[tuple[int, float]] = deque()
+        """(time, room for a requested still) after each base frame of late, where the base does not yield."""
         self._query_ns: int | None = None
         self._last_ns = 0
         self._last_base_ns: int | None = None
@@ -225,6 +229,7 @@ class RollingBudget:
         self._refill(now_ns)
         self._settings = replace(settings, total_bps=total_bps)
         self._total = total_bps * settings.window_ns / 8 / SECOND_NS
+        self._left.clear()
         self._events = [(at_ns, self._counted(size, then_bps)) for at_ns, size, then_bps in self._sent]
         if (base_bps, fps) != (settings.base_bps, settings.fps):
             self.set_base(base_bps, fps, now_ns=now_ns)
@@ -264,6 +269,8 @@ class RollingBudget:
         self._last_base_ns = max(self._last_base_ns or now_ns, now_ns)
         self._base_steps.append(round(self.base_step_bytes) if keyframe else line_bytes)
         self._burst = self._recent_bursts()
+        if not self._settings.yields:
+            self._note_left(now_ns)
 
     def end_base(self) -> None:
         """The source has given its last frame: from now on no room is kept for any."""
@@ -354,21 +361,35 @@ class RollingBudget:
     @property
     def most_requested_bytes(self) -> int:
         """The most line bytes that `requested_allowance` gives at the present rates."""
-        if self._settings.yields:
-            return int(_MOST_SHARE * self._loan_bytes)
-        return max(0, int(min(_MOST_SHARE * self._loan_bytes, self._total - self._burst[-1] - self._spare)))
+        most = _MOST_SHARE * self._loan_bytes
+        if not self._settings.yields:  # where the camera takes all there is, none may ever go
+            most = min(most, self._total - self._burst[-1] - self._spare, self._most_left())
+        return max(0, int(most))
 
     def requested_allowance(self, now_ns: int) -> int:
         """Return how many line bytes a requested still may take now: all that is free in the window that ends now.
 
         The base frames to come wait for their room, or are left out (`leaves_out`).
         """
+        free = self._requested_room(now_ns)
+        return max(0, int(min(free, self._loan.left_bytes(self._loan_bytes, now_ns=now_ns))))
+
+    def _requested_room(self, now_ns: int) -> float:
         self._note_query(now_ns)
         spent = sum(size for at_ns, size in self._events if at_ns > now_ns - self._settings.window_ns)
         free = self._total - spent - self._spare
-        if not self._settings.yields:
-            free = min(free, self._window_allowance(now_ns))
-        return max(0, int(min(free, self._loan.left_bytes(self._loan_bytes, now_ns=now_ns))))
+        return free if self._settings.yields else min(free, self._window_allowance(now_ns))
+
+    def _note_left(self, now_ns: int) -> None:
+        # At new rates the base's habits are known after a window.
+        if now_ns >= self._old_peak[0]:
+            self._left.append((now_ns, self._requested_room(now_ns)))
+            while self._left[0][0] <= now_ns - _LEFT_WINDOWS * self._settings.window_ns:
+                self._left.popleft()
+
+    def _most_left(self) -> float:
+        # The most room that the camera has left a requested still of late: a still that needs more never goes.
+        return max((left for _, left in self._left), default=math.inf)
 
     def record_requested(self, line_bytes: int, *, now_ns: int) -> None:
         """Count a requested still, admitted by `requested_allowance`: what stills have not saved the base yields."""

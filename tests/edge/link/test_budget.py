@@ -445,3 +445,27 @@ def test_metadata_comes_out_of_what_stills_have():
             sent += 300
     assert sent * 8 / 20 == pytest.approx(30_000, rel=0.15)
     assert run.budget.most_still_bytes == 30_000 // 8
+
+
+@pytest.mark.parametrize("share", [0.75, 0.9])
+@pytest.mark.parametrize("cut_bps", [800_000, 600_000, 500_000, 300_000, 200_000, 100_000])
+def test_where_a_camera_takes_all_that_a_budget_has_a_requested_still_is_refused_at_once(cut_bps, share):
+    """After the budget was cut who asked would wait ten seconds for room that never comes."""
+    settings = BudgetSettings(800_000, round(800_000 * share), fps=25, yields=False)
+    budget = RollingBudget(settings)
+    sent, room = False, 0
+    for index in range(300):
+        now_ns, keyframe = START_NS + index * SECOND_NS // 25, index % 25 == 0
+        if index == 50:
+            budget.set_total(cut_bps, round(cut_bps * share), 25, now_ns=now_ns)
+        if index == 150:
+            most_bytes = budget.most_requested_bytes
+        size = 12_000 if keyframe else 2_500
+        wait_ns = budget.earliest_ns(size, now_ns=now_ns, base=True) - now_ns
+        sent = (keyframe or sent) and wait_ns < SECOND_NS // 2
+        if sent:
+            budget.record_base(size, now_ns=now_ns + wait_ns, keyframe=keyframe)
+        if index >= 150:
+            room = max(room, budget.requested_allowance(now_ns + max(0, wait_ns)))
+    assert most_bytes <= room
+    assert most_bytes or cut_bps < 800_000
