@@ -178,7 +178,7 @@ class LeverControl:
         if self._unlike:
             why = "this view is unlike what the detector knows"
         of_tracks = f"{'tracks' if tracks else 'no tracks'}: {why}"
-        renamed = f"{sum(self._changed)} of {len(self._changed)} objects renamed"
+        renamed = f"{sum(self._changed)} of {len(self._changed)} objects named otherwise by the ground"
         renamed = renamed if self._changed else "none was answered yet"
         details = "stills show details, " if self._settings.finer else "stills: "
         return f"{of_tracks}; {details if stills else 'stills paused: '}{renamed}"

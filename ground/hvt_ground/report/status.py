@@ -157,7 +157,8 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         "no gaps" if not content["gaps"] else f"{content['gaps']} gaps, {content['lost']} messages lost"
     )
     tracks = (
-        f"{content['tracks']}, {content['tracks_refined']} refined, {content['class_changes']} class changes"
+        f"{content['tracks']}; stills met {content['tracks_refined']} of them and changed the ground's own class of "
+        f"{content['class_changes']}"
     )
     if not (content["tracks"] or content["detections_run"]):
         tracks = "not known: the detector has looked at no picture"

@@ -98,18 +98,27 @@ def test_numbers_alone_are_no_event(rig, flight):
     real = Status.parse(item.payload)
     said = [
         "no tracks: not measured yet; stills: none was answered yet",
-        "no tracks: the video hides 2 objects, misnames 1; stills: 1 of 2 objects renamed",
-        "tracks: the video hides 9 objects; stills: 1 of 2 objects renamed",
-        "tracks: the video hides 9 objects; stills paused: 1 of 40 objects renamed",
-        "tracks: the video hides 8 objects; stills paused: 1 of 40 objects renamed",
+        (
+            "no tracks: the video hides 2 objects, misnames 1; "
+            "stills: 1 of 2 objects named otherwise by the ground"
+        ),
+        "tracks: the video hides 9 objects; stills: 1 of 2 objects named otherwise by the ground",
+        "tracks: the video hides 9 objects; stills paused: 1 of 40 objects named otherwise by the ground",
+        "tracks: the video hides 8 objects; stills paused: 1 of 40 objects named otherwise by the ground",
     ]
     for number, levers in enumerate(said):
         rig.session.status(replace(real, sequence=real.sequence + 1 + number, levers=levers), item)
     assert rig.session.levers == said[-1]
     assert [one.text for one in rig.events if isinstance(one, Notice)] == [
         "The edge sends no tracks: not measured yet. Stills are sent: none was answered yet.",
-        "The edge sends its tracks: the video hides 9 objects. Stills are sent: 1 of 2 objects renamed.",
-        "The edge sends its tracks: the video hides 9 objects. Stills are paused: 1 of 40 objects renamed.",
+        (
+            "The edge sends its tracks: the video hides 9 objects. "
+            "Stills are sent: 1 of 2 objects named otherwise by the ground."
+        ),
+        (
+            "The edge sends its tracks: the video hides 9 objects. "
+            "Stills are paused: 1 of 40 objects named otherwise by the ground."
+        ),
     ]
 
 
