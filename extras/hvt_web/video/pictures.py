@@ -68,6 +68,8 @@ class Pictures:
         self._gop_bytes = 0
         self._whole = False
         """Nothing is missing since the last keyframe."""
+        self.waits = False
+        """Somebody looks, and nothing of the last sample can be shown before a keyframe."""
         self._decoder: BaseDecoder | None = None
         """None while nobody needs decoded pictures."""
         self._h264: _H264 | None = None
@@ -87,7 +89,9 @@ class Pictures:
         if wanted.get("h264") != self._wanted.get("h264"):
             self._h264 = None
         self._wanted = wanted
-        if not self._remember(sample):
+        whole = self._remember(sample)
+        self.waits = bool(wanted) and not whole
+        if not whole:
             return
         if "hevc" in wanted:
             yield from self._copy(sample)
@@ -121,7 +125,8 @@ class Pictures:
     def _copy(self, sample: VideoSample) -> Iterator[Made]:
         new = [sample]
         if self._copied is None:
-            if not self._gop:
+            self.waits = not self._gop
+            if self.waits:
                 return
             self._copied = Muxer("hevc", size=self._info.base_size, fps=self._info.fps)
             new = self._gop
@@ -134,7 +139,8 @@ class Pictures:
         # The newest picture; who begins in between decodes all since the keyframe first.
         new = [sample]
         if self._decoder is None:
-            if not self._gop:
+            self.waits = not self._gop
+            if self.waits:
                 return None
             self._decoder = BaseDecoder(size=self._info.base_size)
             new = self._gop

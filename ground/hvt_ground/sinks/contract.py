@@ -32,6 +32,8 @@ class SinkWriter(Generic[T]):
 
     path: Path | None = None
     """The file that was opened last; None without one."""
+    awaits_keyframe = False
+    """Without one it can show nothing of what came last, and somebody looks: one is asked for, once."""
 
     def log(self, item: T) -> None:
         """Write an item, or pass it by."""

@@ -185,6 +185,8 @@ class QueuedSink(Generic[T]):
                     sink.skipped(skipped)
                     self._resumed = True
                 sink.log(item)
+                self._resumed |= sink.awaits_keyframe
+                sink.awaits_keyframe = False
                 self._note_file(sink)
             sink.close(self._hurry)
         except Exception as error:  # noqa: BLE001 - whatever it is, everything else goes on

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import av
 import cv2
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 
 from hvt_ground.events import VideoSample
+from hvt_web.feed import SessionFeed
 from hvt_web.video.fmp4 import Fragment, Start
 from hvt_web.video.pictures import Pictures
+from hvt_web.viewers import EdgePage
 from media.moving_square import FPS, SIZE, STEP_PX, moving_square
 from rigs.messages import INFO
 
@@ -86,6 +89,29 @@ def test_who_looks_goes_on_however_rare_keyframes_are(samples, monkeypatch):
     fed(made, samples[:30], set())
     assert fed(made, samples[30:], {"hevc", "h264", "jpeg"}) == []  # their keyframe is no longer kept
     assert fed(made, samples[:3], {"hevc"}, number=2)
+
+
+def test_who_begins_to_look_where_no_keyframe_comes_by_itself_has_one_asked_for(samples, monkeypatch):
+    """With --keyframe-interval 0 the page would wait for one for good."""
+    monkeypatch.setattr("hvt_web.video.pictures.MOST_GOP_UNITS", 10)
+    now_ns, page = samples[0].capture_ns, EdgePage("uav-1")
+    info = replace(INFO, base_size=SIZE, source_size=SIZE, fps=FPS, pace="realtime")
+    sink = SessionFeed(info, page, MagicMock(), clock=lambda: now_ns)
+
+    def asks(some: list[VideoSample]) -> list[int]:
+        nonlocal now_ns
+        asked = []
+        for sample in some:
+            now_ns = sample.capture_ns
+            sink.log(sample)
+            asked += [sample.frame_index] * sink.awaits_keyframe
+            sink.awaits_keyframe = False
+        return asked
+
+    assert asks(samples[:20]) == [], "nobody looks"
+    page.wanted = {"hevc": 1}
+    assert asks(samples[20:]) == [20, 20 + 2 * FPS]
+    assert asks(samples[:5]) == [], "it has come"
 
 
 def test_keyframes_of_the_coded_stream_come_every_two_seconds(samples):

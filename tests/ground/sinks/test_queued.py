@@ -15,6 +15,7 @@ from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
 from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.sinks import Outputs, QueuedSink
+from hvt_ground.sinks.contract import SinkWriter
 from hvt_ground.sinks.line_file import LineFile
 from hvt_ground.sinks.rerun.live_view import LiveView, listening
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -54,6 +55,21 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path, caplog):
     assert sink.join(time.monotonic() + 20)
     assert lines == ["a", *["x" * 100] * 4096], "what was taken is written, in whole lines"
     assert failures.parts == (), "slow is not broken"
+
+
+def test_one_that_waits_for_a_keyframe_has_it_asked_for_once():
+    """An edge that makes none by itself would never show it a picture."""
+
+    class Waiting(SinkWriter[str]):
+        def log(self, item: str) -> None:
+            self.awaits_keyframe = item == "waits"
+
+    sink = QueuedSink("page", Waiting, failures=Failures(time.time_ns))
+    for item, asks in (("shown", False), ("waits", True), ("shown", False)):
+        sink.log(item)
+        eventually(lambda: sink.idle, within_s=20, what="it is taken")
+        assert (sink.take_resumed(), sink.take_resumed()) == (asks, False)
+    sink.close()
 
 
 def test_one_that_never_answers_does_not_keep_the_ground_from_ending(tmp_path):
