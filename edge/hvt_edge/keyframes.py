@@ -56,7 +56,7 @@ class Keyframes:
         """The time since which the frame loop waits for room for one; None if it does not."""
         self._requested_ns: int | None = None
         """The oldest request that no keyframe has met."""
-        self._asked = False
+        self._by_ground = False
         """Of these one is a ground's."""
         self._paid_ns = -(2**63)
         """Requests are paid for up to this time: `_cost_ns` each."""
@@ -90,7 +90,7 @@ class Keyframes:
     def awaited(self) -> bool:
         """Whether a ground waits for one: it can show no other frame, and each would take of the keyframe's room."""
         with self._lock:
-            return self._asked
+            return self._by_ground
 
     def request(self, now_ns: int) -> str | None:
         """A ground wants a keyframe; return why it gets none now, in a sentence, or None where it is served.
@@ -114,7 +114,7 @@ class Keyframes:
             self.served += 1
             if not fresh:
                 self._add(now_ns)
-                self._asked = True
+                self._by_ground = True
             return None
 
     def require(self, now_ns: int) -> None:
@@ -154,7 +154,7 @@ class Keyframes:
     def done(self, now_ns: int) -> None:
         """A keyframe has just been encoded; it also answers what was requested meanwhile."""
         with self._lock:
-            self._last_ns, self._due_ns, self._requested_ns, self._asked = now_ns, None, None, False
+            self._last_ns, self._due_ns, self._requested_ns, self._by_ground = now_ns, None, None, False
             self._lossy = False  # losses before it are no reason any more
             self.sent += 1
 

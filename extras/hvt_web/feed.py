@@ -22,7 +22,7 @@ _LATE_NS = 300_000_000
 """So far behind the link, pictures are decoded and not coded again until it has caught up."""
 _TOO_LATE_NS = 3_000_000_000
 """So far behind, pictures up to the next keyframe are skipped."""
-_ASK_EVERY_NS = 2_000_000_000
+_REQUEST_EVERY_NS = 2_000_000_000
 _SHOWN_BY_BROWSERS = ("image/jpeg", "image/png", "image/webp")
 _MILLION = 1_000_000
 
@@ -37,7 +37,7 @@ class SessionFeed(SinkWriter[Event]):
         self._clock = clock
         self._pictures = Pictures(info)
         self._offset_ns: int | None = None
-        self._late_ns = self._asked_ns = 0
+        self._late_ns = self._requested_ns = 0
         session = {
             "edge": info.edge,
             "session": f"{info.session_id:016x}",
@@ -79,19 +79,19 @@ class SessionFeed(SinkWriter[Event]):
         now_ns, wanted = self._clock(), self._page.wanted
         if self._late_ns > _TOO_LATE_NS and not sample.keyframe:
             self._pictures.gap()
-            self._ask_for_keyframe(bool(wanted), now_ns)
+            self._want_keyframe(bool(wanted), now_ns)
             return
         made = self._pictures.add(sample, wanted=wanted, now_ns=now_ns, hurry=self._late_ns > _LATE_NS)
         captured_ms = self._captured_ms(sample.capture_ns)
         for one in made:
             give = partial(self._hub.made, self._page, one)
             self._hub.post(partial(give, frame_index=sample.frame_index, captured_ms=captured_ms))
-        self._ask_for_keyframe(self._pictures.waits, now_ns)
+        self._want_keyframe(self._pictures.waits, now_ns)
 
-    def _ask_for_keyframe(self, waits: bool, now_ns: int) -> None:  # noqa: FBT001 - two callers
+    def _want_keyframe(self, waits: bool, now_ns: int) -> None:  # noqa: FBT001 - two callers
         # An edge may make none by itself (--keyframe-interval 0).
-        if waits and now_ns - self._asked_ns >= _ASK_EVERY_NS and self._info.pace != "lockstep":
-            self.awaits_keyframe, self._asked_ns = True, now_ns
+        if waits and now_ns - self._requested_ns >= _REQUEST_EVERY_NS and self._info.pace != "lockstep":
+            self.awaits_keyframe, self._requested_ns = True, now_ns
 
     def _captured_ms(self, capture_ns: int) -> float:
         # Capture time by the ground's clock. In lockstep capture is media time: there, and before the first is

@@ -371,10 +371,10 @@ class RollingBudget:
 
         The base frames to come wait for their room, or are left out (`leaves_out`).
         """
-        free = self._requested_room(now_ns)
+        free = self._requested_free(now_ns)
         return max(0, int(min(free, self._loan.left_bytes(self._loan_bytes, now_ns=now_ns))))
 
-    def _requested_room(self, now_ns: int) -> float:
+    def _requested_free(self, now_ns: int) -> float:
         self._note_query(now_ns)
         spent = sum(size for at_ns, size in self._events if at_ns > now_ns - self._settings.window_ns)
         free = self._total - spent - self._spare
@@ -383,7 +383,7 @@ class RollingBudget:
     def _note_left(self, now_ns: int) -> None:
         # At new rates the base's habits are known after a window.
         if now_ns >= self._old_peak[0]:
-            self._left.append((now_ns, self._requested_room(now_ns)))
+            self._left.append((now_ns, self._requested_free(now_ns)))
             while self._left[0][0] <= now_ns - _LEFT_WINDOWS * self._settings.window_ns:
                 self._left.popleft()
 

@@ -190,14 +190,14 @@ class OnDemandStill(OutboxStill):
     """Another was pending when it was requested."""
     link_busy: bool = False
     """The budget had room for it, and the link had not, when that was last tried."""
-    asked: OnDemandRequest = OnDemandRequest()
+    on_demand: OnDemandRequest = OnDemandRequest()
     frame_index: int = -1
     capture_ns: int = 0
 
     def repeats(self, request: OnDemandRequest, capture_ns: int) -> bool:
         """Whether a request, for a frame of that time, is this one once more."""
         near = abs(capture_ns - self.capture_ns) <= _AGAIN_NS
-        return request == self.asked and near and self.state is StillState.PENDING
+        return request == self.on_demand and near and self.state is StillState.PENDING
 
 
 @dataclass(eq=False)
@@ -268,7 +268,7 @@ class OnDemand:
                 number=number,
                 quality_pct=quality_pct,
                 base=frame.base,
-                asked=request,
+                on_demand=request,
                 frame_index=frame.frame_index,
                 capture_ns=frame.capture_ns,
             )

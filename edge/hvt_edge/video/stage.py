@@ -192,9 +192,9 @@ class BaseStage:
         ):  # only at another rate is there one that can go
             keyframe_due = keyframe_due or not self.transmitter.window_holds(frame_bytes)
         line_bytes = keyframe_bytes if keyframe_due else frame_bytes
-        makes_room = awaited and link is State.LIVE and not keyframe_due
+        yields_to_keyframe = awaited and link is State.LIVE and not keyframe_due
         due = self._frame_skip.codes(frame.index)
-        admitted = not makes_room and self.admits(now_ns, line_bytes, self._coding_ns)
+        admitted = not yields_to_keyframe and self.admits(now_ns, line_bytes, self._coding_ns)
         coded = due and admitted and not keyframe_due and link is State.LIVE
         decision = decide(
             FrameInputs(
