@@ -96,9 +96,9 @@ def open_detector(
     ``head`` is one of `heads.choose.HEAD_NAMES`; else the file tells, or what it answers. ``confidence`` is the least
     of a detection, ``nms_iou`` the largest overlap of two of one class, both 0…1. ``size`` is (width, height) of the
     network's input where the model leaves it free; else each image gets the multiples of the network's stride that
-    hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). A plug-in gets none of these;
-    ``confidence`` is applied to its answer. For ``A+B`` (`hvt_models.detectors`) it is on the scale of A, and
-    ``labels``, ``head`` and ``size`` are refused.
+    hold it (at most 1920 on the longer side, or ``imgsz`` of the metadata). ``confidence`` of a plug-in is applied to
+    its answer, that of ``A+B`` (`hvt_models.detectors`) is on the scale of A. For these and for `MOTION` ``labels``,
+    ``head`` and ``size`` are refused.
     Raises `UserError` where there is no such model, it is no detector, its labels do not fit, or a setting is out of
     its range.
     """
@@ -107,21 +107,18 @@ def open_detector(
             raise UserError(f"{name} {value} is not accepted; a number from 0 to 1 is")
     check_head_name(head)
     parts = parts_of(spec)
-    if len(parts) > 1:
-        for word, given in (("labels file", labels), ("head", head), ("detector size", size)):
+    plug_in = None if spec == MOTION or parts[1:] else plug_in_of(spec, taken=model_names)
+    if spec == MOTION or parts[1:] or plug_in is not None:
+        for word, given in (("labels file", labels), ("--head", head), ("detector size", size)):
             if given is not None:
-                raise UserError(f"{word} {given} has no say: detector {spec!r} is several, each with its own")
+                raise UserError(f"{word} {given} has no say: {spec!r} is no network of one file")
+    if parts[1:]:
         settings = {"nms_iou": nms_iou, "threads": threads, "provider": provider}
         return _open_ensemble(parts, confidence=confidence, settings=settings)
-    plug_in = None if spec == MOTION else plug_in_of(spec, taken=model_names)
-    if head is not None and (spec == MOTION or plug_in is not None):
-        raise UserError(f"--head {head} has no say: {spec!r} is no network of a file")
     if spec == MOTION:
         motion: Detector = needed_part(MOTION, f"detector {MOTION}")(confidence=confidence)
         return motion
     if plug_in is not None:
-        if labels is not None:
-            raise UserError(f"labels file {labels} has no say: detector {spec!r} brings its own class names")
         return PlugInDetector(plug_in, spec, confidence=confidence)
     path = resolve_model(spec, role="detector", words=(MOTION, *plug_in_names()))
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))

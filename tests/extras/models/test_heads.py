@@ -94,8 +94,9 @@ def test_what_stays_open_is_refused_with_the_option_that_decides(tmp_path: Path,
         open_detector(str(path), head="yolo")
     with pytest.raises(UserError, match="are not those of --head ssd"):
         open_detector(str(path), head="ssd")
-    with pytest.raises(UserError, match="--head ssd has no say"):
-        open_detector("motion", head="ssd")
+    for given in ({"head": "ssd"}, {"labels": Path("names.txt")}, {"size": (640, 640)}):
+        with pytest.raises(UserError, match="has no say: 'motion' is no network of one file"):
+            open_detector("motion", **given)
 
 
 def test_rt_detr_is_told_by_what_its_file_says(tmp_path: Path) -> None:
