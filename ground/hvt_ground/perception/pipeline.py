@@ -222,33 +222,34 @@ class Pipeline:
         """The outcome of each object in the others."""
         return self._stills.outcomes
 
-    def analyze(self, picture: DecodedFrame, *, hurry: bool, newer: threading.Event | None = None) -> None:
+    def analyze(self, picture: DecodedFrame, *, hurry: bool, news: threading.Event | None = None) -> None:
         """Take the next frame; with ``hurry`` detection waits for a later one, but not for ever.
 
-        Once ``newer`` is set the list goes out without what the detector has not found yet: that is taken in with a
-        later frame, as if it had been known at once. Without, as in lockstep, what is due is waited for.
+        Once ``news`` is set the list goes out without what the detector has not found yet: a later frame, or
+        `take_late`, takes that in as if it had been known at once. Without, as in lockstep, it is waited for.
         """
         index = picture.frame_index
         self._history.add_frame(index, picture.picture)
         image = as_bgr(picture.picture)
-        own = self._own = self._track(picture, image, hurry=hurry, newer=newer)
+        own = self._own = self._track(picture, image, hurry=hurry, news=news)
         self._picture_ns = picture.capture_ns
         ahead = self._now.frame_index > index
         shown_at = (self._now.frame_index, self._now.capture_ns) if ahead else (index, picture.capture_ns)
         self._now = Progress(*shown_at, picture_index=index)
         self._parts.fusion.take_own(own)
-        self._show(own, picture.capture_ns, looked_ns=self._looked_ns(picture.capture_ns))
+        self._show(own, picture.capture_ns)
 
-    def take_late(self, newer: threading.Event | None) -> None:
-        """Take in what the detector is still at, where it is done before ``newer`` is set, though its list is out.
+    def take_late(self) -> bool:
+        """Take in what the detector has found since the list of its picture went out; True while it is still at it.
 
         Stills would else find no tracks at the last pictures before a pause.
         """
-        if newer is not None and self._detection is not None and self._is_found(self._detection, newer):
+        if self._detection is not None and not self.searching:
             self._take_found(self._detection)
             own = self._own = self._parts.tracker.extrapolated(frame_index=self._now.picture_index)
             self._parts.fusion.take_own(own)
-            self._history.revise_tracks(self._parts.fusion.listed(own).tracks)
+            self._revise(own)
+        return self.searching
 
     def pass_over(self, index: int, capture_ns: int) -> None:
         """Take the next frame without its picture: its list goes on from the newest picture that was looked at.
@@ -257,12 +258,7 @@ class Pipeline:
         """
         if index > self._now.frame_index and self._own is not None:
             self._now = Progress(index, capture_ns, self._now.picture_index)
-            looked_ns = self._looked_ns(capture_ns)
-            self._show(
-                self._own_at(index),
-                capture_ns,
-                looked_ns=self._picture_ns if looked_ns is None else looked_ns,
-            )
+            self._show(self._own_at(index), capture_ns, looked_ns=self._picture_ns)
 
     def edge_step(self, step: Tracks, *, capture_ns: int | None = None) -> None:
         """Take what the edge's tracker listed at one frame: ids and class ids the edge's, boxes in base pixels.
@@ -285,9 +281,7 @@ class Pipeline:
             self._now = Progress(frame_index, at_ns, self._now.picture_index)
             self._show(own, at_ns)
             return
-        self._carry_merges()
-        self._history.revise_tracks(self._parts.fusion.listed(own).tracks)
-        self._stills.update(self._now)
+        self._revise(own)
 
     def read(self, stills: Sequence[ReceivedStill]) -> None:
         """Take stills, in the order in which they came; those of one frame are looked at together."""
@@ -323,7 +317,7 @@ class Pipeline:
     # The base stream
 
     def _track(
-        self, picture: DecodedFrame, image: Image, *, hurry: bool, newer: threading.Event | None
+        self, picture: DecodedFrame, image: Image, *, hurry: bool, news: threading.Event | None
     ) -> Tracks:
         parts, index = self._parts, picture.frame_index
         if self._detection is not None and not self.searching:
@@ -335,7 +329,7 @@ class Pipeline:
         before, affine = self._now.picture_index, parts.tracker.camera_step
         if before >= 0 and affine is not None:  # the tracker has followed it: it is not estimated twice
             parts.path.add(affine, start=before, end=index)
-        if begins and self._detection is not None and self._is_found(self._detection, newer):
+        if begins and self._detection is not None and self._is_found(self._detection, news):
             return self._take_found(self._detection)
         return own
 
@@ -356,25 +350,25 @@ class Pipeline:
         if due:
             self._detected_frame = index
             self._due_ns = picture.capture_ns
-            self.detections_run += 1
             self._detection = parts.detector_thread.submit(image, self._detect)
         return due
 
-    def _is_found(self, detection: Detection, newer: threading.Event | None) -> bool:
-        # Whether the detector is done with this picture, before there is a ``newer`` one.
-        if newer is None or self._own is None:  # before the first there is nothing to list
+    def _is_found(self, detection: Detection, news: threading.Event | None) -> bool:
+        # Whether the detector is done with this picture, before there are ``news``.
+        if news is None:
             return bool(wait([detection.found]).done)
         if self._watched is not detection:  # one that hangs is asked for with each picture
             self._watched = detection
-            detection.found.add_done_callback(lambda _: newer.set())
-        newer.wait(self._turn_s)
+            detection.found.add_done_callback(lambda _: news.set())
+        news.wait(self._turn_s)
         if not detection.queued:
-            newer.wait()
+            news.wait()
         return detection.found.done()
 
     def _detect(self, image: Image) -> Detections:
         # In the detector's thread.
         parts = self._parts
+        self.detections_run += 1
         found = parts.detector.detect(image) or Detections.none()
         return found if parts.search is None else parts.search.take(found, image)
 
@@ -410,23 +404,23 @@ class Pipeline:
         before = self._parts.fusion.own_at(frame_index)
         return Tracks.none(frame_index) if before is None else replace(before, frame_index=frame_index)
 
-    def _looked_ns(self, capture_ns: int) -> int | None:
-        # When the picture that the detector is behind with was captured; None where it is not far behind that list.
-        late = self._detection is not None and capture_ns - self._due_ns > _LATE_NS
-        return self._due_ns if late else None
-
     def _capture_ns(self, frame_index: int) -> int:
         return self._picture_ns + round((frame_index - self._now.picture_index) * self._frame_ns)
 
     # The list
 
-    def _show(self, own: Tracks, capture_ns: int, *, looked_ns: int | None = None) -> None:
-        # Put the list at the frame of ``own`` on record and, where nothing newer has been shown, give it out.
+    def _revise(self, own: Tracks) -> FusedTracks:
+        # Put the list at the frame of ``own`` on record.
         self._carry_merges()
         fused = self._parts.fusion.listed(own)
         self._history.revise_tracks(fused.tracks)
-        self._track_ids.add(fused.tracks.ids.tolist())
         self._stills.update(self._now)
+        return fused
+
+    def _show(self, own: Tracks, capture_ns: int, *, looked_ns: int | None = None) -> None:
+        # Put the list on record and, where nothing newer has been shown, give it out.
+        fused = self._revise(own)
+        self._track_ids.add(fused.tracks.ids.tolist())
         if own.frame_index > self._listed_frame:
             step = self._parts.path.between(max(0, self._listed_frame), own.frame_index)
             self._listed_frame = own.frame_index
@@ -436,6 +430,8 @@ class Pipeline:
             self.doubted = int(shown.doubted.sum())
             shown = self._doubting(fused, shown)
             overlay = _overlay(fused, shown, capture_ns, base_size=self._base_size)
+            if self._detection is not None and capture_ns - self._due_ns > _LATE_NS:
+                looked_ns = self._due_ns
             self._emit(replace(overlay, looked_ns=looked_ns))
 
     def _doubting(self, fused: FusedTracks, shown: ShownClasses) -> ShownClasses:

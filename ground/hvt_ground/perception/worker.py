@@ -47,7 +47,7 @@ may overtake it by microseconds: this is what makes the order the same in every 
 _AHEAD = 2
 
 Analyze = Callable[[DecodedFrame, bool, threading.Event | None], None]
-"""Called with a picture, whether to hurry, and what is set once there is a newer one (None: all is waited for)."""
+"""Called with a picture, whether to hurry, and what is set once anything comes (None: all is waited for)."""
 Step = Callable[[Tracks, int], None]
 """Called with the edge's tracks at one frame, and that frame's capture time."""
 Read = Callable[[Sequence[ReceivedStill]], None]
@@ -148,8 +148,9 @@ class PerceptionWorker(ABC):
 class RealtimeWorker(PerceptionWorker):
     """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still.
 
-    ``pass_over`` takes frame and capture time of a picture for which there is no time. `close` gives it ``finish_s``
-    for what waits, then ``leave_s`` for what is in hand.
+    ``pass_over`` takes frame and capture time of a picture for which there is no time, ``take_late()`` what was found
+    since its picture was analyzed: True while more may be. `close` gives it ``finish_s`` for what waits, then
+    ``leave_s`` for what is in hand.
     """
 
     def __init__(
@@ -160,11 +161,13 @@ class RealtimeWorker(PerceptionWorker):
         *,
         name: str,
         pass_over: Callable[[int, int], None] = lambda _frame_index, _capture_ns: None,
+        take_late: Callable[[], bool] = lambda: False,
         finish_s: float = 1.5,
         leave_s: float = 1.0,
     ) -> None:
         super().__init__(analyze, step, read)
         self._pass_over = pass_over
+        self._take_late = take_late
         self._finish_s = finish_s
         self._leave_s = leave_s
         self._lock = threading.Lock()
@@ -179,11 +182,10 @@ class RealtimeWorker(PerceptionWorker):
         self._job_step_s = 0.0
         """When the last step of one was done."""
         self._wake = threading.Event()
-        self._newer = threading.Event()
-        """A picture has come since the one in hand was taken, or the thread is to end."""
+        """Something has come or was found since the picture in hand was taken, or the thread is to end."""
         self._ending = threading.Event()
         self._given_up = threading.Event()
-        self._in_hand = False
+        self._in_hand = self._searching = False
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=f"hvt-perception-{name}", daemon=True)
         self._thread.start()
@@ -191,8 +193,8 @@ class RealtimeWorker(PerceptionWorker):
     @property
     def idle(self) -> bool:
         """Nothing waits, and nothing is in hand."""
-        # What is in hand is requested last: it is taken from what waits, and never put back.
-        return not (self._has_news() or self._jobs or self._last_jobs or self._in_hand)
+        # In the order that things go: from what waits into the hand, from there to the detector.
+        return not (self._has_news() or self._jobs or self._last_jobs or self._in_hand or self._searching)
 
     @property
     def stills_queued(self) -> int:
@@ -208,18 +210,20 @@ class RealtimeWorker(PerceptionWorker):
         return bool(self._steps or self._pictures or self._stills)
 
     def picture(self, picture: DecodedFrame) -> None:
-        """Queue a frame; where the queue is full the oldest goes untracked."""
+        """Queue a frame; where the queue is full, or the oldest has waited for too long, that goes untracked."""
+        now_s = time.monotonic()
         with self._lock:
             queued_bytes = sum(one.picture.nbytes for one, _ in self._pictures) + picture.picture.nbytes
-            while len(self._pictures) >= _MOST_PICTURES or (
-                self._pictures and queued_bytes > _MOST_PICTURE_BYTES
+            while self._pictures and (
+                len(self._pictures) >= _MOST_PICTURES
+                or queued_bytes > _MOST_PICTURE_BYTES
+                or now_s - self._pictures[0][1] > _OLDEST_S
             ):
                 oldest, _ = self._pictures.popleft()
                 queued_bytes -= oldest.picture.nbytes
                 self._passed.append((oldest.frame_index, oldest.capture_ns))
                 self.untracked += 1
-            self._pictures.append((picture, time.monotonic()))
-            self._newer.set()
+            self._pictures.append((picture, now_s))
         self._wake.set()
 
     def step(self, tracks: Tracks, capture_ns: int) -> None:
@@ -250,9 +254,8 @@ class RealtimeWorker(PerceptionWorker):
         self._ending.set()
         self._wake.set()
         self._thread.join(self._finish_s)
-        with self._lock:
-            self._given_up.set()
-            self._newer.set()
+        self._given_up.set()
+        self._wake.set()
         self._thread.join(self._leave_s)
         self.dropped["ended"] += len(self._stills)
         self.untracked += len(self._pictures)
@@ -272,6 +275,7 @@ class RealtimeWorker(PerceptionWorker):
                 self._wake.clear()
                 self._in_hand = True
                 self._work_off()
+                self._searching = self._take_late()
                 self._in_hand = False
                 if self._ending.is_set() and self.idle:
                     return
@@ -290,15 +294,17 @@ class RealtimeWorker(PerceptionWorker):
                 if stills and self._stills[0].header.frame_index != stills[0].header.frame_index:
                     break
                 stills.append(self._stills.popleft())
-        self._take_pictures(hurry=False)
+        self._take_pictures(hurry=False, awaited=bool(stills))
         while self._steps and not self._given_up.is_set() and not self._picture_before(self._steps[0][0]):
             self._step(*self._steps.popleft())
         if stills:
-            self._take_pictures(hurry=True)  # what came while the detector ran would wait as long again
+            self._take_pictures(
+                hurry=True, awaited=True
+            )  # what came while the detector ran would wait as long again
             self._read(stills)
-        self._do_jobs()
         if self._has_news():
             self._wake.set()
+        self._do_jobs()
 
     def _picture_before(self, step: Tracks) -> bool:
         # One that came while the detector ran. Its own list would be older than the step's, and never be shown: the
@@ -306,8 +312,9 @@ class RealtimeWorker(PerceptionWorker):
         with self._lock:
             return bool(self._pictures) and self._pictures[0][0].frame_index <= step.frame_index
 
-    def _take_pictures(self, *, hurry: bool) -> None:
-        # Analyze the pictures that are there: in the newest objects are detected, unless in a ``hurry``.
+    def _take_pictures(self, *, hurry: bool, awaited: bool) -> None:
+        # Analyze the pictures that are there: in the newest objects are detected, unless in a ``hurry``. Where stills
+        # have ``awaited`` them no detection is waited for.
         # Those that come meanwhile are not among them, or on a slow machine stills would wait for ever.
         for _ in range(len(self._pictures)):
             if self._given_up.is_set():
@@ -317,19 +324,21 @@ class RealtimeWorker(PerceptionWorker):
             with self._lock:
                 picture, came_s = self._pictures.popleft()
                 newer = len(self._pictures) > 0
-                if not newer and not self._given_up.is_set():
-                    self._newer.clear()
+                self._wake.clear()
+                stepped = bool(self._steps) and self._steps[-1][0].frame_index > picture.frame_index
+                if newer or awaited or stepped or self._ending.is_set():
+                    self._wake.set()
                 late = newer and time.monotonic() - came_s > _OLDEST_S
                 self.untracked += late
             if late:
                 self._pass_over(picture.frame_index, picture.capture_ns)
             else:
-                self._analyze(picture, hurry or newer, self._newer)
+                self._analyze(picture, hurry or newer, self._wake)
 
     def _do_jobs(self) -> None:
         # Do jobs that can wait, until something comes that cannot.
         while (jobs := self._jobs or self._last_jobs) and not self._given_up.is_set():
-            if self._has_news() and time.monotonic() - self._job_step_s < _JOB_STEP_S:
+            if self._wake.is_set() and time.monotonic() - self._job_step_s < _JOB_STEP_S:
                 return
             if self._is_done(jobs[0]):
                 jobs.popleft().close()

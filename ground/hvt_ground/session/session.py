@@ -142,7 +142,9 @@ class GroundSession:
             worker_of = (
                 partial(LockstepWorker, name=info.edge)
                 if self.lockstep
-                else partial(RealtimeWorker, name=info.edge, pass_over=self._pass_over)
+                else partial(
+                    RealtimeWorker, name=info.edge, pass_over=self._pass_over, take_late=self._take_late
+                )
             )
         self.worker = worker_of(self._analyze, self._step, self._read)
         outputs = [one for one in self._queued if one.for_backlog]
@@ -490,16 +492,22 @@ class GroundSession:
         self,
         picture: DecodedFrame,
         hurry: bool,  # noqa: FBT001 - called by the worker only
-        newer: threading.Event | None,
+        news: threading.Event | None,
     ) -> None:
-        self.pipeline.analyze(picture, hurry=hurry, newer=newer)
+        self.pipeline.analyze(picture, hurry=hurry, news=news)
         self._analyzed = (picture.frame_index, self.pipeline.objects_detected)
         if picture.reference_ns is not None:
             self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
-        self.pipeline.take_late(newer)
         self._collect_results()
         if self.lockstep:
             self.report()
+
+    def _take_late(self) -> bool:
+        if self._pipeline is None:
+            return False
+        searching = self._pipeline.take_late()
+        self._collect_results()
+        return searching
 
     @_perceives
     def _pass_over(self, frame_index: int, capture_ns: int) -> None:

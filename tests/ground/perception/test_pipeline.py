@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from dataclasses import replace
 
@@ -20,6 +21,7 @@ from hvt_ground.events import Notice, Overlay, Refinement
 from hvt_ground.perception.detector_thread import DetectorThread
 from hvt_ground.perception.history import as_bgr
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
+from hvt_ground.perception.worker import RealtimeWorker
 from programs.processes import eventually
 from rigs.flight import (
     CLASSES,
@@ -108,7 +110,7 @@ def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures
 
 def test_a_slow_detector_holds_no_list_up_and_its_boxes_lie_where_objects_are_now(pictures):
     """Beside a browser lists came a second late, and the page showed none on the picture of now."""
-    taken, release, newer = threading.Semaphore(0), threading.Semaphore(0), threading.Event()
+    taken, release, news = threading.Semaphore(0), threading.Semaphore(0), threading.Event()
 
     class Slow(RedSquares):
         def detect(self, image_bgr):
@@ -117,22 +119,21 @@ def test_a_slow_detector_holds_no_list_up_and_its_boxes_lie_where_objects_are_no
             return super().detect(image_bgr)
 
     rig, at_once = Rig(detect_every=5, detector=Slow(), detector_thread=DetectorThread()), Rig(detect_every=5)
-    release.release()  # before the first there is nothing to list
-    newer.set()  # there always is one
+    news.set()  # there always are some
     for picture in pictures:
-        rig.pipeline.analyze(picture, hurry=False, newer=newer)
+        rig.pipeline.analyze(picture, hurry=False, news=news)
         at_once.pipeline.analyze(picture, hurry=False)
         if picture.frame_index % 5 == 0:
             assert taken.acquire(timeout=20), "else the next would take its place"
-        if picture.frame_index % 5 == 2 and picture.frame_index > 5:  # what began two pictures ago
+        if picture.frame_index % 5 == 2:  # what began two pictures ago
             release.release()
             eventually(lambda: rig.pipeline.searching is False, within_s=20, what="it is found")
     lists, expected = rig.of(Overlay), at_once.of(Overlay)
     assert [one.frame_index for one in lists] == list(range(30))
     assert {one.looked_ns for one in lists} == {None}
     for one, right in zip(lists, expected, strict=True):
-        assert one.track_ids.tolist() == [1]
-        if one.frame_index < 5 or one.frame_index % 5 >= 3:
+        assert one.track_ids.tolist() == ([1] if one.frame_index > 2 else [])
+        if one.frame_index % 5 >= 3:
             np.testing.assert_array_equal(one.boxes_base_px, right.boxes_base_px)
             assert (one.classes, one.confidences.tolist()) == (right.classes, right.confidences.tolist())
     assert rig.pipeline.objects_detected == 1
@@ -140,7 +141,7 @@ def test_a_slow_detector_holds_no_list_up_and_its_boxes_lie_where_objects_are_no
 
 def test_lists_of_a_detector_that_is_a_second_behind_are_old(pictures):
     """Boxes that nobody has compared with a picture for so long would pass for seen."""
-    release, newer = threading.Semaphore(0), threading.Event()
+    release, news = threading.Semaphore(0), threading.Event()
 
     class Hangs(NothingSeen):
         def detect(self, image_bgr):
@@ -148,19 +149,22 @@ def test_lists_of_a_detector_that_is_a_second_behind_are_old(pictures):
             return super().detect(image_bgr)
 
     rig = Rig(detect_every=5, detector=Hangs(), detector_thread=DetectorThread())
-    release.release()
-    newer.set()
+    news.set()
     for picture in pictures[:24]:
-        rig.pipeline.analyze(picture, hurry=False, newer=newer)
+        rig.pipeline.analyze(picture, hurry=False, news=news)
+        if picture.frame_index == 0:
+            release.release()
+            eventually(lambda: not rig.pipeline.searching, within_s=20, what="the first is searched")
     rig.pipeline.pass_over(pictures[24].frame_index, pictures[24].capture_ns)
+    rig.pipeline.edge_step(tracks_at(25, {7: (10.0, 10.0, 30.0, 30.0)}), capture_ns=pictures[25].capture_ns)
     due_ns = pictures[5].capture_ns
-    assert [one.looked_ns for one in rig.of(Overlay)] == [None] * 21 + [due_ns] * 4
+    assert [one.looked_ns for one in rig.of(Overlay)] == [None] * 21 + [due_ns] * 5
     release.release(100)
 
 
 def test_a_picture_that_waits_for_the_detector_gives_way_to_the_newest(pictures):
     """Where many edges share it each would be searched in a picture that is seconds old."""
-    go, seen, newer = threading.Event(), [], threading.Event()
+    go, seen, news = threading.Event(), [], threading.Event()
 
     class Other(NothingSeen):
         def detect(self, image_bgr):
@@ -176,13 +180,14 @@ def test_a_picture_that_waits_for_the_detector_gives_way_to_the_newest(pictures)
     other = Rig(detect_every=5, detector=Other(), detector_thread=thread)
     rig = Rig(detect_every=5, detector=Watched(), detector_thread=thread)
     go.set()
-    newer.set()
+    news.set()
     for one in (other, rig):
-        one.pipeline.analyze(pictures[0], hurry=False, newer=newer)
+        one.pipeline.analyze(pictures[0], hurry=False, news=news)
+    eventually(lambda: not (other.pipeline.searching or rig.pipeline.searching), within_s=20, what="both see")
     go.clear()
-    other.pipeline.analyze(pictures[5], hurry=False, newer=newer)
+    other.pipeline.analyze(pictures[5], hurry=False, news=news)
     for picture in pictures[5:9]:
-        rig.pipeline.analyze(picture, hurry=False, newer=newer)
+        rig.pipeline.analyze(picture, hurry=False, news=news)
     go.set()
     eventually(lambda: not rig.pipeline.searching, within_s=20, what="it is searched")
     np.testing.assert_array_equal(seen, [as_bgr(pictures[index].picture) for index in (0, 8)])
@@ -191,7 +196,7 @@ def test_a_picture_that_waits_for_the_detector_gives_way_to_the_newest(pictures)
 
 def test_what_is_found_after_the_list_is_out_counts_though_nothing_comes(pictures):
     """After the last picture of a flight, or where the link pauses, stills would find no track at its frame."""
-    release, newer = threading.Semaphore(1), threading.Event()
+    release, news = threading.Semaphore(1), threading.Event()
 
     class BlindAtLast(RedSquares):
         def detect(self, image_bgr):
@@ -199,16 +204,66 @@ def test_what_is_found_after_the_list_is_out_counts_though_nothing_comes(picture
             return super().detect(image_bgr if rig.pipeline.detections_run == 1 else np.zeros_like(image_bgr))
 
     rig = Rig(detect_every=5, detector=BlindAtLast(), detector_thread=DetectorThread())
-    rig.pipeline.analyze(pictures[0], hurry=False, newer=newer)
-    newer.set()
-    rig.pipeline.analyze(pictures[5], hurry=False, newer=newer)
-    rig.pipeline.take_late(newer)
-    assert (rig.pipeline.searching, rig.pipeline.objects_detected) == (True, 1)
-    newer.clear()
+    rig.pipeline.analyze(pictures[0], hurry=False)
+    news.set()
+    rig.pipeline.analyze(pictures[5], hurry=False, news=news)
+    assert (rig.pipeline.take_late(), rig.pipeline.objects_detected) == (True, 1)
+    news.clear()
     release.release()
-    rig.pipeline.take_late(newer)
-    assert (rig.pipeline.searching, rig.pipeline.objects_detected) == (False, 0)
+    assert news.wait(timeout=20), "who waits for news learns of it"
+    assert (rig.pipeline.take_late(), rig.pipeline.objects_detected) == (False, 0)
     assert len(rig.of(Overlay)) == 2
+
+
+@pytest.mark.parametrize("hangs_at", [0, 5])
+def test_while_the_detector_hangs_all_else_goes_on(flight, pictures, hangs_at):
+    """The edge's boxes came with the next picture alone, and a flight that ended meanwhile gave out no still."""
+    release, runs = threading.Event(), itertools.count()
+
+    class Hangs(RedSquares):
+        def detect(self, image_bgr):
+            if next(runs) * 5 >= hangs_at:
+                assert release.wait(timeout=60)
+            return super().detect(image_bgr)
+
+    rig = Rig(detect_every=5, detector=Hangs(), detector_thread=DetectorThread())
+    worker = RealtimeWorker(
+        lambda one, hurry, news: rig.pipeline.analyze(one, hurry=hurry, news=news),
+        lambda tracks, at_ns: rig.pipeline.edge_step(tracks, capture_ns=at_ns),
+        rig.pipeline.read,
+        name="x",
+        take_late=rig.pipeline.take_late,
+        finish_s=0.1,
+        leave_s=20.0,
+    )
+    if hangs_at:
+        worker.picture(pictures[0])
+        eventually(lambda: worker.idle, within_s=20, what="the first is searched")
+    worker.picture(pictures[hangs_at])
+    worker.step(tracks_at(hangs_at + 1, {7: square_box(hangs_at + 1)}), pictures[hangs_at + 1].capture_ns)
+    worker.still(received(flight, hangs_at, 0))
+    eventually(lambda: rig.reader.had_base, within_s=20, what="the still is read")
+    assert rig.of(Overlay)[-1].frame_index == hangs_at + 1
+    assert rig.of(Overlay)[-1].origins
+    assert not worker.idle
+    assert worker.close()
+    rig.pipeline.end()
+    assert [one.still_sequence for one in rig.of(Refinement)] == [0]
+    assert rig.pipeline.detections_run == hangs_at // 5 + 1
+    release.set()
+
+
+def test_a_picture_that_was_never_searched_is_not_counted(pictures):
+    """A ground whose detector hangs showed a detection that no picture had."""
+    thread, go = DetectorThread(), threading.Event()
+    thread.submit(pictures[0].picture, lambda _: Detections.none() if go.wait(timeout=20) else None)
+    rig, news = Rig(detector_thread=thread), threading.Event()
+    news.set()
+    rig.pipeline.analyze(pictures[0], hurry=False, news=news)
+    rig.pipeline.end()
+    go.set()
+    thread.submit(pictures[0].picture, lambda _: Detections.none()).found.result(timeout=20)
+    assert rig.pipeline.detections_run == 0
 
 
 def test_small_objects_are_looked_at_enlarged_and_less_often(pictures):

@@ -92,7 +92,7 @@ def test_a_report_of_tracks_lets_the_pictures_before_it_go_first():
 
 
 def test_pictures_that_waited_for_long_are_passed_over():
-    """A ground of too many edges would show every one of them ever later."""
+    """A ground of too many edges would show every one of them ever later, and hold them all until it could look."""
     rig = Rig()
     rig.worker.picture(picture(0))
     assert rig.begun.wait(timeout=20)
@@ -100,8 +100,8 @@ def test_pictures_that_waited_for_long_are_passed_over():
         rig.worker.picture(picture(index))
     time.sleep(0.7)
     rig.worker.picture(picture(4))
+    assert rig.worker.untracked == 3, "at once"
     assert rig.finish() == [("picture", 0), ("picture", 4)]
-    assert rig.worker.untracked == 3
 
 
 def test_detection_is_for_the_newest_picture():

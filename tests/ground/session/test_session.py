@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from dataclasses import replace
 from functools import partial
@@ -14,6 +15,7 @@ from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import Info, PoseEncoder
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Pose
+from hvt_ground.perception.detector_thread import DetectorThread
 from hvt_ground.perception.worker import LockstepWorker, RealtimeWorker
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
@@ -35,12 +37,12 @@ class Rig:
     """A receiver with a port; sessions without a recording."""
 
     def __init__(
-        self, *, detector=None, reader=None, clock=None, drain_s=1.0, worker_of=None, **patience
+        self, *, detector=None, thread=None, reader=None, clock=None, drain_s=1.0, worker_of=None, **patience
     ) -> None:
         self.port = Port()
         self.port.inbox = self.inbox = WatchedInbox()
         self.reader = reader or SameAnswer()
-        self.detector = detector
+        self.detector, self.detector_thread = detector, thread
         self.opened: list[GroundSession] = []
         self.ended: list[GroundSession] = []
         self.worker_of = worker_of
@@ -52,7 +54,9 @@ class Rig:
     def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
         session = GroundSession(
             info,
-            pipeline_of=lambda emit: pipeline_of(emit, detector=self.detector, reader=self.reader),
+            pipeline_of=lambda emit: pipeline_of(
+                emit, detector=self.detector, detector_thread=self.detector_thread, reader=self.reader
+            ),
             clock=time.time_ns,
             reports=reports,
             worker_of=self.worker_of,
@@ -480,6 +484,25 @@ def test_slow_detection_never_holds_up_decoding(flight):
     (session,) = rig.ended
     assert session.last_frame_index == 29, "the newest is tracked, whatever is left out"
     assert session.worker.untracked
+
+
+def test_what_the_detector_finds_after_the_last_picture_names_its_tracks(flight):
+    """With ``--once`` the ground ended before, and the last stills had no track."""
+    release = threading.Event()
+
+    class Hangs(RedSquares):
+        def detect(self, image_bgr):
+            assert release.wait(timeout=60)
+            return super().detect(image_bgr)
+
+    with Rig(detector=Hangs(), thread=DetectorThread()) as rig:
+        rig.port.flight = flight
+        rig.put(flight.base(0), flight.still(0, 0))
+        wait_for(lambda: rig.reader.had_base)
+        assert not rig.receiver.idle
+        release.set()
+        rig.settle()
+        assert rig.receiver.session.perceived.refined == 1
 
 
 def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
