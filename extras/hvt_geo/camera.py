@@ -15,7 +15,7 @@ from hvt_common.geodesy import metres_per_degree, moved, turned_deg
 from hvt_common.values import Boxes, Pose, View
 from hvt_geo.surface import FLAT_GROUND, Points, Rays, Surface
 from hvt_ground.events import Places
-from hvt_ground.poses import Footprint
+from hvt_ground.poses import Footprint, Locator
 
 _CHI2_95: Final = 5.991
 """Chi-square of two degrees of freedom: the ellipse that holds 95 % (Abramowitz and Stegun, 26.4.9)."""
@@ -163,8 +163,8 @@ def _effects(
 
 
 @dataclass(frozen=True, slots=True)
-class SurfaceLocator:
-    """A `Locator` on this surface."""
+class SurfaceLocator(Locator):
+    """On this surface."""
 
     surface: Surface = FLAT_GROUND
 

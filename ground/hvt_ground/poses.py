@@ -6,7 +6,7 @@ import math
 import threading
 from bisect import bisect_right
 from dataclasses import dataclass, replace
-from typing import Final, Protocol
+from typing import Final
 
 from hvt_common.geodesy import between, metres_per_degree, turned_deg
 from hvt_common.protocol.messages import PoseDecoder, PoseReport
@@ -132,29 +132,19 @@ class Footprint:
     """Upper left, upper right, lower right, lower left."""
 
 
-class Locator(Protocol):
-    """Where the pictures of one flight lie on the ground."""
+class Locator:
+    """Where the pictures of one flight lie on the ground; this one places nothing, where no extra does."""
 
-    def places(self, pose: Pose, boxes_base_px: Boxes, view: View) -> Places | None:
+    def places(self, pose: Pose, boxes_base_px: Boxes, view: View) -> Places | None:  # noqa: ARG002
         """Places of the objects in (N, 4) boxes; None where the pose does not say enough."""
-        ...
+        return None
 
-    def footprint(self, pose: Pose, view: View) -> Footprint | None:
+    def footprint(self, pose: Pose, view: View) -> Footprint | None:  # noqa: ARG002
         """The footprint of a picture; None where the pose does not say enough, or the centre is in the sky."""
-        ...
+        return None
 
 
-class Nowhere:
-    """Places nothing, where no extra does."""
-
-    def places(self, pose: Pose, boxes_base_px: Boxes, view: View) -> None:
-        """See `Locator.places`."""
-
-    def footprint(self, pose: Pose, view: View) -> None:
-        """See `Locator.footprint`."""
-
-
-NOWHERE: Final = Nowhere()
+NOWHERE: Final = Locator()
 
 
 class SessionPoses:
