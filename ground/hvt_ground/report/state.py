@@ -88,13 +88,16 @@ def _pose(at: _Moment) -> PoseState | None:
         return None
     age_ns = session.newest_capture_ns - newest.capture_ns
     if not session.lockstep:  # the camera may be gone, and flies on
-        age_ns = at.now_ns - session.posed_ns(newest.capture_ns)
+        age_ns = at.now_ns - session.pose_clock.to_local_ns(newest.capture_ns)
     age_s = max(0.0, age_ns / SECOND_NS)
     return PoseState(newest.latitude_deg, newest.longitude_deg, newest.height_m, age_s)
 
 
 def _failed_at_edge(at: _Moment) -> tuple[FailedPart, ...]:
-    since = {one: at.session.to_local_ns(since_ns) for one, since_ns in at.session.edge_failing.items()}
+    since = {
+        one: at.session.clock_offset.to_local_ns(since_ns)
+        for one, since_ns in at.session.edge_failing.items()
+    }
     failed = () if at.status is None else (one for one in at.status.failed if one.part in since)
     return tuple(FailedPart(one.part, one.reason, min(at.now_ns, since[one.part])) for one in failed)
 

@@ -98,8 +98,9 @@ class GroundSession:
         self.budget_bps, self.method = info.budget_bps, info.method
         """As they are now, some seconds late."""
         self.lockstep = info.pace == "lockstep"
-        self._clock_offset = ClockOffset() if reports is None else reports.clock_offset
-        self._capture_clock, self._pose_clock = (CaptureClock(self._clock_offset) for _ in range(2))
+        self.clock_offset = ClockOffset() if reports is None else reports.clock_offset
+        """Of the edge's clock, as `pose_clock` is of the source of poses."""
+        self._capture_clock, self.pose_clock = (CaptureClock(self.clock_offset) for _ in range(2))
         self._account = SessionAccount(info, clock=clock, clock_offset=self._capture_clock, emit=self._emit)
         self.ledger = self._account.ledger
         self.receive_latency = self._account.receive_latency
@@ -146,7 +147,7 @@ class GroundSession:
                     RealtimeWorker, name=info.edge, pass_over=self._pass_over, take_late=self._take_late
                 )
             )
-        self.worker = worker_of(self._analyze, self._step, self._read)
+        self.worker = worker_of(self._analyze, self._step, _perceives(self._read_stills))
         outputs = [one for one in self._queued if one.for_backlog]
         self.backlog = SessionBacklog(
             info,
@@ -241,7 +242,7 @@ class GroundSession:
         pose = self.poses.report(report)
         self._account.time(Channel.POSE, item, report, handled=pose is not None)
         if pose is not None:
-            self._pose_clock.note(pose.capture_ns, received_ns=item.received_ns)
+            self.pose_clock.note(pose.capture_ns, received_ns=item.received_ns)
             self.worker.pose(partial(self.poses.use, pose), pose.capture_ns)
             self._emit(PoseUpdate(max(0, self.newest_index), pose.capture_ns, pose, self.info.view))
             self._note_stale(pose.capture_ns)
@@ -350,10 +351,6 @@ class GroundSession:
         """Whether the times of pictures say how long they were on their way."""
         return self._capture_clock.is_sound and not self.lockstep
 
-    def posed_ns(self, capture_ns: int) -> int:
-        """The time of a pose, this ground's clock."""
-        return self._pose_clock.to_local_ns(capture_ns)
-
     def traffic(self, now_ns: int) -> Traffic | None:
         """The link's load; None before the first access unit, and where none has come lately."""
         fps = self.info.fps if self.last_status is None else self.last_status.coded_fps or self.info.fps
@@ -365,10 +362,6 @@ class GroundSession:
         if self.last_status is None or now_ns - self._status_ns > _LATELY_NS:
             return None
         return self.last_status.health
-
-    def to_local_ns(self, edge_ns: int) -> int:
-        """A time of the edge's clock as this ground's."""
-        return self._clock_offset.to_local_ns(edge_ns)
 
     @property
     def last_frame_index(self) -> int:
@@ -469,7 +462,7 @@ class GroundSession:
         was_sound = self._capture_clock.is_sound
         self._capture_clock.note(capture_ns, received_ns=received_ns)
         if was_sound and not self._capture_clock.is_sound:
-            off_s = abs(received_ns - self._clock_offset.to_local_ns(capture_ns)) // SECOND_NS
+            off_s = abs(received_ns - self.clock_offset.to_local_ns(capture_ns)) // SECOND_NS
             self.note(
                 "warning",
                 f"the camera's clock is {off_s} s off: ages count from the arrival of pictures, and delays are not "
@@ -517,10 +510,6 @@ class GroundSession:
     def _step(self, tracks: Tracks, capture_ns: int) -> None:
         self.pipeline.edge_step(tracks, capture_ns=capture_ns)
         self._collect_results()
-
-    @_perceives
-    def _read(self, stills: Sequence[ReceivedStill]) -> None:
-        self._read_stills(stills)
 
     def _read_stills(self, stills: Sequence[ReceivedStill]) -> None:
         self.pipeline.read(stills)

@@ -296,7 +296,7 @@ def test_a_part_of_the_edge_fails_since_it_stopped(ground):
     assert ground.sessions.session.edge_failing == {"source": at_ns + 3 * SECOND_NS}
     session = ground.sessions.session
     (edge,) = ground.maker.make([("uav-1", ground.sessions)]).edges
-    assert edge.session.edge_failed[0].since_ns == session.to_local_ns(at_ns + 3 * SECOND_NS)
+    assert edge.session.edge_failed[0].since_ns == session.clock_offset.to_local_ns(at_ns + 3 * SECOND_NS)
 
 
 def test_words_of_an_edge_do_not_become_series_without_end(ground):
