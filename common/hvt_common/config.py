@@ -269,7 +269,8 @@ def _flags(config_class: type, *, program: str, description: str, rare: bool) ->
     if any(field.metadata["rare"] for field in fields):
         help_all = "list every setting, also those that few need"
         parser.add_argument("--help-all", action="help", help=help_all)
-    groups = {title: parser.add_argument_group(title) for title in _titles(fields)}
+    titles = dict.fromkeys(field.metadata["group"] for field in fields if field.metadata["group"])
+    groups = {title: parser.add_argument_group(title) for title in titles}
     for field in fields:
         into = groups.get(field.metadata["group"], parser)
         help_line = field.metadata["help"].replace("%", "%%")
@@ -294,10 +295,6 @@ def _flags(config_class: type, *, program: str, description: str, rare: bool) ->
             help=argparse.SUPPRESS if hidden else shown_help,
         )
     return parser
-
-
-def _titles(fields: Sequence[dataclasses.Field[Any]]) -> list[str]:
-    return list(dict.fromkeys(field.metadata["group"] for field in fields if field.metadata["group"]))
 
 
 def _shown(kind: SettingType, default: object) -> str:

@@ -264,7 +264,8 @@ class RemoteEdge:
             if item is not None and _has_ended(item, answer):
                 raise UserError(f"{self.name} has ended: the still does not come")
             header = None if item is None else _header(item)
-            if item is not None and header is not None and _is_answer(header, answer):
+            asked = None if header is None else (header.session_id, header.parameters.get("ask"))
+            if header is not None and item is not None and asked == (answer.session_id, answer.still_request):
                 return header, item
             if now_s >= query_s:
                 note = self._note_of(answer.still_request)
@@ -395,7 +396,3 @@ def _has_ended(item: Received, answer: ControlAnswer) -> bool:
     except WireError:
         return False
     return status.session_id == answer.session_id and status.state == "ended"
-
-
-def _is_answer(header: RoiHeader, answer: ControlAnswer) -> bool:
-    return header.session_id == answer.session_id and header.parameters.get("ask") == answer.still_request

@@ -42,17 +42,17 @@ _BURST, _EVERY_NS = 60, SECOND_NS
 
 def owner_of(edge: str, members: Iterable[str]) -> str:
     """The member that serves the edge, whoever asks."""
-    return max(members, key=lambda member: (_weight(edge, member), member))
+
+    def weight(member: str) -> bytes:
+        return hashlib.blake2b(f"{edge}/{member}".encode(), digest_size=16).digest()
+
+    return max(members, key=lambda member: (weight(member), member))
 
 
 def member_name() -> str:
     """The name of this machine and process, such as ``base-3fa2``."""
     host = re.sub(r"[^a-z0-9-]+", "-", socket.gethostname().lower()).strip("-")[:24]
     return f"{host or 'ground'}-{secrets.token_hex(2)}"
-
-
-def _weight(edge: str, member: str) -> bytes:
-    return hashlib.blake2b(f"{edge}/{member}".encode(), digest_size=16).digest()
 
 
 @dataclass(frozen=True, slots=True)

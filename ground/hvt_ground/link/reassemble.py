@@ -141,19 +141,12 @@ class Reassembler:
             )
         if self._first <= header.sequence < self._next or header.sequence in self._held:
             if now_ns - self._progress_ns < RESTART_SILENCE_NS or self._has_been(header.sequence):
-                return [self._settle_old(unit)]
+                return [self._judged(unit, "duplicate" if self._has_been(header.sequence) else "stale")]
             return self._accept_outsider(unit, "stale", patience_ns=RESTART_SILENCE_NS)
         if not self._plausible(header, now_ns):
             return self._accept_outsider(unit, "implausible", patience_ns=RESTART_SILENCE_NS)
         self._held[header.sequence] = unit
-        return self._release(now_ns)
-
-    def overdue(self, *, now_ns: int) -> list[Arrival]:
-        """What has waited long enough behind a hole, settled though nothing more comes.
-
-        Until it counts as received the edge holds its next frames, and with them what would end the wait.
-        """
-        return self._release(now_ns)
+        return self.overdue(now_ns=now_ns)
 
     def corrupt(self) -> None:
         """Count a message of the base stream that could not be read or whose CRC was wrong."""
@@ -195,8 +188,11 @@ class Reassembler:
 
     # Within the session: a hole waits, then is given up.
 
-    def _release(self, now_ns: int) -> list[Arrival]:
-        # Everything that need not wait any longer: at most ``REORDER_UNITS`` units stay behind a hole.
+    def overdue(self, *, now_ns: int) -> list[Arrival]:
+        """What need not wait any longer behind a hole, where at most ``REORDER_UNITS`` units do.
+
+        Until it counts as received the edge holds its next frames, and with them what would end the wait.
+        """
         released: list[Arrival] = []
         keyframe = max(
             (sequence for sequence, unit in self._held.items() if unit.header.keyframe), default=-1
@@ -238,9 +234,6 @@ class Reassembler:
         if not self._synced and not header.keyframe:
             return "skip"
         return "decode"
-
-    def _settle_old(self, unit: Arrival) -> Arrival:
-        return self._judged(unit, "duplicate" if self._has_been(unit.header.sequence) else "stale")
 
     def _has_been(self, sequence: int) -> bool:
         # Whether this old number is known to have come; of those long ago nothing is known.

@@ -82,7 +82,9 @@ class SessionFiles(SinkWriter[Event]):
             self._recorder.log(item, into=file)
             self._accounts[file].note(item)
         if time.monotonic() - self._reported_s > _REPORT_S:
-            self._report_all()
+            self._reported_s = time.monotonic()
+            for file in self._accounts:
+                self._report(file)
 
     def skipped(self, count: int) -> None:
         """See `Recorder`."""
@@ -192,11 +194,6 @@ class SessionFiles(SinkWriter[Event]):
             self._recorder.close_file(file, hurry)
             self._report(file)
             del self._accounts[file]
-
-    def _report_all(self) -> None:
-        self._reported_s = time.monotonic()
-        for file in self._accounts:
-            self._report(file)
 
     def _report(self, file: RecordingFile) -> None:
         if self._tell is None or file.path is None:

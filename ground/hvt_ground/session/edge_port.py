@@ -112,7 +112,9 @@ class EdgePort:
             try:
                 info = Info.parse(data)
             except UnknownVersionError as error:
-                self._say_version(error.between(f"edge {self.edge}", "this ground"))
+                if not self._version_said:  # once: it is asked again and again
+                    self._version_said = True
+                    _log.warning("%s", error.between(f"edge {self.edge}", "this ground"))
                 return
             except WireError as error:
                 self._unusable += 1
@@ -130,12 +132,6 @@ class EdgePort:
 
         request = InfoRequest(requester_id=self._requester_id, still_codecs=self._still_codecs)
         self._query(Channel.INFO, request.pack(), on_answer=note, on_end=on_end)
-
-    def _say_version(self, sentence: str) -> None:
-        # Once: it is asked again and again.
-        if not self._version_said:
-            self._version_said = True
-            _log.warning("%s", sentence)
 
     def fail(self, error: Exception) -> None:
         """Hand over the error of a callback."""

@@ -187,7 +187,8 @@ class QueuedSink(Generic[T]):
                 sink.log(item)
                 self._resumed |= sink.awaits_keyframe
                 sink.awaits_keyframe = False
-                self._note_file(sink)
+                if sink.path is not None and sink.path != self.files[-1]:
+                    self.files.append(sink.path)
             sink.close(self._hurry)
         except Exception as error:  # noqa: BLE001 - whatever it is, everything else goes on
             if sink is not None:
@@ -205,10 +206,6 @@ class QueuedSink(Generic[T]):
             self._open, self._failing = True, False
             self._changed.notify_all()
         self._failures.works(self.part)
-
-    def _note_file(self, sink: SinkWriter[T]) -> None:
-        if sink.path is not None and sink.path != self.files[-1]:
-            self.files.append(sink.path)
 
     def _take(self) -> tuple[T, int] | None:
         # The next item, and how many were dropped before it; None at the end.

@@ -132,7 +132,9 @@ def static_chunks(title: str, facts: Mapping[str, str], *, info: bytes) -> list[
 
 def session_chunk(title: str, facts: Mapping[str, str]) -> Chunk:
     """The session panel; the last one written holds."""
-    return static_chunk(SESSION, rr.TextDocument(_facts(title, facts), media_type=rr.MediaType.MARKDOWN))
+    reported = "  ·  ".join([f"**{title}**", *(f"{name} **{value}**" for name, value in facts.items())])
+    text = f"{reported}\n\n{_LEGEND}"
+    return static_chunk(SESSION, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
 def class_chunk(path: str, class_ids: Mapping[tuple[str, int], int]) -> Chunk:
@@ -280,8 +282,3 @@ def _lines(lines: tuple[tuple[str, tuple[int, int, int], float], ...]) -> rr.Ser
         colors=[colour for _, colour, _ in lines],
         widths=[width for _, _, width in lines],
     )
-
-
-def _facts(title: str, facts: Mapping[str, str]) -> str:
-    reported = "  ·  ".join([f"**{title}**", *(f"{name} **{value}**" for name, value in facts.items())])
-    return f"{reported}\n\n{_LEGEND}"

@@ -63,7 +63,8 @@ def place_labels(
         order = sorted(range(len(places)), key=lambda side: side != sides.get(word.row, -1))
         for side in order:
             area = places[side]
-            if _inside(area, size) and not _overlaps(area, others):
+            inside = (area[:2] >= 0).all() and area[2] <= size[0] and area[3] <= size[1]
+            if inside and not _overlaps(area, others):
                 at = (float(area[0] + area[2]) / 2, float(area[1]))
                 labels.append(Label(word.row, word.text, at, side))
                 taken = np.vstack([taken, area])
@@ -99,10 +100,6 @@ def _places(box: _Boxes, text: str, size: tuple[int, int]) -> list[_Boxes]:
 
 def _width(text: str, size: tuple[int, int]) -> float:
     return points(_LETTER * len(text) + _MARGIN, size[0])
-
-
-def _inside(area: _Boxes, size: tuple[int, int]) -> bool:
-    return bool((area[:2] >= 0).all() and area[2] <= size[0] and area[3] <= size[1])
 
 
 def _overlaps(area: _Boxes, others: _Boxes) -> bool:

@@ -57,7 +57,8 @@ class LiveView:
             f"http://{_HOST}:{web_port}/?url=rerun%2Bhttp://{_HOST}:{port}/proxy" if kind == "serve" else ""
         )
         """The address for a browser; empty for the native viewer."""
-        if kind == "spawn" and sys.platform == "linux" and not _display():
+        displays = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+        if kind == "spawn" and sys.platform == "linux" and not any(map(os.environ.get, displays)):
             raise UserError("--view needs a display and DISPLAY is not set: use --serve and a browser")
         self._port, self._web_port = port, web_port
         self._lock = threading.Lock()
@@ -190,10 +191,6 @@ def listening(port: int) -> bool:
     with socket.socket() as probe:
         probe.settimeout(0.2)
         return probe.connect_ex((_HOST, port)) == 0
-
-
-def _display() -> bool:
-    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"))
 
 
 def free_port() -> int:
