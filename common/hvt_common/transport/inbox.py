@@ -39,7 +39,6 @@ class ReceivedQueue(Protocol):
 
     def put(self, item: Received) -> None:
         """Take one message."""
-        ...
 
 
 class Inbox:

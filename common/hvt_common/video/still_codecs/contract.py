@@ -57,24 +57,20 @@ class StillCodec(Protocol):
     @property
     def name(self) -> str:
         """The word on the wire, ``[a-z0-9-]``, at most 24 characters."""
-        ...
 
     @property
     def media_type(self) -> str:
         """``image/jpeg`` and the like; also the Zenoh encoding of the payload."""
-        ...
 
     @property
     def needs_base(self) -> bool:
         """Whether ``base_bgr`` has to be given: the same crop of the decoded base frame, at the same size."""
-        ...
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:
         """Code a crop of at least 1x1 pixels; ``quality_pct`` runs from 1 (smallest) to 100 (best).
 
         More quality never means a worse picture; it nearly always means more bytes.
         """
-        ...
 
     def decode(
         self,
@@ -89,7 +85,6 @@ class StillCodec(Protocol):
         Raises `StillError` for anything hostile, before it costs more than a picture of that size; `BaseMissingError`
         where ``base_bgr`` is needed and is None or another than the edge had.
         """
-        ...
 
 
 _QP = (

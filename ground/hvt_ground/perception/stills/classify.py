@@ -54,14 +54,12 @@ class StillReader(Protocol):
     @property
     def class_names(self) -> tuple[str, ...]:
         """The classes of the posteriors, and of ``found``."""
-        ...
 
     def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:
         """One reading for every object of every still.
 
         All stills are of one frame, ``base_bgr`` is that frame decoded, where it is still at hand.
         """
-        ...
 
 
 def _silent(stills: Sequence[DecodedStill]) -> FrameReadings:
