@@ -56,18 +56,6 @@ class Kind(ABC):
         return value
 
 
-@dataclass(frozen=True, slots=True)
-class _Sequence(Kind):
-    inner: Kind
-
-    def _encode(self, value: Any) -> Any:
-        return [self.inner.encode(item) for item in value]
-
-    def _items(self, raw: Any, most: int) -> tuple[Any, ...]:
-        _check_size(raw, list, "list", most)
-        return tuple(self.inner.decode(item) for item in raw)
-
-
 def wire_field(kind: Kind, *, default: Any = MISSING, since: int = 0, before: Any = None) -> Any:
     """A dataclass field that crosses the wire as ``kind``; fields are sent in the order they are declared.
 
@@ -270,43 +258,41 @@ class Scalar(Kind):
 
 
 @dataclass(frozen=True, slots=True)
-class ListOf(_Sequence):
-    """At most ``max_items`` of one kind, as a tuple."""
+class ListOf(Kind):
+    """``least`` to ``max_items`` of one kind, as a tuple."""
 
+    inner: Kind
     max_items: int
+    least: int = 0
+
+    def _encode(self, value: Any) -> Any:
+        return [self.inner.encode(item) for item in value]
 
     def decode(self, raw: Any) -> Any:
-        return self._items(raw, self.max_items)
+        _check_size(raw, list, "list", self.max_items)
+        if len(raw) < self.least:
+            raise WireError(f"{len(raw)} numbers in place of {self.least}")
+        return tuple(self.inner.decode(item) for item in raw)
 
     def schema(self) -> dict[str, Any]:
-        return {"type": "array", "least": 0, "most": self.max_items, "of": self.inner.schema()}
+        return {
+            "type": "array",
+            "least": self.least,
+            "most": self.max_items,
+            "of": self.inner.schema(),
+        }
 
 
 @dataclass(frozen=True, slots=True)
-class TupleOf(_Sequence):
-    """Exactly ``length`` of one kind."""
-
-    length: int
-
-    def decode(self, raw: Any) -> Any:
-        items = self._items(raw, self.length)
-        if len(items) != self.length:
-            raise WireError(f"{len(items)} numbers in place of {self.length}")
-        return items
-
-    def schema(self) -> dict[str, Any]:
-        return {"type": "array", "least": self.length, "most": self.length, "of": self.inner.schema()}
-
-
-@dataclass(frozen=True, slots=True)
-class Box(TupleOf):
+class Box(ListOf):
     """x1, y1, x2, y2 of one kind, x2 and y2 exclusive: never inside out; ``empty``: it may have no inside."""
 
-    length: int = 4
+    max_items: int = 4
+    least: int = 4
     empty: bool = True
 
     def decode(self, raw: Any) -> Any:
-        items = TupleOf.decode(self, raw)
+        items = ListOf.decode(self, raw)
         x1, y1, x2, y2 = items
         if x2 < x1 or y2 < y1:
             raise WireError(f"box {items} is inside out")
@@ -315,7 +301,7 @@ class Box(TupleOf):
         return items
 
     def schema(self) -> dict[str, Any]:
-        return TupleOf.schema(self) | {"box": "may be empty" if self.empty else "never empty"}
+        return ListOf.schema(self) | {"box": "may be empty" if self.empty else "never empty"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,6 @@ from hvt_common.protocol.messages.fields import (
     Real,
     Scaled,
     Text,
-    TupleOf,
     fitted_text,
     wire_field,
 )
@@ -67,11 +66,11 @@ class Info(Message):
     software: str = wire_field(Text(32))
     """Version of HVT on the edge."""
     started_ns: int = wire_field(_TIME)
-    source_size: tuple[int, int] = wire_field(TupleOf(_SIDE, 2))
+    source_size: tuple[int, int] = wire_field(ListOf(_SIDE, 2, 2))
     """(width, height) in pixels."""
-    base_size: tuple[int, int] = wire_field(TupleOf(_SIDE, 2))
+    base_size: tuple[int, int] = wire_field(ListOf(_SIDE, 2, 2))
     view_scale: float = wire_field(Real(1e-4, 1e4))
-    view_offset_px: tuple[float, float] = wire_field(TupleOf(Real(-32767, 32767), 2))
+    view_offset_px: tuple[float, float] = wire_field(ListOf(Real(-32767, 32767), 2, 2))
     """base = source x scale + offset, in base pixels."""
     fps: float = wire_field(Real(0.01, 1000))
     codec: str = wire_field(Text(24))
@@ -167,7 +166,7 @@ class Status(Message):
     roi_messages: int = wire_field(_COUNT)
     backlog_messages: int = wire_field(_COUNT)
     meta_messages: int = wire_field(_COUNT)
-    worst_window_bps: tuple[int, int, int] = wire_field(TupleOf(_BPS, 3))
+    worst_window_bps: tuple[int, int, int] = wire_field(ListOf(_BPS, 3, 3))
     """Base, roi, total: the fullest rolling window of the run."""
     sent: Mapping[str, int] = wire_field(_REASONS)
     """Stills sent, by reason."""

@@ -69,7 +69,6 @@ from hvt_common.protocol.messages.fields import (
     Scalar,
     Scaled,
     Text,
-    TupleOf,
 )
 from hvt_common.units import shown_text
 from hvt_common.values import View
@@ -119,10 +118,8 @@ def value_of(kind: Kind) -> SearchStrategy:  # noqa: C901, PLR0911, PLR0912 - on
             corner, side = st.integers(0, 16000), st.integers(1, 16000)
             crop = st.tuples(corner, corner, side, side)
             return crop.map(lambda box: (box[0], box[1], box[0] + box[2], box[1] + box[3]))
-        case TupleOf(inner, length):
-            return st.tuples(*[value_of(inner)] * length)
-        case ListOf(inner, max_items):
-            return st.lists(value_of(inner), max_size=min(max_items, 6)).map(tuple)
+        case ListOf(inner, max_items, least):
+            return st.lists(value_of(inner), min_size=least, max_size=min(max_items, 6)).map(tuple)
         case MapOf(inner, max_items, key_bytes):
             return st.dictionaries(value_of(Text(key_bytes)), value_of(inner), max_size=min(max_items, 6))
         case Nested(of):
