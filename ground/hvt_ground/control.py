@@ -264,8 +264,12 @@ class RemoteEdge:
             if item is not None and _has_ended(item, answer):
                 raise UserError(f"{self.name} has ended: the still does not come")
             header = None if item is None else _header(item)
-            asked = None if header is None else (header.session_id, header.parameters.get("ask"))
-            if header is not None and item is not None and asked == (answer.session_id, answer.still_request):
+            answers = None if header is None else (header.session_id, header.parameters.get("ask"))
+            if (
+                header is not None
+                and item is not None
+                and answers == (answer.session_id, answer.still_request)
+            ):
                 return header, item
             if now_s >= query_s:
                 note = self._note_of(answer.still_request)
