@@ -7,7 +7,7 @@ import io
 import logging
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,17 +37,26 @@ def read_tracks(path: Path, *, column: str = "class") -> dict[int, FrameView]:
     rows: dict[int, tuple[list[list[float]], list[str]]] = defaultdict(lambda: ([], []))
     try:
         with io.StringIO(read_text(path, most=MOST_TABLE_BYTES), newline="") as file:
-            for line in csv.DictReader(file):
-                x, y, w, h = (float(line[name]) for name in ("x", "y", "w", "h"))
-                frame = int(line["frame_index"]) + 1 if "frame_index" in line else int(line["frame"])
-                boxes, names = rows[frame]
-                boxes.append([x, y, x + w, y + h])
-                names.append(line[column])
+            for frame, box, name in _lines(csv.DictReader(file), column):
+                rows[frame][0].append(box)
+                rows[frame][1].append(name)
     except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
         raise UserError(
             f"{path} is not a table of tracks as hvt-ground --tracks writes it ({error})"
         ) from None
     return _held({frame: FrameView.plain(*found) for frame, found in rows.items()})
+
+
+def _lines(table: csv.DictReader[str], column: str) -> Iterator[tuple[int, list[float], str]]:
+    # Frame, box and class of each line; KeyError, TypeError or ValueError where there are none.
+    if column not in (table.fieldnames or ()):
+        raise KeyError(column)
+    for line in table:
+        x, y, w, h = (float(line[name]) for name in ("x", "y", "w", "h"))
+        if not math.isfinite(x + y + w + h):
+            raise ValueError(f"line {table.line_num} has no box")
+        frame = int(line["frame_index"]) + 1 if "frame_index" in line else int(line["frame"])
+        yield frame, [x, y, x + w, y + h], line[column]
 
 
 def read_truth(path: Path, *, class_names: Sequence[str]) -> dict[int, FrameLabels]:
@@ -84,7 +93,7 @@ def _held(tracks: dict[int, FrameView]) -> dict[int, FrameView]:
     usual = min(_MOST_HELD, int(np.quantile(gaps, 0.9, method="lower"))) if len(gaps) >= _LEAST_GAPS else 1
     between = {
         frame + step: tracks[frame]
-        for frame, gap in zip(frames, [*gaps, usual], strict=True)
+        for frame, gap in zip(frames, [*gaps, usual], strict=False)  # of no frame there is no gap
         for step in range(1, min(int(gap), usual))
     }
     return tracks | between

@@ -127,13 +127,15 @@ def test_perfect_tracks_of_the_demo_score_one(tmp_path: Path, capsys: pytest.Cap
 def test_wrong_files_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A table of something else is named, not counted as no tracks."""
     junk = tmp_path / "junk.csv"
-    junk.write_text("a,b\n1,2\n")
-    with pytest.raises(UserError, match=r"junk\.csv"):
-        read_tracks(junk)
-    endless = tmp_path / "endless.csv"  # a quotation mark that nothing closes
-    endless.write_text('frame,x,y,w,h,class\n1,1,2,3,4,"' + "car" * 50_000)
-    with pytest.raises(UserError, match=r"endless\.csv is not a table of tracks"):
-        read_tracks(endless)
+    for text in (
+        "",
+        "frame,x,y,w,h,class\n1,nan,2,3,4,car\n",
+        'frame,x,y,w,h,class\n1,1,2,3,4,"' + "car" * 50_000,  # a quotation mark that nothing closes
+        "a,b\n1,2\n",
+    ):
+        junk.write_text(text)
+        with pytest.raises(UserError, match=r"junk\.csv is not a table of tracks"):
+            read_tracks(junk)
     with pytest.raises(UserError, match=r"junk\.csv, line 1 is 'a,b'"):
         read_truth(junk, class_names=("car",))
     assert main(["score", str(junk), "--truth", str(junk)]) == 2
@@ -143,6 +145,7 @@ def test_wrong_files_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("frames", "shown"),
     [
+        ([], set()),
         ([*range(1, 24, 2)], {*range(1, 25)}),
         ([1, 2, 3, 6, 7, 8, 9, 10, 11, 12, 13, 14], {1, 2, 3, 6, 7, 8, 9, 10, 11, 12, 13, 14}),
         ([1, 5], {1, 5}),
