@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 _PART, _REQUESTED_PART = "stills", "requested stills"
 _LEAST_FRAMES = 2
 MAX_QUEUE_BYTES = 24 * 2**20
-"""Of frames that are queued: 4 of 1280x720, 2 of 1920x1080 and more."""
+"""Of frames that are queued: 9 of 1280x720 that are coded in that size, 2 of 1920x1080 and more."""
 _RETRY_S = 0.025
 _FAILED_S = 1.0
 _MOST_SKIPPED_BYTES = 2 * 2**20
@@ -118,7 +118,8 @@ class StillWorker:
         """Queue one frame, in order, with its access unit if it has one; False where it is skipped."""
         self.stage.capture(frame)
         # All frames of a source have one size, so a bound in bytes is a bound in frames.
-        fitting = self.max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
+        pictures = {id(one): one.nbytes for one in (frame.source_bgr, frame.base_bgr)}
+        fitting = self.max_bytes // sum(pictures.values())
         self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))
         with self._lock:
             if self.full or late:
