@@ -469,6 +469,7 @@ def _overlay(
         origins=_of(fused.origins, rows),
         doubted=shown.doubted[rows],
         sure=shown.sure[rows],
+        vague=shown.vague[rows],
     )
 
 
