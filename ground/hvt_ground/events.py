@@ -15,7 +15,6 @@ import numpy.typing as npt
 from hvt_common.protocol.messages import RoiHeader
 from hvt_common.values import Boxes, Image, Pose, View
 
-
 VEHICLE = "vehicle"
 
 
