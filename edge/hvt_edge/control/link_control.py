@@ -101,7 +101,7 @@ class LinkControl:
         turn: Callable[[], None] = lambda: None,
     ) -> None:
         """After the last frame of a recorded source: send what was stored, and call ``turn`` meanwhile."""
-        self.transmitter.end_base()
+        self.transmitter.budget.end_base()
 
         def before_frame(now_ns: int) -> None:
             turn()

@@ -18,7 +18,6 @@ same windows.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from typing import Protocol
@@ -33,7 +32,6 @@ from hvt_common.protocol.messages import (
     CaptureTimes,
     Flags,
     PackedMessage,
-    Status,
 )
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Still
@@ -89,7 +87,7 @@ class Transmitter:
     def __post_init__(self) -> None:
         self._keys = EdgeKeys(self.edge_id)
         self._flags = Flags.LOCKSTEP if self.lockstep else Flags(0)
-        self._lock = threading.Lock()
+        self._lock = self.budget.lock
         self.base_sequence = -1
         """Index of the last access unit sent; -1 before the first."""
         self.still_sequence = -1
@@ -187,16 +185,6 @@ class Transmitter:
             line_bytes = size_bytes + STILL_ATTACHMENT_BYTES + overhead
             self.budget.want_requested(min(line_bytes, self.budget.most_requested_bytes), now_ns=now_ns)
 
-    def yielding(self, now_ns: int) -> bool:
-        """Whether frames are being left out for a requested still that waits."""
-        with self._lock:
-            return self.budget.yielding(now_ns)
-
-    def leaves_out(self, now_ns: int) -> bool:
-        """Whether the frame that is due now is left out for a requested still; ask once for each."""
-        with self._lock:
-            return self.budget.leaves_out(now_ns)
-
     def most_requested_bytes(self) -> int:
         """About the payload of the largest still that a ground may have at the present rates."""
         with self._lock:
@@ -260,11 +248,6 @@ class Transmitter:
         """The round trip of the link; half a second if it is not measured."""
         return SECOND_NS // 2 if self.pacer is None else self.pacer.round_trip_ns
 
-    @property
-    def total_bps(self) -> int:
-        """The budget as it is now."""
-        return self.budget.total_bps
-
     def backlog_allowance_bytes(self, now_ns: int, *, reserve: float) -> int:
         """Payload that a chunk of the backlog may have now; ``reserve``: see `RollingBudget.backlog_allowance`."""
         with self._lock:
@@ -279,7 +262,7 @@ class Transmitter:
             key=self._keys.key(Channel.BACKLOG),
             encoding=DELIVERIES[Channel.BACKLOG].encoding,
         )
-        most = min(_MOST_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, round(_CHUNK_S * self.total_bps / 8)))
+        most = min(_MOST_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, round(_CHUNK_S * self.budget.total_bps / 8)))
         return min(most, max(0, line_bytes - around))
 
     def backlog(self, chunk: Chunk, *, now_ns: int) -> int:
@@ -302,7 +285,7 @@ class Transmitter:
             if needed_bytes > self.budget.backlog_allowance(now_ns, reserve=0.0):
                 return 0
             line_bytes = self._count(Channel.BACKLOG, Account.BACKLOG, chunk.data, attachment, at_ns=now_ns)
-            self.budget.record_backlog(line_bytes, now_ns=now_ns)
+            self.budget.record_other(line_bytes, now_ns)
             if self.pacer is not None:
                 self.pacer.sent_other(line_bytes, now_ns=now_ns)
         self.outlet.put(
@@ -319,7 +302,15 @@ class Transmitter:
         before_frames: bool = False,
         last: bool = False,
     ) -> bool:
-        """Send what belongs to neither stream where the next frame keeps its room; else False. See `status`."""
+        """Send what belongs to neither stream, where the next frame keeps its room; else False: try again.
+
+        ``before_frames``: one that has waited long goes as soon as it fits. The ``last`` one, of ``status``, waits
+        until it does.
+
+        ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment. Behind the
+        ``last`` one go no stills and no tracks, whichever thread still has some: a ground that has all that it names
+        closes the session.
+        """
         at_ns = now_ns
         with self._lock:
             if self._ended:
@@ -339,25 +330,6 @@ class Transmitter:
         self.outlet.put(channel, payload, encoding=DELIVERIES[channel].encoding)
         return True
 
-    def status(
-        self, make: Callable[[int], Status], *, now_ns: int, before_frames: bool = False, last: bool = False
-    ) -> bool:
-        """Send the once-a-second report, where the next frame keeps its room; else False, and it may be tried again.
-
-        ``before_frames``: one that has waited long goes as soon as it fits. The ``last`` one waits until it does.
-
-        ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment. Behind the
-        ``last`` one go no stills and no tracks, whichever thread still has some: a ground that has all that it names
-        closes the session.
-        """
-        return self.metadata(
-            Channel.STATUS,
-            lambda at_ns: make(at_ns).pack(),
-            now_ns=now_ns,
-            before_frames=before_frames,
-            last=last,
-        )
-
     def reply(self, channel: Channel, payload: bytes) -> bytes:
         """Count an answer to a query, and let it go at once: the link puts it on the line as this returns.
 
@@ -373,20 +345,10 @@ class Transmitter:
             self.ledger.count_reply(len(payload) + overhead)
         return payload
 
-    def set_rates(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
-        """Total, base stream's share and coded frames a second from now on; see `RollingBudget.set_total`."""
-        with self._lock:
-            self.budget.set_total(total_bps, base_bps, fps, now_ns=now_ns)
-
-    @property
-    def frame_bytes(self) -> int:
-        """Line bytes of an average base frame at the rate that the encoder is open for."""
-        return round(self.budget.base_step_bytes)
-
     def base_wait_ns(self, now_ns: int, *, line_bytes: int | None = None) -> int:
         """The wait of a base message for the budget's window, were it sent now; None: an average frame."""
         with self._lock:
-            line_bytes = self.frame_bytes if line_bytes is None else line_bytes
+            line_bytes = round(self.budget.base_step_bytes) if line_bytes is None else line_bytes
             return max(0, self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True) - now_ns)
 
     def base_unit_wait_ns(self, unit: AccessUnit, *, now_ns: int) -> int | None:
@@ -402,28 +364,8 @@ class Transmitter:
         with self._lock:
             return self._holds(unit, line_bytes)
 
-    def window_holds(self, line_bytes: int) -> bool:
-        """Tell whether an empty window of the budget has room for a message of so many line bytes."""
-        with self._lock:
-            return self.budget.holds(line_bytes)
-
     def _holds(self, unit: AccessUnit, line_bytes: int) -> bool:
         return len(unit.data) <= MAX_PAYLOAD_BYTES and self.budget.holds(line_bytes)
-
-    def end_base(self) -> None:
-        """The source has given its last frame; see `RollingBudget.end_base`."""
-        with self._lock:
-            self.budget.end_base()
-
-    def takes_ns(self, line_bytes: int) -> int:
-        """The time of so many line bytes at the whole budget."""
-        with self._lock:
-            return 8 * SECOND_NS * line_bytes // self.budget.total_bps
-
-    def keyframe_fits(self, line_bytes: int, *, now_ns: int, awaited: bool = False) -> bool:
-        """Tell whether a keyframe of so many line bytes leaves the budget whole (`RollingBudget.keyframe_fits`)."""
-        with self._lock:
-            return self.budget.keyframe_fits(line_bytes, now_ns=now_ns, awaited=awaited)
 
     def outcome(self, outcome: str, reason: str) -> None:
         """Note what became of a candidate: ``sent``, ``deferred`` or ``dropped``, and why."""

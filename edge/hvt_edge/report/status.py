@@ -108,8 +108,12 @@ class StatusReporter:
             return
         (state, levers), now_ns = self._pending, self._of.loop_clock()
         late = self._due_ns is not None and now_ns - self._due_ns >= _LATE_NS
-        if self._of.transmitter.status(
-            lambda at_ns: self._status(state, levers, at_ns), now_ns=now_ns, before_frames=late, last=last
+        if self._of.transmitter.metadata(
+            Channel.STATUS,
+            lambda at_ns: self._status(state, levers, at_ns).pack(),
+            now_ns=now_ns,
+            before_frames=late,
+            last=last,
         ):
             self._pending = self._due_ns = None
             self._sequence += 1

@@ -191,7 +191,7 @@ class EncoderReconfiguration:
     def _set_budget(self, now_ns: int) -> None:
         now = self.operating.now
         fps = self.settings.nominal_fps / now.decimation
-        self.transmitter.set_rates(now.total_bps, now.base_bps, fps, now_ns=now_ns)
+        self.transmitter.budget.set_total(now.total_bps, now.base_bps, fps, now_ns=now_ns)
 
     def _base_of(self, total_bps: int) -> int:
         # The base's part of so much in all; never less than x265 can follow at its lowest frame rate.

@@ -232,18 +232,20 @@ def test_in_an_outage_stills_have_the_room_that_the_link_gave_them(tmp_path):
     """The pacer takes silence for a link of 100 kbps: not one still of the outage would be kept."""
     rig = Rig(tmp_path / "store", adapt=True)
     rig.play(0, 21, reports=True)
-    assert rig.sender.total_bps == 800_000
+    assert rig.sender.budget.total_bps == 800_000
     rig.out.dark = True
     rig.play(21, 60)
     assert rig.backlog.offline
     assert rig.pacer.rate_bps == 100_000
-    assert rig.sender.total_bps == 800_000
+    assert rig.sender.budget.total_bps == 800_000
     assert rig.sender.still_allowance_bytes(rig.now_ns, paced=False) > 5_000
     rig.out.dark = False
     rig.report()
     rig.play(60, 62)
     assert not rig.backlog.offline
-    assert rig.sender.total_bps == rig.pacer.rate_bps < 800_000, "the link has to show first what it carries"
+    assert rig.sender.budget.total_bps == rig.pacer.rate_bps < 800_000, (
+        "the link has to show first what it carries"
+    )
     rig.backlog.close()
 
 

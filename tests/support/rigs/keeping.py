@@ -330,7 +330,7 @@ def link_of(sender: Transmitter, outbox: Outbox) -> BacklogLink:
         allowance_bytes=lambda now_ns, reserve: sender.backlog_allowance_bytes(now_ns, reserve=reserve),
         send=lambda chunk, now_ns: sender.backlog(chunk, now_ns=now_ns),
         round_trip_ns=lambda: sender.round_trip_ns,
-        total_bps=lambda: sender.total_bps,
+        total_bps=lambda: sender.budget.total_bps,
         stills_pending=lambda: outbox.any_pending,
         stills_in_flight=lambda: outbox.unacknowledged,
     )

@@ -375,12 +375,7 @@ class LiveFlight:
             self.rates.append((self.second, self.pacer.rate_bps))
 
     def _status(self) -> None:
-        class Report:
-            @staticmethod
-            def pack() -> bytes:
-                return bytes(330)
-
-        self.transmitter.status(lambda _: Report(), now_ns=self.now_ns)  # type: ignore[arg-type,return-value]
+        self.transmitter.metadata(Channel.STATUS, lambda _: bytes(330), now_ns=self.now_ns)
 
     def _command(self, budget_bps: int) -> None:
         now = self.operating.now
