@@ -170,7 +170,7 @@ class Edge:
                     raise
                 raise FlightError(str(error)) from error
             finally:
-                stages.stills.close()
+                stages.stills.chooser.close()
                 self._say_goodbye(stages, link)
         return self._summary(stages, link)
 

@@ -169,7 +169,7 @@ class Commands:
                 "R0 codes the video in another way from the first frame on: start the edge with it"
             )
         self._change(now.budget_bps, self._share_for(policy.video_only), policy.name)
-        self.chooser.set_method(policy)
+        self.chooser.method = policy  # from the next decision step on; pending stills stay
         return _Result()
 
     def _send_backlog(self, arguments: Arguments) -> _Result:

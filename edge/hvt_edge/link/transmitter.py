@@ -134,8 +134,8 @@ class Transmitter:
         )
         return line_bytes
 
-    def envelope(self, still: Still) -> StillEnvelope:
-        """The still with its header. The newest is cached, so the measured bytes are those sent."""
+    def _envelope(self, still: Still) -> StillEnvelope:
+        # The newest is cached: its header is packed once, however often it is asked for.
         newest = self._newest
         if newest is None or newest.still is not still:
             self._newest = newest = StillEnvelope.of(still, session_id=self.session_id)
@@ -152,19 +152,13 @@ class Transmitter:
             line_bytes = self.budget.still_allowance(now_ns)
         if paced and self.pacer is not None and not self.pacer.admits_still(now_ns):
             return 0
-        if still is None:
-            return self._payload_bytes(line_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding)
-        envelope = self.envelope(still)
-        header_bytes = self._header_at(envelope, now_ns).size_bytes
-        return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
+        return self._usual_payload(line_bytes) if still is None else self._payload(line_bytes, still, now_ns)
 
     def requested_allowance_bytes(self, now_ns: int, *, still: Still) -> int:
         """Like `still_allowance_bytes`, not paced, for a requested still: the video yields to it."""
         with self._lock:
             line_bytes = self.budget.requested_allowance(now_ns)
-        envelope = self.envelope(still)
-        header_bytes = self._header_at(envelope, now_ns).size_bytes
-        return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
+        return self._payload(line_bytes, still, now_ns)
 
     def link_is_free(self, now_ns: int) -> bool:
         """Whether a still may go as far as the link is concerned."""
@@ -176,28 +170,20 @@ class Transmitter:
             if size_bytes is None:
                 self.budget.want_requested(None, now_ns=now_ns)
                 return
-            overhead = overhead_bytes(
-                size_bytes,
-                STILL_ATTACHMENT_BYTES,
-                key=self._keys.key(Channel.ROI),
-                encoding=DELIVERIES[Channel.ROI].encoding,
-            )
-            line_bytes = size_bytes + STILL_ATTACHMENT_BYTES + overhead
+            line_bytes = size_bytes + self._around(Channel.ROI, size_bytes, STILL_ATTACHMENT_BYTES)
             self.budget.want_requested(min(line_bytes, self.budget.most_requested_bytes), now_ns=now_ns)
 
     def most_requested_bytes(self) -> int:
         """About the payload of the largest still that a ground may have at the present rates."""
         with self._lock:
             line_bytes = self.budget.most_requested_bytes
-        return self._payload_bytes(line_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding)
+        return self._usual_payload(line_bytes)
 
     def most_still_bytes(self) -> int:
         """About the payload of the largest still that the budget ever admits."""
-        return self._payload_bytes(
-            self.budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding
-        )
+        return self._usual_payload(self.budget.most_still_bytes)
 
-    def still(self, envelope: StillEnvelope, *, now_ns: int, copy: str = "", requested: bool = False) -> None:
+    def still(self, still: Still, *, now_ns: int, copy: str = "", requested: bool = False) -> None:
         """Send one still that `still_allowance_bytes` admitted at this very time; ``copy``: why it is sent again.
 
         ``requested`` by a ground: `requested_allowance_bytes` admitted it.
@@ -206,8 +192,8 @@ class Transmitter:
         it waits until there is one again, as everything does.
         Its outcome is noted with its bytes: ``sent``, or ``dropped`` once the run has ended.
         """
-        still, encoding = envelope.still, envelope.encoding
         with self._lock:
+            envelope = self._envelope(still)
             if self._ended:
                 self.ledger.record_outcome("dropped", "ended")
                 return
@@ -216,7 +202,7 @@ class Transmitter:
             at_ns = self._still_at_ns(envelope, max(now_ns, now_ns if self.clock is None else self.clock()))
             attachment = self._header_at(envelope, at_ns).pack(still.data)
             line_bytes = self._count(
-                Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=encoding
+                Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=envelope.encoding
             )
             record = self.budget.record_requested if requested else self.budget.record_still
             record(line_bytes, now_ns=at_ns)
@@ -225,7 +211,7 @@ class Transmitter:
             elif self.pacer is not None:
                 self.pacer.sent_still(still.sequence, line_bytes, now_ns=at_ns)
         self.wait_until(at_ns)
-        self.outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=encoding)
+        self.outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=envelope.encoding)
 
     def store_base(self, unit: AccessUnit, *, now_ns: int) -> None:
         """An access unit is stored: it has used up its share, and left nothing of it to a still."""
@@ -233,15 +219,17 @@ class Transmitter:
         with self._lock:
             self.budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe, stored=True)
 
-    def store_still(self, envelope: StillEnvelope, *, now_ns: int, counted: bool = True) -> BacklogStill:
+    def store_still(self, still: Still, *, now_ns: int, counted: bool = True) -> BacklogStill:
         """The still as it would have gone out, for the backlog; ``counted``: its share of the budget is taken."""
-        still, encoding = envelope.still, envelope.encoding
+        envelope = self._envelope(still)
         attachment = envelope.header_at(now_ns, flags=self._flags | Flags.STORED).pack(still.data)
         if counted:
-            line_bytes = self._line_bytes(Channel.ROI, still.data, len(attachment), encoding=encoding)
+            line_bytes = self._line_bytes(
+                Channel.ROI, still.data, len(attachment), encoding=envelope.encoding
+            )
             with self._lock:
                 self.budget.record_still(line_bytes, now_ns=now_ns)
-        return BacklogStill(attachment, encoding, still.data)
+        return BacklogStill(attachment, envelope.encoding, still.data)
 
     @property
     def round_trip_ns(self) -> int:
@@ -256,12 +244,7 @@ class Transmitter:
             line_bytes = self.budget.backlog_allowance(now_ns, reserve=reserve)
         if self.pacer is not None and not self.pacer.admits_still(now_ns):
             return 0
-        around = BACKLOG_ATTACHMENT_BYTES + overhead_bytes(
-            line_bytes,
-            BACKLOG_ATTACHMENT_BYTES,
-            key=self._keys.key(Channel.BACKLOG),
-            encoding=DELIVERIES[Channel.BACKLOG].encoding,
-        )
+        around = self._around(Channel.BACKLOG, line_bytes, BACKLOG_ATTACHMENT_BYTES)
         most = min(_MOST_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, round(_CHUNK_S * self.budget.total_bps / 8)))
         return min(most, max(0, line_bytes - around))
 
@@ -386,11 +369,14 @@ class Transmitter:
         frame_sent = self._captures.knows(self.session_id, envelope.still.frame_index)
         return envelope.header_at(send_ns, flags=self._flags, frame_sent=frame_sent)
 
-    def _payload_bytes(self, line_bytes: int, attachment_bytes: int, media_type: str) -> int:
-        around = attachment_bytes + overhead_bytes(
-            line_bytes, attachment_bytes, key=self._keys.key(Channel.ROI), encoding=media_type
-        )
+    def _payload(self, line_bytes: int, still: Still, now_ns: int) -> int:
+        envelope = self._envelope(still)
+        header_bytes = self._header_at(envelope, now_ns).size_bytes
+        around = self._around(Channel.ROI, line_bytes, header_bytes, encoding=envelope.encoding)
         return max(0, line_bytes - around)
+
+    def _usual_payload(self, line_bytes: int) -> int:
+        return max(0, line_bytes - self._around(Channel.ROI, line_bytes, STILL_ATTACHMENT_BYTES))
 
     def _count(
         self,
@@ -415,10 +401,13 @@ class Transmitter:
     def _line_bytes(
         self, channel: Channel, payload: bytes, attachment_bytes: int, *, encoding: str = ""
     ) -> int:
-        overhead = overhead_bytes(
-            len(payload),
+        return len(payload) + self._around(channel, len(payload), attachment_bytes, encoding=encoding)
+
+    def _around(self, channel: Channel, size_bytes: int, attachment_bytes: int, *, encoding: str = "") -> int:
+        # Line bytes of a message beside so many of payload.
+        return attachment_bytes + overhead_bytes(
+            size_bytes,
             attachment_bytes,
             key=self._keys.key(channel),
             encoding=encoding or DELIVERIES[channel].encoding,
         )
-        return len(payload) + attachment_bytes + overhead

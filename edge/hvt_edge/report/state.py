@@ -320,7 +320,7 @@ class Heartbeat:
             keyframes=self.keyframes.sent,
             keyframe_requests=self.keyframes.served,
             stills_sent=sum(ledger.outcomes("sent").values()),
-            stills_pending=self.stills.pending,
+            stills_pending=len(self.stills.outbox),
             stills_in_flight=self.stills.outbox.unacknowledged,
             stills_not_sent=dict(outcomes),
             tracks=analyzer.tracks,

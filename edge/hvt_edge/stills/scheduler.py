@@ -176,7 +176,8 @@ class Chooser:
     on_demand: OnDemand | None = None
 
     def __post_init__(self) -> None:
-        self._most_bytes = self.settings.most_bytes
+        self.most_bytes = self.settings.most_bytes
+        """The largest admission that the budget can give from now on, payload."""
         self._costs: dict[str, CostModel] = {}
         self._put_off = False
         self._held_up: dict[int, int] = {}
@@ -330,7 +331,7 @@ class Chooser:
             padding=self.maker.padding,
             source_size=self.view.source_size,
         )
-        if limit_bytes >= min(expected, self._most_bytes * _FULL_SHARE):
+        if limit_bytes >= min(expected, self.most_bytes * _FULL_SHARE):
             return True
         # By track: methods request again at each step, and every new still takes the place of the last.
         since_ns = self._held_up.setdefault(pending.track_id, now_ns)
@@ -394,24 +395,6 @@ class Chooser:
                 sharpness=one.sharpness() if one.sharpness else None,
                 at_border=one.touches_border,
             )
-
-    # What changes in flight
-
-    def record_feedback(
-        self, track_id: int, *, class_name: str, confidence: float, entropy_nats: float
-    ) -> None:
-        """The ground has classified a still of this track."""
-        self.memory.record_feedback(
-            track_id, class_name=class_name, confidence=confidence, entropy_nats=entropy_nats
-        )
-
-    def set_method(self, method: Method) -> None:
-        """Use it from the next decision step on; pending stills stay."""
-        self.method = method
-
-    def set_most_bytes(self, most_bytes: int) -> None:
-        """The largest admission that the budget can give from now on, payload."""
-        self._most_bytes = most_bytes
 
     def close(self) -> None:
         """End: pending stills will not be sent any more."""

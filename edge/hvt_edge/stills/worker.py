@@ -151,7 +151,7 @@ class StillWorker:
             try:
                 if (item := self._next()) is None:
                     return
-                self.stage.cpu_budget.queued = self._frames.qsize()
+                self.stage.analyzer.cpu_budget.queued = self._frames.qsize()
                 self.stage.on_results(self.results(), detected=self.detected())
                 analyzed = self.stage.analyze(*item)
                 self.stage.send(analyzed, now_ns=self.clock())
@@ -162,7 +162,7 @@ class StillWorker:
     def _run_requested(self) -> None:
         while not self._given_up.wait(_RETRY_S):
             try:
-                if self.stage.any_requested:
+                if self.stage.outbox.on_demand is not None:
                     self.stage.send_requested(now_ns=self.clock())
                     self.failures.works(_REQUESTED_PART)
             except Exception as error:  # noqa: BLE001 - it ends one requested still, never the flight
@@ -187,5 +187,5 @@ class StillWorker:
             try:
                 return self._frames.get(timeout=_RETRY_S)
             except queue.Empty:
-                if self.stage.pending and self._pause.due(self.clock()):
+                if len(self.stage.outbox) and self._pause.due(self.clock()):
                     self.stage.send_pending(now_ns=self.clock())

@@ -37,7 +37,7 @@ class Rig:
     def still(self, number: int, size: int, *, now_ns: int = NOW_NS) -> None:
         """One of so many bytes."""
         still = replace(STILL, sequence=number, data=b"\xff" * size)
-        self.sender.still(self.sender.envelope(still), now_ns=now_ns)
+        self.sender.still(still, now_ns=now_ns)
 
     def backlog(self, size: int, *, now_ns: int = NOW_NS, offset: int = 0) -> int:
         """A chunk of so many bytes."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
@@ -19,6 +20,7 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.perception.cpu_budget import CpuBudget
+from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.worker import SkippedUnits
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.stage import BaseStage
@@ -47,12 +49,12 @@ class BlockedStills:
     """Decodes what it is given; sending its first still takes until it is released."""
 
     def __init__(self) -> None:
-        self.latest_tracks, self.pending, self.any_requested = None, 0, False
+        self.latest_tracks, self.outbox = None, Outbox()
         self.released, self.decoder = threading.Event(), BaseDecoder()
         self.frames: list[int] = []
         self.decoded = 0
         self.detected: list[int] = []
-        self.used, self.cpu_budget = True, CpuBudget()
+        self.used, self.analyzer = True, SimpleNamespace(cpu_budget=CpuBudget())
 
     def capture(self, frame):
         """Nobody asks for a still of it."""

@@ -328,8 +328,8 @@ def test_while_a_keyframe_is_due_stills_are_held():
     rig.run()
     assert rig.out.stills == []
     rig.keyframes.done(FRAMES[-1].capture_ns)
-    assert rig.stage.pending == 1
-    rig.stage.close()
+    assert len(rig.stage.outbox) == 1
+    rig.stage.chooser.close()
     assert rig.outcomes["dropped", "ended"] == 1
 
 
