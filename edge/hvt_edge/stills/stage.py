@@ -49,8 +49,8 @@ class StillStage:
 
     def __post_init__(self) -> None:
         self.latest_tracks: Tracks | None = None
-        """Those of the frame that `send` took last. In lockstep it changes at the same point of the frame loop in every
-        run, whatever `analyze` does meanwhile."""
+        """Those of the frame that `send` took last. In lockstep they change at the same point of the frame loop in
+        every run, whatever `analyze` does meanwhile."""
         self._scene_changes = 0
         self._detected: Detected | None = None
         """Reported since the decision before; in lockstep a frame may be compared at this very moment."""
