@@ -276,7 +276,7 @@ class Edge:
     def _say_goodbye(self, stages: Stages, link: EdgeLink) -> None:
         transmitter = stages.transmitter
         if stages.backlog is not None:
-            stages.backlog.send_no_more()
+            stages.backlog.worker.send_no_more()  # the last report says how much there was
         stages.status.send("ended")
         self._reached |= link.has_subscriber(Channel.BASE)
         if link.has_ground():  # what is still in a queue would be lost with the session
@@ -316,6 +316,6 @@ class Edge:
             perception_ms=stages.stills.analyzer.mean_ms,
             unusable_messages=link.unusable,
             unreached="" if self._reached else link.trouble or "nobody subscribed to its video",
-            store=None if backlog is None else backlog.numbers,
+            store=None if backlog is None else backlog.worker.numbers,
             failed=self._failures.parts,
         )

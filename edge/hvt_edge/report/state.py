@@ -373,7 +373,7 @@ class Heartbeat:
 
 
 def _backlog(backlog: BacklogStage) -> BacklogState:
-    numbers = backlog.numbers
+    numbers = backlog.worker.numbers
     return BacklogState(
         offline=backlog.offline,
         stills=numbers.stills,
@@ -381,7 +381,7 @@ def _backlog(backlog: BacklogStage) -> BacklogState:
         video_s=numbers.video_s,
         disk_bytes=numbers.disk_bytes,
         limit_bytes=backlog.max_bytes,
-        disk_free_bytes=backlog.disk_free_bytes,
+        disk_free_bytes=backlog.worker.disk_free_bytes,
         frames_stored=backlog.frames,
         sent_stills=numbers.sent_stills,
         sent_video_s=numbers.sent_video_s,

@@ -11,6 +11,7 @@ from hvt_edge.wiring.video import (
     base_size,
     default_size,
     first_decimation,
+    first_rates,
     make_encoder,
     qualify_encoder,
     say_size,

@@ -14,7 +14,7 @@ from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.operating import Operating
-from hvt_edge.perception.levers import LeverControl, LeverSettings
+from hvt_edge.perception.levers import LeverSettings
 from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder_settings import least_base_bps
 from hvt_edge.video.encoders.passthrough import CameraRates, LeastLink, measure_camera, needed_bps
@@ -89,13 +89,6 @@ def make_split(config: EdgeConfig, size: tuple[int, int], *, first_share: float)
             own_rest_s=_AUTO_REST_S,
         )
     return Split(settings, first_share=first_share)
-
-
-def make_levers(config: EdgeConfig, operating: Operating, view: View) -> LeverControl | None:
-    """Make the part that decides what is sent beside the video; None if the settings do."""
-    if not config.measures:
-        return None
-    return LeverControl(operating, lever_settings(config, view))
 
 
 def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:

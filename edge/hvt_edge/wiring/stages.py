@@ -12,6 +12,7 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import fitted_class_names
 from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import EdgeConfig
 from hvt_edge.control.commands import Commands
@@ -23,37 +24,42 @@ from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts, processors
 from hvt_edge.loop.pose import PoseSource, PoseStage
-from hvt_edge.operating import LoopClock, Operating, base_rate_bps
+from hvt_edge.operating import LoopClock, Operating, Rates, base_rate_bps
+from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.cpu_budget import CpuBudget
+from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.perception.levers import LeverControl
 from hvt_edge.report.state import Heartbeat
 from hvt_edge.report.status import InfoReporter, StatusReporter
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
+from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Gate
 from hvt_edge.stills.stage import StillSender, StillStage
+from hvt_edge.video.encoder_settings import PresetControl, share_of
 from hvt_edge.video.passthrough import PassthroughStage, VideoStage
 from hvt_edge.video.rate_model import LimitedFrameSkip
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
+from hvt_edge.video.x265 import TrackRegions
 from hvt_edge.wiring.link import (
     channels_of,
+    lever_settings,
     make_budget,
     make_camera_rates,
     make_least_link,
-    make_levers,
     make_pacer,
     make_split,
 )
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
-from hvt_edge.wiring.stills import make_method, make_stills
+from hvt_edge.wiring.stills import make_maker, make_method, make_suppression
 from hvt_edge.wiring.storing import make_backlog, open_local_copy
 from hvt_edge.wiring.trial import Beginning
 from hvt_edge.wiring.video import (
     encoder_opener,
     make_frame_skip,
     make_keyframes,
-    make_presets,
-    make_regions,
     reconfiguration_settings,
 )
 
@@ -100,11 +106,15 @@ class Stages:
         )
         self.keyframes = make_keyframes(config, source)
         pacer = make_pacer(config, source.camera_stream, view.base_size)
-        presets = make_presets(config, self.operating)
+        presets = None
+        if config.auto_preset:
+            presets = PresetControl(
+                self.operating, nominal_fps=config.nominal_fps, most_cores=share_of(processors())
+            )
         open_encoder = encoder_opener(
             config, self.operating, size=view.base_size, headroom=headroom, presets=presets
         )
-        encoder = open_encoder(total_bps=config.budget_bps, base_bps=base_bps, decimation=decimation)
+        encoder = open_encoder(Rates(config.budget_bps, base_bps, decimation))
         budget = make_budget(config, base_bps=base_bps, decimation=decimation)
         # Files come after all that may be refused: a failed start leaves nothing behind.
         write_truth_of(source, config.truth, fps=config.nominal_fps)
@@ -130,21 +140,40 @@ class Stages:
             self.operating,
             reconfiguration_settings(config, view.base_size),
             open_encoder=open_encoder,
-            transmitter=self.transmitter,
+            budget=budget,
             split=make_split(config, view.base_size, first_share=beginning.share),
             pacer=pacer,
             presets=presets,
         )
         still_readers = StillReaders(clock)
-        chooser, on_demand = make_stills(
-            config,
+        maker = make_maker(config, readable=still_readers.read)
+        on_demand = OnDemand(
+            FrameRing(RingSettings(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS))),
             outbox=outbox,
-            transmitter=self.transmitter,
+            maker=maker,
             view=view,
             class_names=class_names,
+            line=self.transmitter,
             offline=lambda: self.backlog is not None and self.backlog.offline,
-            readable=still_readers.read,
+        )
+        chooser = Chooser(
+            make_method(config, view),
+            suppression=make_suppression(config),
+            outbox=outbox,
+            maker=maker,
+            memory=TrackMemory(padding=config.padding),
+            view=view,
+            class_names=class_names,
+            settings=ChooserSettings(
+                fps=config.nominal_fps,
+                most_bytes=self.transmitter.most_still_bytes(),
+                gate=Gate(psnr_y_db=config.gate),
+                share=config.group_stills,
+                from_source=config.candidates == "source",
+            ),
+            on_outcome=self.transmitter.outcome,
             observe=self.reconfiguration.observe,
+            on_demand=on_demand,
         )
         info = InfoReporter(
             config,
@@ -153,7 +182,7 @@ class Stages:
             view=view,
             class_names=fitted_class_names(class_names),
             channels=channels_of(config, live=source.live),
-            still_codecs=lambda: chooser.maker.codec_names,
+            still_codecs=lambda: maker.codec_names,
             clock=clock,
         )
         self.backlog = make_backlog(
@@ -171,9 +200,7 @@ class Stages:
         )
         if self.backlog is not None:
             stack.enter_context(self.backlog)
-        still_sender = StillSender(
-            outbox, maker=chooser.maker, transmitter=self.transmitter, backlog=self.backlog
-        )
+        still_sender = StillSender(outbox, maker=maker, transmitter=self.transmitter, backlog=self.backlog)
         stack.callback(lambda: still_sender.close(clock()))
         self.link_control = LinkControl(
             has_ground=link.has_ground,
@@ -226,7 +253,7 @@ class Stages:
                 transmitter=self.transmitter,
                 local_copy=local_copy,
                 first_keyframe_bytes=base_bps // 40,  # a fifth of a second: what the VBV lets through
-                regions=make_regions(config, view.base_size),
+                regions=TrackRegions(view.base_size, depth=config.roi_depth) if config.roi_depth else None,
                 frame_skip=LimitedFrameSkip(
                     make_frame_skip(config, decimation, size=view.base_size),
                     self.reconfiguration.least_decimation,
@@ -239,10 +266,10 @@ class Stages:
                 open_again=None if lockstep else self.reconfiguration.open_again,
                 failures=failures,
             )
-        levers = make_levers(config, self.operating, view)
-        trust = (
-            None if levers is None else ViewTrust(config.detector, hence="auto gives its tracks no credit")
-        )
+        levers = trust = None
+        if config.measures:
+            levers = LeverControl(self.operating, lever_settings(config, view))
+            trust = ViewTrust(config.detector, hence="auto gives its tracks no credit")
         cpu_budget = CpuBudget() if lockstep else CpuBudget(fps=config.nominal_fps, processors=processors())
         self.stills = StillStage(
             make_analyzer(config, detector=detector, view=view, trust=trust, cpu_budget=cpu_budget),

@@ -23,7 +23,7 @@ from hvt_edge.video.share import FIRST_SHARE
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.link import SPARSE_SHARE, lever_settings
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
-from hvt_edge.wiring.video import first_decimation, make_encoder, scene
+from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, scene
 
 _FINE = 33.5
 """Of `trial_quantiser`: below it all frames are coded. Measured as `PROMPT` was."""
@@ -71,9 +71,7 @@ def try_scene(
     analyzer = make_analyzer(config, detector=detector, view=source.view)
     until_ns = None if config.pace == "lockstep" else clock() + _MOST_NS
 
-    encoder = make_encoder(
-        config, size=size, decimation=decimation, total_bps=config.budget_bps, base_bps=config.base_bps
-    )
+    encoder = make_encoder(config, first_rates(config, decimation), size=size)
     assert isinstance(encoder, BaseEncoder), "x265 alone is tried"
     spent: list[tuple[int, int]] = []
 

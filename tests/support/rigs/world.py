@@ -99,7 +99,7 @@ def make_reconfiguration(
     """Of a real encoder, with fixed shares."""
     plain = {"open_encoder": partial(make_encoder, config, size=size), "split": None, "pacer": None}
     settings = reconfiguration_settings(config, size)
-    return EncoderReconfiguration(operating, settings, transmitter=transmitter, **(plain | parts))
+    return EncoderReconfiguration(operating, settings, budget=transmitter.budget, **(plain | parts))
 
 
 def make_still_stage(
