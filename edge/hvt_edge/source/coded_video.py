@@ -23,7 +23,7 @@ from hvt_edge.source.camera_stream import (
     rate_of,
     without_jumps,
 )
-from hvt_edge.source.contract import BaseSize, CameraStream, Notes, SeenUnit, Source
+from hvt_edge.source.contract import BaseSize, CameraStream, ClipSource, Notes, SeenUnit
 from hvt_edge.source.decoding.container import name_of, open_video, said_rate, survey, without_stamps
 from hvt_edge.source.decoding.timeline import Stamps
 from hvt_edge.source.resample import Resizer
@@ -34,13 +34,11 @@ _MOST_SURVEY_S, _MOST_SURVEYED = 600.0, 40_000
 """The part of a clip that is surveyed before the flight."""
 
 
-class CodedVideoSource(Source):
-    """A clip by presentation time. Nothing is repeated or left out: its rate is the base rate.
+class CodedVideoSource(ClipSource):
+    """A clip by presentation time, from its first keyframe on. Nothing is left out: its rate is the base rate.
 
     Raises `UserError` where its units cannot be the base stream.
     """
-
-    live = False
 
     def __init__(
         self,
@@ -82,19 +80,6 @@ class CodedVideoSource(Source):
                 )
         self.notes = notes.taken()
         self.camera_stream = CameraStream(without_jumps(seen), self.fps)
-        self._running: Generator[Frame, None, None] | None = None
-
-    def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """The clip from its first keyframe on."""
-        self.close()
-        self._running = self._play(start_ns)
-        return self._running
-
-    def close(self) -> None:
-        """Stop reading."""
-        if self._running is not None:
-            self._running.close()
-            self._running = None
 
     def _play(self, start_ns: int) -> Generator[Frame, None, None]:
         container, stream = open_video(self._spec, growing=self._growing)

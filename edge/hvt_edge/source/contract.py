@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Self
@@ -99,6 +99,28 @@ class Source(ABC):
 
     def __exit__(self, *_error: object) -> None:
         self.close()
+
+
+class ClipSource(Source):
+    """A clip that waits for its reader, and is played again from its beginning."""
+
+    live = False
+    _running: Generator[Frame, None, None] | None = None
+
+    def frames(self, *, start_ns: int) -> Iterator[Frame]:
+        """The clip from its beginning."""
+        self.close()
+        self._running = self._play(start_ns)
+        return self._running
+
+    def close(self) -> None:
+        """Stop reading."""
+        if self._running is not None:
+            self._running.close()
+            self._running = None
+
+    @abstractmethod
+    def _play(self, start_ns: int) -> Generator[Frame, None, None]: ...
 
 
 def size_within(source_size: tuple[int, int], box: tuple[int, int]) -> tuple[int, int]:

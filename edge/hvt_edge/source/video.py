@@ -14,7 +14,7 @@ import av
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_common.values import Fit, Frame
-from hvt_edge.source.contract import BaseSize, Notes, Source
+from hvt_edge.source.contract import BaseSize, ClipSource, Notes
 from hvt_edge.source.decoding.container import (
     decoded,
     duration_s,
@@ -30,10 +30,8 @@ from hvt_edge.source.decoding.timeline import Stamps
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
 
-class VideoSource(Source):
+class VideoSource(ClipSource):
     """A clip by presentation time; the first frame that decodes is its zero. Every decodable frame is played."""
-
-    live = False
 
     def __init__(
         self,
@@ -73,7 +71,6 @@ class VideoSource(Source):
         counts += [] if max_frames is None else [max_frames]
         self._limit = max_frames
         self.frame_count = min(counts, default=None) if lasts_s is not None else None
-        self._running: Generator[Frame, None, None] | None = None
 
     @property
     def source_fps(self) -> float:
@@ -92,18 +89,6 @@ class VideoSource(Source):
         timed = ((at_s, index) for index, at_s in enumerate(times))
         held = hold(timed, fps=exact_rate(self.fps), tail_s=self._stamps.period_s, slack_s=slack_s)
         return len(times), tuple(index for _, index in held)
-
-    def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """The clip from its beginning."""
-        self.close()
-        self._running = self._play(start_ns)
-        return self._running
-
-    def close(self) -> None:
-        """Stop decoding."""
-        if self._running is not None:
-            self._running.close()
-            self._running = None
 
     def _play(self, start_ns: int) -> Generator[Frame, None, None]:
         base_rate = exact_rate(self.fps)

@@ -174,8 +174,8 @@ class StillStage:
             if self._detected is not None:
                 self.shadow.take_detected(self._detected)
                 self._detected = None
-            self.levers.take_shadow(self.shadow.measured)
-        self.levers.take_view(unlike=self.analyzer.view_unlike)
+            self.levers.measured = self.shadow.measured
+        self.levers.unlike = self.analyzer.view_unlike
         return self.levers.decide(now_ns)
 
     def _note_change(self, result: StillResult) -> None:
