@@ -20,7 +20,7 @@ from hvt_edge.config import EdgeConfig, least_budget_bps, stream_text
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.operating import Operating
 from hvt_edge.profiles import REGIMES
-from hvt_edge.stills.on_demand import OnDemand, OnDemandRequest, RefusedError
+from hvt_edge.stills.on_demand import OnDemandRequest, RefusedError
 from hvt_edge.stills.policy.base import Method
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser
@@ -55,7 +55,6 @@ class Commands:
     operating: Operating
     session_id: int
     keyframes: Keyframes
-    on_demand: OnDemand
     chooser: Chooser
     make_method: Callable[[str], Method]
     """By its name, with the edge's settings; `UserError` for an unknown one."""
@@ -130,18 +129,18 @@ class Commands:
         return self._answer()
 
     def _still(self, arguments: Arguments) -> ControlAnswer:
-        number, frame_index = self.on_demand.request(_on_demand_request(arguments))
+        number, frame_index = self.chooser.on_demand.request(_on_demand_request(arguments))
         return self._answer(still_request=number, frame_index=frame_index)
 
     def _still_outcome(self, arguments: Arguments) -> ControlAnswer:
         reader = _Reader("still-outcome", arguments)
         number = reader.needed("ask", 0, _U32)
         reader.end()
-        return self._answer(note=self.on_demand.outcome(number))
+        return self._answer(note=self.chooser.on_demand.outcome(number))
 
     def _tracks(self, arguments: Arguments) -> ControlAnswer:
         _Reader("tracks", arguments).end()
-        frame_index, tracks, there = self.on_demand.tracks()
+        frame_index, tracks, there = self.chooser.on_demand.tracks()
         note = (
             f"of {there} tracks these are the {len(tracks)} of most confidence" if there > len(tracks) else ""
         )

@@ -80,7 +80,7 @@ class Grabber(Protocol):
         """Open for the first time: raises UserError where there is nothing."""
 
     def restart(self) -> None:
-        """Open again after `SignalLost`; raises `SignalLost` if that fails."""
+        """Open again after `SignalLost`; raises that or `UserError` if it fails."""
 
     def grab(self) -> Shot:
         """Wait for the next frame; raises `SignalLost`."""
@@ -229,7 +229,7 @@ class LiveSource(Source):
 
 def _reason(error: Exception) -> str:
     # A driver or a decoder raises what it likes.
-    return str(error) if isinstance(error, SignalLost) else reason_of(error)
+    return str(error) if isinstance(error, SignalLost | UserError) else reason_of(error)
 
 
 @contextmanager

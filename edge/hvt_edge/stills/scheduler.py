@@ -172,8 +172,8 @@ class Chooser:
     class_names: tuple[str, ...]
     settings: ChooserSettings
     on_outcome: Callable[[str, str], None]
+    on_demand: OnDemand
     observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None
-    on_demand: OnDemand | None = None
 
     def __post_init__(self) -> None:
         self.most_bytes = self.settings.most_bytes
@@ -192,8 +192,7 @@ class Chooser:
 
         Where stills build on the base, a step that falls on a frame without one is put off to the next that has one.
         """
-        if self.on_demand is not None:
-            self.on_demand.add(analyzed)
+        self.on_demand.add(analyzed)
         if self.method.video_only:
             return
         due = analyzed.detected or self._put_off
@@ -274,7 +273,7 @@ class Chooser:
 
     def requested(self, *, now_ns: int, store: bool = False) -> Coded:
         """Yield coded stills that grounds requested, as `stills` does those of the method."""
-        while isinstance(pending := self.outbox.on_demand, OnDemandStill) and self.on_demand is not None:
+        while isinstance(pending := self.outbox.on_demand, OnDemandStill):
             sequence = self.outbox.sequence(store=store)
             still = self.on_demand.code(pending, now_ns=now_ns, sequence=sequence, paced=not store)
             if still is not None:
@@ -398,15 +397,13 @@ class Chooser:
 
     def close(self) -> None:
         """End: pending stills will not be sent any more."""
-        if self.on_demand is not None:
-            self.on_demand.close()
+        self.on_demand.close()
         self._count_left(self.outbox.clear(), now_ns=0)
 
     def _count_left(self, left: Iterable[tuple[OutboxStill, str]], *, now_ns: int) -> None:
         for one, reason in left:
             if isinstance(one, OnDemandStill):
-                if self.on_demand is not None:
-                    self.on_demand.expired(one, reason, now_ns=now_ns)
+                self.on_demand.expired(one, reason, now_ns=now_ns)
             else:
                 self.on_outcome("deferred" if reason == "replaced" else "dropped", reason)
 

@@ -36,9 +36,7 @@ class StillStage:
     analyzer: Analyzer
     chooser: Chooser
     _: KW_ONLY
-    outbox: Outbox
     sender: StillSender
-    transmitter: Transmitter
     keyframes: Keyframes
     reporter: TrackReporter | None = None
     shadow: ShadowGround | None = None
@@ -48,6 +46,7 @@ class StillStage:
     """Decides by what ``shadow`` and the grounds say; None: tracks and stills are sent as the settings allow."""
 
     def __post_init__(self) -> None:
+        self.outbox = self.sender.outbox
         self.latest_tracks: Tracks | None = None
         """Those of the frame that `send` took last. In lockstep they change at the same point of the frame loop in
         every run, whatever `analyze` does meanwhile."""
@@ -57,8 +56,7 @@ class StillStage:
 
     def capture(self, frame: Frame) -> None:
         """The camera gave a frame, which may never be analyzed: a ground may ask for a still of it."""
-        if self.chooser.on_demand is not None:
-            self.chooser.on_demand.ring.capture(frame)
+        self.chooser.on_demand.ring.capture(frame)
 
     def analyze(
         self,
@@ -80,10 +78,8 @@ class StillStage:
 
     def is_used(self, capture_ns: int) -> bool:
         """Whether anybody uses what `analyze` makes of a frame of that time."""
-        chooser = self.chooser
-        if self.tracks_used or not chooser.method.video_only:
-            return True
-        return chooser.on_demand is not None and chooser.on_demand.wants_tracks(capture_ns)
+        wanted = self.tracks_used or not self.chooser.method.video_only
+        return wanted or self.chooser.on_demand.wants_tracks(capture_ns)
 
     def send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Choose, and send the stills of the method that may go now; return their sequence numbers.
@@ -99,10 +95,10 @@ class StillStage:
         levers = self._decided(now_ns)
         if self.reporter is not None and analyzed.detected and levers.tracks:
             self.reporter.report(analyzed, now_ns=now_ns)
-        if most_bytes := self.transmitter.most_still_bytes():
+        if most_bytes := self.sender.transmitter.most_still_bytes():
             self.chooser.most_bytes = most_bytes
         # What a method requests waits until the link is free, which right behind a base frame it never is.
-        allowance_bytes = self.transmitter.still_allowance_bytes(now_ns, paced=False)
+        allowance_bytes = self.sender.transmitter.still_allowance_bytes(now_ns, paced=False)
         self.chooser.consider(
             analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not levers.stills
         )

@@ -172,8 +172,8 @@ class Stages:
                 from_source=config.candidates == "source",
             ),
             on_outcome=self.transmitter.outcome,
-            observe=self.reconfiguration.observe,
             on_demand=on_demand,
+            observe=self.reconfiguration.observe,
         )
         info = InfoReporter(
             config,
@@ -205,17 +205,12 @@ class Stages:
         self.link_control = LinkControl(
             has_ground=link.has_ground,
             has_subscriber=partial(link.has_subscriber, Channel.BASE),
-            session_id=session_id,
-            transmitter=self.transmitter,
             keyframes=self.keyframes,
             inbox=inbox,
             reconfiguration=self.reconfiguration,
             clock=clock,
-            pacer=pacer,
             in_flight=in_flight,
-            outbox=outbox,
             stills=still_sender,
-            backlog=self.backlog,
             failures=failures,
         )
         self.pose = None
@@ -274,9 +269,7 @@ class Stages:
         self.stills = StillStage(
             make_analyzer(config, detector=detector, view=view, trust=trust, cpu_budget=cpu_budget),
             chooser,
-            outbox=outbox,
             sender=still_sender,
-            transmitter=self.transmitter,
             keyframes=self.keyframes,
             tracks_used=config.tracks_used,
             reporter=TrackReporter(self.transmitter, session_id=session_id) if config.send_tracks else None,
@@ -288,7 +281,6 @@ class Stages:
             operating=self.operating,
             session_id=session_id,
             keyframes=self.keyframes,
-            on_demand=on_demand,
             chooser=chooser,
             make_method=lambda name: make_method(config, view, name=name),
             backlog=self.backlog,

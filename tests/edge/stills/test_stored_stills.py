@@ -124,7 +124,6 @@ def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
             operating=rig.operating,
             session_id=7,
             keyframes=rig.keyframes,
-            on_demand=None,
             chooser=None,
             make_method=method,
             backlog=backlog,

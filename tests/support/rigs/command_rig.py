@@ -86,7 +86,6 @@ class Rig:
             operating=self.operating,
             session_id=SESSION,
             keyframes=self.keyframes,
-            on_demand=self.on_demand,
             chooser=self.chooser,
             make_method=method,
             backlog=None,

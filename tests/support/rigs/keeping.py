@@ -211,17 +211,12 @@ class Rig:
             has_ground=self._has_ground,
             has_subscriber=lambda: self.watched,
             failures=self.failures,
-            session_id=session_id,
-            transmitter=self.sender,
             keyframes=self.keyframes,
             inbox=inbox or FeedbackInbox(),
             reconfiguration=make_reconfiguration(self.operating, config, SIZE, self.sender, pacer=pacer),
             clock=lambda: self.now_ns,
-            pacer=pacer,
             in_flight=self.in_flight,
-            outbox=self.outbox,
             stills=self.stills,
-            backlog=self.backlog,
         )
         self.before_link: Callable[[], None] = lambda: None
         """Called before the edge is told whether anybody is there."""

@@ -227,19 +227,14 @@ class LiveFlight:
         self.link_control = LinkControl(
             has_ground=lambda: self.second >= self.joins_s,
             has_subscriber=lambda: False,
-            session_id=1,
-            transmitter=self.transmitter,
             keyframes=self.keyframes,
             inbox=FeedbackInbox(),
             reconfiguration=reconfiguration,
             clock=self._clock,
-            pacer=self.pacer,
             in_flight=in_flight,
-            outbox=outbox,
             stills=StillSender(
                 outbox, maker=StillMaker(), transmitter=self.transmitter, backlog=self.backlog
             ),
-            backlog=self.backlog,
             failures=self.failures,
         )
         self.stage = make_base_stage(

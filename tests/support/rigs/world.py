@@ -18,7 +18,7 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import Operating
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
-from hvt_edge.perception.frame_ring import FrameRing
+from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
@@ -122,11 +122,10 @@ def make_still_stage(
     Grounds may request stills of what ``ring`` holds.
     """
     outbox, maker = Outbox() if outbox is None else outbox, maker or StillMaker()
-    on_demand = None
-    if ring is not None:
-        on_demand = OnDemand(
-            ring, outbox=outbox, maker=maker, view=view, class_names=class_names, line=transmitter
-        )
+    ring = FrameRing(RingSettings(max_bytes=0)) if ring is None else ring
+    on_demand = OnDemand(
+        ring, outbox=outbox, maker=maker, view=view, class_names=class_names, line=transmitter
+    )
     chooser = Chooser(
         method("M1"),
         outbox=outbox,
@@ -142,9 +141,7 @@ def make_still_stage(
     return StillStage(
         analyzer,
         chooser,
-        outbox=outbox,
         sender=StillSender(outbox, maker=maker, transmitter=transmitter, backlog=backlog),
-        transmitter=transmitter,
         keyframes=keyframes,
         reporter=reporter,
     )
