@@ -16,7 +16,7 @@ from typing import Any, Literal
 from hvt_common import __version__
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.edge_words import FrameAccount
-from hvt_common.protocol.ledger import Account, Ledger
+from hvt_common.protocol.ledger import Account
 from hvt_common.protocol.messages import WIRE_VERSION
 from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.runtime.process import notify_systemd
@@ -24,10 +24,8 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import View
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
-from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import Cores, FrameCounts
 from hvt_edge.operating import Levers, LoopClock, Operating
 from hvt_edge.stills.stage import StillStage
@@ -239,15 +237,10 @@ class Heartbeat:
 
     config: EdgeConfig
     _: KW_ONLY
-    session_id: int
     view: View
     operating: Operating
-    ledger: Ledger
     counts: FrameCounts
-    keyframes: Keyframes
-    transmitter: Transmitter
     stills: StillStage
-    backlog: BacklogStage | None
     link: EdgeLink
     inbox: FeedbackInbox
     failures: Failures
@@ -255,6 +248,8 @@ class Heartbeat:
     loop_clock: LoopClock
 
     def __post_init__(self) -> None:
+        self.transmitter, self.backlog = self.stills.sender.transmitter, self.stills.sender.backlog
+        self.ledger, self.session_id = self.transmitter.ledger, self.transmitter.session_id
         self._ground, self._since_ns = False, self.clock()
         self._due_ns = 0
         self.state: EdgeState | None = None
@@ -317,8 +312,8 @@ class Heartbeat:
                 unanalyzed=counts.unanalyzed,
             ),
             source_silent_s=None if came_ns is None else max(0.0, (now_ns - came_ns) / SECOND_NS),
-            keyframes=self.keyframes.sent,
-            keyframe_requests=self.keyframes.served,
+            keyframes=self.stills.keyframes.sent,
+            keyframe_requests=self.stills.keyframes.served,
             stills_sent=sum(ledger.outcomes("sent").values()),
             stills_pending=len(self.stills.outbox),
             stills_in_flight=self.stills.outbox.unacknowledged,

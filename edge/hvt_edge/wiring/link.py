@@ -13,7 +13,6 @@ from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.operating import Operating
 from hvt_edge.perception.levers import LeverSettings
 from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder_settings import least_base_bps
@@ -111,27 +110,20 @@ def make_pacer(config: EdgeConfig, stream: CameraStream | None, size: tuple[int,
 
 
 def make_camera_rates(
-    config: EdgeConfig,
-    stream: CameraStream,
-    *,
-    reconfiguration: EncoderReconfiguration,
-    operating: Operating,
-    pacer: Pacer | None,
+    config: EdgeConfig, stream: CameraStream, reconfiguration: EncoderReconfiguration
 ) -> CameraRates:
     """Make the rates that change at the keyframes of a passed-through camera."""
 
     def needed(window_bytes: int) -> int:
-        return _camera_needs_bps(config, window_bytes, operating.now.video_share or config.share)
+        share = reconfiguration.operating.now.video_share or config.share
+        return _camera_needs_bps(config, window_bytes, share)
 
     return CameraRates(
         reconfiguration,
-        operating=operating,
-        pacer=pacer,
         needed=needed,
         least_bps=config.min_budget_bps,
         surveyed_bytes=_surveyed_bytes(config, stream),
         window_ns=config.window_ns,
-        edge_id=config.edge_id,
     )
 
 

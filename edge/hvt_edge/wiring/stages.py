@@ -220,13 +220,7 @@ class Stages:
             )
         if config.passes_through:
             assert source.camera_stream is not None, "checked by as_the_camera_is"
-            rates = make_camera_rates(
-                config,
-                source.camera_stream,
-                reconfiguration=self.reconfiguration,
-                operating=self.operating,
-                pacer=pacer,
-            )
+            rates = make_camera_rates(config, source.camera_stream, self.reconfiguration)
             self.base: VideoStage = PassthroughStage(
                 self.keyframes,
                 self.transmitter,
@@ -297,15 +291,10 @@ class Stages:
         )
         self.heartbeat = Heartbeat(
             config,
-            session_id=session_id,
             view=view,
             operating=self.operating,
-            ledger=ledger,
             counts=counts,
-            keyframes=self.keyframes,
-            transmitter=self.transmitter,
             stills=self.stills,
-            backlog=self.backlog,
             link=link,
             inbox=inbox,
             failures=failures,

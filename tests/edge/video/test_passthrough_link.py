@@ -71,9 +71,7 @@ class Flight:
         self.reconfiguration = make_reconfiguration(
             self.operating, config, SIZE, self.transmitter, pacer=self.pacer
         )
-        rates = make_camera_rates(
-            config, stream, reconfiguration=self.reconfiguration, operating=self.operating, pacer=self.pacer
-        )
+        rates = make_camera_rates(config, stream, self.reconfiguration)
         self.stage = PassthroughStage(
             Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=stream.keyframe_s)),
             self.transmitter,
