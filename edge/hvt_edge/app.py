@@ -172,7 +172,8 @@ class Edge:
             finally:
                 stages.stills.chooser.close()
                 self._say_goodbye(stages, link)
-        return self._summary(stages, link)
+        unreached = "" if self._reached else link.trouble or "nobody subscribed to its video"
+        return summary(stages.heartbeat, unreached=unreached)
 
     def _play(self, source: Source, stages: Stages, link: EdgeLink, line: StatusLine) -> None:
         next_status_ns = restarts = 0
@@ -291,31 +292,3 @@ class Edge:
             if stages.backlog is not None:
                 left_ns = max(0, until_ns - self._world.clock())
                 stages.backlog.wait_for_end(timeout_s=left_ns / SECOND_NS)
-
-    def _summary(self, stages: Stages, link: EdgeLink) -> dict[str, Any]:
-        counts, config, backlog, now = self._counts, self._config, stages.backlog, stages.operating.now
-        return summary(
-            self.ledger,
-            edge=config.edge_id,
-            session=f"{self._world.session_id:016x}",
-            method=now.method,
-            levers=now.levers.says,
-            preset=now.preset,
-            preset_says=now.preset_says,
-            frames=counts.account(coded_fps=config.nominal_fps / now.decimation, auto_fps=config.auto_fps),
-            unanalyzed=counts.unanalyzed,
-            clip_paused_s=counts.paused_ns / SECOND_NS,
-            cores=counts.cpu.short,
-            duration_s=counts.duration_s(config.nominal_fps),
-            budget_bps=now.highest_budget_bps,
-            budget_base_bps=now.base_bps,
-            keyframes=stages.keyframes.sent,
-            keyframe_requests=stages.keyframes.served,
-            tracks=stages.stills.analyzer.tracks,
-            encode_ms=counts.encode_ms,
-            perception_ms=stages.stills.analyzer.mean_ms,
-            unusable_messages=link.unusable,
-            unreached="" if self._reached else link.trouble or "nobody subscribed to its video",
-            store=None if backlog is None else backlog.worker.numbers,
-            failed=self._failures.parts,
-        )

@@ -255,6 +255,12 @@ class Heartbeat:
         self.state: EdgeState | None = None
         """The newest; None before the first. Any thread may read it."""
 
+    @property
+    def frames(self) -> FrameAccount:
+        """The outcome of each frame so far."""
+        fps = self.config.nominal_fps / self.operating.now.decimation
+        return self.counts.account(coded_fps=fps, auto_fps=self.config.auto_fps)
+
     def beat(self, phase: Phase) -> EdgeState:
         """Make a state now."""
         self._due_ns = self.clock() + SECOND_NS
@@ -305,9 +311,7 @@ class Heartbeat:
             meta_bps=self._bps(Account.META),
             budget_share=None if total_bps is None else total_bps / now.total_bps,
             frames=Frames(
-                account=counts.account(
-                    coded_fps=config.nominal_fps / now.decimation, auto_fps=config.auto_fps
-                ),
+                account=self.frames,
                 encoded=counts.encoded,
                 unanalyzed=counts.unanalyzed,
             ),
