@@ -11,8 +11,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from types import TracebackType
-from typing import Self
 
 from hvt_common.protocol.messages import BacklogKind, BacklogStill, Feedback
 from hvt_common.runtime.failures import Failures
@@ -260,14 +258,6 @@ class BacklogStage:
             self.end_in_flight()
         finally:
             self.worker.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _note_sent(self, entry: Entry) -> None:
         # A lower number was lost in an outage and counted when it was sent; a former run has its own ledger.

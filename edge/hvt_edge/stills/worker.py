@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Self
 
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures, RetryPause
@@ -138,12 +137,6 @@ class StillWorker:
         until_s = time.monotonic() + self.finish_s
         for thread in (self._thread, self._requested):
             thread.join(timeout=max(0.0, until_s - time.monotonic()))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
 
     def _run(self) -> None:
         lower_priority()

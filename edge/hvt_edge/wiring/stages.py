@@ -199,7 +199,7 @@ class Stages:
             failures=failures,
         )
         if self.backlog is not None:
-            stack.enter_context(self.backlog)
+            stack.callback(self.backlog.close)
         still_sender = StillSender(outbox, maker=maker, transmitter=self.transmitter, backlog=self.backlog)
         stack.callback(lambda: still_sender.close(clock()))
         self.link_control = LinkControl(
