@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -372,18 +372,12 @@ class Heartbeat:
 
 
 def _backlog(backlog: BacklogStage) -> BacklogState:
-    numbers = backlog.worker.numbers
+    here = {one.name for one in fields(BacklogState)}
+    numbers = asdict(backlog.worker.numbers)
     return BacklogState(
         offline=backlog.offline,
-        stills=numbers.stills,
-        segments=numbers.segments,
-        video_s=numbers.video_s,
-        disk_bytes=numbers.disk_bytes,
         limit_bytes=backlog.max_bytes,
         disk_free_bytes=backlog.worker.disk_free_bytes,
         frames_stored=backlog.frames,
-        sent_stills=numbers.sent_stills,
-        sent_video_s=numbers.sent_video_s,
-        evicted_stills=numbers.evicted_stills,
-        evicted_segments=numbers.evicted_segments,
+        **{name: number for name, number in numbers.items() if name in here},
     )

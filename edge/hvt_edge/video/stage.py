@@ -158,6 +158,7 @@ class BaseStage:
     transmitter: Transmitter
     local_copy: LocalCopy | None
     first_keyframe_bytes: int
+    failures: Failures
     regions: TrackRegions | None = None
     frame_skip: FrameSkip | None = None
     reconfigure: Callable[[int, int], Encoder | None] | None = None
@@ -166,7 +167,6 @@ class BaseStage:
     holder: Callable[[int], FrameGroup] = lambda _now_ns: "budget"
     backlog: BacklogStage | None = None
     open_again: Callable[[], Encoder] | None = None
-    failures: Failures | None = None
 
     def __post_init__(self) -> None:
         self._keyframe_bytes = self.first_keyframe_bytes
@@ -235,7 +235,7 @@ class BaseStage:
             self._recover(error, now_ns=now_ns)
             return None
         assert unit.keyframe or not decision.keyframe, "others than x265 are checked (CheckedEncoder)"
-        if self._begins_anew and self.failures is not None:
+        if self._begins_anew:
             self.failures.works(_PART)
         self._begins_anew = False
         self._frame_skip.coded(frame.index, keyframe=unit.keyframe, mean_qp=self.encoder.mean_qp)
@@ -271,8 +271,7 @@ class BaseStage:
         if not line_bytes:
             self._leave_out(unit)
             return False
-        if self.failures is not None:
-            self.failures.works(_SIZE_PART)
+        self.failures.works(_SIZE_PART)
         if unit.keyframe:
             self._keyframe_bytes = line_bytes
             self.keyframes.note_cost(8 * SECOND_NS * line_bytes // self.transmitter.budget.total_bps)
@@ -302,18 +301,16 @@ class BaseStage:
     def _leave_out(self, unit: AccessUnit) -> None:
         # Nothing has room for it: what follows cannot be shown before another keyframe.
         self._begins_anew = True
-        if self.failures is not None:
-            what = f"{'a keyframe' if unit.keyframe else 'a frame'} of {len(unit.data) / 1000:.1f} kB"
-            total = bitrate_text(self.transmitter.budget.total_bps)
-            self.failures.failed(
-                _SIZE_PART,
-                f"{what} is more than a window of {total} or one message holds, and is left out: raise --budget, or "
-                "lower --size",
-            )
+        what = f"{'a keyframe' if unit.keyframe else 'a frame'} of {len(unit.data) / 1000:.1f} kB"
+        total = bitrate_text(self.transmitter.budget.total_bps)
+        self.failures.failed(
+            _SIZE_PART,
+            f"{what} is more than a window of {total} or one message holds, and is left out: raise --budget, or "
+            "lower --size",
+        )
 
     def _recover(self, error: Exception, *, now_ns: int) -> None:
         assert self.open_again is not None, "checked"
-        assert self.failures is not None, "goes with it"
         while True:
             self.failures.failed(_PART, f"{self.encoder_name} failed ({error})")
             self._failed_ns.append(now_ns)

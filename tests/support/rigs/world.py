@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from functools import partial
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader, RoiHeader
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import View
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
@@ -79,6 +81,7 @@ def make_transmitter(
 def make_base_stage(encoder: Any, transmitter: Transmitter, **parts: Any) -> BaseStage:
     """Of this encoder, without a copy and without a store."""
     plain = {"keyframes": Keyframes(), "local_copy": None, "first_keyframe_bytes": 5000}
+    plain["failures"] = Failures(time.time_ns)
     return BaseStage(encoder, transmitter=transmitter, **(plain | parts))
 
 
