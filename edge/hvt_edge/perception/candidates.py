@@ -151,26 +151,17 @@ class TrackMemory:
             history.seen_ns = now_ns
         self._forget(now_ns)
 
-    def record_sent(
-        self,
-        track_id: int,
-        *,
-        frame_index: int,
-        now_ns: int,
-        area_px: float,
-        sharpness: float | None = None,
-        at_border: bool = False,
-    ) -> None:
-        """Note that a still went out; ``frame_index`` is the frame it shows, ``area_px`` its box in source pixels."""
-        history = self._histories.get(track_id)
+    def record_sent(self, candidate: Candidate, *, frame_index: int, now_ns: int) -> None:
+        """Note that a still of it went out; ``frame_index`` is the frame that it shows."""
+        history = self._histories.get(candidate.track_id)
         if history is None:
             return
         history.sent_count += 1
         history.sent_frame = frame_index
         history.sent_ns = now_ns
-        history.sent_area_px = area_px
-        history.sent_sharpness = sharpness
-        history.sent_at_border = at_border
+        history.sent_area_px = candidate.area_px
+        history.sent_sharpness = candidate.sharpness() if candidate.sharpness else None
+        history.sent_at_border = candidate.touches_border
 
     def record_refused(self, track_id: int, *, now_ns: int) -> None:
         """Note that the still stage had no still for it; suppression then lets it rest for a while."""

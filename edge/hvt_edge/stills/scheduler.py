@@ -359,7 +359,8 @@ class Chooser:
         if (
             not pending.again
         ):  # else its tracks have rested since it was sent first, and it is not sent a third time
-            self._record_sent(pending.request, made, now_ns=now_ns)
+            for one in (pending.request.candidate, *pending.request.also):
+                self.memory.record_sent(one, frame_index=made.frame_index, now_ns=now_ns)
             if (
                 made.codec != self.maker.without_base.name
             ):  # it builds on the base, and a ground may lack that
@@ -383,17 +384,6 @@ class Chooser:
             self.on_outcome("deferred", "stored")
         else:
             self.outbox.sent(pending, still, now_ns=now_ns, resend=resend)
-
-    def _record_sent(self, request: Request, still: Still, *, now_ns: int) -> None:
-        for one in (request.candidate, *request.also):
-            self.memory.record_sent(
-                one.track_id,
-                frame_index=still.frame_index,
-                now_ns=now_ns,
-                area_px=one.area_px,
-                sharpness=one.sharpness() if one.sharpness else None,
-                at_border=one.touches_border,
-            )
 
     def close(self) -> None:
         """End: pending stills will not be sent any more."""
