@@ -12,12 +12,24 @@ from typing import Self
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.log import START_LOGGER
-from hvt_common.values import Frame, View
+from hvt_common.values import Fit, Frame, View
 
 BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
 """(width, height) of the base frames, or how they follow from those of the source."""
 
 _LEAST_SIDE_PX, _MOST_SIDE_PX = 64, 8192
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceSettings:
+    """How every kind of source is opened; see `hvt_edge.source.opening.open_source`."""
+
+    size: BaseSize
+    fps: float
+    fit: Fit = "letterbox"
+    max_frames: int | None = None
+    source_fps: float | None = None
+    growing: bool = False
 
 
 @dataclass(frozen=True, slots=True)
