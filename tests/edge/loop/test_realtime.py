@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -35,14 +36,15 @@ SIZE = (320, 192)
 class Out:
     """Counts base frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, sleep: Callable[[float], None] = time.sleep) -> None:
         self.units = 0
         self.takes_s = 0.0
+        self.sleep = sleep
 
     def put(self, channel, payload, *, attachment=None, encoding="") -> None:
         """One message."""
         self.units += channel is Channel.BASE
-        time.sleep(self.takes_s)
+        self.sleep(self.takes_s)
 
 
 class BlockedStills:
@@ -111,11 +113,12 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
 @pytest.mark.timeout(60)
 def test_frames_missed_count_for_the_link_or_for_the_machine():
     """Who flies would buy a faster computer for a thin link."""
-    out, stills, counts = Out(), BlockedStills(), FrameCounts()
+    clock, stills, counts = SteppedTime(), BlockedStills(), FrameCounts()
+    out = Out(clock.pass_s)
     stills.released.set()
     frames = list(framed(smooth_pictures(6, size=SIZE)))
     with RealtimePace(
-        base_stage(out), stills, inbox=FeedbackInbox(), clock=SteadyClock(), fps=15, live=True, counts=counts,
+        base_stage(out), stills, inbox=FeedbackInbox(), clock=clock, fps=15, live=True, counts=counts,
         stop=threading.Event(), failures=Failures(time.time_ns),
     ) as pace:  # fmt: skip
         pace.step(frames[0], missed=4)
