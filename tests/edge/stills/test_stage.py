@@ -293,7 +293,8 @@ def test_a_requested_still_is_given_up_in_time_though_a_keyframe_goes_first_and_
     on_demand, now_ns = rig.stage.chooser.on_demand, FRAMES[0].capture_ns
     assert on_demand is not None
     rig.stage.capture(FRAMES[0])
-    number, behind = (on_demand.request(OnDemandRequest(box_xywh_px=(40, 40, 96, 64)))[0] for _ in range(2))
+    boxes = (40, 40, 96, 64), (40, 40, 64, 96)
+    number, behind = (on_demand.request(OnDemandRequest(box_xywh_px=box))[0] for box in boxes)
     rig.keyframes.require(now_ns)
     for second in range(12):
         assert not rig.stage.send_requested(now_ns=now_ns + second * SECOND_NS)
