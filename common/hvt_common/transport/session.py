@@ -222,9 +222,17 @@ def _query_options(channel: Channel) -> dict[str, Any]:
 
 
 def serve(
-    session: zenoh.Session, channel: Channel, *, keys: EdgeKeys, answer: Callable[[bytes], bytes | None]
+    session: zenoh.Session,
+    channel: Channel,
+    *,
+    keys: EdgeKeys,
+    answer: Callable[[bytes], bytes | None],
+    declared_as: str | None = None,
 ) -> zenoh.Queryable[None]:
-    """Answer a queryable channel; ``answer(question)`` runs in Zenoh's callback, must be quick, and may give None."""
+    """Answer a queryable channel; ``answer(question)`` runs in Zenoh's callback, must be quick, and may give None.
+
+    ``declared_as`` is another expression for its key.
+    """
     key = keys.key(channel)
 
     def reply(query: zenoh.Query) -> None:
@@ -234,7 +242,7 @@ def serve(
             if data is not None:
                 query.reply(key, data, encoding=MSGPACK_ENCODING)
 
-    return session.declare_queryable(key, reply)
+    return session.declare_queryable(declared_as or key, reply)
 
 
 def _open_failure(text: str, listen: tuple[str, ...], config: zenoh.Config) -> str:

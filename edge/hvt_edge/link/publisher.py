@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass
@@ -23,7 +24,7 @@ from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.transport.inbox import FloodWatch
 from hvt_common.transport.link_doctor import link_doctor
 from hvt_common.transport.session import declare_publisher, open_session, serve
-from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_common.units import SECOND_NS
 from hvt_edge.link.transmitter import Outlet
 
@@ -80,6 +81,12 @@ class EdgeLink(Outlet, Protocol):
         ...
 
 
+def loses_messages(settings: LinkSettings) -> bool:
+    """Whether a declaration may be lost on the way: over UDP; no other transport loses one."""
+    config = configure(settings)[0]
+    return any('"udp/' in str(config.get_json(f"{side}/endpoints")) for side in ("connect", "listen"))
+
+
 class ZenohLink:
     """One Zenoh session with publishers of all channels; a context manager.
 
@@ -95,6 +102,7 @@ class ZenohLink:
         doctor = link_doctor()
         doctor.check_id(settings, self._keys)
         self._listener: EdgeListener | None = None
+        self._loses = loses_messages(settings)
         self._stack = ExitStack()
         self._session = self._stack.enter_context(open_session(settings, failures=failures))
         self._publishers = {
@@ -128,7 +136,9 @@ class ZenohLink:
         """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""
         try:
             self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
-            if channel is Channel.STATUS and self._listener is not None:  # about once a second
+            if (
+                channel is Channel.STATUS and self._listener is not None and self._loses
+            ):  # about once a second
                 self._listener.declare_again(there=self.has_ground())
         except zenoh.ZError as error:
             _log.debug("%s was not sent: %s", channel, error)
@@ -170,6 +180,7 @@ class EdgeListener:
         """Of who is there now."""
         self._waits: dict[Channel, RetryPause] = {}
         """Channels of which nothing is heard while a ground is there."""
+        self._again: Counter[Channel] = Counter()
         self._declared: dict[Channel, zenoh.Queryable[None] | zenoh.Subscriber[None]] = {}
         for channel in (Channel.INFO, Channel.CONTROL, Channel.FEEDBACK):
             self._declare(channel)
@@ -198,15 +209,20 @@ class EdgeListener:
             pause.failed(now_ns)
 
     def _declare(self, channel: Channel) -> None:
+        # Zenoh gives a key its number once: where that datagram is lost, the same key is never understood again.
+        key = self.keys.key(channel)
         if channel in self._declared:
             self._declared[channel].undeclare()  # type: ignore[no-untyped-call]
+            self._again[channel] += 1
+            at = len(key) - 1 - self._again[channel] % (len(channel) - 1)
+            key = f"{key[:at]}$*{key[at:]}"
         if channel is Channel.FEEDBACK:
-            self._declared[channel] = self.session.declare_subscriber(
-                self.keys.key(channel), self._on_feedback
-            )
+            self._declared[channel] = self.session.declare_subscriber(key, self._on_feedback)
         else:
             answer = self._on_info if channel is Channel.INFO else self._on_control
-            self._declared[channel] = serve(self.session, channel, keys=self.keys, answer=answer)
+            self._declared[channel] = serve(
+                self.session, channel, keys=self.keys, answer=answer, declared_as=key
+            )
 
     def _on_info(self, query: bytes) -> bytes | None:
         self._used.add(Channel.INFO)

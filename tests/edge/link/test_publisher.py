@@ -7,9 +7,11 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import msgpack
+import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import WIRE_VERSION, Feedback, Message
+from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
 from hvt_edge.link import publisher
 from rigs.messages import ANSWER, FEEDBACK, INFO_REQUEST, REQUEST
@@ -59,15 +61,16 @@ def test_a_ground_of_another_version_commands_nothing(caplog, monkeypatch):
 
 def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):
     """One datagram that UDP loses at the start would leave a ground without a picture, or its reports unheard."""
-    declared, now_s = [], [0.0]
+    declared, keys, now_s = [], [], [0.0]
 
     def serve(_session: object, channel: Channel, **told: object) -> MagicMock:
         declared.append((channel, told["answer"]))
+        keys.append(told["declared_as"])
         return MagicMock()
 
     def subscribe(key: str, callback: object) -> MagicMock:
-        assert key == EdgeKeys("uav-1").key(Channel.FEEDBACK)
         declared.append((Channel.FEEDBACK, callback))
+        keys.append(key)
         return MagicMock()
 
     monkeypatch.setattr(publisher, "serve", serve)
@@ -93,6 +96,10 @@ def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):
 
     assert after(10, there=False) == (0, 0, 0)
     assert after(7, there=True) == (3, 2, 2)
+    for (channel, _), key in zip(declared, keys, strict=True):
+        met = {one for one in Channel if zenoh.KeyExpr(key).intersects(EdgeKeys("uav-1").key(one))}
+        assert met == {channel}
+    assert len(set(keys)) == len(keys), "a key whose number was lost is never understood again"
     answer = next(answer for channel, answer in reversed(declared) if channel is Channel.INFO)
     assert answer(b"") == b"info"
     assert after(30, there=True) == (0, 2, 2), "it has asked, and reports nothing: it may only listen"
@@ -105,3 +112,14 @@ def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):
     assert (after(1, there=False), after(3, there=True)) == ((0, 0, 0), (1, 1, 1)), (
         "another, or on another way"
     )
+
+
+def test_only_over_udp_something_is_declared_again(tmp_path):
+    """Rights name whole keys: over TLS an edge would withdraw what its grounds may use for what they may not."""
+    file = tmp_path / "link.json5"
+    file.write_text('{connect: {endpoints: ["udp/10.0.0.1:7447"]}}')
+    assert publisher.loses_messages(LinkSettings("edge", connect=("udp/127.0.0.1:7447",)))
+    assert publisher.loses_messages(LinkSettings("edge", listen=("udp/127.0.0.1:7447",)))
+    assert publisher.loses_messages(LinkSettings("edge", zenoh_config=file))
+    assert not publisher.loses_messages(LinkSettings("edge"))
+    assert not publisher.loses_messages(LinkSettings("edge", connect=("tls/127.0.0.1:7447",)))
