@@ -75,7 +75,10 @@ class CameraGrabber:
     def restart(self) -> None:
         """Open again after `SignalLost`."""
         self.close()
-        self.open()
+        try:
+            self.open()
+        except UserError as error:
+            raise SignalLost(str(error)) from error
 
     def grab(self) -> Shot:
         """The next frame, at most the read timeout from now, with the time that the driver gave its buffer."""

@@ -76,7 +76,10 @@ class StreamGrabber:
     def restart(self) -> None:
         """Open again after `SignalLost`."""
         self.close()
-        self._start(_RESTART_S + self._read_s)
+        try:
+            self._start(_RESTART_S + self._read_s)
+        except UserError as error:
+            raise SignalLost(str(error)) from error
 
     def grab(self) -> Shot:
         """The next frame, at most the read timeout from now."""

@@ -11,6 +11,7 @@ from enum import Enum
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Still
 from hvt_edge.backlog.entry import FIRST_STORED
+from hvt_edge.link.stills import StillEnvelope
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.policy.base import Request
 
@@ -64,6 +65,8 @@ class OutboxStill:
     """The ground could not decode the first still of this crop."""
     state: StillState = StillState.PENDING
     coded: Still | None = None
+    envelope: StillEnvelope | None = None
+    """With its header, packed once: by the first that sends or stores it."""
     sent_ns: int = 0
     copies: int = 0
 

@@ -3,8 +3,8 @@
 A still arrives after its frame: it is matched to the tracks of that very frame and shown beside (or pasted
 into) the decoded picture of it. Tracks are small and kept for `track_frames`. Pictures are large: 1280x720 BGR
 is 2.7 MB, so they are kept as they were decoded, in half of it. Where the edge codes fewer frames than there are
-frames, as many reach back further. There is no lossy detour, because a residual still must be applied to exactly the
-pixels that the edge had.
+frames, as many reach back further, up to a bound. There is no lossy detour, because a residual still must be applied
+to exactly the pixels that the edge had.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ DEFAULT_MAX_BYTES = 96 * 1024 * 1024
 class History:
     """Two bounded rings of one session, of pictures and of tracks; both grow by rising frame index only.
 
-    The newest picture is stored whatever ``max_bytes``. ``track_frames`` covers at least the time that a still may
-    be late; over ``gap_frames`` that the base stream leaves out, tracks are still interpolated.
+    The newest picture is stored whatever ``max_bytes``, and none of more than ``reach_frames`` before it.
+    ``track_frames`` covers at least the time that a still may be late; over ``gap_frames`` that the base stream
+    leaves out, tracks are still interpolated.
     """
 
     def __init__(
@@ -32,6 +33,7 @@ class History:
         *,
         max_frames: int = 45,
         max_bytes: int = DEFAULT_MAX_BYTES,
+        reach_frames: int = 300,
         track_frames: int = 300,
         gap_frames: int = 0,
     ) -> None:
@@ -39,6 +41,7 @@ class History:
             raise ValueError(f"bounds must be positive: {max_frames=}, {max_bytes=}, {track_frames=}")
         self._max_frames = max_frames
         self._max_bytes = max_bytes
+        self._reach_frames = reach_frames
         self._track_frames = track_frames
         self._gap_frames = gap_frames
         self._frames: OrderedDict[int, Image | YuvPicture] = OrderedDict()
@@ -65,7 +68,8 @@ class History:
         _require_rising(next(reversed(self._frames), None), frame_index)
         self._frames[frame_index] = picture
         self._frame_bytes += picture.nbytes
-        while len(self._frames) > 1 and self._frames_too_large():
+        oldest = frame_index - self._reach_frames
+        while len(self._frames) > 1 and (self._frames_too_large() or next(iter(self._frames)) < oldest):
             _, dropped = self._frames.popitem(last=False)
             self._frame_bytes -= dropped.nbytes
 

@@ -50,6 +50,9 @@ _LATE_NS = SECOND_NS
 
 _HISTORY_S = 3.0
 """Of pictures that residual stills may build on."""
+_REACH_S = 4.0
+"""Of a stream that leaves out frames as many pictures reach back further, but for so long alone an edge sends its
+stills again."""
 _MOST_HISTORY_FRAMES = 45
 _MOST_HISTORY_BYTES = 128 * 2**20
 
@@ -143,6 +146,7 @@ class Pipeline:
         self._history = History(
             max_frames=min(_MOST_HISTORY_FRAMES, max(1, round(_HISTORY_S * fps))),
             max_bytes=_MOST_HISTORY_BYTES,
+            reach_frames=max(1, round(_REACH_S * fps)),
             gap_frames=gap_frames,
         )
         self._stills = StillStage(
@@ -469,7 +473,6 @@ def _overlay(
         origins=_of(fused.origins, rows),
         doubted=shown.doubted[rows],
         sure=shown.sure[rows],
-        vague=shown.vague[rows],
     )
 
 

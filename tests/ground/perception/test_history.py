@@ -41,6 +41,14 @@ def test_pictures_stay_within_their_bytes():
     assert history.size_bytes == picture(50, height=40).nbytes
 
 
+def test_pictures_of_a_thin_stream_do_not_reach_back_for_ever():
+    """Half of the frames coded, and a ground held six seconds of each edge, for stills that nobody sends any more."""
+    history = History(max_frames=45, reach_frames=60)
+    for index in range(0, 200, 2):
+        history.add_frame(index, picture(index))
+    assert [index for index in range(200) if history.frame(index) is not None] == list(range(138, 200, 2))
+
+
 def test_the_default_holds_two_seconds_of_720p():
     """Stills that wait two seconds on a thin link would have no picture to be compared with."""
     history = History()
