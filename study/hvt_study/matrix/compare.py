@@ -27,6 +27,7 @@ from hvt_study.matrix.schedule import Pool
 from hvt_study.matrix.time_left import TimeLeft
 from hvt_study.runs.methods import METHODS, Method
 from hvt_study.runs.spec import ModelChoice, RunSpec
+from hvt_study.runs.video_shape import competing_sizes
 
 COMPARED: Mapping[str, tuple[str, str]] = {
     "M0": ("M0", ""),
@@ -41,8 +42,8 @@ COMPARED: Mapping[str, tuple[str, str]] = {
 }
 """(method, still codec) by the name in tables, in their order."""
 Labels = Literal["auto", "exact", "reference"]
-_OTHER_SIZES = 4
-"""So many flights at other sizes are usual."""
+_TRIED_SIZES, _AT_A_SIZE = 2, 2
+"""So many other sizes are usually tried where there are as many, in so many flights each."""
 _RATE_POWER = 0.2
 _FPS_POWER = 0.4
 _REPORT_EVERY_S = 1.0
@@ -163,7 +164,8 @@ def compare(
         for name in plan.methods
     }
     run = partial(_run, cache=plan.cache, folder=Path.cwd())
-    left, work, kinds = what_is_ahead(specs)
+    size = next(iter(specs.values())).size
+    left, work, kinds = what_is_ahead(specs, sizes=len(competing_sizes(size, sequence.source_size)))
     time_left = TimeLeft(work, kinds=kinds, workers=workers, now_s=time.monotonic())
     flights = ResultCache(plan.cache / FLIGHTS)
     before = at_last = flights.count()
@@ -195,21 +197,26 @@ def _run(spec: RunSpec, *, cache: Path, folder: Path) -> dict[str, Any]:
 
 
 def what_is_ahead(
-    specs: Mapping[_Run, RunSpec],
+    specs: Mapping[_Run, RunSpec], *, sizes: int
 ) -> tuple[dict[_Run, int], dict[_Run, float], dict[_Run, tuple[str, ...]]]:
-    """(flights, work, kinds) of each run, in the order in which they are flown; work and kinds as of `TimeLeft`."""
+    """(flights, work, kinds) of each run, in the order in which they are flown; work and kinds as of `TimeLeft`.
+
+    ``sizes`` is how many the base stream can have.
+    """
     first, rest = _in_order(specs)
     names = {name for _, name in specs}
-    flights = dict.fromkeys(first, 1) | {one: _distinct_flights(specs[one], beside=names) for one in rest}
+    flights = dict.fromkeys(first, 1) | {
+        one: _distinct_flights(specs[one], beside=names, sizes=sizes) for one in rest
+    }
     work = {one: count * _work_of_a_flight(specs[one]) for one, count in flights.items()}
     return flights, work, {one: (one[1], _kind(METHODS[specs[one].method])) for one in flights}
 
 
-def _distinct_flights(spec: RunSpec, *, beside: Collection[str]) -> int:
+def _distinct_flights(spec: RunSpec, *, beside: Collection[str], sizes: int) -> int:
     """About how many flights a run takes that no other run of its rate takes too."""
     method = METHODS[spec.method]
     if method.any_size:
-        return len(method.fps_choices) + _OTHER_SIZES
+        return len(method.fps_choices) + _AT_A_SIZE * min(sizes - 1, _TRIED_SIZES)
     best = (METHODS[COMPARED[one][0]] for one in beside)
     if any(one.any_size and one.flags == method.flags for one in best):
         return 0  # it is among those of the best one

@@ -44,7 +44,7 @@ def estimates(workers: int, times: dict[str, float]) -> tuple[float, list[tuple[
         for rate, kbps in enumerate(RATES_KBPS)
         for name, (method, codec) in COMPARED.items()
     }
-    _, work, kinds = what_is_ahead(specs)
+    _, work, kinds = what_is_ahead(specs, sizes=2)
     left = TimeLeft(work, kinds=kinds, workers=workers, now_s=0.0)
     waiting, flown, events = list(work), set(), []
 
