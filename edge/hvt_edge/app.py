@@ -35,6 +35,7 @@ from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.source.live import SOURCE_PART, closing_on
 from hvt_edge.wiring import (
+    Flight,
     Stages,
     as_the_camera_is,
     check_codecs,
@@ -132,13 +133,12 @@ class Edge:
             beginning = try_scene(config, source, detector=detector, clock=world.clock, stop=self._stop)
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             link = world.open_link(stack, config)
-            stages = Stages(
-                stack,
-                config,
+            flight = Flight(
+                stack=stack,
+                config=config,
                 source=source,
-                pose_source=pose_source,
                 detector=detector,
-                link=link,
+                ends=link,
                 session_id=world.session_id,
                 ledger=self.ledger,
                 counts=self._counts,
@@ -149,6 +149,7 @@ class Edge:
                 beginning=beginning,
                 headroom=headroom,
             )
+            stages = Stages(flight, pose_source=pose_source)
             self._heartbeat = stages.heartbeat
             link.listen(stages.answers)
             self._on_started()
@@ -162,7 +163,7 @@ class Edge:
                     note=line.note,
                     turn=lambda: stages.heartbeat.turn("waiting"),
                 )
-            stages.operating.start(world.clock())
+            stages.link.operating.start(world.clock())
             try:
                 self._play(source, stages, link, line)
             except UserError as error:
@@ -170,9 +171,10 @@ class Edge:
                     raise
                 raise FlightError(str(error)) from error
             finally:
-                stages.stills.close()
+                stages.stills.chooser.close()
                 self._say_goodbye(stages, link)
-        return self._summary(stages, link)
+        unreached = "" if self._reached else link.trouble or "nobody subscribed to its video"
+        return summary(stages.heartbeat, unreached=unreached)
 
     def _play(self, source: Source, stages: Stages, link: EdgeLink, line: StatusLine) -> None:
         next_status_ns = restarts = 0
@@ -183,13 +185,13 @@ class Edge:
                 stack.enter_context(closing_on(self._stop, source))
             pace = self._make_pace(source, stages, link)
             stack.enter_context(pace)
-            for frame in source.steps(start_ns=stages.operating.now.started_ns):
+            for frame in source.steps(start_ns=stages.link.operating.now.started_ns):
                 if self._stop.is_set():
                     break
                 stages.status.send_pending()
                 if source.restarts != restarts:  # another picture than the last
                     restarts = source.restarts
-                    stages.keyframes.require(self._loop_clock())
+                    stages.link.keyframes.require(self._loop_clock())
                 if frame is not None:
                     self._counts.newest_came_ns = self._world.clock()
                 pace.step(frame, missed=source.missed)
@@ -206,8 +208,8 @@ class Edge:
                     if heartbeat.state is not None:
                         line.show(status_text(heartbeat.state, paused_s=self._counts.paused_ns / SECOND_NS))
                     more_frames = stages.base.wants_keyframe(self._counts.last_index)
-                    if more_frames or stages.reconfiguration.wants_keyframe(now_ns):
-                        stages.keyframes.require(now_ns)
+                    if more_frames or stages.link.reconfiguration.wants_keyframe(now_ns):
+                        stages.link.keyframes.require(now_ns)
                 heartbeat.turn("running")  # in lockstep a second of the stream may take longer
         if not source.live:
             stages.link_control.finish(
@@ -219,7 +221,7 @@ class Edge:
         if stages.pose is None or frame is None:
             return
         stages.pose.step(
-            frame.capture_ns - stages.operating.now.started_ns,
+            frame.capture_ns - stages.link.operating.now.started_ns,
             capture_ns=frame.capture_ns + self._counts.paused_ns,
             now_ns=self._loop_clock(),
         )
@@ -230,7 +232,7 @@ class Edge:
                 stages.base,
                 stages.stills,
                 inbox=self._world.inbox,
-                keyframes=stages.keyframes,
+                keyframes=stages.link.keyframes,
                 clock=self._loop_clock,
                 fps=source.fps,
                 counts=self._counts,
@@ -274,9 +276,9 @@ class Edge:
         )
 
     def _say_goodbye(self, stages: Stages, link: EdgeLink) -> None:
-        transmitter = stages.transmitter
+        transmitter = stages.link.transmitter
         if stages.backlog is not None:
-            stages.backlog.send_no_more()
+            stages.backlog.worker.send_no_more()  # the last report says how much there was
         stages.status.send("ended")
         self._reached |= link.has_subscriber(Channel.BASE)
         if link.has_ground():  # what is still in a queue would be lost with the session
@@ -291,31 +293,3 @@ class Edge:
             if stages.backlog is not None:
                 left_ns = max(0, until_ns - self._world.clock())
                 stages.backlog.wait_for_end(timeout_s=left_ns / SECOND_NS)
-
-    def _summary(self, stages: Stages, link: EdgeLink) -> dict[str, Any]:
-        counts, config, backlog, now = self._counts, self._config, stages.backlog, stages.operating.now
-        return summary(
-            self.ledger,
-            edge=config.edge_id,
-            session=f"{self._world.session_id:016x}",
-            method=now.method,
-            levers=now.levers.says,
-            preset=now.preset,
-            preset_says=now.preset_says,
-            frames=counts.account(coded_fps=config.nominal_fps / now.decimation, auto_fps=config.auto_fps),
-            unanalyzed=counts.unanalyzed,
-            clip_paused_s=counts.paused_ns / SECOND_NS,
-            cores=counts.cpu.short,
-            duration_s=counts.duration_s(config.nominal_fps),
-            budget_bps=now.highest_budget_bps,
-            budget_base_bps=now.base_bps,
-            keyframes=stages.keyframes.sent,
-            keyframe_requests=stages.keyframes.served,
-            tracks=stages.stills.analyzer.tracks,
-            encode_ms=counts.encode_ms,
-            perception_ms=stages.stills.analyzer.mean_ms,
-            unusable_messages=link.unusable,
-            unreached="" if self._reached else link.trouble or "nobody subscribed to its video",
-            store=None if backlog is None else backlog.numbers,
-            failed=self._failures.parts,
-        )

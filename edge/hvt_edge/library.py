@@ -20,7 +20,7 @@ from hvt_common.runtime.process import join_threads_at_exit
 from hvt_common.values import Fit, Image
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
-from hvt_edge.source.contract import Source
+from hvt_edge.source.contract import Source, SourceSettings
 from hvt_edge.source.live import LiveSource, Shot, SignalLost
 from hvt_edge.wiring import base_size
 from hvt_edge.world import World
@@ -187,15 +187,13 @@ class _PushGrabber:
 
 class _PushedSource(LiveSource):
     def __init__(self, grabber: _PushGrabber, config: EdgeConfig, world: World) -> None:
-        super().__init__(
-            grabber,
+        settings = SourceSettings(
             size=base_size(config),
             fps=config.nominal_fps,
             fit=cast("Fit", config.fit),
             max_frames=config.max_frames,
-            clock=world.clock,
-            failures=world.failures,
         )
+        super().__init__(grabber, settings, clock=world.clock, failures=world.failures)
         self._pushed = grabber
         self._pause = RetryPause(0, 0)  # a program that pushes again is there at once
 

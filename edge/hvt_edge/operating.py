@@ -28,6 +28,18 @@ class Levers:
 
 
 @dataclass(frozen=True, slots=True)
+class Rates:
+    """The rates for which x265 is opened, in line bits a second."""
+
+    total_bps: int
+    """B_tot: the budget, or less if the link carries less."""
+    base_bps: int
+    """B_v."""
+    decimation: int
+    """Each n-th source frame is coded."""
+
+
+@dataclass(frozen=True, slots=True)
 class OperatingPoint:
     """The rates of one moment, in line bits a second."""
 
@@ -100,9 +112,9 @@ class Operating:
         """Allow this rate from now on."""
         self._set(total_bps=total_bps)
 
-    def open(self, *, total_bps: int, base_bps: int, decimation: int) -> None:
-        """Note the rate for which x265 is opened, and the total that goes with it."""
-        self._set(total_bps=total_bps, base_bps=base_bps, decimation=decimation)
+    def open(self, rates: Rates, *, total_bps: int) -> None:
+        """Note the rates for which x265 is opened, and the total that may be sent now."""
+        self._set(total_bps=total_bps, base_bps=rates.base_bps, decimation=rates.decimation)
 
     def encode_with(self, preset: str, says: str) -> None:
         """Use this preset from the next keyframe on; ``says`` is the sentence about it."""

@@ -33,6 +33,7 @@ from hvt_edge.wiring import (
     check_files,
     check_store,
     first_decimation,
+    first_rates,
     make_encoder,
     make_link_settings,
     qualify_encoder,
@@ -251,12 +252,5 @@ class _Checks:
         return (time.process_time() - cpu_s) / count, count / (time.monotonic() - began_s)
 
     def _encoder(self, size: tuple[int, int], *, preset: str = "") -> Encoder:
-        config = self._config
-        return make_encoder(
-            config,
-            size=size,
-            total_bps=config.budget_bps,
-            base_bps=config.base_bps,
-            decimation=first_decimation(config, size),
-            preset=preset,
-        )
+        rates = first_rates(self._config, first_decimation(self._config, size))
+        return make_encoder(self._config, rates, size=size, preset=preset)

@@ -108,7 +108,7 @@ class SessionFeed(SinkWriter[Event]):
         rows = zip(
             item.track_ids.tolist(),
             item.boxes_base_px.round(1).tolist(),
-            item.classes,
+            item.words,
             item.confidences.tolist(),
             item.refined.tolist(),
             item.doubted.tolist(),
@@ -120,7 +120,7 @@ class SessionFeed(SinkWriter[Event]):
             | {word: 1 for word, holds in (("read", read), ("doubted", doubt), ("sure", known)) if holds}
             for track, box, name, sureness, read, doubt, known in rows
         ]
-        colours = {name: "#{:02x}{:02x}{:02x}".format(*class_colour(name)) for name in set(item.classes)}
+        colours = {name: "#{:02x}{:02x}{:02x}".format(*class_colour(name)) for name in set(item.words)}
         looked_ns = item.capture_ns if item.looked_ns is None else item.looked_ns
         looked_ms = round(self._captured_ms(looked_ns), 1)
         return self._text("overlay", item, looked=looked_ms, tracks=tracks, colours=colours)

@@ -15,6 +15,8 @@ import numpy.typing as npt
 from hvt_common.protocol.messages import RoiHeader
 from hvt_common.values import Boxes, Image, Pose, View
 
+VEHICLE = "vehicle"
+
 
 def _nowhere() -> npt.NDArray[np.bool_]:
     return np.zeros(0, np.bool_)
@@ -90,6 +92,8 @@ class Overlay:
     all are in a view that the detector does not know; by default nowhere."""
     sure: npt.NDArray[np.bool_] = field(default_factory=_nowhere)
     """(N,) True where stills agree on the class with a calibrated probability above .9; by default nowhere."""
+    vague: npt.NDArray[np.bool_] = field(default_factory=_nowhere)
+    """(N,) True where it is a vehicle, and its class rather a guess; by default nowhere."""
     looked_ns: int | None = None
     """Capture time of the picture from which the list goes on, where its own was not looked at; None is its own."""
     places: Places | None = None
@@ -98,15 +102,18 @@ class Overlay:
     def __post_init__(self) -> None:
         count = len(self.track_ids)
         nowhere = np.zeros(count, np.bool_)
-        for name, usual in (("origins", ("base",) * count), ("doubted", nowhere), ("sure", nowhere)):
+        usual = {"origins": ("base",) * count, "doubted": nowhere, "sure": nowhere, "vague": nowhere}
+        for name, value in usual.items():
             if not len(getattr(self, name)):
-                object.__setattr__(self, name, usual)
+                object.__setattr__(self, name, value)
 
     @property
     def words(self) -> tuple[str, ...]:
-        """N names for people: that of the class, or ``something`` where it is doubted."""
-        pairs = zip(self.classes, self.doubted.tolist(), strict=True)
-        return tuple("something" if doubt else name for name, doubt in pairs)
+        """N names for people: that of the class, ``vehicle`` where it is vague, ``something`` where it is doubted."""
+        words = np.array(self.classes, object)
+        words[self.vague] = VEHICLE
+        words[self.doubted] = "something"
+        return tuple(words)
 
     @property
     def firm(self) -> npt.NDArray[np.bool_]:

@@ -23,7 +23,7 @@ from onnx import compose, helper, numpy_helper, parser, version_converter
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES
 from hvt_common.inference.labels import metadata_labels
-from hvt_train.learning.halve import halve, unfold_stem
+from hvt_train.learning.halve import halve, stripe_stem, unfold_stem
 
 PREFIX = "street_"
 """Of all names of YOLOX-nano's part."""
@@ -141,6 +141,8 @@ def join(aerial: Path, street: Path, out: Path) -> None:
         raise UserError(f"{aerial} has no classes or no hvt.confidence: a detector of hvt_train is expected")
     theirs, levels = _levels_of(onnx.load(str(street)), street, opset=ours.opset_import[0].version)
     halve(theirs)
+    stripe_stem(ours.graph, "images")
+    stripe_stem(theirs, f"{PREFIX}images")
 
     gain = float(properties["hvt.confidence"]) / _THEIR_CONFIDENCE
     nodes = [*ours.graph.node, *_nodes(_SHRINK), *_nodes(_COLOUR, own="colour_"), *theirs.node]

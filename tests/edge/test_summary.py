@@ -2,46 +2,62 @@
 
 from __future__ import annotations
 
-import inspect
-import re
+from types import SimpleNamespace
+from typing import Any
 
 from hvt_common.protocol.edge_words import FrameAccount
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failure
-from hvt_edge import app
 from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.loop.counts import Cores
 from hvt_edge.report.status import in_vain, summary, table, title
 from programs.summary_page import unexplained
 
+NINE_SENT = FrameAccount({"sent": 9})
 
-def summary_of(**changed):
+
+def summary_of(
+    *,
+    frames: FrameAccount = NINE_SENT,
+    unanalyzed: int = 0,
+    clip_paused_s: float = 0.0,
+    store: StoreNumbers | None = None,
+    failed: tuple[Failure, ...] = (),
+    unreached: str = "",
+) -> dict[str, Any]:
     """Of a short flight."""
-    facts = {
-        "edge": "uav-1",
-        "session": "0",
-        "method": "M6",
-        "levers": "no tracks: the video hides 0 objects; stills: 2 of 3 objects named otherwise by the ground",
-        "preset": "superfast",
-        "preset_says": "preset superfast: veryfast would take 0.5 of a core",
-        "frames": FrameAccount({"sent": 9}),
-        "unanalyzed": 0,
-        "clip_paused_s": 0.0,
-        "cores": Cores(needed=1.63, free=1.1),
-        "duration_s": 5.3,
-        "budget_bps": 800_000,
-        "budget_base_bps": 650_000,
-        "keyframes": 1,
-        "keyframe_requests": 0,
-        "tracks": 0,
-        "encode_ms": 20.0,
-        "perception_ms": 50.0,
-        "unusable_messages": 0,
-        "unreached": "",
-        "store": None,
-        "failed": (),
-    }
-    return summary(Ledger(), **{**facts, **changed})
+    now = SimpleNamespace(
+        method="M6",
+        levers=SimpleNamespace(
+            says="no tracks: the video hides 0 objects; stills: 2 of 3 objects named otherwise by the ground"
+        ),
+        preset="superfast",
+        preset_says="preset superfast: veryfast would take 0.5 of a core",
+        highest_budget_bps=800_000,
+        base_bps=650_000,
+    )
+    counts = SimpleNamespace(
+        duration_s=lambda _fps: 5.3,
+        unanalyzed=unanalyzed,
+        paused_ns=clip_paused_s * 10**9,
+        cpu=SimpleNamespace(short=Cores(needed=1.63, free=1.1)),
+        encode_ms=20.0,
+    )
+    heartbeat: Any = SimpleNamespace(
+        config=SimpleNamespace(edge_id="uav-1", nominal_fps=15),
+        session_id=0,
+        operating=SimpleNamespace(now=now),
+        counts=counts,
+        frames=frames,
+        ledger=Ledger(),
+        stills=SimpleNamespace(
+            keyframes=SimpleNamespace(sent=1, served=0), analyzer=SimpleNamespace(tracks=0, mean_ms=50.0)
+        ),
+        link=SimpleNamespace(unusable=0),
+        backlog=None if store is None else SimpleNamespace(worker=SimpleNamespace(numbers=store)),
+        failures=SimpleNamespace(parts=failed),
+    )
+    return summary(heartbeat, unreached=unreached)
 
 
 def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
@@ -100,7 +116,4 @@ def test_every_key_stands_on_the_page_of_the_summary():
     """Who reads the JSON would look `given_up` up in the source."""
     failure = Failure("source", "gone", 1, 10**18, 10**18)
     content = summary_of(store=StoreNumbers(), failed=(failure,))
-    _, _, call = inspect.getsource(app).partition("return summary(")
-    given = set(re.findall(r"^ +(\w+)=", call, re.MULTILINE))
-    assert given - content.keys() == {"unanalyzed", "cores"}, "the facts of a real flight"
     assert unexplained(content) == set()

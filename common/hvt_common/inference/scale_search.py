@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import cv2
@@ -33,6 +34,8 @@ _OTHER: Final = 2.0
 """Twice or half as many promised as at the last probe: another scene, which is probed at once."""
 _MORE, _LEAST_MORE = 3.0, 8.0
 """The part must promise so many times as much enlarged, and so many objects more."""
+_SEEN_WHOLE_PX: Final = 80
+"""What is so long in the picture its one run sees; a part alone, enlarged, sees a bus in a crossing's stripes."""
 _STILL_MORE: Final = 2.0
 _IN_VAIN: Final = 3
 """So many pictures in a row that promise less than `_STILL_MORE` times as much end it."""
@@ -121,7 +124,9 @@ class ScaleSearch:
         scale = _MOST_SIDE / max(part_bgr.shape[:2])
         large = cv2.resize(part_bgr, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         found = self._detected(np.asarray(large, np.uint8))
-        return Detections(found.boxes_xyxy_px / np.float32(scale), found.confidences, found.class_ids)
+        found = replace(found, boxes_xyxy_px=found.boxes_xyxy_px / np.float32(scale))
+        sides = found.boxes_xyxy_px[:, 2:] - found.boxes_xyxy_px[:, :2]
+        return found.take(np.flatnonzero(sides.max(axis=1, initial=0) < _SEEN_WHOLE_PX))
 
     def _detected(self, image_bgr: Image) -> Detections:
         return self._detect(image_bgr) or Detections.none()

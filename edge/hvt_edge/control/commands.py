@@ -20,7 +20,7 @@ from hvt_edge.config import EdgeConfig, least_budget_bps, stream_text
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.operating import Operating
 from hvt_edge.profiles import REGIMES
-from hvt_edge.stills.on_demand import OnDemand, OnDemandRequest, RefusedError
+from hvt_edge.stills.on_demand import OnDemandRequest, RefusedError
 from hvt_edge.stills.policy.base import Method
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser
@@ -42,14 +42,6 @@ _REASON_BYTES = 200
 Arguments = Mapping[str, int | float | str]
 
 
-@dataclass(frozen=True, slots=True)
-class _Result:
-    still_request: int = -1
-    frame_index: int = -1
-    tracks: tuple[TrackNow, ...] = ()
-    note: str = ""
-
-
 @dataclass(eq=False)
 class Commands:
     """Answers one session's requests; may be called from any thread.
@@ -63,7 +55,6 @@ class Commands:
     operating: Operating
     session_id: int
     keyframes: Keyframes
-    on_demand: OnDemand
     chooser: Chooser
     make_method: Callable[[str], Method]
     """By its name, with the edge's settings; `UserError` for an unknown one."""
@@ -76,7 +67,7 @@ class Commands:
         self._lock = threading.Lock()
         self._request_times: deque[int] = deque(maxlen=_MOST_REQUESTS)
         self._changed_ns: int | None = None
-        self._commands: dict[str, Callable[[Arguments], _Result]] = {
+        self._commands: dict[str, Callable[[Arguments], ControlAnswer]] = {
             Command.KEYFRAME: self._keyframe,
             Command.STILL: self._still,
             Command.STILL_OUTCOME: self._still_outcome,
@@ -90,23 +81,30 @@ class Commands:
         """Do it or say why not; never raises, whatever a ground sends."""
         try:
             with self._lock:
-                result = self._obey(request)
+                return self._obey(request)
         except (RefusedError, UserError) as refusal:
-            return self._answer(_Result(), reason=fitted_text(str(refusal), _REASON_BYTES))
-        return self._answer(result)
+            return self._answer(reason=str(refusal))
 
-    def _answer(self, result: _Result, *, reason: str = "") -> ControlAnswer:
+    def _answer(
+        self,
+        *,
+        reason: str = "",
+        still_request: int = -1,
+        frame_index: int = -1,
+        tracks: tuple[TrackNow, ...] = (),
+        note: str = "",
+    ) -> ControlAnswer:
         return ControlAnswer(
             session_id=self.session_id,
             accepted=not reason,
-            reason=reason,
-            still_request=result.still_request,
-            frame_index=result.frame_index,
-            tracks=result.tracks,
-            note=fitted_text(result.note, _REASON_BYTES),
+            reason=fitted_text(reason, _REASON_BYTES),
+            still_request=still_request,
+            frame_index=frame_index,
+            tracks=tracks,
+            note=fitted_text(note, _REASON_BYTES),
         )
 
-    def _obey(self, request: ControlRequest) -> _Result:
+    def _obey(self, request: ControlRequest) -> ControlAnswer:
         if request.session_id not in (0, self.session_id):
             raise RefusedError("that session has ended")
         self._check_rate()
@@ -123,62 +121,62 @@ class Commands:
 
     # The commands
 
-    def _keyframe(self, arguments: Arguments) -> _Result:
+    def _keyframe(self, arguments: Arguments) -> ControlAnswer:
         _Reader("keyframe", arguments).end()
         refusal = self.keyframes.request(self.loop_clock())
         if refusal is not None:
             raise RefusedError(refusal)
-        return _Result()
+        return self._answer()
 
-    def _still(self, arguments: Arguments) -> _Result:
-        number, frame_index = self.on_demand.request(_on_demand_request(arguments))
-        return _Result(still_request=number, frame_index=frame_index)
+    def _still(self, arguments: Arguments) -> ControlAnswer:
+        number, frame_index = self.chooser.on_demand.request(_on_demand_request(arguments))
+        return self._answer(still_request=number, frame_index=frame_index)
 
-    def _still_outcome(self, arguments: Arguments) -> _Result:
+    def _still_outcome(self, arguments: Arguments) -> ControlAnswer:
         reader = _Reader("still-outcome", arguments)
         number = reader.needed("ask", 0, _U32)
         reader.end()
-        return _Result(note=self.on_demand.outcome(number))
+        return self._answer(note=self.chooser.on_demand.outcome(number))
 
-    def _tracks(self, arguments: Arguments) -> _Result:
+    def _tracks(self, arguments: Arguments) -> ControlAnswer:
         _Reader("tracks", arguments).end()
-        frame_index, tracks, there = self.on_demand.tracks()
+        frame_index, tracks, there = self.chooser.on_demand.tracks()
         note = (
             f"of {there} tracks these are the {len(tracks)} of most confidence" if there > len(tracks) else ""
         )
-        return _Result(frame_index=frame_index, tracks=tracks, note=note)
+        return self._answer(frame_index=frame_index, tracks=tracks, note=note)
 
-    def _set_budget(self, arguments: Arguments) -> _Result:
+    def _set_budget(self, arguments: Arguments) -> ControlAnswer:
         reader = _Reader("set-budget", arguments)
         bps = reader.needed("bps", 1, _MOST_BPS)
         reader.end()
         now = self.operating.now
         self._change(bps, now.video_share, now.method)
-        return _Result()
+        return self._answer()
 
-    def _set_method(self, arguments: Arguments) -> _Result:
+    def _set_method(self, arguments: Arguments) -> ControlAnswer:
         reader = _Reader("set-method", arguments)
         name = reader.text("method")
         reader.end()
         now = self.operating.now
         before, policy = method(now.method), self.make_method(name)
         if policy.name == before.name:
-            return _Result()
+            return self._answer()
         if "R0" in (policy.name, before.name):
             raise RefusedError(
                 "R0 codes the video in another way from the first frame on: start the edge with it"
             )
         self._change(now.budget_bps, self._share_for(policy.video_only), policy.name)
-        self.chooser.set_method(policy)
-        return _Result()
+        self.chooser.method = policy  # from the next decision step on; pending stills stay
+        return self._answer()
 
-    def _send_backlog(self, arguments: Arguments) -> _Result:
+    def _send_backlog(self, arguments: Arguments) -> ControlAnswer:
         _Reader("send-backlog", arguments).end()
         if self.backlog is None:
             raise RefusedError("this edge stores nothing while its link is away (--store 0)")
         if not self.backlog.send_video():
             raise RefusedError("nothing is stored that was not sent")
-        return _Result()
+        return self._answer()
 
     # Changes of the rates
 

@@ -12,12 +12,8 @@ from hvt_common.protocol.messages import Feedback
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.outage import BaseInFlight
-from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox, PrimaryReceiver
-from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 
@@ -31,7 +27,7 @@ out before it is encoded."""
 class LinkControl:
     """Applies receiver reports: `on_feedback` in the link's thread, all else in the frame loop.
 
-    ``pacer`` is None without ``--adapt``, ``backlog`` where nothing is stored while the link is offline. Whoever
+    There is no pacer without ``--adapt``, no backlog where nothing is stored while the link is offline. Whoever
     subscribes to the video and is no ground (``has_subscriber``, and not ``has_ground``) reports nothing: it gets all
     that the budget allows, and is no link of which anything is known.
     """
@@ -39,20 +35,17 @@ class LinkControl:
     _: KW_ONLY
     has_ground: Callable[[], bool]
     has_subscriber: Callable[[], bool]
-    session_id: int
-    transmitter: Transmitter
     keyframes: Keyframes
     inbox: FeedbackInbox
     reconfiguration: EncoderReconfiguration
     clock: Callable[[], int]
-    pacer: Pacer | None
     in_flight: BaseInFlight
-    outbox: Outbox
     stills: StillSender
-    backlog: BacklogStage | None
     failures: Failures
 
     def __post_init__(self) -> None:
+        self.transmitter, self.backlog = self.stills.transmitter, self.stills.backlog
+        self.pacer = self.transmitter.pacer
         self._had_ground = False
         self._primary = PrimaryReceiver()
 
@@ -101,7 +94,7 @@ class LinkControl:
         turn: Callable[[], None] = lambda: None,
     ) -> None:
         """After the last frame of a recorded source: send what was stored, and call ``turn`` meanwhile."""
-        self.transmitter.end_base()
+        self.transmitter.budget.end_base()
 
         def before_frame(now_ns: int) -> None:
             turn()
@@ -117,7 +110,7 @@ class LinkControl:
 
     def on_feedback(self, feedback: Feedback) -> None:
         """A ground reports (any thread). Where that fails the rate falls to its floor until a report counts again."""
-        if feedback.session_id != self.session_id:
+        if feedback.session_id != self.transmitter.session_id:
             return
         try:
             self._apply(feedback, now_ns=self.clock())
@@ -138,7 +131,7 @@ class LinkControl:
             self.keyframes.note_round_trip(self.pacer.round_trip_ns)
         if report.primary:
             self.in_flight.on_report(feedback.base_sequence)
-            self.outbox.on_report(
+            self.stills.outbox.on_report(
                 feedback.still_sequence,
                 feedback.missing_stills,
                 now_ns=now_ns,

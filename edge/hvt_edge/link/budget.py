@@ -28,6 +28,7 @@ pose and status by one of their own (`metadata_fits`).
 from __future__ import annotations
 
 import math
+import threading
 from bisect import bisect
 from collections import deque
 from collections.abc import Sequence
@@ -166,11 +167,13 @@ class VideoLoan:
 class RollingBudget:
     """Admits stills. Time is an argument.
 
-    Two threads may ask with clocks that differ a little, and a base message may be recorded for a time still to come:
-    the order of the calls does not matter as long as no time is more than a window behind another.
+    Whoever asks or records holds `lock`; what the frame loop asks besides takes it itself. Two threads may ask with
+    clocks that differ a little, and a base message may be recorded for a time still to come: the order of the calls
+    does not matter as long as no time is more than a window behind another.
     """
 
     def __init__(self, settings: BudgetSettings) -> None:
+        self.lock = threading.RLock()
         self._total = settings.total_bps * settings.window_ns / 8 / SECOND_NS
         self._sent: list[tuple[int, int, int]] = []
         """(time, line bytes, total then), in order of time."""
@@ -203,10 +206,11 @@ class RollingBudget:
             np.linspace(0, steps, min(steps, _FORECASTS) + 1).round().astype(np.int64)
         )
         window_s, fps = settings.window_ns / SECOND_NS, settings.fps
-        self._step_bytes = (
+        self.base_step_bytes = (
             frames_bps(settings.base_bps, settings.total_bps, fps=fps, window_s=window_s) / 8 / fps
         )
-        self._base_peak = BASE_PEAK * max(steps, window_s * fps) * self._step_bytes
+        """The mean of one base frame at the rate that x265 was opened for, in line bytes."""
+        self._base_peak = BASE_PEAK * max(steps, window_s * fps) * self.base_step_bytes
         self._base_steps: deque[int] = deque(maxlen=steps * _MEMORY_WINDOWS)
         self._burst = self._recent_bursts()
         self._cap = settings.still_bps * settings.carry_s / 8
@@ -225,26 +229,22 @@ class RollingBudget:
         What went out under a higher total still counts: messages wait until the window has room. In a window of more
         than `_WHOLE_NS` it counts for its share of the window, which would else be full for all its seconds.
         """
-        settings = self._settings
-        self._refill(now_ns)
-        self._settings = replace(settings, total_bps=total_bps)
-        self._total = total_bps * settings.window_ns / 8 / SECOND_NS
-        self._left.clear()
-        self._events = [(at_ns, self._counted(size, then_bps)) for at_ns, size, then_bps in self._sent]
-        if (base_bps, fps) != (settings.base_bps, settings.fps):
-            self.set_base(base_bps, fps, now_ns=now_ns)
-        self._cap = self._settings.still_bps * settings.carry_s / 8
-        self._tokens = min(self._cap, self._tokens)
+        with self.lock:
+            settings = self._settings
+            self._refill(now_ns)
+            self._settings = replace(settings, total_bps=total_bps)
+            self._total = total_bps * settings.window_ns / 8 / SECOND_NS
+            self._left.clear()
+            self._events = [(at_ns, self._counted(size, then_bps)) for at_ns, size, then_bps in self._sent]
+            if (base_bps, fps) != (settings.base_bps, settings.fps):
+                self.set_base(base_bps, fps, now_ns=now_ns)
+            self._cap = self._settings.still_bps * settings.carry_s / 8
+            self._tokens = min(self._cap, self._tokens)
 
     @property
     def total_bps(self) -> int:
         """B_tot as it is now."""
         return self._settings.total_bps
-
-    @property
-    def base_step_bytes(self) -> float:
-        """The mean of one base frame at the rate that x265 was opened for, in line bytes."""
-        return self._step_bytes
 
     @property
     def most_still_bytes(self) -> int:
@@ -264,7 +264,7 @@ class RollingBudget:
         while self._base_events[0][0] <= now_ns - 2 * self._settings.window_ns:
             self._base_events.popleft()
         if not stored:
-            self._record(line_bytes, now_ns)
+            self.record_other(line_bytes, now_ns)
             self._last_ns = max(self._last_ns, now_ns)
         self._last_base_ns = max(self._last_base_ns or now_ns, now_ns)
         self._base_steps.append(round(self.base_step_bytes) if keyframe else line_bytes)
@@ -277,13 +277,9 @@ class RollingBudget:
         self._base_ended = True
 
     def record_metadata(self, line_bytes: int, *, now_ns: int) -> None:
-        """Count a message that belongs to neither stream, such as ``status``."""
-        self._record(line_bytes, now_ns)
+        """Count a message that belongs to neither stream, such as ``status``; none goes before it any more."""
+        self.record_other(line_bytes, now_ns)
         self._last_ns = max(self._last_ns, now_ns)
-
-    def record_backlog(self, line_bytes: int, *, now_ns: int) -> None:
-        """Count a chunk of the backlog that `backlog_allowance` admitted at this very time."""
-        self._record(line_bytes, now_ns)
 
     def record_still(self, line_bytes: int, *, now_ns: int) -> None:
         """Count one still; it was admitted by `still_allowance` at this very time."""
@@ -293,7 +289,7 @@ class RollingBudget:
         if borrowed > 0:
             self._lent.append((now_ns, borrowed))
         self._tokens -= line_bytes - borrowed
-        self._record(line_bytes, now_ns)
+        self.record_other(line_bytes, now_ns)
 
     def holds(self, line_bytes: int) -> bool:
         """Tell whether an empty window has room for a message of so many line bytes."""
@@ -398,7 +394,7 @@ class RollingBudget:
         self._tokens -= saved
         self._lent.append((now_ns, line_bytes - saved))
         self._loan.take(line_bytes, now_ns=now_ns)
-        self._record(line_bytes, now_ns)
+        self.record_other(line_bytes, now_ns)
 
     def want_requested(self, line_bytes: int | None, *, now_ns: int) -> None:
         """A requested still of about so many line bytes waits for its room; None: none waits any more."""
@@ -409,11 +405,13 @@ class RollingBudget:
 
     def yielding(self, now_ns: int) -> bool:
         """Whether a requested still waits for which frames are left out: what gets free is its own."""
-        return self._settings.yields and self._loan.waits(self._loan_bytes, now_ns=now_ns)
+        with self.lock:
+            return self._settings.yields and self._loan.waits(self._loan_bytes, now_ns=now_ns)
 
     def leaves_out(self, now_ns: int) -> bool:
         """Whether the base frame that is due now is left out for a requested still; ask once for each."""
-        return self._settings.yields and self._loan.leaves_out(self._loan_bytes, now_ns=now_ns)
+        with self.lock:
+            return self._settings.yields and self._loan.leaves_out(self._loan_bytes, now_ns=now_ns)
 
     @property
     def _loan_bytes(self) -> float:
@@ -439,12 +437,14 @@ class RollingBudget:
 
         Where it is ``awaited``, or no base frame has gone out for a window, none but the keyframe is expected.
         """
-        last_ns = self._last_base_ns
-        alone = awaited or last_ns is None or now_ns - last_ns > self._settings.window_ns
-        free = self._unspent(now_ns)[0][0] if alone else self._window_allowance(now_ns)
-        return bool(free + self.base_step_bytes >= keyframe_bytes)
+        with self.lock:
+            last_ns = self._last_base_ns
+            alone = awaited or last_ns is None or now_ns - last_ns > self._settings.window_ns
+            free = self._unspent(now_ns)[0][0] if alone else self._window_allowance(now_ns)
+            return bool(free + self.base_step_bytes >= keyframe_bytes)
 
-    def _record(self, line_bytes: int, now_ns: int) -> None:
+    def record_other(self, line_bytes: int, now_ns: int) -> None:
+        """Count what is admitted at this very time and has no share, such as a chunk of the backlog."""
         sent = (now_ns, line_bytes, self._settings.total_bps)
         index = bisect(self._sent, sent)
         self._sent.insert(index, sent)

@@ -145,10 +145,10 @@ class ZenohLink:
 
     def listen(self, answers: Answers) -> None:
         """Answer grounds from now on; see `EdgeListener`."""
-        listener = EdgeListener(
+        self._listener = EdgeListener(
             self._session, self._keys, answers, failures=self._failures, clock=self._clock
         )
-        self._listener = self._stack.enter_context(listener)
+        self._stack.callback(self._listener.close)
 
     def __enter__(self) -> Self:
         return self
@@ -189,12 +189,6 @@ class EdgeListener:
     def close(self) -> None:
         """Withdraw the token, so that grounds see the end."""
         self._token.undeclare()  # type: ignore[no-untyped-call]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
 
     def declare_again(self, *, there: bool) -> None:
         """Declare anew what a ground that is ``there`` does not use; call it about once a second.

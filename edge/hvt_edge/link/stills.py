@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from hvt_common.protocol.messages import (
     BASE_CODEC,
@@ -76,6 +76,12 @@ class StillReaders:
 _PLAIN_ENCODING = "application/octet-stream"
 """The encoding of formats that only HVT reads; one byte on the wire."""
 _OWN_TYPES = "application/vnd.hvt."
+_AS_THEY_ARE = {one.name for one in fields(Still)} & {one.name for one in fields(RoiHeader)} - {
+    "class_name",
+    "reason",
+    "also",
+}
+"""Fields of a still that its header has too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,21 +101,12 @@ class StillEnvelope:
         """Pack the header."""
         header = RoiHeader(
             session_id=session_id,
-            sequence=still.sequence,
-            frame_index=still.frame_index,
-            capture_ns=still.capture_ns,
             send_delay_ns=0,
             flags=0,
-            track_id=still.track_id,
-            box_source_px=still.box_source_px,
-            crop_source_px=still.crop_source_px,
             class_name=fitted_text(still.class_name, 64),
-            confidence=still.confidence,
             reason=fitted_text(still.reason, 48),
-            codec=still.codec,
-            quality_pct=still.quality_pct,
-            parameters=still.parameters,
             also=tuple(AlsoShown(track_id=one, box_source_px=box) for one, box in still.also),
+            **{name: getattr(still, name) for name in _AS_THEY_ARE},
         )
         own = still.media_type.startswith(_OWN_TYPES)
         return cls(still, PackedMessage.of(header), _PLAIN_ENCODING if own else still.media_type)

@@ -18,7 +18,6 @@ same windows.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from typing import Protocol
@@ -33,7 +32,6 @@ from hvt_common.protocol.messages import (
     CaptureTimes,
     Flags,
     PackedMessage,
-    Status,
 )
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Still
@@ -89,7 +87,7 @@ class Transmitter:
     def __post_init__(self) -> None:
         self._keys = EdgeKeys(self.edge_id)
         self._flags = Flags.LOCKSTEP if self.lockstep else Flags(0)
-        self._lock = threading.Lock()
+        self._lock = self.budget.lock
         self.base_sequence = -1
         """Index of the last access unit sent; -1 before the first."""
         self.still_sequence = -1
@@ -136,8 +134,8 @@ class Transmitter:
         )
         return line_bytes
 
-    def envelope(self, still: Still) -> StillEnvelope:
-        """The still with its header. The newest is cached, so the measured bytes are those sent."""
+    def _envelope(self, still: Still) -> StillEnvelope:
+        # The newest is cached: its header is packed once, however often it is asked for.
         newest = self._newest
         if newest is None or newest.still is not still:
             self._newest = newest = StillEnvelope.of(still, session_id=self.session_id)
@@ -154,19 +152,13 @@ class Transmitter:
             line_bytes = self.budget.still_allowance(now_ns)
         if paced and self.pacer is not None and not self.pacer.admits_still(now_ns):
             return 0
-        if still is None:
-            return self._payload_bytes(line_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding)
-        envelope = self.envelope(still)
-        header_bytes = self._header_at(envelope, now_ns).size_bytes
-        return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
+        return self._usual_payload(line_bytes) if still is None else self._payload(line_bytes, still, now_ns)
 
     def requested_allowance_bytes(self, now_ns: int, *, still: Still) -> int:
         """Like `still_allowance_bytes`, not paced, for a requested still: the video yields to it."""
         with self._lock:
             line_bytes = self.budget.requested_allowance(now_ns)
-        envelope = self.envelope(still)
-        header_bytes = self._header_at(envelope, now_ns).size_bytes
-        return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
+        return self._payload(line_bytes, still, now_ns)
 
     def link_is_free(self, now_ns: int) -> bool:
         """Whether a still may go as far as the link is concerned."""
@@ -178,38 +170,20 @@ class Transmitter:
             if size_bytes is None:
                 self.budget.want_requested(None, now_ns=now_ns)
                 return
-            overhead = overhead_bytes(
-                size_bytes,
-                STILL_ATTACHMENT_BYTES,
-                key=self._keys.key(Channel.ROI),
-                encoding=DELIVERIES[Channel.ROI].encoding,
-            )
-            line_bytes = size_bytes + STILL_ATTACHMENT_BYTES + overhead
+            line_bytes = size_bytes + self._around(Channel.ROI, size_bytes, STILL_ATTACHMENT_BYTES)
             self.budget.want_requested(min(line_bytes, self.budget.most_requested_bytes), now_ns=now_ns)
-
-    def yielding(self, now_ns: int) -> bool:
-        """Whether frames are being left out for a requested still that waits."""
-        with self._lock:
-            return self.budget.yielding(now_ns)
-
-    def leaves_out(self, now_ns: int) -> bool:
-        """Whether the frame that is due now is left out for a requested still; ask once for each."""
-        with self._lock:
-            return self.budget.leaves_out(now_ns)
 
     def most_requested_bytes(self) -> int:
         """About the payload of the largest still that a ground may have at the present rates."""
         with self._lock:
             line_bytes = self.budget.most_requested_bytes
-        return self._payload_bytes(line_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding)
+        return self._usual_payload(line_bytes)
 
     def most_still_bytes(self) -> int:
         """About the payload of the largest still that the budget ever admits."""
-        return self._payload_bytes(
-            self.budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding
-        )
+        return self._usual_payload(self.budget.most_still_bytes)
 
-    def still(self, envelope: StillEnvelope, *, now_ns: int, copy: str = "", requested: bool = False) -> None:
+    def still(self, still: Still, *, now_ns: int, copy: str = "", requested: bool = False) -> None:
         """Send one still that `still_allowance_bytes` admitted at this very time; ``copy``: why it is sent again.
 
         ``requested`` by a ground: `requested_allowance_bytes` admitted it.
@@ -218,8 +192,8 @@ class Transmitter:
         it waits until there is one again, as everything does.
         Its outcome is noted with its bytes: ``sent``, or ``dropped`` once the run has ended.
         """
-        still, encoding = envelope.still, envelope.encoding
         with self._lock:
+            envelope = self._envelope(still)
             if self._ended:
                 self.ledger.record_outcome("dropped", "ended")
                 return
@@ -228,7 +202,7 @@ class Transmitter:
             at_ns = self._still_at_ns(envelope, max(now_ns, now_ns if self.clock is None else self.clock()))
             attachment = self._header_at(envelope, at_ns).pack(still.data)
             line_bytes = self._count(
-                Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=encoding
+                Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=envelope.encoding
             )
             record = self.budget.record_requested if requested else self.budget.record_still
             record(line_bytes, now_ns=at_ns)
@@ -237,7 +211,7 @@ class Transmitter:
             elif self.pacer is not None:
                 self.pacer.sent_still(still.sequence, line_bytes, now_ns=at_ns)
         self.wait_until(at_ns)
-        self.outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=encoding)
+        self.outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=envelope.encoding)
 
     def store_base(self, unit: AccessUnit, *, now_ns: int) -> None:
         """An access unit is stored: it has used up its share, and left nothing of it to a still."""
@@ -245,25 +219,22 @@ class Transmitter:
         with self._lock:
             self.budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe, stored=True)
 
-    def store_still(self, envelope: StillEnvelope, *, now_ns: int, counted: bool = True) -> BacklogStill:
+    def store_still(self, still: Still, *, now_ns: int, counted: bool = True) -> BacklogStill:
         """The still as it would have gone out, for the backlog; ``counted``: its share of the budget is taken."""
-        still, encoding = envelope.still, envelope.encoding
+        envelope = self._envelope(still)
         attachment = envelope.header_at(now_ns, flags=self._flags | Flags.STORED).pack(still.data)
         if counted:
-            line_bytes = self._line_bytes(Channel.ROI, still.data, len(attachment), encoding=encoding)
+            line_bytes = self._line_bytes(
+                Channel.ROI, still.data, len(attachment), encoding=envelope.encoding
+            )
             with self._lock:
                 self.budget.record_still(line_bytes, now_ns=now_ns)
-        return BacklogStill(attachment, encoding, still.data)
+        return BacklogStill(attachment, envelope.encoding, still.data)
 
     @property
     def round_trip_ns(self) -> int:
         """The round trip of the link; half a second if it is not measured."""
         return SECOND_NS // 2 if self.pacer is None else self.pacer.round_trip_ns
-
-    @property
-    def total_bps(self) -> int:
-        """The budget as it is now."""
-        return self.budget.total_bps
 
     def backlog_allowance_bytes(self, now_ns: int, *, reserve: float) -> int:
         """Payload that a chunk of the backlog may have now; ``reserve``: see `RollingBudget.backlog_allowance`."""
@@ -273,13 +244,8 @@ class Transmitter:
             line_bytes = self.budget.backlog_allowance(now_ns, reserve=reserve)
         if self.pacer is not None and not self.pacer.admits_still(now_ns):
             return 0
-        around = BACKLOG_ATTACHMENT_BYTES + overhead_bytes(
-            line_bytes,
-            BACKLOG_ATTACHMENT_BYTES,
-            key=self._keys.key(Channel.BACKLOG),
-            encoding=DELIVERIES[Channel.BACKLOG].encoding,
-        )
-        most = min(_MOST_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, round(_CHUNK_S * self.total_bps / 8)))
+        around = self._around(Channel.BACKLOG, line_bytes, BACKLOG_ATTACHMENT_BYTES)
+        most = min(_MOST_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, round(_CHUNK_S * self.budget.total_bps / 8)))
         return min(most, max(0, line_bytes - around))
 
     def backlog(self, chunk: Chunk, *, now_ns: int) -> int:
@@ -302,7 +268,7 @@ class Transmitter:
             if needed_bytes > self.budget.backlog_allowance(now_ns, reserve=0.0):
                 return 0
             line_bytes = self._count(Channel.BACKLOG, Account.BACKLOG, chunk.data, attachment, at_ns=now_ns)
-            self.budget.record_backlog(line_bytes, now_ns=now_ns)
+            self.budget.record_other(line_bytes, now_ns)
             if self.pacer is not None:
                 self.pacer.sent_other(line_bytes, now_ns=now_ns)
         self.outlet.put(
@@ -319,7 +285,15 @@ class Transmitter:
         before_frames: bool = False,
         last: bool = False,
     ) -> bool:
-        """Send what belongs to neither stream where the next frame keeps its room; else False. See `status`."""
+        """Send what belongs to neither stream, where the next frame keeps its room; else False: try again.
+
+        ``before_frames``: one that has waited long goes as soon as it fits. The ``last`` one, of ``status``, waits
+        until it does.
+
+        ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment. Behind the
+        ``last`` one go no stills and no tracks, whichever thread still has some: a ground that has all that it names
+        closes the session.
+        """
         at_ns = now_ns
         with self._lock:
             if self._ended:
@@ -339,25 +313,6 @@ class Transmitter:
         self.outlet.put(channel, payload, encoding=DELIVERIES[channel].encoding)
         return True
 
-    def status(
-        self, make: Callable[[int], Status], *, now_ns: int, before_frames: bool = False, last: bool = False
-    ) -> bool:
-        """Send the once-a-second report, where the next frame keeps its room; else False, and it may be tried again.
-
-        ``before_frames``: one that has waited long goes as soon as it fits. The ``last`` one waits until it does.
-
-        ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment. Behind the
-        ``last`` one go no stills and no tracks, whichever thread still has some: a ground that has all that it names
-        closes the session.
-        """
-        return self.metadata(
-            Channel.STATUS,
-            lambda at_ns: make(at_ns).pack(),
-            now_ns=now_ns,
-            before_frames=before_frames,
-            last=last,
-        )
-
     def reply(self, channel: Channel, payload: bytes) -> bytes:
         """Count an answer to a query, and let it go at once: the link puts it on the line as this returns.
 
@@ -373,20 +328,10 @@ class Transmitter:
             self.ledger.count_reply(len(payload) + overhead)
         return payload
 
-    def set_rates(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
-        """Total, base stream's share and coded frames a second from now on; see `RollingBudget.set_total`."""
-        with self._lock:
-            self.budget.set_total(total_bps, base_bps, fps, now_ns=now_ns)
-
-    @property
-    def frame_bytes(self) -> int:
-        """Line bytes of an average base frame at the rate that the encoder is open for."""
-        return round(self.budget.base_step_bytes)
-
     def base_wait_ns(self, now_ns: int, *, line_bytes: int | None = None) -> int:
         """The wait of a base message for the budget's window, were it sent now; None: an average frame."""
         with self._lock:
-            line_bytes = self.frame_bytes if line_bytes is None else line_bytes
+            line_bytes = round(self.budget.base_step_bytes) if line_bytes is None else line_bytes
             return max(0, self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True) - now_ns)
 
     def base_unit_wait_ns(self, unit: AccessUnit, *, now_ns: int) -> int | None:
@@ -402,28 +347,8 @@ class Transmitter:
         with self._lock:
             return self._holds(unit, line_bytes)
 
-    def window_holds(self, line_bytes: int) -> bool:
-        """Tell whether an empty window of the budget has room for a message of so many line bytes."""
-        with self._lock:
-            return self.budget.holds(line_bytes)
-
     def _holds(self, unit: AccessUnit, line_bytes: int) -> bool:
         return len(unit.data) <= MAX_PAYLOAD_BYTES and self.budget.holds(line_bytes)
-
-    def end_base(self) -> None:
-        """The source has given its last frame; see `RollingBudget.end_base`."""
-        with self._lock:
-            self.budget.end_base()
-
-    def takes_ns(self, line_bytes: int) -> int:
-        """The time of so many line bytes at the whole budget."""
-        with self._lock:
-            return 8 * SECOND_NS * line_bytes // self.budget.total_bps
-
-    def keyframe_fits(self, line_bytes: int, *, now_ns: int, awaited: bool = False) -> bool:
-        """Tell whether a keyframe of so many line bytes leaves the budget whole (`RollingBudget.keyframe_fits`)."""
-        with self._lock:
-            return self.budget.keyframe_fits(line_bytes, now_ns=now_ns, awaited=awaited)
 
     def outcome(self, outcome: str, reason: str) -> None:
         """Note what became of a candidate: ``sent``, ``deferred`` or ``dropped``, and why."""
@@ -444,11 +369,14 @@ class Transmitter:
         frame_sent = self._captures.knows(self.session_id, envelope.still.frame_index)
         return envelope.header_at(send_ns, flags=self._flags, frame_sent=frame_sent)
 
-    def _payload_bytes(self, line_bytes: int, attachment_bytes: int, media_type: str) -> int:
-        around = attachment_bytes + overhead_bytes(
-            line_bytes, attachment_bytes, key=self._keys.key(Channel.ROI), encoding=media_type
-        )
+    def _payload(self, line_bytes: int, still: Still, now_ns: int) -> int:
+        envelope = self._envelope(still)
+        header_bytes = self._header_at(envelope, now_ns).size_bytes
+        around = self._around(Channel.ROI, line_bytes, header_bytes, encoding=envelope.encoding)
         return max(0, line_bytes - around)
+
+    def _usual_payload(self, line_bytes: int) -> int:
+        return max(0, line_bytes - self._around(Channel.ROI, line_bytes, STILL_ATTACHMENT_BYTES))
 
     def _count(
         self,
@@ -473,10 +401,13 @@ class Transmitter:
     def _line_bytes(
         self, channel: Channel, payload: bytes, attachment_bytes: int, *, encoding: str = ""
     ) -> int:
-        overhead = overhead_bytes(
-            len(payload),
+        return len(payload) + self._around(channel, len(payload), attachment_bytes, encoding=encoding)
+
+    def _around(self, channel: Channel, size_bytes: int, attachment_bytes: int, *, encoding: str = "") -> int:
+        # Line bytes of a message beside so many of payload.
+        return attachment_bytes + overhead_bytes(
+            size_bytes,
             attachment_bytes,
             key=self._keys.key(channel),
             encoding=encoding or DELIVERIES[channel].encoding,
         )
-        return len(payload) + attachment_bytes + overhead

@@ -182,8 +182,30 @@ class FrameCounts:
 
         ``coded``: there is a unit; ``taken``: it was sent or stored; ``has_viewer``: somebody
         subscribes to the video.
+
+        | decision | coded | taken | has_viewer | group |
+        |---|---|---|---|---|
+        | skip | | | | frame_rate |
+        | hold | | | | who held it: budget, link, closer_look … |
+        | code | no | | | encoder |
+        | code, to the store | yes | no | | link |
+        | code, to the link | yes | no | | budget |
+        | code, to the store | yes | yes | | stored |
+        | code, to the link | yes | yes | yes | sent |
+        | code, to the link | yes | yes | no | nobody_listened |
         """
-        self.groups[_group(decision, coded=coded, taken=taken, has_viewer=has_viewer)] += 1
+        group: FrameGroup = "sent" if has_viewer else "nobody_listened"
+        if decision.action is Action.SKIP:
+            group = "frame_rate"
+        elif decision.action is Action.HOLD:
+            group = decision.held_by
+        elif not coded:
+            group = "encoder"
+        elif not taken:
+            group = "link" if decision.to_store else "budget"
+        elif decision.to_store:
+            group = "stored"
+        self.groups[group] += 1
 
     def begin(self, source: Source) -> None:
         """The flight begins: frames that the source left out before do not count."""
@@ -225,30 +247,3 @@ class FrameCounts:
         if self.first_capture_ns is None:
             return 0.0
         return (self.last_capture_ns - self.first_capture_ns) / SECOND_NS + 1 / fps
-
-
-def _group(decision: FrameDecision, *, coded: bool, taken: bool, has_viewer: bool) -> FrameGroup:
-    """The one group of a frame.
-
-    | decision | coded | taken | has_viewer | group |
-    |---|---|---|---|---|
-    | skip | | | | frame_rate |
-    | hold | | | | who held it: budget, link, closer_look … |
-    | code | no | | | encoder |
-    | code, to the store | yes | no | | link |
-    | code, to the link | yes | no | | budget |
-    | code, to the store | yes | yes | | stored |
-    | code, to the link | yes | yes | yes | sent |
-    | code, to the link | yes | yes | no | nobody_listened |
-    """
-    if decision.action is Action.SKIP:
-        return "frame_rate"
-    if decision.action is Action.HOLD:
-        return decision.held_by
-    if not coded:
-        return "encoder"
-    if not taken:
-        return "link" if decision.to_store else "budget"
-    if decision.to_store:
-        return "stored"
-    return "sent" if has_viewer else "nobody_listened"

@@ -112,7 +112,7 @@ class RealtimePace:
         # Video goes first: perception gets no frame while the loop is late, and fewer for a while after it lost one.
         # Where nobody uses it, it takes no time.
         used = self.stills.is_used(frame.capture_ns)
-        cpu_budget, lost = self.stills.cpu_budget, self.counts.dropped_cpu
+        cpu_budget, lost = self.stills.analyzer.cpu_budget, self.counts.dropped_cpu
         rests = used and not cpu_budget.admits_frame(frame.capture_ns, lost=lost, late=behind)
         taken_up = self._worker.take(frame, unit, late=rests)
         self.counts.unanalyzed += used and not taken_up

@@ -151,26 +151,17 @@ class TrackMemory:
             history.seen_ns = now_ns
         self._forget(now_ns)
 
-    def record_sent(
-        self,
-        track_id: int,
-        *,
-        frame_index: int,
-        now_ns: int,
-        area_px: float,
-        sharpness: float | None = None,
-        at_border: bool = False,
-    ) -> None:
-        """Note that a still went out; ``frame_index`` is the frame it shows, ``area_px`` its box in source pixels."""
-        history = self._histories.get(track_id)
+    def record_sent(self, candidate: Candidate, *, frame_index: int, now_ns: int) -> None:
+        """Note that a still of it went out; ``frame_index`` is the frame that it shows."""
+        history = self._histories.get(candidate.track_id)
         if history is None:
             return
         history.sent_count += 1
         history.sent_frame = frame_index
         history.sent_ns = now_ns
-        history.sent_area_px = area_px
-        history.sent_sharpness = sharpness
-        history.sent_at_border = at_border
+        history.sent_area_px = candidate.area_px
+        history.sent_sharpness = candidate.sharpness() if candidate.sharpness else None
+        history.sent_at_border = candidate.touches_border
 
     def record_refused(self, track_id: int, *, now_ns: int) -> None:
         """Note that the still stage had no still for it; suppression then lets it rest for a while."""
@@ -208,78 +199,51 @@ class TrackMemory:
         covered = _covered_shares(boxes_base)
         result = []
         for row, track_id in enumerate(tracks.ids.tolist()):
-            history = self._histories[track_id]
+            history, class_id = self._histories[track_id], int(tracks.class_ids[row])
+            box_base_px, box_source_px = tuple(boxes_base[row].tolist()), tuple(boxes_source[row].tolist())
+            crop = crop_box(box_source_px, padding=self._padding, source_size=view.source_size)
+            coded = coded_size(crop, max_side_px=self._max_side_px)
+            touches, leaving = _note_border(history, box_base_px, picture=picture, now_ns=now_ns)
+            x1, y1, x2, y2 = box_base_px
+            sharp = loss = None
+            if source_bgr is not None:
+                sharp = _sharpness_of(source_bgr, crop)
+                loss = None if base_bgr is None else _loss_of(source_bgr, base_bgr, crop, view=view)
             result.append(
-                self._candidate(
-                    tracks,
-                    row,
-                    history,
-                    box_base_px=tuple(boxes_base[row].tolist()),
-                    box_source_px=tuple(boxes_source[row].tolist()),
+                Candidate(
+                    frame_index=tracks.frame_index,
+                    track_id=track_id,
+                    box_base_px=box_base_px,
+                    box_source_px=box_source_px,
+                    class_id=class_id,
+                    class_name=class_names[class_id] if 0 <= class_id < len(class_names) else str(class_id),
+                    confidence=float(tracks.confidences[row]),
+                    area_share=(x2 - x1) * (y2 - y1) / (view.base_size[0] * view.base_size[1]),
+                    crop_area_px=float(coded[0] * coded[1]),
+                    born_frame=int(tracks.born_frames[row]),
+                    started=history.start_frame > self._last_step_frame,
+                    frames_since_start=tracks.frame_index - history.start_frame,
+                    detected=bool(tracks.seen_frames[row] == tracks.frame_index),
+                    touches_border=touches,
+                    border_s=0.0
+                    if history.border_since_ns is None
+                    else (now_ns - history.border_since_ns) / 1e9,
+                    leaving=leaving,
                     covered_share=covered[row],
-                    view=view,
-                    picture=picture,
-                    class_names=class_names,
-                    now_ns=now_ns,
-                    source_bgr=source_bgr,
-                    base_bgr=base_bgr,
+                    sent_count=history.sent_count,
+                    last_sent_frame=history.sent_frame,
+                    last_sent_ns=history.sent_ns,
+                    last_sent_area_px=history.sent_area_px,
+                    last_sent_sharpness=history.sent_sharpness,
+                    last_sent_at_border=history.sent_at_border,
+                    last_refused_ns=history.refused_ns,
+                    posterior=history.class_posterior,
+                    sharpness=sharp,
+                    loss=loss,
                 )
             )
         self._last_step_frame = tracks.frame_index
         return result
-
-    def _candidate(
-        self,
-        tracks: Tracks,
-        row: int,
-        history: _History,
-        *,
-        box_base_px: Box,
-        box_source_px: Box,
-        covered_share: float,
-        view: View,
-        picture: Box,
-        class_names: Sequence[str],
-        now_ns: int,
-        source_bgr: Image | None,
-        base_bgr: Image | None,
-    ) -> Candidate:
-        class_id = int(tracks.class_ids[row])
-        crop = crop_box(box_source_px, padding=self._padding, source_size=view.source_size)
-        coded = coded_size(crop, max_side_px=self._max_side_px)
-        touches, leaving = _note_border(history, box_base_px, picture=picture, now_ns=now_ns)
-        width, height = box_base_px[2] - box_base_px[0], box_base_px[3] - box_base_px[1]
-        return Candidate(
-            frame_index=tracks.frame_index,
-            track_id=int(tracks.ids[row]),
-            box_base_px=box_base_px,
-            box_source_px=box_source_px,
-            class_id=class_id,
-            class_name=class_names[class_id] if 0 <= class_id < len(class_names) else str(class_id),
-            confidence=float(tracks.confidences[row]),
-            area_share=width * height / (view.base_size[0] * view.base_size[1]),
-            crop_area_px=float(coded[0] * coded[1]),
-            born_frame=int(tracks.born_frames[row]),
-            started=history.start_frame > self._last_step_frame,
-            frames_since_start=tracks.frame_index - history.start_frame,
-            detected=bool(tracks.seen_frames[row] == tracks.frame_index),
-            touches_border=touches,
-            border_s=0.0 if history.border_since_ns is None else (now_ns - history.border_since_ns) / 1e9,
-            leaving=leaving,
-            covered_share=covered_share,
-            sent_count=history.sent_count,
-            last_sent_frame=history.sent_frame,
-            last_sent_ns=history.sent_ns,
-            last_sent_area_px=history.sent_area_px,
-            last_sent_sharpness=history.sent_sharpness,
-            last_sent_at_border=history.sent_at_border,
-            last_refused_ns=history.refused_ns,
-            posterior=history.class_posterior,
-            sharpness=None if source_bgr is None else _sharpness_of(source_bgr, crop),
-            loss=None
-            if source_bgr is None or base_bgr is None
-            else _loss_of(source_bgr, base_bgr, crop_source_px=crop, view=view),
-        )
 
     def _forget(self, now_ns: int) -> None:
         oldest_ns = now_ns - self._forget_ns
@@ -333,7 +297,7 @@ def _sharpness_of(source_bgr: Image, crop_source_px: tuple[int, int, int, int]) 
 
 
 def _loss_of(
-    source_bgr: Image, base_bgr: Image, *, crop_source_px: tuple[int, int, int, int], view: View
+    source_bgr: Image, base_bgr: Image, crop_source_px: tuple[int, int, int, int], *, view: View
 ) -> Callable[[], BaseLoss]:
     # Measures the loss by coding, not by the size of the base: detectors there see its grid and no finer.
     x1, y1, x2, y2 = crop_source_px

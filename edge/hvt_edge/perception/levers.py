@@ -92,20 +92,15 @@ class LeverControl:
         self._operating = operating
         self._settings = settings
         self._lock = threading.Lock()
-        self._measured = Measured()
+        self.measured = Measured()
+        """The newest measurement of the shadow ground."""
+        self.unlike = False
+        """The detector does not know the view, so that a gain in what it finds is a gain in guesses."""
         self._changed: deque[bool] = deque(maxlen=settings.most_answers)
         self._paused_until_ns: int | None = None
         self._pauses = 1
-        self._too_slow = self._unlike = False
+        self._too_slow = False
         operating.pull(Levers(tracks=False))
-
-    def take_shadow(self, measured: Measured) -> None:
-        """Take a measurement of the shadow ground."""
-        self._measured = measured
-
-    def take_view(self, *, unlike: bool) -> None:
-        """``unlike``: the detector does not know the view, so that a gain in what it finds is a gain in guesses."""
-        self._unlike = unlike
 
     def take_answer(self, *, changed: bool) -> None:
         """A ground has inspected a still; ``changed``: it now names the object otherwise than the edge does."""
@@ -122,7 +117,7 @@ class LeverControl:
 
     def forget(self) -> None:
         """Another scene: measurements of the last one say nothing of it."""
-        self._measured = Measured()
+        self.measured = Measured()
         self._changed.clear()
         self._paused_until_ns, self._pauses = None, 1
 
@@ -135,7 +130,7 @@ class LeverControl:
         before = self._operating.now.levers
         tracks = self._tracks(before.tracks) and not self._too_slow
         # Tracks tell classes too; without them a still is what corrects one.
-        named = tracks or self._measured.misnamed_share < self._settings.least_changed
+        named = tracks or self.measured.misnamed_share < self._settings.least_changed
         wanted = self._settings.finer or self._stills(now_ns) or not named
         stills = wanted and not self._too_slow
         levers = Levers(tracks, stills, self._says(tracks=tracks, stills=stills))
@@ -144,9 +139,9 @@ class LeverControl:
         return levers
 
     def _tracks(self, sent: bool) -> bool:  # noqa: FBT001 - the state before
-        if self._unlike:
+        if self.unlike:
             return False
-        return self._settings.tracks_pay(self._measured, total_bps=self._operating.now.total_bps, sent=sent)
+        return self._settings.tracks_pay(self.measured, total_bps=self._operating.now.total_bps, sent=sent)
 
     def _stills(self, now_ns: int) -> bool:
         settings = self._settings
@@ -168,14 +163,14 @@ class LeverControl:
     def _says(self, *, tracks: bool, stills: bool) -> str:
         if self._too_slow:
             return "video alone: this machine is too slow for the detector"
-        measured = self._measured
+        measured = self.measured
         who = "the ground overlooks" if measured.reported else "the video hides"
         hidden = f"{who} {_objects(measured.hidden)}"
         for count, what in ((measured.suppressed, "shows {} false"), (measured.misnamed, "misnames {}")):
             if round(count):
                 hidden += f", {what.format(f'{count:.0f}')}"
         why = hidden if measured.comparisons else "not measured yet"
-        if self._unlike:
+        if self.unlike:
             why = "this view is unlike what the detector knows"
         of_tracks = f"{'tracks' if tracks else 'no tracks'}: {why}"
         renamed = f"{sum(self._changed)} of {len(self._changed)} objects named otherwise by the ground"

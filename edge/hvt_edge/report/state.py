@@ -9,14 +9,14 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
 from hvt_common import __version__
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.edge_words import FrameAccount
-from hvt_common.protocol.ledger import Account, Ledger
+from hvt_common.protocol.ledger import Account
 from hvt_common.protocol.messages import WIRE_VERSION
 from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.runtime.process import notify_systemd
@@ -24,10 +24,8 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import View
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
-from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import Cores, FrameCounts
 from hvt_edge.operating import Levers, LoopClock, Operating
 from hvt_edge.stills.stage import StillStage
@@ -239,15 +237,10 @@ class Heartbeat:
 
     config: EdgeConfig
     _: KW_ONLY
-    session_id: int
     view: View
     operating: Operating
-    ledger: Ledger
     counts: FrameCounts
-    keyframes: Keyframes
-    transmitter: Transmitter
     stills: StillStage
-    backlog: BacklogStage | None
     link: EdgeLink
     inbox: FeedbackInbox
     failures: Failures
@@ -255,10 +248,18 @@ class Heartbeat:
     loop_clock: LoopClock
 
     def __post_init__(self) -> None:
+        self.transmitter, self.backlog = self.stills.sender.transmitter, self.stills.sender.backlog
+        self.ledger, self.session_id = self.transmitter.ledger, self.transmitter.session_id
         self._ground, self._since_ns = False, self.clock()
         self._due_ns = 0
         self.state: EdgeState | None = None
         """The newest; None before the first. Any thread may read it."""
+
+    @property
+    def frames(self) -> FrameAccount:
+        """The outcome of each frame so far."""
+        fps = self.config.nominal_fps / self.operating.now.decimation
+        return self.counts.account(coded_fps=fps, auto_fps=self.config.auto_fps)
 
     def beat(self, phase: Phase) -> EdgeState:
         """Make a state now."""
@@ -310,17 +311,15 @@ class Heartbeat:
             meta_bps=self._bps(Account.META),
             budget_share=None if total_bps is None else total_bps / now.total_bps,
             frames=Frames(
-                account=counts.account(
-                    coded_fps=config.nominal_fps / now.decimation, auto_fps=config.auto_fps
-                ),
+                account=self.frames,
                 encoded=counts.encoded,
                 unanalyzed=counts.unanalyzed,
             ),
             source_silent_s=None if came_ns is None else max(0.0, (now_ns - came_ns) / SECOND_NS),
-            keyframes=self.keyframes.sent,
-            keyframe_requests=self.keyframes.served,
+            keyframes=self.stills.keyframes.sent,
+            keyframe_requests=self.stills.keyframes.served,
             stills_sent=sum(ledger.outcomes("sent").values()),
-            stills_pending=self.stills.pending,
+            stills_pending=len(self.stills.outbox),
             stills_in_flight=self.stills.outbox.unacknowledged,
             stills_not_sent=dict(outcomes),
             tracks=analyzer.tracks,
@@ -373,18 +372,12 @@ class Heartbeat:
 
 
 def _backlog(backlog: BacklogStage) -> BacklogState:
-    numbers = backlog.numbers
+    here = {one.name for one in fields(BacklogState)}
+    numbers = asdict(backlog.worker.numbers)
     return BacklogState(
         offline=backlog.offline,
-        stills=numbers.stills,
-        segments=numbers.segments,
-        video_s=numbers.video_s,
-        disk_bytes=numbers.disk_bytes,
         limit_bytes=backlog.max_bytes,
-        disk_free_bytes=backlog.disk_free_bytes,
+        disk_free_bytes=backlog.worker.disk_free_bytes,
         frames_stored=backlog.frames,
-        sent_stills=numbers.sent_stills,
-        sent_video_s=numbers.sent_video_s,
-        evicted_stills=numbers.evicted_stills,
-        evicted_segments=numbers.evicted_segments,
+        **{name: number for name, number in numbers.items() if name in here},
     )

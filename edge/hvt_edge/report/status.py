@@ -9,8 +9,7 @@ from typing import Any, Literal
 
 from hvt_common import __version__
 from hvt_common.protocol.channels import Channel
-from hvt_common.protocol.edge_words import FrameAccount, counts_text
-from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.edge_words import counts_text
 from hvt_common.protocol.messages import (
     BASE_CODEC,
     MOST_FAILED_PARTS,
@@ -20,12 +19,9 @@ from hvt_common.protocol.messages import (
     Status,
     fitted_text,
 )
-from hvt_common.runtime.failures import Failure
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import View
-from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.config import EdgeConfig
-from hvt_edge.loop.counts import Cores
 from hvt_edge.operating import Levers, Operating
 from hvt_edge.report.state import EdgeState, Heartbeat, LinkState
 
@@ -108,8 +104,12 @@ class StatusReporter:
             return
         (state, levers), now_ns = self._pending, self._of.loop_clock()
         late = self._due_ns is not None and now_ns - self._due_ns >= _LATE_NS
-        if self._of.transmitter.status(
-            lambda at_ns: self._status(state, levers, at_ns), now_ns=now_ns, before_frames=late, last=last
+        if self._of.transmitter.metadata(
+            Channel.STATUS,
+            lambda at_ns: self._status(state, levers, at_ns).pack(),
+            now_ns=now_ns,
+            before_frames=late,
+            last=last,
         ):
             self._pending = self._due_ns = None
             self._sequence += 1
@@ -216,39 +216,45 @@ def _link_text(link: LinkState) -> str:
     return "no link" if link.trouble else "no ground listens"
 
 
-def summary(
-    ledger: Ledger,
-    *,
-    duration_s: float,
-    frames: FrameAccount,
-    unanalyzed: int,
-    cores: Cores,
-    store: StoreNumbers | None,
-    failed: tuple[Failure, ...],
-    **facts: str | float,
-) -> dict[str, Any]:
+def summary(of: Heartbeat, *, unreached: str) -> dict[str, Any]:
     """The JSON summary; rates count every byte on the line: payload, attachments, transport overhead.
 
-    ``duration_s`` is from the first frame sent to the last, by their capture; ``frames`` says what became of each;
-    perception skipped ``unanalyzed`` of those that came to it; ``cores`` are of the times in which frames were left
-    out for want of time. ``facts`` are numbers that the ledger does not hold, as they are.
+    ``unreached`` says why nobody had its video; empty where somebody had.
     """
+    config, counts, now, ledger, frames = of.config, of.counts, of.operating.now, of.ledger, of.frames
+    keyframes, analyzer, cores = of.stills.keyframes, of.stills.analyzer, counts.cpu.short
+    duration_s = counts.duration_s(config.nominal_fps)
     account = ledger.summary(duration_s)
     reasons = {outcome: account.outcomes[outcome] for outcome in ("sent", "deferred", "dropped")}
-    stills: dict[str, Any] = {outcome: sum(counts.values()) for outcome, counts in reasons.items()}
+    stills: dict[str, Any] = {outcome: sum(by.values()) for outcome, by in reasons.items()}
     on_roi = stills["sent"] - account.outcomes["sent"].get("stored", 0)
     stills["reasons"] = reasons
     stills["mean_bytes"] = round(account.roi_bytes / on_roi) if on_roi else 0
     stills["per_minute"] = round(60 * stills["sent"] / duration_s, 2) if duration_s else 0.0
     return {
-        **{name: round(fact, 2) if isinstance(fact, float) else fact for name, fact in facts.items()},
+        "edge": config.edge_id,
+        "session": f"{of.session_id:016x}",
+        "method": now.method,
+        "levers": now.levers.says,
+        "preset": now.preset,
+        "preset_says": now.preset_says,
+        "clip_paused_s": round(counts.paused_ns / SECOND_NS, 2),
+        "budget_bps": now.highest_budget_bps,
+        "budget_base_bps": now.base_bps,
+        "keyframes": keyframes.sent,
+        "keyframe_requests": keyframes.served,
+        "tracks": analyzer.tracks,
+        "encode_ms": round(counts.encode_ms, 2),
+        "perception_ms": round(analyzer.mean_ms, 2),
+        "unusable_messages": of.link.unusable,
+        "unreached": unreached,
         "duration_s": round(duration_s, 3),
         "frames": frames.groups.get("sent", 0) + frames.groups.get("nobody_listened", 0),
         "frames_stored": frames.groups.get("stored", 0),
         "frames_captured": frames.came,
         "frames_dropped": frames.dropped,
         "frames_dropped_cpu": frames.groups.get("processor", 0),
-        "frames_unanalyzed": unanalyzed,
+        "frames_unanalyzed": counts.unanalyzed,
         "frame_account": frames.as_dict(),
         **account.as_dict(),
         "replies": ledger.replies,
@@ -256,8 +262,8 @@ def summary(
         "stills": stills,
         "cores_needed": round(cores.needed, 2),
         "cores_free": round(cores.free, 2),
-        "store": None if store is None else asdict(store),
-        "failed": [asdict(one) | {"failed_at": _clock_time(one.failed_ns)} for one in failed],
+        "store": None if of.backlog is None else asdict(of.backlog.worker.numbers),
+        "failed": [asdict(one) | {"failed_at": _clock_time(one.failed_ns)} for one in of.failures.parts],
     }
 
 

@@ -75,10 +75,7 @@ class CameraGrabber:
     def restart(self) -> None:
         """Open again after `SignalLost`."""
         self.close()
-        try:
-            self.open()
-        except UserError as error:
-            raise SignalLost(str(error)) from error
+        self.open()
 
     def grab(self) -> Shot:
         """The next frame, at most the read timeout from now, with the time that the driver gave its buffer."""

@@ -9,13 +9,13 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from hvt_common.errors import NotYetError
 from hvt_common.runtime.failures import Failures
-from hvt_common.values import Fit, Frame, Image
+from hvt_common.values import Frame, Image
 from hvt_edge.source.camera_stream import (
     CameraDecoder,
     check_picture,
@@ -24,7 +24,7 @@ from hvt_edge.source.camera_stream import (
     rate_of,
     without_jumps,
 )
-from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit
+from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit, SourceSettings
 from hvt_edge.source.live import SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
 from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped, packets_of
 
@@ -82,10 +82,8 @@ class CodedLiveSource(LiveSource):
     def __init__(
         self,
         grabber: CodedStreamGrabber,
+        settings: SourceSettings,
         *,
-        size: BaseSize,
-        fit: Fit,
-        max_frames: int | None = None,
         clock: Callable[[], int] | None = None,
         failures: Failures | None = None,
     ) -> None:
@@ -94,9 +92,7 @@ class CodedLiveSource(LiveSource):
         self._queued_bytes = self._number = 0
         self._skips = False
         """Units are left out up to the next keyframe because the reader was too slow for some."""
-        super().__init__(
-            grabber, size=size, fps=1.0, fit=fit, max_frames=max_frames, clock=clock, failures=failures
-        )
+        super().__init__(grabber, replace(settings, fps=1.0), clock=clock, failures=failures)
 
     def steps(self, *, start_ns: int) -> Iterator[Frame | None]:  # noqa: ARG002 - a camera has its own time
         """See `Source`. The first is a keyframe."""

@@ -12,7 +12,7 @@ import av.error
 
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS, exact_rate
-from hvt_common.values import Fit, Frame
+from hvt_common.values import Frame
 from hvt_edge.source.camera_stream import (
     LONG_STEP_S,
     CameraDecoder,
@@ -23,7 +23,7 @@ from hvt_edge.source.camera_stream import (
     rate_of,
     without_jumps,
 )
-from hvt_edge.source.contract import BaseSize, CameraStream, Notes, SeenUnit, Source
+from hvt_edge.source.contract import CameraStream, ClipSource, Notes, SeenUnit, SourceSettings
 from hvt_edge.source.decoding.container import name_of, open_video, said_rate, survey, without_stamps
 from hvt_edge.source.decoding.timeline import Stamps
 from hvt_edge.source.resample import Resizer
@@ -34,67 +34,44 @@ _MOST_SURVEY_S, _MOST_SURVEYED = 600.0, 40_000
 """The part of a clip that is surveyed before the flight."""
 
 
-class CodedVideoSource(Source):
-    """A clip by presentation time. Nothing is repeated or left out: its rate is the base rate.
+class CodedVideoSource(ClipSource):
+    """A clip by presentation time, from its first keyframe on. Nothing is left out: its rate is the base rate.
 
     Raises `UserError` where its units cannot be the base stream.
     """
 
-    live = False
-
-    def __init__(
-        self,
-        spec: str,
-        *,
-        size: BaseSize,
-        fit: Fit,
-        max_frames: int | None = None,
-        source_fps: float | None = None,
-        growing: bool = False,
-    ) -> None:
+    def __init__(self, spec: str, settings: SourceSettings) -> None:
         self._spec, self._name = spec, name_of(spec)
-        self._limit, self._growing = max_frames, growing
+        self._limit, self._growing = settings.max_frames, settings.growing
         notes = Notes(self._name)
-        container, stream = open_video(spec, growing=growing, note=notes)
+        container, stream = open_video(spec, growing=self._growing, note=notes)
         with container:
             check_stream(self._name, stream)
             self._stamps, first = survey(container, stream)
-            if source_fps is not None:
-                self._stamps = Stamps(1 / exact_rate(source_fps), usable=False)
+            if settings.source_fps is not None:
+                self._stamps = Stamps(1 / exact_rate(settings.source_fps), usable=False)
         if first is None:
             raise UserError(f"source {self._name!r} holds a video stream of which no frame can be decoded")
-        self.warning = check_picture(self._name, first, size=size)
+        self.warning = check_picture(self._name, first, size=settings.size)
         self._size = (first.width, first.height)
-        self._resizer = Resizer(self._size, size, fit=fit)
+        self._resizer = Resizer(self._size, settings.size, fit=settings.fit)
         self.view = self._resizer.view
-        container, stream = open_video(spec, growing=growing)
+        container, stream = open_video(spec, growing=self._growing)
         with container:
             said = float(1 / self._stamps.period_s)
             seen = _seen(self._timed(container, stream), open_units(self._name, stream))
             if len(seen) < 2:
                 raise UserError(f"source {self._name!r} holds no keyframe that a ground could begin with")
             self.fps = rate_of(self._name, seen, said=said)
-            self.frame_count = None if not stream.frames else min(stream.frames, max_frames or stream.frames)
-            if without_stamps(stream) and source_fps is None:
+            frames = stream.frames
+            self.frame_count = None if not frames else min(frames, settings.max_frames or frames)
+            if without_stamps(stream) and settings.source_fps is None:
                 source = "as the stream itself says" if said_rate(stream) else "which is a guess"
                 notes(
                     f"it has no time stamps: {said:.4g} frames a second, {source}; --source-fps N says another"
                 )
         self.notes = notes.taken()
         self.camera_stream = CameraStream(without_jumps(seen), self.fps)
-        self._running: Generator[Frame, None, None] | None = None
-
-    def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """The clip from its first keyframe on."""
-        self.close()
-        self._running = self._play(start_ns)
-        return self._running
-
-    def close(self) -> None:
-        """Stop reading."""
-        if self._running is not None:
-            self._running.close()
-            self._running = None
 
     def _play(self, start_ns: int) -> Generator[Frame, None, None]:
         container, stream = open_video(self._spec, growing=self._growing)

@@ -5,19 +5,31 @@ from __future__ import annotations
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Self
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.log import START_LOGGER
-from hvt_common.values import Frame, View
+from hvt_common.values import Fit, Frame, View
 
 BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
 """(width, height) of the base frames, or how they follow from those of the source."""
 
 _LEAST_SIDE_PX, _MOST_SIDE_PX = 64, 8192
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceSettings:
+    """How every kind of source is opened; see `hvt_edge.source.opening.open_source`."""
+
+    size: BaseSize
+    fps: float
+    fit: Fit = "letterbox"
+    max_frames: int | None = None
+    source_fps: float | None = None
+    growing: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +111,28 @@ class Source(ABC):
 
     def __exit__(self, *_error: object) -> None:
         self.close()
+
+
+class ClipSource(Source):
+    """A clip that waits for its reader, and is played again from its beginning."""
+
+    live = False
+    _running: Generator[Frame, None, None] | None = None
+
+    def frames(self, *, start_ns: int) -> Iterator[Frame]:
+        """The clip from its beginning."""
+        self.close()
+        self._running = self._play(start_ns)
+        return self._running
+
+    def close(self) -> None:
+        """Stop reading."""
+        if self._running is not None:
+            self._running.close()
+            self._running = None
+
+    @abstractmethod
+    def _play(self, start_ns: int) -> Generator[Frame, None, None]: ...
 
 
 def size_within(source_size: tuple[int, int], box: tuple[int, int]) -> tuple[int, int]:

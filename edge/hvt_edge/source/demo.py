@@ -23,8 +23,8 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
-from hvt_common.values import Fit, Frame, Image, Pose, View
-from hvt_edge.source.contract import BaseSize, Source
+from hvt_common.values import Frame, Image, Pose, View
+from hvt_edge.source.contract import Source, SourceSettings
 from hvt_edge.source.resample import Resizer, capture_time_ns
 
 _END_S = 5.0
@@ -79,9 +79,7 @@ class DemoSource(Source):
 
     live = False
 
-    def __init__(
-        self, spec: str = "demo", *, size: BaseSize, fps: float, fit: Fit, seed: int, max_frames: int | None
-    ) -> None:
+    def __init__(self, spec: str, settings: SourceSettings, *, seed: int) -> None:
         demo_scene(spec)  # says what is wrong with it here
         if not entry_points(group="hvt.scenes", name="demo"):
             raise UserError("--source demo: no package installed here draws a scene; install hvt whole")
@@ -96,11 +94,11 @@ class DemoSource(Source):
         self._pictures_due = 0
         """Asked for, and not yet taken."""
         self._size, self.class_names, duration_s = self._answer()
-        self.fps = fps
-        self._resizer = Resizer(self._size, size, fit=fit)
+        self.fps = settings.fps
+        self._resizer = Resizer(self._size, settings.size, fit=settings.fit)
         self.view = self._resizer.view
-        whole = math.ceil(duration_s * exact_rate(fps))
-        self.frame_count = self._count = whole if max_frames is None else min(whole, max_frames)
+        whole = math.ceil(duration_s * exact_rate(self.fps))
+        self.frame_count = self._count = min(whole, settings.max_frames or whole)
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         """The scene from its beginning."""

@@ -14,8 +14,8 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
-from hvt_common.values import Fit, Frame, Image
-from hvt_edge.source.contract import BaseSize, Notes, Source
+from hvt_common.values import Frame, Image
+from hvt_edge.source.contract import Notes, Source, SourceSettings
 from hvt_edge.source.decoding.pictures import Stretch
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
@@ -68,16 +68,8 @@ class FolderSource(Source):
 
     live = False
 
-    def __init__(
-        self,
-        spec: str,
-        *,
-        size: BaseSize,
-        fps: float,
-        fit: Fit,
-        max_frames: int | None = None,
-        source_fps: float | None = None,
-    ) -> None:
+    def __init__(self, spec: str, settings: SourceSettings) -> None:
+        self.fps = fps = settings.fps
         self._files = sequence_files(Path(spec))
         if not self._files:
             endings = ", ".join(sorted(ending[1:] for ending in _ENDINGS))
@@ -90,18 +82,18 @@ class FolderSource(Source):
             raise UserError(
                 f"source folder {spec!r} holds {len(self._files)} image files, none of which can be read"
             )
-        if source_fps is None:
+        if settings.source_fps is None:
             notes(f"images have no time: {fps:g} a second, as --fps says; --source-fps N says another rate")
         if gaps := _gaps(self._files):
             notes(gaps)
         self.notes = notes.taken()
         self._first = first
-        self.fps = fps
-        self._period_s = 1 / exact_rate(fps if source_fps is None else source_fps)
-        self._resizer = Resizer((first.shape[1], first.shape[0]), size, fit=fit, name=spec)
+        self._period_s = 1 / exact_rate(fps if settings.source_fps is None else settings.source_fps)
+        size = (first.shape[1], first.shape[0])
+        self._resizer = Resizer(size, settings.size, fit=settings.fit, name=spec)
         self.view = self._resizer.view
         whole = base_frame_count(len(self._files) * self._period_s, fps=exact_rate(fps))
-        self.frame_count = whole if max_frames is None else min(whole, max_frames)
+        self.frame_count = whole if settings.max_frames is None else min(whole, settings.max_frames)
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         """The sequence from its beginning."""

@@ -17,9 +17,9 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Fit, Frame, Image
+from hvt_common.values import Frame, Image
 from hvt_edge.source.camera_stream import CameraDecoder
-from hvt_edge.source.contract import BaseSize, Notes, Source
+from hvt_edge.source.contract import BaseSize, Notes, Source, SourceSettings
 from hvt_edge.source.resample import Gate, Resizer
 
 _log = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ class Grabber(Protocol):
         """Open for the first time: raises UserError where there is nothing."""
 
     def restart(self) -> None:
-        """Open again after `SignalLost`; raises `SignalLost` if that fails."""
+        """Open again after `SignalLost`; raises that or `UserError` if it fails."""
 
     def grab(self) -> Shot:
         """Wait for the next frame; raises `SignalLost`."""
@@ -104,21 +104,18 @@ class LiveSource(Source):
     def __init__(
         self,
         grabber: Grabber,
+        settings: SourceSettings,
         *,
-        size: BaseSize,
-        fps: float,
-        fit: Fit,
-        max_frames: int | None = None,
         clock: Callable[[], int] | None = None,
         failures: Failures | None = None,
     ) -> None:
-        self.fps, self._limit = fps, max_frames
+        self.fps, self._limit = settings.fps, settings.max_frames
         self._clock = clock or SteadyClock()
         self._failures = failures or Failures(self._clock)
         self._grabber = grabber
         grabber.open()
         try:
-            first_size = self._first_size(grabber, size)
+            first_size = self._first_size(grabber, settings.size)
         except UserError:
             grabber.close()
             raise
@@ -127,7 +124,7 @@ class LiveSource(Source):
             raise NotYetError(
                 f"source {grabber.name} opens but delivers no picture ({_reason(error)})"
             ) from error
-        self._resizer = Resizer(first_size, size, fit=fit, name=grabber.name)
+        self._resizer = Resizer(first_size, settings.size, fit=settings.fit, name=grabber.name)
         self.notes = () if grabber.notes is None else grabber.notes.taken()
         self.view = self._resizer.view
         self._pause = RetryPause(FIRST_WAIT_NS, _LONGEST_WAIT_NS)
@@ -229,7 +226,7 @@ class LiveSource(Source):
 
 def _reason(error: Exception) -> str:
     # A driver or a decoder raises what it likes.
-    return str(error) if isinstance(error, SignalLost) else reason_of(error)
+    return str(error) if isinstance(error, SignalLost | UserError) else reason_of(error)
 
 
 @contextmanager

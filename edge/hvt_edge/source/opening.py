@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 from hvt_common.errors import NotYetError, UserError
@@ -16,7 +15,7 @@ from hvt_edge.source.camera import CameraGrabber
 from hvt_edge.source.camera_stream import REENCODE
 from hvt_edge.source.coded_live import CodedLiveSource, CodedStreamGrabber
 from hvt_edge.source.coded_video import CodedVideoSource
-from hvt_edge.source.contract import BaseSize, Source, check_shape
+from hvt_edge.source.contract import BaseSize, Source, SourceSettings, check_shape
 from hvt_edge.source.decoding.container import is_local
 from hvt_edge.source.demo import DemoSource, is_demo
 from hvt_edge.source.folder import FolderSource
@@ -57,38 +56,33 @@ def open_source(  # noqa: PLR0911 - one return a kind of source
     Raises `UserError` if nothing usable is there, or size or rate are impossible.
     """
     check_shape(size=size, fps=fps, source_fps=source_fps)
+    settings = SourceSettings(
+        size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps, growing=growing
+    )
     clock = clock or SteadyClock()
     if coded:
         _check_coded(spec)
     if is_demo(spec):
-        return DemoSource(spec, size=size, fps=fps, fit=fit, seed=seed, max_frames=max_frames)
-    live = partial(
-        LiveSource, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock, failures=failures
-    )
+        return DemoSource(spec, settings, seed=seed)
     scheme = "" if is_local(spec) else spec.partition("://")[0].lower()
     if scheme in LIVE_SCHEMES or (is_description(spec) and _is_there(spec)):
         stream = (CodedStreamGrabber if coded else StreamGrabber)(spec, read_s=patience_s(fps))
         stream.open()
         if isinstance(stream, CodedStreamGrabber) and not stream.holds_a_clip:
-            return CodedLiveSource(
-                stream, size=size, fit=fit, max_frames=max_frames, clock=clock, failures=failures
-            )
+            return CodedLiveSource(stream, settings, clock=clock, failures=failures)
         if not stream.holds_a_clip:
-            return live(stream)
+            return LiveSource(stream, settings, clock=clock, failures=failures)
         stream.close()
     elif _is_device(spec):
-        return live(CameraGrabber(spec, fps=fps, clock=clock))
+        grabber = CameraGrabber(spec, fps=fps, clock=clock)
+        return LiveSource(grabber, settings, clock=clock, failures=failures)
     else:
         _check_there(spec, scheme, growing=growing)
     if coded:
-        return CodedVideoSource(
-            spec, size=size, fit=fit, max_frames=max_frames, source_fps=source_fps, growing=growing
-        )
+        return CodedVideoSource(spec, settings)
     if not scheme and Path(spec).is_dir():
-        return FolderSource(spec, size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps)
-    return VideoSource(
-        spec, size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps, growing=growing
-    )
+        return FolderSource(spec, settings)
+    return VideoSource(spec, settings)
 
 
 def _check_there(spec: str, scheme: str, *, growing: bool) -> None:

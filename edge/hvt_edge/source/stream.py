@@ -76,10 +76,7 @@ class StreamGrabber:
     def restart(self) -> None:
         """Open again after `SignalLost`."""
         self.close()
-        try:
-            self._start(_RESTART_S + self._read_s)
-        except UserError as error:
-            raise SignalLost(str(error)) from error
+        self._start(_RESTART_S + self._read_s)
 
     def grab(self) -> Shot:
         """The next frame, at most the read timeout from now."""

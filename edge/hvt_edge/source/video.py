@@ -13,8 +13,8 @@ import av
 
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
-from hvt_common.values import Fit, Frame
-from hvt_edge.source.contract import BaseSize, Notes, Source
+from hvt_common.values import Frame
+from hvt_edge.source.contract import ClipSource, Notes, SourceSettings
 from hvt_edge.source.decoding.container import (
     decoded,
     duration_s,
@@ -30,28 +30,16 @@ from hvt_edge.source.decoding.timeline import Stamps
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
 
-class VideoSource(Source):
+class VideoSource(ClipSource):
     """A clip by presentation time; the first frame that decodes is its zero. Every decodable frame is played."""
 
-    live = False
-
-    def __init__(
-        self,
-        spec: str,
-        *,
-        size: BaseSize,
-        fps: float,
-        fit: Fit,
-        max_frames: int | None = None,
-        source_fps: float | None = None,
-        growing: bool = False,
-    ) -> None:
-        self._spec, self.fps = spec, fps
-        self._name, self._growing = name_of(spec), growing
-        self._override = None if source_fps is None else exact_rate(source_fps)
+    def __init__(self, spec: str, settings: SourceSettings) -> None:
+        self._spec, self.fps = spec, settings.fps
+        self._name, self._growing = name_of(spec), settings.growing
+        self._override = None if settings.source_fps is None else exact_rate(settings.source_fps)
         notes = Notes(self._name)
         self._pictures = Pictures(notes)
-        container, stream = open_video(spec, growing=growing, note=notes)
+        container, stream = open_video(spec, growing=self._growing, note=notes)
         with container:
             self._stamps, first = survey(container, stream)
             if self._override is not None:
@@ -67,13 +55,13 @@ class VideoSource(Source):
             for one in self._about_times(stream):
                 notes(one)
         self.notes = notes.taken()
-        self._resizer = Resizer((picture.shape[1], picture.shape[0]), size, fit=fit, name=self._name)
+        shape = (picture.shape[1], picture.shape[0])
+        self._resizer = Resizer(shape, settings.size, fit=settings.fit, name=self._name)
         self.view = self._resizer.view
-        counts = [] if lasts_s is None else [max(1, base_frame_count(lasts_s, fps=exact_rate(fps)))]
-        counts += [] if max_frames is None else [max_frames]
-        self._limit = max_frames
+        counts = [] if lasts_s is None else [max(1, base_frame_count(lasts_s, fps=exact_rate(self.fps)))]
+        self._limit = settings.max_frames
+        counts += [] if self._limit is None else [self._limit]
         self.frame_count = min(counts, default=None) if lasts_s is not None else None
-        self._running: Generator[Frame, None, None] | None = None
 
     @property
     def source_fps(self) -> float:
@@ -92,18 +80,6 @@ class VideoSource(Source):
         timed = ((at_s, index) for index, at_s in enumerate(times))
         held = hold(timed, fps=exact_rate(self.fps), tail_s=self._stamps.period_s, slack_s=slack_s)
         return len(times), tuple(index for _, index in held)
-
-    def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """The clip from its beginning."""
-        self.close()
-        self._running = self._play(start_ns)
-        return self._running
-
-    def close(self) -> None:
-        """Stop decoding."""
-        if self._running is not None:
-            self._running.close()
-            self._running = None
 
     def _play(self, start_ns: int) -> Generator[Frame, None, None]:
         base_rate = exact_rate(self.fps)

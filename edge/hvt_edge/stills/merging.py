@@ -24,8 +24,6 @@ _MOST_COMPARED = 96
 """Of more requests only the most useful are compared with each other, which bounds the time."""
 _LEAST_SAVING_BYTES = 1.0
 
-Crop = tuple[int, int, int, int]
-
 
 def group(
     requests: Sequence[Request],
@@ -48,16 +46,19 @@ def group(
     first, ties by the lead's track id. Each request is in exactly one group.
     """
     compared = list(requests[:_MOST_COMPARED])
-    board = _Board.of(
-        compared,
+    crops = [
+        crop_box(one.candidate.box_source_px, padding=padding, source_size=source_size) for one in compared
+    ]
+    single = np.array([cost.of(one.candidate) + overhead_bytes for one in compared], np.float64)
+    board = _Board(
         cost=cost,
         overhead_bytes=overhead_bytes,
-        crops=[
-            crop_box(one.candidate.box_source_px, padding=padding, source_size=source_size)
-            for one in compared
-        ],
         most=most,
         max_side_px=max_side_px,
+        crops=np.array(crops, np.int64).reshape(-1, 4),
+        bytes=single.copy(),
+        single_bytes=single,
+        members=[[index] for index in range(len(compared))],
     )
     board.join()
     joined = [board.request(members, compared) for members in board.groups()]
@@ -80,29 +81,6 @@ class _Board:
     single_bytes: npt.NDArray[np.float64]
     members: list[list[int]]
     """Empty where another has taken the still in."""
-
-    @classmethod
-    def of(
-        cls,
-        requests: Sequence[Request],
-        *,
-        cost: CostEstimate,
-        overhead_bytes: float,
-        crops: Sequence[Crop],
-        most: int,
-        max_side_px: int,
-    ) -> _Board:
-        single = np.array([cost.of(one.candidate) + overhead_bytes for one in requests], np.float64)
-        return cls(
-            cost=cost,
-            overhead_bytes=overhead_bytes,
-            most=most,
-            max_side_px=max_side_px,
-            crops=np.array(crops, np.int64).reshape(-1, 4),
-            bytes=single.copy(),
-            single_bytes=single,
-            members=[[index] for index in range(len(requests))],
-        )
 
     def join(self) -> None:
         """Join pairs while that saves bytes."""

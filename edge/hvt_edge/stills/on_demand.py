@@ -358,7 +358,7 @@ class OnDemand:
         capacity = Capacity(
             prompt_bytes=max(0, round(_PROMPT_SHARE * most_bytes) - _MARGIN_BYTES),
             most_bytes=max(0, most_bytes - _MARGIN_BYTES),
-            total_bps=self.line.total_bps,
+            total_bps=self.line.budget.total_bps,
         )
         coded: CodedRequest | NothingCloser
         try:

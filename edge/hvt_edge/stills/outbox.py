@@ -11,7 +11,6 @@ from enum import Enum
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Still
 from hvt_edge.backlog.entry import FIRST_STORED
-from hvt_edge.link.stills import StillEnvelope
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.policy.base import Request
 
@@ -65,8 +64,6 @@ class OutboxStill:
     """The ground could not decode the first still of this crop."""
     state: StillState = StillState.PENDING
     coded: Still | None = None
-    envelope: StillEnvelope | None = None
-    """With its header, packed once: by the first that sends or stores it."""
     sent_ns: int = 0
     copies: int = 0
 

@@ -172,11 +172,12 @@ class Chooser:
     class_names: tuple[str, ...]
     settings: ChooserSettings
     on_outcome: Callable[[str, str], None]
+    on_demand: OnDemand
     observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None
-    on_demand: OnDemand | None = None
 
     def __post_init__(self) -> None:
-        self._most_bytes = self.settings.most_bytes
+        self.most_bytes = self.settings.most_bytes
+        """The largest admission that the budget can give from now on, payload."""
         self._costs: dict[str, CostModel] = {}
         self._put_off = False
         self._held_up: dict[int, int] = {}
@@ -191,8 +192,7 @@ class Chooser:
 
         Where stills build on the base, a step that falls on a frame without one is put off to the next that has one.
         """
-        if self.on_demand is not None:
-            self.on_demand.add(analyzed)
+        self.on_demand.add(analyzed)
         if self.method.video_only:
             return
         due = analyzed.detected or self._put_off
@@ -273,7 +273,7 @@ class Chooser:
 
     def requested(self, *, now_ns: int, store: bool = False) -> Coded:
         """Yield coded stills that grounds requested, as `stills` does those of the method."""
-        while isinstance(pending := self.outbox.on_demand, OnDemandStill) and self.on_demand is not None:
+        while isinstance(pending := self.outbox.on_demand, OnDemandStill):
             sequence = self.outbox.sequence(store=store)
             still = self.on_demand.code(pending, now_ns=now_ns, sequence=sequence, paced=not store)
             if still is not None:
@@ -330,7 +330,7 @@ class Chooser:
             padding=self.maker.padding,
             source_size=self.view.source_size,
         )
-        if limit_bytes >= min(expected, self._most_bytes * _FULL_SHARE):
+        if limit_bytes >= min(expected, self.most_bytes * _FULL_SHARE):
             return True
         # By track: methods request again at each step, and every new still takes the place of the last.
         since_ns = self._held_up.setdefault(pending.track_id, now_ns)
@@ -359,7 +359,8 @@ class Chooser:
         if (
             not pending.again
         ):  # else its tracks have rested since it was sent first, and it is not sent a third time
-            self._record_sent(pending.request, made, now_ns=now_ns)
+            for one in (pending.request.candidate, *pending.request.also):
+                self.memory.record_sent(one, frame_index=made.frame_index, now_ns=now_ns)
             if (
                 made.codec != self.maker.without_base.name
             ):  # it builds on the base, and a ground may lack that
@@ -384,46 +385,15 @@ class Chooser:
         else:
             self.outbox.sent(pending, still, now_ns=now_ns, resend=resend)
 
-    def _record_sent(self, request: Request, still: Still, *, now_ns: int) -> None:
-        for one in (request.candidate, *request.also):
-            self.memory.record_sent(
-                one.track_id,
-                frame_index=still.frame_index,
-                now_ns=now_ns,
-                area_px=one.area_px,
-                sharpness=one.sharpness() if one.sharpness else None,
-                at_border=one.touches_border,
-            )
-
-    # What changes in flight
-
-    def record_feedback(
-        self, track_id: int, *, class_name: str, confidence: float, entropy_nats: float
-    ) -> None:
-        """The ground has classified a still of this track."""
-        self.memory.record_feedback(
-            track_id, class_name=class_name, confidence=confidence, entropy_nats=entropy_nats
-        )
-
-    def set_method(self, method: Method) -> None:
-        """Use it from the next decision step on; pending stills stay."""
-        self.method = method
-
-    def set_most_bytes(self, most_bytes: int) -> None:
-        """The largest admission that the budget can give from now on, payload."""
-        self._most_bytes = most_bytes
-
     def close(self) -> None:
         """End: pending stills will not be sent any more."""
-        if self.on_demand is not None:
-            self.on_demand.close()
+        self.on_demand.close()
         self._count_left(self.outbox.clear(), now_ns=0)
 
     def _count_left(self, left: Iterable[tuple[OutboxStill, str]], *, now_ns: int) -> None:
         for one, reason in left:
             if isinstance(one, OnDemandStill):
-                if self.on_demand is not None:
-                    self.on_demand.expired(one, reason, now_ns=now_ns)
+                self.on_demand.expired(one, reason, now_ns=now_ns)
             else:
                 self.on_outcome("deferred" if reason == "replaced" else "dropped", reason)
 

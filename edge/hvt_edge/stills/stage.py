@@ -15,7 +15,6 @@ from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import Levers
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
-from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.perception.levers import LeverControl
 from hvt_edge.perception.shadow import Detected, ShadowGround
 from hvt_edge.stills.crop_job import CropJob
@@ -37,9 +36,7 @@ class StillStage:
     analyzer: Analyzer
     chooser: Chooser
     _: KW_ONLY
-    outbox: Outbox
     sender: StillSender
-    transmitter: Transmitter
     keyframes: Keyframes
     reporter: TrackReporter | None = None
     shadow: ShadowGround | None = None
@@ -49,38 +46,17 @@ class StillStage:
     """Decides by what ``shadow`` and the grounds say; None: tracks and stills are sent as the settings allow."""
 
     def __post_init__(self) -> None:
-        self._latest_tracks: Tracks | None = None
+        self.outbox = self.sender.outbox
+        self.latest_tracks: Tracks | None = None
+        """Those of the frame that `send` took last. In lockstep they change at the same point of the frame loop in
+        every run, whatever `analyze` does meanwhile."""
         self._scene_changes = 0
         self._detected: Detected | None = None
         """Reported since the decision before; in lockstep a frame may be compared at this very moment."""
 
-    @property
-    def latest_tracks(self) -> Tracks | None:
-        """Those of the frame that `send` took last; None before the first.
-
-        In lockstep it changes at the same point of the frame loop in every run, whatever `analyze` does meanwhile.
-        """
-        return self._latest_tracks
-
-    @property
-    def cpu_budget(self) -> CpuBudget:
-        """What of perception runs, for want of processor."""
-        return self.analyzer.cpu_budget
-
-    @property
-    def pending(self) -> int:
-        """Number of pending stills of the method."""
-        return len(self.outbox)
-
-    @property
-    def any_requested(self) -> bool:
-        """Whether one that a ground requested is pending."""
-        return self.outbox.on_demand is not None
-
     def capture(self, frame: Frame) -> None:
         """The camera gave a frame, which may never be analyzed: a ground may ask for a still of it."""
-        if self.chooser.on_demand is not None:
-            self.chooser.on_demand.ring.capture(frame)
+        self.chooser.on_demand.ring.capture(frame)
 
     def analyze(
         self,
@@ -102,10 +78,8 @@ class StillStage:
 
     def is_used(self, capture_ns: int) -> bool:
         """Whether anybody uses what `analyze` makes of a frame of that time."""
-        chooser = self.chooser
-        if self.tracks_used or not chooser.method.video_only:
-            return True
-        return chooser.on_demand is not None and chooser.on_demand.wants_tracks(capture_ns)
+        wanted = self.tracks_used or not self.chooser.method.video_only
+        return wanted or self.chooser.on_demand.wants_tracks(capture_ns)
 
     def send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Choose, and send the stills of the method that may go now; return their sequence numbers.
@@ -113,18 +87,18 @@ class StillStage:
         ``now_ns`` is the time that windows go by. With ``held`` none is sent, because a keyframe is to come; None
         asks the plan.
         """
-        with self.cpu_budget.spending("choose") if analyzed.detected else nullcontext():
+        with self.analyzer.cpu_budget.spending("choose") if analyzed.detected else nullcontext():
             return self._send(analyzed, now_ns=now_ns, held=held)
 
     def _send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None) -> set[int]:
-        self._latest_tracks = analyzed.tracks
+        self.latest_tracks = analyzed.tracks
         levers = self._decided(now_ns)
         if self.reporter is not None and analyzed.detected and levers.tracks:
             self.reporter.report(analyzed, now_ns=now_ns)
-        if most_bytes := self.transmitter.most_still_bytes():
-            self.chooser.set_most_bytes(most_bytes)
+        if most_bytes := self.sender.transmitter.most_still_bytes():
+            self.chooser.most_bytes = most_bytes
         # What a method requests waits until the link is free, which right behind a base frame it never is.
-        allowance_bytes = self.transmitter.still_allowance_bytes(now_ns, paced=False)
+        allowance_bytes = self.sender.transmitter.still_allowance_bytes(now_ns, paced=False)
         self.chooser.consider(
             analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not levers.stills
         )
@@ -172,7 +146,7 @@ class StillStage:
                 self.outbox.on_undecodable(result.still_sequence)
             if result.class_name:
                 self._note_change(result)
-                self.chooser.record_feedback(
+                self.chooser.memory.record_feedback(
                     result.track_id,
                     class_name=result.class_name,
                     confidence=result.confidence,
@@ -181,9 +155,10 @@ class StillStage:
 
     def note_load(self, cores: float, *, now_ns: int) -> None:
         """Take how many cores the process takes; about once a second."""
-        self.cpu_budget.measure(cores, now_ns=now_ns)
+        cpu_budget = self.analyzer.cpu_budget
+        cpu_budget.measure(cores, now_ns=now_ns)
         if self.levers is not None:
-            self.levers.take_load(too_slow=self.cpu_budget.too_slow, now_ns=now_ns)
+            self.levers.take_load(too_slow=cpu_budget.too_slow, now_ns=now_ns)
 
     def _decided(self, now_ns: int) -> Levers:
         if self.levers is None:
@@ -195,23 +170,19 @@ class StillStage:
             if self._detected is not None:
                 self.shadow.take_detected(self._detected)
                 self._detected = None
-            self.levers.take_shadow(self.shadow.measured)
-        self.levers.take_view(unlike=self.analyzer.view_unlike)
+            self.levers.measured = self.shadow.measured
+        self.levers.unlike = self.analyzer.view_unlike
         return self.levers.decide(now_ns)
 
     def _note_change(self, result: StillResult) -> None:
         # A still changed something where the ground now calls the object other than the edge does.
-        if self.levers is None or self._latest_tracks is None:
+        tracks = self.latest_tracks
+        if self.levers is None or tracks is None:
             return
-        tracks = self._latest_tracks
         rows = (tracks.ids == result.track_id).nonzero()[0]
         if len(rows):
             name = self.chooser.class_names[int(tracks.class_ids[rows[0]])]
             self.levers.take_answer(changed=not same_kind(result.class_name, name))
-
-    def close(self) -> None:
-        """Give up what is pending."""
-        self.chooser.close()
 
 
 @dataclass(eq=False)
@@ -245,10 +216,9 @@ class StillSender:
         if store:
             self._store(coded, now_ns=now_ns, counted=True)
             return
-        coded.envelope = coded.envelope or self.transmitter.envelope(coded.still)
         # A second copy waits for its allowance like any other: nobody waits for it.
         copy, requested = AGAIN if coded.copies > 1 else "", coded.request is None and coded.copies == 1
-        self.transmitter.still(coded.envelope, now_ns=now_ns, copy=copy, requested=requested)
+        self.transmitter.still(coded.still, now_ns=now_ns, copy=copy, requested=requested)
 
     def store_lost(self, now_ns: int) -> None:
         """Store stills that were sent before the link went, or came back, and that no report has named."""
@@ -267,9 +237,7 @@ class StillSender:
 
     def _store(self, one: OutboxStill, *, now_ns: int, counted: bool) -> None:
         assert self.backlog is not None, "nothing is stored without one"
-        if one.envelope is None or one.envelope.still is not one.still:
-            one.envelope = self.transmitter.envelope(one.still)
-        packed = self.transmitter.store_still(one.envelope, now_ns=now_ns, counted=counted)
+        packed = self.transmitter.store_still(one.still, now_ns=now_ns, counted=counted)
         self.backlog.store_still(
             packed, number=one.still.sequence, capture_ns=one.still.capture_ns, utility=one.utility
         )

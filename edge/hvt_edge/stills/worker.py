@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Self
 
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures, RetryPause
@@ -26,7 +25,7 @@ _log = logging.getLogger(__name__)
 _PART, _REQUESTED_PART = "stills", "requested stills"
 _LEAST_FRAMES = 2
 MAX_QUEUE_BYTES = 24 * 2**20
-"""Of frames that are queued: 4 of 1280x720, 2 of 1920x1080 and more."""
+"""Of frames that are queued: 9 of 1280x720 that are coded in that size, 2 of 1920x1080 and more."""
 _RETRY_S = 0.025
 _FAILED_S = 1.0
 _MOST_SKIPPED_BYTES = 2 * 2**20
@@ -118,7 +117,8 @@ class StillWorker:
         """Queue one frame, in order, with its access unit if it has one; False where it is skipped."""
         self.stage.capture(frame)
         # All frames of a source have one size, so a bound in bytes is a bound in frames.
-        fitting = self.max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
+        pictures = {id(one): one.nbytes for one in (frame.source_bgr, frame.base_bgr)}
+        fitting = self.max_bytes // sum(pictures.values())
         self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))
         with self._lock:
             if self.full or late:
@@ -138,19 +138,13 @@ class StillWorker:
         for thread in (self._thread, self._requested):
             thread.join(timeout=max(0.0, until_s - time.monotonic()))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
     def _run(self) -> None:
         lower_priority()
         while not self._given_up.is_set():
             try:
                 if (item := self._next()) is None:
                     return
-                self.stage.cpu_budget.queued = self._frames.qsize()
+                self.stage.analyzer.cpu_budget.queued = self._frames.qsize()
                 self.stage.on_results(self.results(), detected=self.detected())
                 analyzed = self.stage.analyze(*item)
                 self.stage.send(analyzed, now_ns=self.clock())
@@ -161,7 +155,7 @@ class StillWorker:
     def _run_requested(self) -> None:
         while not self._given_up.wait(_RETRY_S):
             try:
-                if self.stage.any_requested:
+                if self.stage.outbox.on_demand is not None:
                     self.stage.send_requested(now_ns=self.clock())
                     self.failures.works(_REQUESTED_PART)
             except Exception as error:  # noqa: BLE001 - it ends one requested still, never the flight
@@ -186,5 +180,5 @@ class StillWorker:
             try:
                 return self._frames.get(timeout=_RETRY_S)
             except queue.Empty:
-                if self.stage.pending and self._pause.due(self.clock()):
+                if len(self.stage.outbox) and self._pause.due(self.clock()):
                     self.stage.send_pending(now_ns=self.clock())

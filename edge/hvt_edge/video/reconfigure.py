@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Protocol
 
+from hvt_edge.link.budget import RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import ReconfigurationTrigger
-from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating import Operating, base_rate_bps
+from hvt_edge.operating import Operating, Rates, base_rate_bps
 from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import Step
 from hvt_edge.video.encoder_settings import PresetControl, least_base_bps, most_keyframe_bytes
@@ -37,12 +36,8 @@ class ReconfigurationSettings:
     """The floor of the link's rate, unless the budget is lower itself."""
 
 
-class OpenEncoder(Protocol):
-    """Opens the encoder."""
-
-    def __call__(self, *, total_bps: int, base_bps: int, decimation: int) -> Encoder:
-        """Return an encoder for this rate."""
-        ...
+OpenEncoder = Callable[[Rates], Encoder]
+"""Opens the encoder for these rates."""
 
 
 @dataclass(eq=False)
@@ -58,7 +53,7 @@ class EncoderReconfiguration:
     settings: ReconfigurationSettings
     _: KW_ONLY
     open_encoder: OpenEncoder
-    transmitter: Transmitter
+    budget: RollingBudget
     split: Split | None
     pacer: Pacer | None = None
     presets: PresetControl | None = None
@@ -70,8 +65,8 @@ class EncoderReconfiguration:
         settings = self.settings
         self._least_base_bps = least_base_bps(settings.size, settings.least_fps, edge_id=settings.edge_id)
         now = self.operating.now
-        self._opened = {"total_bps": now.budget_bps, "base_bps": now.base_bps, "decimation": now.decimation}
-        """The rate for which x265 was last opened."""
+        self._opened = Rates(now.budget_bps, now.base_bps, now.decimation)
+        """For which x265 was last opened."""
         self._commanded = (now.budget_bps, now.video_share)
         """Budget and share that x265 was last opened under."""
         self.count = 0
@@ -142,7 +137,7 @@ class EncoderReconfiguration:
 
     def open_again(self) -> Encoder:
         """Return another encoder with the last settings."""
-        return self.open_encoder(**self._opened)
+        return self.open_encoder(self._opened)
 
     def __call__(self, decimation: int, now_ns: int) -> Encoder | None:
         """Return the encoder to go on with from this keyframe, or None for the one there is."""
@@ -156,7 +151,7 @@ class EncoderReconfiguration:
         base_bps, total_bps = self._proposed_bps(decimation, changed=changed), now.budget_bps
         if same_preset and not changed and (decimation, base_bps) == (now.decimation, now.base_bps):
             return None
-        return self._open(total_bps, base_bps, decimation, now_ns=now_ns, encoder_total_bps=total_bps)
+        return self._open(Rates(total_bps, base_bps, decimation), total_bps=total_bps, now_ns=now_ns)
 
     def _at_links_rate(
         self, pacer: Pacer, decimation: int, now_ns: int, *, changed: bool, same_preset: bool
@@ -171,15 +166,13 @@ class EncoderReconfiguration:
         if same_preset and decimation == now.decimation and (near or base_bps == now.base_bps):
             return None
         self._trigger.done(now_ns)
-        total_bps = max(base_bps, pacer.steady_bps)
-        return self._open(pacer.rate_bps, base_bps, decimation, now_ns=now_ns, encoder_total_bps=total_bps)
+        rates = Rates(max(base_bps, pacer.steady_bps), base_bps, decimation)
+        return self._open(rates, total_bps=pacer.rate_bps, now_ns=now_ns)
 
-    def _open(
-        self, total_bps: int, base_bps: int, decimation: int, *, now_ns: int, encoder_total_bps: int
-    ) -> Encoder:
+    def _open(self, rates: Rates, *, total_bps: int, now_ns: int) -> Encoder:
         self.count += 1
-        self._opened = {"total_bps": encoder_total_bps, "base_bps": base_bps, "decimation": decimation}
-        self.operating.open(total_bps=total_bps, base_bps=base_bps, decimation=decimation)
+        self._opened = rates
+        self.operating.open(rates, total_bps=total_bps)
         self._set_budget(now_ns)
         return self.open_again()
 
@@ -191,7 +184,7 @@ class EncoderReconfiguration:
     def _set_budget(self, now_ns: int) -> None:
         now = self.operating.now
         fps = self.settings.nominal_fps / now.decimation
-        self.transmitter.set_rates(now.total_bps, now.base_bps, fps, now_ns=now_ns)
+        self.budget.set_total(now.total_bps, now.base_bps, fps, now_ns=now_ns)
 
     def _base_of(self, total_bps: int) -> int:
         # The base's part of so much in all; never less than x265 can follow at its lowest frame rate.

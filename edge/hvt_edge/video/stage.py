@@ -158,6 +158,7 @@ class BaseStage:
     transmitter: Transmitter
     local_copy: LocalCopy | None
     first_keyframe_bytes: int
+    failures: Failures
     regions: TrackRegions | None = None
     frame_skip: FrameSkip | None = None
     reconfigure: Callable[[int, int], Encoder | None] | None = None
@@ -166,7 +167,6 @@ class BaseStage:
     holder: Callable[[int], FrameGroup] = lambda _now_ns: "budget"
     backlog: BacklogStage | None = None
     open_again: Callable[[], Encoder] | None = None
-    failures: Failures | None = None
 
     def __post_init__(self) -> None:
         self._keyframe_bytes = self.first_keyframe_bytes
@@ -180,17 +180,17 @@ class BaseStage:
     def decide(self, frame: Frame, *, now_ns: int) -> FrameDecision:
         """Decide on this source frame; once for each, in order."""
         keyframe_bytes = self.keyframe_bytes(self._keyframe_bytes)
-        awaited = self.keyframes.awaited
-        fits = self.transmitter.keyframe_fits(keyframe_bytes, now_ns=now_ns, awaited=awaited)
+        awaited, budget = self.keyframes.awaited, self.transmitter.budget
+        fits = budget.keyframe_fits(keyframe_bytes, now_ns=now_ns, awaited=awaited)
         if not self.keyframes.requested:  # one of the schedule: a requested still goes before it
-            fits = fits and not self.transmitter.yielding(now_ns)
-        backlog, frame_bytes = self.backlog, self.transmitter.frame_bytes
+            fits = fits and not budget.yielding(now_ns)
+        backlog, frame_bytes = self.backlog, round(budget.base_step_bytes)
         link = State.LIVE if backlog is None else backlog.state
         keyframe_due = self.keyframes.now(now_ns, fits=fits) or self._begins_anew
         if (
             link is State.LIVE and self.reconfigure is not None
         ):  # only at another rate is there one that can go
-            keyframe_due = keyframe_due or not self.transmitter.window_holds(frame_bytes)
+            keyframe_due = keyframe_due or not budget.holds(frame_bytes)
         line_bytes = keyframe_bytes if keyframe_due else frame_bytes
         yields_to_keyframe = awaited and link is State.LIVE and not keyframe_due
         due = self._frame_skip.codes(frame.index)
@@ -201,7 +201,7 @@ class BaseStage:
                 due=due,
                 keyframe_due=keyframe_due,
                 admitted=admitted,
-                yielded=coded and self.transmitter.leaves_out(now_ns),
+                yielded=coded and budget.leaves_out(now_ns),
                 link=link,
                 segment_due=backlog is not None and backlog.segment_due(now_ns),
                 probe_due=backlog is not None and backlog.probe_due(now_ns),
@@ -235,7 +235,7 @@ class BaseStage:
             self._recover(error, now_ns=now_ns)
             return None
         assert unit.keyframe or not decision.keyframe, "others than x265 are checked (CheckedEncoder)"
-        if self._begins_anew and self.failures is not None:
+        if self._begins_anew:
             self.failures.works(_PART)
         self._begins_anew = False
         self._frame_skip.coded(frame.index, keyframe=unit.keyframe, mean_qp=self.encoder.mean_qp)
@@ -271,11 +271,10 @@ class BaseStage:
         if not line_bytes:
             self._leave_out(unit)
             return False
-        if self.failures is not None:
-            self.failures.works(_SIZE_PART)
+        self.failures.works(_SIZE_PART)
         if unit.keyframe:
             self._keyframe_bytes = line_bytes
-            self.keyframes.note_cost(self.transmitter.takes_ns(line_bytes))
+            self.keyframes.note_cost(8 * SECOND_NS * line_bytes // self.transmitter.budget.total_bps)
         return True
 
     def wants_keyframe(self, index: int) -> bool:
@@ -302,17 +301,16 @@ class BaseStage:
     def _leave_out(self, unit: AccessUnit) -> None:
         # Nothing has room for it: what follows cannot be shown before another keyframe.
         self._begins_anew = True
-        if self.failures is not None:
-            what = f"{'a keyframe' if unit.keyframe else 'a frame'} of {len(unit.data) / 1000:.1f} kB"
-            self.failures.failed(
-                _SIZE_PART,
-                f"{what} is more than a window of {bitrate_text(self.transmitter.total_bps)} or one message holds, "
-                "and is left out: raise --budget, or lower --size",
-            )
+        what = f"{'a keyframe' if unit.keyframe else 'a frame'} of {len(unit.data) / 1000:.1f} kB"
+        total = bitrate_text(self.transmitter.budget.total_bps)
+        self.failures.failed(
+            _SIZE_PART,
+            f"{what} is more than a window of {total} or one message holds, and is left out: raise --budget, or "
+            "lower --size",
+        )
 
     def _recover(self, error: Exception, *, now_ns: int) -> None:
         assert self.open_again is not None, "checked"
-        assert self.failures is not None, "goes with it"
         while True:
             self.failures.failed(_PART, f"{self.encoder_name} failed ({error})")
             self._failed_ns.append(now_ns)

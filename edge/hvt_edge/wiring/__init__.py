@@ -2,7 +2,7 @@
 
 from hvt_edge.wiring.link import make_link_settings
 from hvt_edge.wiring.perception import make_detector, open_for_flight, track_confidence, warm_up_for
-from hvt_edge.wiring.stages import Stages
+from hvt_edge.wiring.stages import Flight, Stages
 from hvt_edge.wiring.stills import check_codecs
 from hvt_edge.wiring.storing import check_files, check_store, store_folder
 from hvt_edge.wiring.trial import Beginning, try_scene
@@ -11,6 +11,7 @@ from hvt_edge.wiring.video import (
     base_size,
     default_size,
     first_decimation,
+    first_rates,
     make_encoder,
     qualify_encoder,
     say_size,

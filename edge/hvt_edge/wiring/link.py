@@ -13,8 +13,7 @@ from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.operating import Operating
-from hvt_edge.perception.levers import LeverControl, LeverSettings
+from hvt_edge.perception.levers import LeverSettings
 from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder_settings import least_base_bps
 from hvt_edge.video.encoders.passthrough import CameraRates, LeastLink, measure_camera, needed_bps
@@ -91,13 +90,6 @@ def make_split(config: EdgeConfig, size: tuple[int, int], *, first_share: float)
     return Split(settings, first_share=first_share)
 
 
-def make_levers(config: EdgeConfig, operating: Operating, view: View) -> LeverControl | None:
-    """Make the part that decides what is sent beside the video; None if the settings do."""
-    if not config.measures:
-        return None
-    return LeverControl(operating, lever_settings(config, view))
-
-
 def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:
     """The thresholds of tracks and stills."""
     return LeverSettings(tracks_bps=config.metadata_bps, finer=shows_details(config, view))
@@ -118,27 +110,20 @@ def make_pacer(config: EdgeConfig, stream: CameraStream | None, size: tuple[int,
 
 
 def make_camera_rates(
-    config: EdgeConfig,
-    stream: CameraStream,
-    *,
-    reconfiguration: EncoderReconfiguration,
-    operating: Operating,
-    pacer: Pacer | None,
+    config: EdgeConfig, stream: CameraStream, reconfiguration: EncoderReconfiguration
 ) -> CameraRates:
     """Make the rates that change at the keyframes of a passed-through camera."""
 
     def needed(window_bytes: int) -> int:
-        return _camera_needs_bps(config, window_bytes, operating.now.video_share or config.share)
+        share = reconfiguration.operating.now.video_share or config.share
+        return _camera_needs_bps(config, window_bytes, share)
 
     return CameraRates(
         reconfiguration,
-        operating=operating,
-        pacer=pacer,
         needed=needed,
         least_bps=config.min_budget_bps,
         surveyed_bytes=_surveyed_bytes(config, stream),
         window_ns=config.window_ns,
-        edge_id=config.edge_id,
     )
 
 

@@ -1,9 +1,13 @@
-"""Every part of an edge, built once from the parts it needs. They form a tree."""
+"""Every part of an edge, built once: `Link`, then `Stills`, then `Video`, each from what stands before it.
+
+`Stages` has them, and what a ground reaches of them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 
 from hvt_common.inference.detect import FailingDetector
@@ -12,6 +16,7 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import fitted_class_names
 from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import EdgeConfig
 from hvt_edge.control.commands import Commands
@@ -23,71 +28,81 @@ from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts, processors
 from hvt_edge.loop.pose import PoseSource, PoseStage
-from hvt_edge.operating import LoopClock, Operating, base_rate_bps
+from hvt_edge.operating import LoopClock, Operating, Rates, base_rate_bps
+from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.cpu_budget import CpuBudget
+from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.perception.levers import LeverControl
 from hvt_edge.report.state import Heartbeat
 from hvt_edge.report.status import InfoReporter, StatusReporter
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
+from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Gate
 from hvt_edge.stills.stage import StillSender, StillStage
+from hvt_edge.video.encoder_settings import PresetControl, share_of
 from hvt_edge.video.passthrough import PassthroughStage, VideoStage
 from hvt_edge.video.rate_model import LimitedFrameSkip
 from hvt_edge.video.reconfigure import EncoderReconfiguration
-from hvt_edge.video.stage import BaseStage
+from hvt_edge.video.stage import BaseStage, LocalCopy
+from hvt_edge.video.x265 import TrackRegions
 from hvt_edge.wiring.link import (
     channels_of,
+    lever_settings,
     make_budget,
     make_camera_rates,
     make_least_link,
-    make_levers,
     make_pacer,
     make_split,
 )
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
-from hvt_edge.wiring.stills import make_method, make_stills
+from hvt_edge.wiring.stills import make_maker, make_method, make_suppression
 from hvt_edge.wiring.storing import make_backlog, open_local_copy
 from hvt_edge.wiring.trial import Beginning
 from hvt_edge.wiring.video import (
     encoder_opener,
     make_frame_skip,
     make_keyframes,
-    make_presets,
-    make_regions,
     reconfiguration_settings,
 )
 
 
-class Stages:
-    """The stages of a frame, the ends that a ground reaches, and what reports of them."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flight:
+    """What all parts of one flight are built from."""
 
-    def __init__(
-        self,
-        stack: ExitStack,
-        config: EdgeConfig,
-        *,
-        source: Source,
-        pose_source: PoseSource | None,
-        detector: FailingDetector,
-        link: EdgeLink,
-        session_id: int,
-        ledger: Ledger,
-        counts: FrameCounts,
-        inbox: FeedbackInbox,
-        failures: Failures,
-        clock: Callable[[], int],
-        loop_clock: LoopClock,
-        beginning: Beginning,
-        headroom: float = 1.0,
-    ) -> None:
-        """Build every part once, each with all that it needs; files and threads end with ``stack``.
+    stack: ExitStack
+    """Files and threads end with it."""
+    config: EdgeConfig
+    source: Source
+    detector: FailingDetector
+    ends: EdgeLink
+    """The link to grounds."""
+    session_id: int
+    ledger: Ledger
+    counts: FrameCounts
+    inbox: FeedbackInbox
+    failures: Failures
+    clock: Callable[[], int]
+    loop_clock: LoopClock
+    beginning: Beginning
+    headroom: float = 1.0
+    """The share of its rate that the encoder is set to (`qualify_encoder`)."""
 
-        ``beginning`` is what `try_scene` found.
-        ``headroom`` is the share of its rate that the encoder is set to (`qualify_encoder`).
-        Raises `UserError` where the encoder does not take the settings, or a file cannot be written.
-        """
-        view, class_names, decimation = source.view, detector.class_names, beginning.decimation
-        lockstep = config.pace == "lockstep"
+    @property
+    def lockstep(self) -> bool:
+        """Whether windows go by in media time."""
+        return self.config.pace == "lockstep"
+
+
+class Link:
+    """What may be sent, and who sends it: the rates, the encoder that is opened for them, budget and pacer."""
+
+    def __init__(self, flight: Flight) -> None:
+        """Raises `UserError` where the encoder does not take the settings."""
+        config, beginning, lockstep = flight.config, flight.beginning, flight.lockstep
+        size, decimation = flight.source.view.base_size, beginning.decimation
         base_bps = base_rate_bps(config.budget_bps, beginning.share, metadata_bps=config.metadata_bps)
         self.operating = Operating(
             budget_bps=config.budget_bps,
@@ -98,199 +113,233 @@ class Stages:
             preset=beginning.preset.preset,
             preset_says=beginning.preset.says,
         )
-        self.keyframes = make_keyframes(config, source)
-        pacer = make_pacer(config, source.camera_stream, view.base_size)
-        presets = make_presets(config, self.operating)
-        open_encoder = encoder_opener(
-            config, self.operating, size=view.base_size, headroom=headroom, presets=presets
-        )
-        encoder = open_encoder(total_bps=config.budget_bps, base_bps=base_bps, decimation=decimation)
-        budget = make_budget(config, base_bps=base_bps, decimation=decimation)
-        # Files come after all that may be refused: a failed start leaves nothing behind.
-        write_truth_of(source, config.truth, fps=config.nominal_fps)
-        local_copy = None
-        if config.record_base:
-            local_copy = stack.enter_context(
-                open_local_copy(config.record_base, failures=failures, wait=lockstep)
+        self.keyframes = make_keyframes(config, flight.source)
+        self.pacer = make_pacer(config, flight.source.camera_stream, size)
+        presets = None
+        if config.auto_preset:
+            presets = PresetControl(
+                self.operating, nominal_fps=config.nominal_fps, most_cores=share_of(processors())
             )
-        in_flight, outbox = BaseInFlight(), Outbox(reports=not lockstep)
+        open_encoder = encoder_opener(
+            config, self.operating, size=size, headroom=flight.headroom, presets=presets
+        )
+        self.encoder = open_encoder(Rates(config.budget_bps, base_bps, decimation))
+        budget = make_budget(config, base_bps=base_bps, decimation=decimation)
+        self.in_flight = BaseInFlight()
         self.transmitter = Transmitter(
-            link,
-            ledger=ledger,
+            flight.ends,
+            ledger=flight.ledger,
             budget=budget,
             edge_id=config.edge_id,
-            session_id=session_id,
+            session_id=flight.session_id,
             lockstep=lockstep,
-            wait_until=loop_clock.wait_until,
-            pacer=pacer,
-            in_flight=None if lockstep else in_flight,
-            clock=None if lockstep else loop_clock,
+            wait_until=flight.loop_clock.wait_until,
+            pacer=self.pacer,
+            in_flight=None if lockstep else self.in_flight,
+            clock=None if lockstep else flight.loop_clock,
         )
         self.reconfiguration = EncoderReconfiguration(
             self.operating,
-            reconfiguration_settings(config, view.base_size),
+            reconfiguration_settings(config, size),
             open_encoder=open_encoder,
-            transmitter=self.transmitter,
-            split=make_split(config, view.base_size, first_share=beginning.share),
-            pacer=pacer,
+            budget=budget,
+            split=make_split(config, size, first_share=beginning.share),
+            pacer=self.pacer,
             presets=presets,
         )
-        still_readers = StillReaders(clock)
-        chooser, on_demand = make_stills(
-            config,
+
+
+class Stills:
+    """Perception, who chooses and codes stills, and the store for an outage."""
+
+    def __init__(self, flight: Flight, link: Link) -> None:
+        config, view, clock = flight.config, flight.source.view, flight.clock
+        class_names, outbox = flight.detector.class_names, Outbox(reports=not flight.lockstep)
+        self.readers = StillReaders(clock)
+        maker = make_maker(config, readable=self.readers.read)
+        on_demand = OnDemand(
+            FrameRing(RingSettings(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS))),
             outbox=outbox,
-            transmitter=self.transmitter,
+            maker=maker,
             view=view,
             class_names=class_names,
+            line=link.transmitter,
             offline=lambda: self.backlog is not None and self.backlog.offline,
-            readable=still_readers.read,
-            observe=self.reconfiguration.observe,
         )
-        info = InfoReporter(
+        chooser = Chooser(
+            make_method(config, view),
+            suppression=make_suppression(config),
+            outbox=outbox,
+            maker=maker,
+            memory=TrackMemory(padding=config.padding),
+            view=view,
+            class_names=class_names,
+            settings=ChooserSettings(
+                fps=config.nominal_fps,
+                most_bytes=link.transmitter.most_still_bytes(),
+                gate=Gate(psnr_y_db=config.gate),
+                share=config.group_stills,
+                from_source=config.candidates == "source",
+            ),
+            on_outcome=link.transmitter.outcome,
+            on_demand=on_demand,
+            observe=link.reconfiguration.observe,
+        )
+        self.info = InfoReporter(
             config,
-            session_id=session_id,
-            operating=self.operating,
+            session_id=flight.session_id,
+            operating=link.operating,
             view=view,
             class_names=fitted_class_names(class_names),
-            channels=channels_of(config, live=source.live),
-            still_codecs=lambda: chooser.maker.codec_names,
+            channels=channels_of(config, live=flight.source.live),
+            still_codecs=lambda: maker.codec_names,
             clock=clock,
         )
         self.backlog = make_backlog(
             config,
-            session_id=session_id,
-            live=source.live,
-            has_subscriber=partial(link.has_subscriber, Channel.BACKLOG),
-            transmitter=self.transmitter,
-            in_flight=in_flight,
+            session_id=flight.session_id,
+            live=flight.source.live,
+            has_subscriber=partial(flight.ends.has_subscriber, Channel.BACKLOG),
+            transmitter=link.transmitter,
+            in_flight=link.in_flight,
             outbox=outbox,
-            keyframes=self.keyframes,
+            keyframes=link.keyframes,
             clock=clock,
-            info=info.info,
-            failures=failures,
+            info=self.info.info,
+            failures=flight.failures,
         )
         if self.backlog is not None:
-            stack.enter_context(self.backlog)
-        still_sender = StillSender(
-            outbox, maker=chooser.maker, transmitter=self.transmitter, backlog=self.backlog
+            flight.stack.callback(self.backlog.close)
+        sender = StillSender(outbox, maker=maker, transmitter=link.transmitter, backlog=self.backlog)
+        flight.stack.callback(lambda: sender.close(clock()))
+        levers = trust = reporter = None
+        if config.measures:
+            levers = LeverControl(link.operating, lever_settings(config, view))
+            trust = ViewTrust(config.detector, hence="auto gives its tracks no credit")
+        if config.send_tracks:
+            reporter = TrackReporter(link.transmitter, session_id=flight.session_id)
+        cpu_budget = CpuBudget()
+        if not flight.lockstep:
+            cpu_budget = CpuBudget(fps=config.nominal_fps, processors=processors())
+        self.stage = StillStage(
+            make_analyzer(config, detector=flight.detector, view=view, trust=trust, cpu_budget=cpu_budget),
+            chooser,
+            sender=sender,
+            keyframes=link.keyframes,
+            tracks_used=config.tracks_used,
+            reporter=reporter,
+            shadow=make_shadow(
+                config, flight.detector, before=flight.beginning.shadow, cpu_budget=cpu_budget
+            ),
+            levers=levers,
         )
-        stack.callback(lambda: still_sender.close(clock()))
-        self.link_control = LinkControl(
-            has_ground=link.has_ground,
-            has_subscriber=partial(link.has_subscriber, Channel.BASE),
-            session_id=session_id,
-            transmitter=self.transmitter,
-            keyframes=self.keyframes,
-            inbox=inbox,
-            reconfiguration=self.reconfiguration,
-            clock=clock,
-            pacer=pacer,
-            in_flight=in_flight,
-            outbox=outbox,
-            stills=still_sender,
-            backlog=self.backlog,
+
+
+class Video:
+    """The base stream: who codes it or passes it through, and who says when there is room for it."""
+
+    def __init__(self, flight: Flight, link: Link, stills: Stills, *, local_copy: LocalCopy | None) -> None:
+        config, source, failures = flight.config, flight.source, flight.failures
+        self.control = LinkControl(
+            has_ground=flight.ends.has_ground,
+            has_subscriber=partial(flight.ends.has_subscriber, Channel.BASE),
+            keyframes=link.keyframes,
+            inbox=flight.inbox,
+            reconfiguration=link.reconfiguration,
+            clock=flight.clock,
+            in_flight=link.in_flight,
+            stills=stills.stage.sender,
             failures=failures,
         )
-        self.pose = None
-        if pose_source is not None:
-            self.pose = PoseStage(
-                pose_source, session_id=session_id, sender=self.transmitter, failures=failures
-            )
         if config.passes_through:
             assert source.camera_stream is not None, "checked by as_the_camera_is"
-            rates = make_camera_rates(
-                config,
-                source.camera_stream,
-                reconfiguration=self.reconfiguration,
-                operating=self.operating,
-                pacer=pacer,
-            )
-            self.base: VideoStage = PassthroughStage(
-                self.keyframes,
-                self.transmitter,
+            rates = make_camera_rates(config, source.camera_stream, link.reconfiguration)
+            self.stage: VideoStage = PassthroughStage(
+                link.keyframes,
+                link.transmitter,
                 failures=failures,
                 local_copy=local_copy,
                 reconfigure=rates,
                 observe=rates.observe,
-                least_link=make_least_link(config, pacer=pacer, in_flight=in_flight),
-                admits=self.link_control.admits,
-                holder=self.link_control.holder,
-                pause=None if lockstep else loop_clock.pause,
-                backlog=self.backlog,
+                least_link=make_least_link(config, pacer=link.pacer, in_flight=link.in_flight),
+                admits=self.control.admits,
+                holder=self.control.holder,
+                pause=None if flight.lockstep else flight.loop_clock.pause,
+                backlog=stills.backlog,
             )
-        else:
-            self.base = BaseStage(
-                encoder,
-                encoder_name=config.encoder,
-                keyframes=self.keyframes,
-                transmitter=self.transmitter,
-                local_copy=local_copy,
-                first_keyframe_bytes=base_bps // 40,  # a fifth of a second: what the VBV lets through
-                regions=make_regions(config, view.base_size),
-                frame_skip=LimitedFrameSkip(
-                    make_frame_skip(config, decimation, size=view.base_size),
-                    self.reconfiguration.least_decimation,
-                ),
-                reconfigure=self.reconfiguration,
-                keyframe_bytes=self.reconfiguration.keyframe_bytes,
-                admits=self.link_control.admits,
-                holder=self.link_control.holder,
-                backlog=self.backlog,
-                open_again=None if lockstep else self.reconfiguration.open_again,
-                failures=failures,
+            return
+        size = source.view.base_size
+        frame_skip = make_frame_skip(config, flight.beginning.decimation, size=size)
+        self.stage = BaseStage(
+            link.encoder,
+            encoder_name=config.encoder,
+            keyframes=link.keyframes,
+            transmitter=link.transmitter,
+            local_copy=local_copy,
+            first_keyframe_bytes=link.operating.now.base_bps // 40,  # .2 s: what the VBV lets through
+            regions=TrackRegions(size, depth=config.roi_depth) if config.roi_depth else None,
+            frame_skip=LimitedFrameSkip(frame_skip, link.reconfiguration.least_decimation),
+            reconfigure=link.reconfiguration,
+            keyframe_bytes=link.reconfiguration.keyframe_bytes,
+            admits=self.control.admits,
+            holder=self.control.holder,
+            backlog=stills.backlog,
+            open_again=None if flight.lockstep else link.reconfiguration.open_again,
+            failures=failures,
+        )
+
+
+class Stages:
+    """The stages of a frame, the ends that a ground reaches, and what reports of them."""
+
+    def __init__(self, flight: Flight, *, pose_source: PoseSource | None) -> None:
+        """Raises `UserError` where the encoder does not take the settings, or a file cannot be written."""
+        config, view = flight.config, flight.source.view
+        self.link = link = Link(flight)
+        # Files come after all that may be refused: a failed start leaves nothing behind.
+        write_truth_of(flight.source, config.truth, fps=config.nominal_fps)
+        local_copy = None
+        if config.record_base:
+            copy = open_local_copy(config.record_base, failures=flight.failures, wait=flight.lockstep)
+            local_copy = flight.stack.enter_context(copy)
+        stills = Stills(flight, link)
+        video = Video(flight, link, stills, local_copy=local_copy)
+        self.stills, self.backlog = stills.stage, stills.backlog
+        self.base, self.link_control = video.stage, video.control
+        self.pose = None
+        if pose_source is not None:
+            self.pose = PoseStage(
+                pose_source, session_id=flight.session_id, sender=link.transmitter, failures=flight.failures
             )
-        levers = make_levers(config, self.operating, view)
-        trust = (
-            None if levers is None else ViewTrust(config.detector, hence="auto gives its tracks no credit")
-        )
-        cpu_budget = CpuBudget() if lockstep else CpuBudget(fps=config.nominal_fps, processors=processors())
-        self.stills = StillStage(
-            make_analyzer(config, detector=detector, view=view, trust=trust, cpu_budget=cpu_budget),
-            chooser,
-            outbox=outbox,
-            sender=still_sender,
-            transmitter=self.transmitter,
-            keyframes=self.keyframes,
-            tracks_used=config.tracks_used,
-            reporter=TrackReporter(self.transmitter, session_id=session_id) if config.send_tracks else None,
-            shadow=make_shadow(config, detector, before=beginning.shadow, cpu_budget=cpu_budget),
-            levers=levers,
-        )
         commands = Commands(
             config,
-            operating=self.operating,
-            session_id=session_id,
-            keyframes=self.keyframes,
-            on_demand=on_demand,
-            chooser=chooser,
+            operating=link.operating,
+            session_id=flight.session_id,
+            keyframes=link.keyframes,
+            chooser=self.stills.chooser,
             make_method=lambda name: make_method(config, view, name=name),
             backlog=self.backlog,
             base_size=view.base_size,
-            clock=clock,
-            loop_clock=loop_clock,
+            clock=flight.clock,
+            loop_clock=flight.loop_clock,
         )
         self.answers = Answers(
-            info=info.info,
+            info=stills.info.info,
             control=commands.answer,
             on_feedback=self.link_control.on_feedback,
-            on_info_request=still_readers.on_request,
-            reply=self.transmitter.reply,
+            on_info_request=stills.readers.on_request,
+            reply=link.transmitter.reply,
         )
         self.heartbeat = Heartbeat(
             config,
-            session_id=session_id,
             view=view,
-            operating=self.operating,
-            ledger=ledger,
-            counts=counts,
-            keyframes=self.keyframes,
-            transmitter=self.transmitter,
+            operating=link.operating,
+            counts=flight.counts,
             stills=self.stills,
-            backlog=self.backlog,
-            link=link,
-            inbox=inbox,
-            failures=failures,
-            clock=clock,
-            loop_clock=loop_clock,
+            link=flight.ends,
+            inbox=flight.inbox,
+            failures=flight.failures,
+            clock=flight.clock,
+            loop_clock=flight.loop_clock,
         )
         self.status = StatusReporter(self.heartbeat)

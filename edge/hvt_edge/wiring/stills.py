@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from hvt_common.errors import UserError
-from hvt_common.units import SECOND_NS
 from hvt_common.values import View
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.config import EdgeConfig
-from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.perception.candidates import Candidate, TrackMemory
-from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.on_demand import OnDemand
-from hvt_edge.stills.outbox import Outbox
-from hvt_edge.stills.policy.base import Method, Step
+from hvt_edge.stills.policy.base import Method
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Gate, Suppression
+from hvt_edge.stills.scheduler import Suppression
 
 _TRIAL_PX = 48
 _LEAST_STILL_BYTES = 400
@@ -76,23 +70,10 @@ def make_suppression(config: EdgeConfig) -> Suppression:
     return Suppression.for_cooldown(config.cooldown, min_gain=config.min_gain)
 
 
-def make_stills(
-    config: EdgeConfig,
-    *,
-    outbox: Outbox,
-    transmitter: Transmitter,
-    view: View,
-    class_names: tuple[str, ...],
-    offline: Callable[[], bool],
-    readable: Callable[[str], bool],
-    observe: Callable[[Sequence[Candidate], Step], None],
-) -> tuple[Chooser, OnDemand]:
-    """Who chooses stills, with method, rules and maker; and the ring of source frames, who serves requested ones.
-
-    ``readable``: see `StillMaker`; ``observe``: see `Chooser`; ``offline``: see `OnDemand`.
-    """
+def make_maker(config: EdgeConfig, *, readable: Callable[[str], bool]) -> StillMaker:
+    """Who crops and codes; for ``readable`` see there."""
     codec = still_codec(config.still_codec)
-    maker = StillMaker(
+    return StillMaker(
         codec=codec,
         fallback=still_codec(config.fallback_codec) if codec.needs_base else None,
         quality_pct=config.jpeg_quality,
@@ -102,32 +83,3 @@ def make_stills(
         least_bytes=_LEAST_STILL_BYTES if codec.needs_base else 0,
         readable=readable,
     )
-    on_demand = OnDemand(
-        FrameRing(RingSettings(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS))),
-        outbox=outbox,
-        maker=maker,
-        view=view,
-        class_names=class_names,
-        line=transmitter,
-        offline=offline,
-    )
-    chooser = Chooser(
-        make_method(config, view),
-        suppression=make_suppression(config),
-        outbox=outbox,
-        maker=maker,
-        memory=TrackMemory(padding=config.padding),
-        view=view,
-        class_names=class_names,
-        settings=ChooserSettings(
-            fps=config.nominal_fps,
-            most_bytes=transmitter.most_still_bytes(),
-            gate=Gate(psnr_y_db=config.gate),
-            share=config.group_stills,
-            from_source=config.candidates == "source",
-        ),
-        on_outcome=transmitter.outcome,
-        observe=observe,
-        on_demand=on_demand,
-    )
-    return chooser, on_demand

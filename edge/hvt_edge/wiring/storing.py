@@ -122,7 +122,7 @@ def make_backlog(
             ),
             send=lambda chunk, now_ns: transmitter.backlog(chunk, now_ns=now_ns),
             round_trip_ns=lambda: transmitter.round_trip_ns,
-            total_bps=lambda: transmitter.total_bps,
+            total_bps=lambda: transmitter.budget.total_bps,
             stills_pending=lambda: outbox.any_pending,
             stills_in_flight=lambda: outbox.unacknowledged,
         ),

@@ -5,28 +5,28 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from hvt_common.inference.detect import FailingDetector
 from hvt_common.runtime.log import START_LOGGER
 from hvt_common.units import SECOND_NS
-from hvt_common.values import AccessUnit, Frame, View
+from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.loop.counts import processors
 from hvt_edge.perception.shadow import UNMEASURED, Shadow
 from hvt_edge.source.contract import Source
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.video.encoder_settings import PresetChoice, choose_preset, least_base_bps, share_of
-from hvt_edge.video.encoders.registry import X265, Encoder
+from hvt_edge.video.encoders.registry import X265
 from hvt_edge.video.share import FIRST_SHARE
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.link import SPARSE_SHARE, lever_settings
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
-from hvt_edge.wiring.video import first_decimation, make_encoder, scene
+from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, scene
 
 _FINE = 33.5
-"""Of `trial_quantiser`: below it all frames are coded. Measured as `PROMPT` was."""
+"""Mean quantiser (0…51) of the last frames: below it all frames are coded. Measured as `PROMPT` was."""
 _MOST_NS = 3 * SECOND_NS
 """On a slow machine comparing ends after so long: a flight is not to wait for its detector."""
 _TRIAL_S = 0.85
@@ -67,28 +67,23 @@ def try_scene(
     rates = measures and (shadow is not None or (config.auto_fps and decimation > 1))
     if not (rates or config.auto_preset):  # nothing would come of it
         return Beginning(decimation, _share(config, source.view, decimation), PresetChoice(config.preset))
-    count = trial_frames(fps)
+    count = max(_LAST, 1 + math.floor(_TRIAL_S * fps))
     analyzer = make_analyzer(config, detector=detector, view=source.view)
     until_ns = None if config.pace == "lockstep" else clock() + _MOST_NS
 
-    encoder = make_encoder(
-        config, size=size, decimation=decimation, total_bps=config.budget_bps, base_bps=config.base_bps
-    )
+    encoder = make_encoder(config, first_rates(config, decimation), size=size)
     assert isinstance(encoder, BaseEncoder), "x265 alone is tried"
     spent: list[tuple[int, int]] = []
-
-    def compare(frame: Frame, unit: AccessUnit) -> None:
+    quantisers: list[float] = []
+    for frame in scene(source, decimation=decimation, count=count, clock=clock, stop=stop):
+        unit = encoder.encode(frame, keyframe=not quantisers)
+        quantisers.append(encoder.mean_qp)
         spent.append(encoder.spent)
         if shadow is not None and (until_ns is None or clock() < until_ns):
             shadow.compare(analyzer.analyze(frame, unit))
-
-    quantiser = trial_quantiser(
-        encoder,
-        scene(source, decimation=decimation, count=count, clock=clock, stop=stop),
-        count=count,
-        on_unit=compare,
-    )
-    if rates and config.auto_fps and quantiser < _FINE:
+    # Of a shorter scene, or an encoder that tells none, nothing is known.
+    fine = len(quantisers) == count and sum(quantisers[-_LAST:]) / _LAST < _FINE
+    if rates and config.auto_fps and fine:
         decimation = _most_frames(config, size, decimation)
     seen = UNMEASURED if shadow is None else shadow.now
     preset = PresetChoice(config.preset)
@@ -124,23 +119,3 @@ def _share(config: EdgeConfig, view: View, decimation: int, seen: Shadow = UNMEA
     seen = replace(seen, suppressed=0.0, suppressed_p=0.0)
     pay = lever_settings(config, view).tracks_pay(seen.measured, total_bps=config.budget_bps)
     return FIRST_SHARE if pay and not method(config.method).video_only else share
-
-
-def trial_frames(fps: float) -> int:
-    """Number of coded frames of a trial, at so many a second; as many as count, at least."""
-    return max(_LAST, 1 + math.floor(_TRIAL_S * fps))
-
-
-def trial_quantiser(
-    encoder: Encoder, scene: Iterable[Frame], *, count: int, on_unit: Callable[[Frame, AccessUnit], object]
-) -> float:
-    """Mean quantiser (0…51) of the last of ``count`` frames; NaN for a shorter scene, or an encoder that tells none.
-
-    ``on_unit`` takes each frame with its unit.
-    """
-    quantisers = []
-    for number, frame in enumerate(scene):
-        unit = encoder.encode(frame, keyframe=number == 0)
-        quantisers.append(encoder.mean_qp)
-        on_unit(frame, unit)
-    return sum(quantisers[-_LAST:]) / _LAST if len(quantisers) == count else math.nan

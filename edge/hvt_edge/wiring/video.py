@@ -16,8 +16,7 @@ from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Fit, Frame, View
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, least_budget_bps
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
-from hvt_edge.loop.counts import processors
-from hvt_edge.operating import Operating
+from hvt_edge.operating import Operating, Rates
 from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, shown
 from hvt_edge.video.encoder_settings import (
@@ -27,11 +26,10 @@ from hvt_edge.video.encoder_settings import (
     keyframe_interval_s,
     keyframe_total_bps,
     payload_bps,
-    share_of,
     usual_keyframe_bytes,
 )
 from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
-from hvt_edge.video.encoders.qualification import allowed, headroom_of, run_frames
+from hvt_edge.video.encoders.qualification import Allowed, allowed, headroom_of, run_frames
 from hvt_edge.video.encoders.registry import X265, Encoder, open_encoder
 from hvt_edge.video.rate_model import (
     LEAST_SIDE_PX,
@@ -44,7 +42,7 @@ from hvt_edge.video.rate_model import (
     sizes_of,
 )
 from hvt_edge.video.reconfigure import OpenEncoder, ReconfigurationSettings
-from hvt_edge.video.x265 import BaseEncoder, TrackRegions
+from hvt_edge.video.x265 import BaseEncoder
 
 _log = logging.getLogger(__name__)
 
@@ -157,15 +155,13 @@ def make_frame_skip(config: EdgeConfig, decimation: int, *, size: tuple[int, int
     )
 
 
+def first_rates(config: EdgeConfig, decimation: int) -> Rates:
+    """The rates at the start, where each n-th source frame is coded."""
+    return Rates(config.budget_bps, config.base_bps, decimation)
+
+
 def make_encoder(
-    config: EdgeConfig,
-    *,
-    size: tuple[int, int],
-    total_bps: int,
-    base_bps: int,
-    decimation: int,
-    preset: str = "",
-    headroom: float = 1.0,
+    config: EdgeConfig, rates: Rates, *, size: tuple[int, int], preset: str = "", headroom: float = 1.0
 ) -> Encoder:
     """The encoder at the rate that the budget leaves it; with several threads only where bytes need not repeat.
 
@@ -174,11 +170,11 @@ def make_encoder(
     """
     settings = encoder_settings(
         size=size,
-        fps=config.nominal_fps / decimation,
+        fps=config.nominal_fps / rates.decimation,
         preset=preset or (SLOWEST if config.preset == AUTO else config.preset),
         # What is kept for tracks may be the base's while none are sent.
-        total_bps=_video_bps(config, total_bps=total_bps, base_bps=base_bps),
-        base_bps=base_bps,
+        total_bps=_video_bps(config, rates),
+        base_bps=rates.base_bps,
         edge_id=config.edge_id,
         window_s=config.window,
         side_data=config.roi_depth > 0,
@@ -198,16 +194,8 @@ def encoder_opener(
 ) -> OpenEncoder:
     """Opens encoders in flight, with the preset that is in force then."""
 
-    def open_for(*, total_bps: int, base_bps: int, decimation: int) -> Encoder:
-        encoder = make_encoder(
-            config,
-            size=size,
-            total_bps=total_bps,
-            base_bps=base_bps,
-            decimation=decimation,
-            preset=operating.now.preset,
-            headroom=headroom,
-        )
+    def open_for(rates: Rates) -> Encoder:
+        encoder = make_encoder(config, rates, size=size, preset=operating.now.preset, headroom=headroom)
         if presets is not None and isinstance(encoder, BaseEncoder):
             presets.watch(lambda: encoder.spent)
         return encoder
@@ -215,15 +203,18 @@ def encoder_opener(
     return open_for
 
 
-def make_presets(config: EdgeConfig, operating: Operating) -> PresetControl | None:
-    """The control that steps to another preset in flight; None where the preset is set."""
-    if not config.auto_preset:
-        return None
-    return PresetControl(operating, nominal_fps=config.nominal_fps, most_cores=share_of(processors()))
+def _video_bps(config: EdgeConfig, rates: Rates) -> int:
+    return max(rates.total_bps - config.metadata_bps, rates.base_bps)
 
 
-def _video_bps(config: EdgeConfig, *, total_bps: int, base_bps: int) -> int:
-    return max(total_bps - config.metadata_bps, base_bps)
+def _allowed(config: EdgeConfig, size: tuple[int, int], rates: Rates) -> Allowed:
+    return allowed(
+        size=size,
+        fps=config.nominal_fps / rates.decimation,
+        total_bps=_video_bps(config, rates),
+        base_bps=rates.base_bps,
+        window_s=config.window,
+    )
 
 
 def qualify_encoder(
@@ -239,23 +230,13 @@ def qualify_encoder(
     if config.passes_through:
         _qualify_camera(config, source)
         return 1.0
-    size, decimation = source.view.base_size, first_decimation(config, source.view.base_size)
-    total_bps, base_bps = config.budget_bps, config.base_bps
-    fps = config.nominal_fps / decimation
-    limit = allowed(
-        size=size,
-        fps=fps,
-        total_bps=_video_bps(config, total_bps=total_bps, base_bps=base_bps),
-        base_bps=base_bps,
-        window_s=config.window,
-    )
-    count = run_frames(fps, limit)
-
+    size = source.view.base_size
+    rates = first_rates(config, decimation := first_decimation(config, size))
+    limit = _allowed(config, size, rates)
+    count = run_frames(config.nominal_fps / decimation, limit)
     headroom = headroom_of(
         config.encoder,
-        open_at=lambda share: make_encoder(
-            config, size=size, total_bps=total_bps, base_bps=base_bps, decimation=decimation, headroom=share
-        ),
+        open_at=lambda share: make_encoder(config, rates, size=size, headroom=share),
         scene=lambda: scene(source, decimation=decimation, count=count, clock=clock, stop=stop),
         frames=count,
         limit=limit,
@@ -303,13 +284,7 @@ def as_the_camera_is(config: EdgeConfig, source: Source) -> EdgeConfig:
 def _qualify_camera(config: EdgeConfig, source: Source) -> None:
     stream, name = source.camera_stream, shown(str(config.source))
     assert stream is not None, "checked by as_the_camera_is"
-    limit = allowed(
-        size=source.view.base_size,
-        fps=config.nominal_fps,
-        total_bps=_video_bps(config, total_bps=config.budget_bps, base_bps=config.base_bps),
-        base_bps=config.base_bps,
-        window_s=config.window,
-    )
+    limit = _allowed(config, source.view.base_size, first_rates(config, 1))
     found = check_camera(name, stream, limit, budget_bps=config.budget_bps, edge_id=config.edge_id)
     logging.getLogger(START_LOGGER).info("%s", found)
     for warning in filter(None, (about_keyframes(name, stream), source.warning)):
@@ -341,11 +316,6 @@ def least_rate_bps(config: EdgeConfig, size: tuple[int, int]) -> int:
         size, window_s=config.window, metadata_bps=config.metadata_bps, edge_id=config.edge_id
     )
     return max(config.min_budget_bps, needed_bps)
-
-
-def make_regions(config: EdgeConfig, size: tuple[int, int]) -> TrackRegions | None:
-    """Which regions of the base get more bits; None for none."""
-    return TrackRegions(size, depth=config.roi_depth) if config.roi_depth else None
 
 
 def make_keyframes(config: EdgeConfig, source: Source) -> Keyframes:

@@ -157,7 +157,7 @@ def _tracks(recorded: Recorded) -> dict[int, _Track]:
             if math.isnan(latitude) or overlay.doubted[row]:
                 continue
             track = tracks[track_id]
-            track.classes[overlay.classes[row]] += 1
+            track.classes[overlay.words[row]] += 1
             track.confidence = max(track.confidence, float(overlay.confidences[row]))
             track.refined |= bool(overlay.refined[row])
             track.last_ns = overlay.capture_ns

@@ -10,11 +10,9 @@ from hvt_archive.reading.spool import SpooledRows, Timed
 from hvt_ground.events import Origin
 from hvt_ground.sinks.rerun.overlays import ORIGINS
 
-TRACK_COMPONENTS = frozenset(
-    {"centers", "half_sizes", "track_id", "class_before", "class_ids", "confidence_pct", "origin"}
-)
+_CLASSES = ("class_before", "class_now", "class_ids")
+TRACK_COMPONENTS = frozenset({"centers", "half_sizes", "track_id", *_CLASSES, "confidence_pct", "origin"})
 """The rest is of the layer, once: how it is drawn."""
-_CLASSES = ("class_before", "class_ids")
 _IDS = 2**16
 """Numbers of classes in a file; another ground may have given the same ones to other classes."""
 _HUNDRED = 100
@@ -39,6 +37,8 @@ class DrawnBox:
     """x1 y1 x2 y2, base pixels."""
     base_class: str
     class_name: str
+    word: str
+    """What it is called."""
     confidence: float
     origin: Origin
 
@@ -70,18 +70,20 @@ class DrawnLayer:
     def at(self, frame: int, *, reported: bool) -> Iterator[DrawnBox]:
         """The boxes drawn at a frame."""
         ids = self._latest("track_id", frame)
-        before, after = self._latest("class_before", frame), self._latest("class_ids", frame)
+        before, words = self._latest("class_before", frame), self._latest("class_ids", frame)
+        now = self._latest("class_now", frame) or words  # older recordings have one of them
         percents = self._latest("confidence_pct", frame) or [0] * len(ids)
         origins = self._latest("origin", frame) or [int(reported)] * len(ids)
         places = zip(self._latest("centers", frame), self._latest("half_sizes", frame), strict=False)
-        for track, ((x, y), (w, h)), was, now, percent, origin in zip(
-            ids, places, before, after, percents, origins, strict=False
+        for track, ((x, y), (w, h)), was, named, shown, percent, origin in zip(
+            ids, places, before, now, words, percents, origins, strict=False
         ):
             yield DrawnBox(
                 track,
                 (x - w, y - h, x + w, y + h),
                 self._names.get(was, "?"),
-                self._names.get(now, "?"),
+                self._names.get(named, "?"),
+                self._names.get(shown, "?"),
                 percent / _HUNDRED,
                 ORIGINS[origin] if origin < len(ORIGINS) else "base",
             )

@@ -24,7 +24,7 @@ from hvt_archive.reading.spool import Mapped, Spool, SpooledRows, Timed
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireError
 from hvt_common.video.hevc import is_keyframe
-from hvt_ground.events import Notice, Overlay, PoseUpdate, VideoSample
+from hvt_ground.events import VEHICLE, Notice, Overlay, PoseUpdate, VideoSample
 from hvt_ground.poses import NOWHERE, Locator
 from hvt_ground.recordings.contract import Recorded, RecordedStill
 from hvt_ground.sinks.rerun.blueprint import (
@@ -95,6 +95,7 @@ class _Read(Recorded):
             refined=np.array([self._is_refined(row.track_id, path, frame) for row, path in rows], np.bool_),
             origins=tuple(row.origin for row, _ in rows),
             doubted=np.array([path == DOUBTED for _, path in rows], np.bool_),
+            vague=np.array([row.word == VEHICLE != row.class_name for row, _ in rows], np.bool_),
         )
         return self._located(overlay)
 

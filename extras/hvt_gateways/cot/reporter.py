@@ -196,7 +196,7 @@ def placed_tracks(overlay: Overlay) -> Iterator[PlacedTrack]:
             track_id=int(overlay.track_ids[row]),
             place=(latitude, longitude),
             error_m=float(places.ellipses[row, 0]),
-            name=overlay.classes[row],
+            name=overlay.words[row],
             base_name=overlay.base_classes[row],
             confidence=float(overlay.confidences[row]),
             refined=bool(overlay.refined[row]),

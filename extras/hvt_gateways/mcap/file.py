@@ -156,7 +156,7 @@ def _annotations(overlay: Overlay) -> ImageAnnotations:
             "confidence": f"{overlay.confidences[row]:.3f}",
             "refined": int(refined),
             "origin": overlay.origins[row],
-            "doubted": int(words[row] != name),
+            "doubted": int(overlay.doubted[row]),
         }
         corners = _points(((x1, y1), (x2, y1), (x2, y2), (x1, y2)))
         result.points.append(

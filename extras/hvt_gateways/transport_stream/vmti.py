@@ -77,7 +77,7 @@ def _target(
         offsets = [imapb(one, -_OFFSET_DEG, _OFFSET_DEG, size=3) for one in (latitude - centre[0], across)]
         if all(offsets):
             items += [item(10, offsets[0]), item(11, offsets[1])]
-    name = overlay.classes[row].encode()[:_LONGEST_CLASS].decode(errors="ignore").encode()
+    name = overlay.words[row].encode()[:_LONGEST_CLASS].decode(errors="ignore").encode()
     items.append(item(102, item(2, name)))
     pack = ber_oid(max(0, int(overlay.track_ids[row]))) + b"".join(items)
     return ber_length(len(pack)) + pack

@@ -1,6 +1,6 @@
 // Boxes and names on the picture, in step with it; a click or a drag is a box too.
 
-import { boxWords, trackName } from "./words.js";
+import { boxWords } from "./words.js";
 
 /** @typedef {{id: number, box: number[], name: string, sureness: number, read?: 1, doubted?: 1, sure?: 1}} Track */
 /** @typedef {{frame: number, captured: number, looked: number, tracks: Track[], colours: Record<string, string>}} Overlay */
@@ -122,7 +122,7 @@ export class Boxes {
   /** Those that are drawn. */
   drawn() {
     if (!this.shown) return [];
-    return (this.current()?.tracks ?? []).filter((track) => !this.left.has(trackName(track)));
+    return (this.current()?.tracks ?? []).filter((track) => !this.left.has(track.name));
   }
 
   /** @param {string} name */
@@ -177,7 +177,7 @@ export class Boxes {
   /** @param {CanvasRenderingContext2D} context @param {Track} track @param {number} scale @param {number} ratio */
   drawBox(context, track, scale, ratio) {
     const [x, y, right, bottom] = track.box.map((value) => value * scale);
-    context.strokeStyle = this.colourOf(trackName(track));
+    context.strokeStyle = this.colourOf(track.name);
     context.lineWidth = (track.read ? 3 : 1.5) * ratio;
     context.setLineDash(track.doubted ? [4 * ratio, 4 * ratio] : []);
     if (track.doubted) context.lineWidth = ratio;
@@ -207,7 +207,7 @@ export class Boxes {
       taken.push([left, top, right, bottom]);
       context.fillStyle = "#000a";
       context.fillRect(left, top, width, height);
-      context.fillStyle = this.colourOf(trackName(track));
+      context.fillStyle = this.colourOf(track.name);
       context.fillText(words, left + letter * 0.25, top + letter);
       return;
     }

@@ -316,7 +316,7 @@ function listTracks() {
 function listClasses(tracks) {
   const known = new Set([...by("classes").children].map((one) => one.dataset.name));
   for (const track of tracks) {
-    const name = words.trackName(track);
+    const { name } = track;
     if (known.has(name) || known.size >= 24) continue;
     known.add(name);
     const button = make("button", "", by("classes"));

@@ -188,14 +188,11 @@ export function tracksTitle(count, behind) {
 
 export const OF_LAST_PICTURE = "of the last picture";
 
-/** @param {{name: string, doubted?: 1}} track */
-export const trackName = (track) => (track.doubted ? "something" : track.name);
+/** @param {TrackFacts} track */
+export const trackWords = (track) => `${track.name} ${track.id}, ${percent(track.sureness)}`;
 
 /** @param {TrackFacts} track */
-export const trackWords = (track) => `${trackName(track)} ${track.id}, ${percent(track.sureness)}`;
-
-/** @param {TrackFacts} track */
-export const trackLabel = (track) => `${trackName(track)}, track ${track.id}${track.doubted ? ", doubted" : ""}: closer look`;
+export const trackLabel = (track) => `${track.name}, track ${track.id}${track.doubted ? ", doubted" : ""}: closer look`;
 
 /** @param {StillFacts} still */
 export function stillWords(still) {
@@ -221,7 +218,7 @@ export const BASE_ALT = "what the base stream showed";
 // Commands, and what came of them
 
 /** @param {TrackFacts | null} track */
-const place = (track) => (track ? `${trackName(track)} ${track.id}` : "this place");
+const place = (track) => (track ? `${track.name} ${track.id}` : "this place");
 
 /** @param {string} edge @param {TrackFacts | null} track */
 export const askingStill = (edge, track) => `asking ${edge} for ${place(track)}`;

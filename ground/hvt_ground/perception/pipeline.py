@@ -473,6 +473,7 @@ def _overlay(
         origins=_of(fused.origins, rows),
         doubted=shown.doubted[rows],
         sure=shown.sure[rows],
+        vague=shown.vague[rows],
     )
 
 

@@ -10,6 +10,7 @@ from hvt_common.inference.detect import FailingDetector, detect_every, detect_st
 from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.retried import RetriedDetector
 from hvt_common.inference.scale_search import ScaleSearch
+from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import searches_scale
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -49,6 +50,7 @@ def make_pipeline(
             fps=info.fps,
             vocabulary=vocabulary,
             calibrated=models.facts.stills_calibrated,
+            vague_kinds=config.detector == EMBEDDED_DETECTOR,
         ),
         vocabulary=vocabulary,
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path, base_per_source=info.view.scale),

@@ -6,7 +6,7 @@ import argparse
 import csv
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,14 @@ from hvt_study.datasets.labels import FrameLabels, inside_frame
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.judged import Judged, judged
-from hvt_study.metrics.operating_point import right_boxes
-from hvt_study.metrics.picture_score import VEHICLES, above, as_one, picture_score
+from hvt_study.metrics.operating_point import (
+    along_line,
+    calibration_error,
+    chance_error,
+    fitted_line,
+    right_boxes,
+)
+from hvt_study.metrics.picture_score import VEHICLES, above, as_one, picture_score, sure_and_right
 from hvt_study.report.figures.sheet import Finding, write_sheet
 
 _LEAST_CONFIDENCE = 0.01
@@ -88,7 +94,8 @@ def _detect(arguments: argparse.Namespace) -> int:
     if not _LEAST_CONFIDENCE <= confidence <= 1:
         raise UserError(f"--confidence is {confidence}, must be from {_LEAST_CONFIDENCE} to 1")
     names = names_of(arguments.classes)
-    pictures = [one for place in arguments.pictures for one in find_pictures(place, classes=names or None)]
+    sets = {place: find_pictures(place, classes=names or None) for place in arguments.pictures}
+    pictures = [one for of_set in sets.values() for one in of_set]
     detector = tiled(
         open_detector(
             arguments.detector,
@@ -132,6 +139,12 @@ def _detect(arguments: argparse.Namespace) -> int:
         (arguments.out / "score.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
         _write_sheets(arguments.out, paths, used, classes=classes, recall_only=recall_only)
         print_score(about)
+        if not recall_only:
+            of_sets = (
+                [frame for path, frame in zip(paths, used, strict=True) if path in known]
+                for known in ({one.path for one in of_set} for of_set in sets.values())
+            )
+            _print_calibration(dict(zip(map(str, sets), of_sets, strict=True)), classes)
     print(f"{arguments.out}: {seen} pictures, {len(frames)} of them labelled")
     return 0 if seen else 2
 
@@ -201,6 +214,23 @@ def _write_sheets(
             missed.append(Finding(path, box, frame.class_names[row], float(frame.areas_px2[row])))
     write_sheet(out / "false-alarms.png", [] if recall_only else false)
     write_sheet(out / "misses.png", missed)
+
+
+def _print_calibration(sets: Mapping[str, Sequence[Judged]], classes: Sequence[str]) -> None:
+    """The calibration error of each labelled set, as it is and with the line that makes the others' scores true."""
+    found = {name: sure_and_right(frames, classes) for name, frames in sets.items()}
+    found = {name: one for name, one in found.items() if len(one[0])}
+    if len(found) < 2:  # nothing to fit on
+        return
+    rows = []
+    for name, (sure, right) in found.items():
+        others = [one for other, one in found.items() if other != name]
+        line = fitted_line(*(np.concatenate(column) for column in zip(*others, strict=True)))
+        fitted = calibration_error(along_line(sure, line), right)
+        errors = calibration_error(sure, right), fitted, chance_error(sure)
+        rows.append((Path(name).name, str(len(sure)), *map(decimals, errors)))
+    heads = ("set", "boxes", "error", "fitted on the others", "by chance")
+    print_columns("expected calibration error", heads, rows, words=("set",))
 
 
 def print_score(score: dict[str, Any]) -> None:

@@ -18,6 +18,8 @@ import numpy.typing as npt
 from hvt_study.metrics.judged import Judged, matched_rows
 
 BINS = 15
+_DRAWS = 200
+_EPSILON = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,3 +75,34 @@ def calibration_error(confidences: npt.NDArray[np.float64], right: npt.NDArray[n
     count = np.bincount(which, minlength=BINS)
     gap = np.abs(np.bincount(which, confidences, BINS) - np.bincount(which, right, BINS))
     return float(gap[count > 0].sum() / len(confidences))
+
+
+def chance_error(confidences: npt.NDArray[np.float64]) -> float:
+    """The calibration error that so few boxes have in the mean though each confidence is true; NaN of none."""
+    draws = np.random.default_rng(0).random((_DRAWS, len(confidences))) < confidences
+    return float(np.mean([calibration_error(confidences, right) for right in draws]))
+
+
+def fitted_line(confidences: npt.NDArray[np.float64], right: npt.NDArray[np.bool_]) -> tuple[float, float]:
+    """Slope and shift of the line through the logits that makes these true (Platt 1999), by Newton's method."""
+    count = np.count_nonzero(right)
+    target = np.where(
+        right, (count + 1) / (count + 2), 1 / (len(right) - count + 2)
+    )  # where all are right too
+    logits = np.column_stack((_logits(confidences), np.ones(len(confidences))))
+    line = np.array([1.0, 0.0])
+    for _ in range(20):
+        true = (1 + np.tanh(logits @ line / 2)) / 2
+        bend = logits.T @ (logits * (true * (1 - true))[:, None]) + _EPSILON * np.eye(2)
+        line += np.linalg.solve(bend, logits.T @ (target - true))
+    return float(line[0]), float(line[1])
+
+
+def along_line(confidences: npt.NDArray[np.float64], line: tuple[float, float]) -> npt.NDArray[np.float64]:
+    """(N,) confidences after a line through their logits."""
+    return np.asarray((1 + np.tanh((line[0] * _logits(confidences) + line[1]) / 2)) / 2)
+
+
+def _logits(confidences: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    clipped = np.clip(confidences, _EPSILON, 1 - _EPSILON)
+    return np.asarray(np.log(clipped / (1 - clipped)))

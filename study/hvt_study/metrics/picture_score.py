@@ -55,7 +55,7 @@ def picture_score(
         **all_in_all,
         "ap50_95": _number(curve.mean.at_50_95),
         "ap50_by_size": {size: _number(one.at_50) for size, one in curve.by_size.items()},
-        "calibration_error": _number(calibration_error(*_sure_and_right(used, seen))),
+        "calibration_error": _number(calibration_error(*sure_and_right(used, seen))),
         "by_class": by_class,
     }
 
@@ -75,9 +75,10 @@ def _recall_of(shares: dict[str, Any]) -> dict[str, Any]:
     return {name: value if name in ("labels", "recall") else None for name, value in shares.items()}
 
 
-def _sure_and_right(
+def sure_and_right(
     frames: Sequence[Judged], names: Collection[str]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """(N,) the confidences of all boxes, and which of them are right."""
     right = [np.zeros(len(frame.view), np.bool_) for frame in frames]
     for flags, frame in zip(right, frames, strict=True):
         flags[right_boxes(frame, classes=names)[1]] = True

@@ -6,6 +6,7 @@ import logging
 
 import cv2
 import numpy as np
+import pytest
 
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.values import Detections, Image
@@ -62,6 +63,20 @@ def test_small_objects_are_looked_at_enlarged_from_the_first_second_on(caplog):
     assert search.interval(5) == 15, "five runs as often as one would take the whole processor"
     (record,) = caplog.records
     assert "objects are small here" in record.getMessage()
+
+
+@pytest.mark.parametrize(("side_px", "found"), [(200, 4), (400, 0)])
+def test_what_the_whole_picture_would_show_is_not_taken_from_a_part_of_it(side_px, found):
+    """Five stripes of a crossing, 104 pixels long, were a bus for two seconds: a part hides what is around them."""
+
+    def detect(image: Image) -> Detections:
+        boxes = [[100, 100, 100 + side_px, 160]] if max(image.shape) > max(SIZE) else np.empty((0, 4))
+        count = len(boxes)
+        return Detections(np.array(boxes, np.float32), np.full(count, 0.8, np.float32), np.zeros(count, int))
+
+    search = ScaleSearch(detect, confidence=0.4)
+    search.enlarged = True
+    assert len(search.take(Detections.none(), picture(0, 0))) == found
 
 
 def test_boxes_lie_on_the_objects(caplog):

@@ -79,7 +79,7 @@ def test_a_still_that_is_pending_at_the_end_does_not_hold_up_what_was_stored(tmp
         OutboxStill(CropJob(STILL, np.zeros((4, 4, 3), np.uint8), None, None), None, 1.0, rig.now_ns)
     )
     rig.finish()
-    assert rig.backlog.numbers.empty
+    assert rig.backlog.worker.numbers.empty
     sizes = [len(data) for _, data in rig.out.backlog]
     assert max(sizes) > 1400, "no trickle"
     rig.close()
@@ -98,7 +98,7 @@ def test_an_outage_at_the_end_of_a_clip_is_waited_out(tmp_path):
     assert {number: ground.backlog_frames[number] for number in range(21, 45)}.items() <= rig.coded.items()
     assert ground.backlog_stills == {STILL.sequence}
     assert rig.outcomes == [("sent", "stored")]
-    assert rig.backlog.numbers.empty
+    assert rig.backlog.worker.numbers.empty
     rig.backlog.close()
 
 
@@ -232,18 +232,20 @@ def test_in_an_outage_stills_have_the_room_that_the_link_gave_them(tmp_path):
     """The pacer takes silence for a link of 100 kbps: not one still of the outage would be kept."""
     rig = Rig(tmp_path / "store", adapt=True)
     rig.play(0, 21, reports=True)
-    assert rig.sender.total_bps == 800_000
+    assert rig.sender.budget.total_bps == 800_000
     rig.out.dark = True
     rig.play(21, 60)
     assert rig.backlog.offline
     assert rig.pacer.rate_bps == 100_000
-    assert rig.sender.total_bps == 800_000
+    assert rig.sender.budget.total_bps == 800_000
     assert rig.sender.still_allowance_bytes(rig.now_ns, paced=False) > 5_000
     rig.out.dark = False
     rig.report()
     rig.play(60, 62)
     assert not rig.backlog.offline
-    assert rig.sender.total_bps == rig.pacer.rate_bps < 800_000, "the link has to show first what it carries"
+    assert rig.sender.budget.total_bps == rig.pacer.rate_bps < 800_000, (
+        "the link has to show first what it carries"
+    )
     rig.backlog.close()
 
 
@@ -256,7 +258,7 @@ def test_an_error_in_the_stores_thread_ends_storing_alone(tmp_path):
     rig = Rig(tmp_path / "store", info=broken)
     rig.play(0, 7, reports=True)
     rig.store()
-    eventually(lambda: rig.backlog.failed, within_s=10, what="it is noticed")
+    eventually(lambda: rig.backlog.worker.failed, within_s=10, what="it is noticed")
     rig.play(7, 12, reports=True)
     rig.backlog.close()
 
@@ -269,7 +271,7 @@ def test_stills_of_a_former_run_count_for_that_one(tmp_path):
     rig.play(0, 21, reports=True)
     rig.finish()
     assert len([key for key in rig.out.ground.twice if key[1] == "still"]) == 2
-    assert rig.backlog.numbers.sent_stills == 2
+    assert rig.backlog.worker.numbers.sent_stills == 2
     assert rig.outcomes == []
     rig.backlog.close()
 
@@ -282,6 +284,6 @@ def test_what_goes_out_of_the_store_is_within_the_budget(tmp_path):
     rig.linked = True
     rig.finish()
     assert sum(row is Channel.BACKLOG for row, _, _ in rig.out.puts) > 10
-    assert rig.backlog.numbers.empty
+    assert rig.backlog.worker.numbers.empty
     assert rig.ledger.worst_window_bps.total <= 800_000
     rig.backlog.close()

@@ -437,7 +437,7 @@ def test_the_link_that_blocks_is_the_edges_own(tmp_path):
     rig.play(40, 90, linked=True, reports=True)
     assert entered.wait(timeout=10), "a chunk is being sent"
     rig.play(90, 110, linked=False)
-    eventually(lambda: rig.backlog.numbers.video_s > 2.5, within_s=10, what="frames are stored")
+    eventually(lambda: rig.backlog.worker.numbers.video_s > 2.5, within_s=10, what="frames are stored")
     gate.set()
     assert {unit.frame_index for unit in rig.kept()} >= set(range(90, 110))
 

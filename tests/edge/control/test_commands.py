@@ -191,9 +191,9 @@ def test_an_answer_that_leaves_tracks_out_says_so(monkeypatch):
     """64 of 119 tracks came without a word: whoever counts them would count wrong."""
     rig = Rig()
     rig.run(10)
-    frame_index, tracks, there = rig.commands.on_demand.tracks()
+    frame_index, tracks, there = rig.on_demand.tracks()
     assert (len(tracks), there, rig.ask("tracks").note) == (1, 1, "")
-    monkeypatch.setattr(rig.commands.on_demand, "tracks", lambda: (frame_index, tracks, 119))
+    monkeypatch.setattr(rig.on_demand, "tracks", lambda: (frame_index, tracks, 119))
     assert rig.ask("tracks").note == "of 119 tracks these are the 1 of most confidence"
 
 

@@ -173,7 +173,7 @@ def test_nothing_of_lower_priority_delays_a_frame(total, share, fps, silence_s, 
             elif kind == 1 and (room := budget.still_allowance(now_ns)) >= 600:
                 budget.record_still(room, now_ns=now_ns)
             elif kind > 1 and (room := min(2_000, budget.backlog_allowance(now_ns, reserve=0.0))) >= 600:
-                budget.record_backlog(room, now_ns=now_ns)
+                budget.record_other(room, now_ns=now_ns)
                 backlog_bytes += room
     assert backlog_bytes or share * total > total - 5_000 or total < 100_000, "what is over is used"
 

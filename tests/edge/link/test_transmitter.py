@@ -110,6 +110,11 @@ def still(size: int = 100, **changes) -> Still:
     return Still(**(fields | changes))
 
 
+def send_status(rig, make, **how) -> bool:
+    """Once, as `make` makes it."""
+    return rig.sender.metadata(Channel.STATUS, lambda at_ns: make(at_ns).pack(), **how)
+
+
 def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
     """A report with so many reasons."""
     counts = {f"{name}{number}": 4_000_000_000 for number in range(reasons)}
@@ -139,7 +144,7 @@ def test_lockstep_is_flagged():
     """The ground would show media time as delay."""
     rig = Rig(lockstep=True)
     rig.sender.base(unit(0, keyframe=True), now_ns=NOW_NS)
-    rig.sender.still(rig.sender.envelope(still()), now_ns=NOW_NS)
+    rig.sender.still(still(), now_ns=NOW_NS)
     (_, payload, attachment, _), (_, data, roi, _) = rig.out.puts
     assert BaseHeader.parse(attachment, payload).flags == 7
     assert RoiHeader.parse(roi, data).flags == Flags.LOCKSTEP
@@ -149,7 +154,7 @@ def test_a_still_says_what_it_shows():
     """The ground could not place it."""
     rig = Rig()
     sent = still(sequence=6)
-    rig.sender.still(rig.sender.envelope(sent), now_ns=NOW_NS + 50)
+    rig.sender.still(sent, now_ns=NOW_NS + 50)
     ((row, payload, attachment, encoding),) = rig.out.puts
     header = RoiHeader.parse(attachment, payload)
     assert (row, payload, encoding) == (Channel.ROI, sent.data, JPEG)
@@ -179,9 +184,9 @@ def test_the_ledger_counts_the_very_bytes_that_were_put():
         around = overhead_bytes(len(payload), len(attachment), key="hvt/uav-1/base", encoding=encoding)
         assert line == len(payload) + len(attachment) + around
         if index % 3 == 0:
-            rig.sender.still(rig.sender.envelope(still(300 + index, sequence=index // 3)), now_ns=now_ns)
+            rig.sender.still(still(300 + index, sequence=index // 3), now_ns=now_ns)
         if index % 15 == 0:
-            rig.sender.status(lambda at_ns: status(at_ns, reasons=3), now_ns=now_ns)
+            send_status(rig, lambda at_ns: status(at_ns, reasons=3), now_ns=now_ns)
     puts = rig.out.puts
     assert rig.ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
     assert rig.ledger.base_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Channel.BASE)
@@ -195,7 +200,7 @@ def test_what_finds_no_room_is_sent_when_there_is_and_says_so():
     rig = Rig(total_bps=80_000)  # 10 000 bytes a second
     rig.sender.base(unit(0, 6_000, keyframe=True), now_ns=NOW_NS)
     rig.sender.base(unit(1, 6_000), now_ns=NOW_NS + 100)
-    rig.sender.status(status, now_ns=NOW_NS + 200, last=True)
+    send_status(rig, status, now_ns=NOW_NS + 200, last=True)
     assert rig.waits == [NOW_NS, NOW_NS + SECOND_NS, NOW_NS + SECOND_NS]
     (_, _, _, _), (_, payload, attachment, _), (_, report, _, _) = rig.out.puts
     assert BaseHeader.parse(attachment, payload).send_ns == NOW_NS + SECOND_NS
@@ -251,7 +256,7 @@ def test_a_still_of_just_the_room_takes_just_the_room(  # noqa: PLR0917 - hypoth
     room_line = rig.budget.still_allowance(now_ns)
     room = rig.sender.still_allowance_bytes(now_ns, still=asked)
     before = rig.ledger.line_bytes
-    rig.sender.still(rig.sender.envelope(replace(asked, data=bytes(room))), now_ns=now_ns)
+    rig.sender.still(replace(asked, data=bytes(room)), now_ns=now_ns)
     _, payload, attachment, encoding = rig.out.puts[-1]
     assert encoding == ("application/octet-stream" if "hvt" in media_type else media_type)
     taken = rig.ledger.line_bytes - before
@@ -266,7 +271,7 @@ def test_a_still_is_stamped_and_counted_when_it_goes_not_when_its_coding_began()
     """Windows on the line would be fuller than those of the account, and every still seem to take long on its way."""
     rig = Rig()
     rig.sender.clock = lambda: NOW_NS + 400_000_000
-    rig.sender.still(rig.sender.envelope(still()), now_ns=NOW_NS)
+    rig.sender.still(still(), now_ns=NOW_NS)
     header = RoiHeader.parse(rig.out.puts[0][2], rig.out.puts[0][1])
     assert header.send_ns == NOW_NS + 400_000_000
     assert not rig.budget.fits(99_900, now_ns=NOW_NS + SECOND_NS + 200_000_000)
@@ -289,7 +294,7 @@ def test_what_is_no_frame_waits_for_nothing_and_leaves_the_next_frame_its_room(c
 
     def send(now_ns: int, **late: bool) -> bool:
         if channel is Channel.STATUS:
-            return rig.sender.status(status, now_ns=now_ns, **late)
+            return send_status(rig, status, now_ns=now_ns, **late)
         return rig.sender.metadata(channel, lambda _at_ns: bytes(200), now_ns=now_ns)
 
     rig.sender.base(unit(0, 9_000, keyframe=True), now_ns=NOW_NS)
@@ -312,8 +317,8 @@ def test_a_status_that_has_waited_long_goes_before_the_next_frame():
     """Where video takes all that there is, a ground would take the edge for gone."""
     rig = Rig(total_bps=80_000)
     rig.sender.base(unit(0, 9_150, keyframe=True), now_ns=NOW_NS)
-    assert not rig.sender.status(status, now_ns=NOW_NS + 100)
-    assert rig.sender.status(status, now_ns=NOW_NS + 100, before_frames=True)
+    assert not send_status(rig, status, now_ns=NOW_NS + 100)
+    assert send_status(rig, status, now_ns=NOW_NS + 100, before_frames=True)
     assert rig.ledger.worst_window_bps.total <= 80_000
 
 
@@ -354,7 +359,7 @@ def test_what_is_set_aside_for_headers_and_status_suffices():
     rig = Rig(total_bps=50_000_000)
     for index in range(15):
         rig.sender.base(unit(index, 5_000), now_ns=NOW_NS + index * SECOND_NS // 15)
-    rig.sender.status(lambda at_ns: status(at_ns, reasons=3), now_ns=NOW_NS + SECOND_NS - 1)
+    send_status(rig, lambda at_ns: status(at_ns, reasons=3), now_ns=NOW_NS + SECOND_NS - 1)
     spent_bps = 8 * (rig.ledger.line_bytes - rig.ledger.base_bytes)
     aside_bps = base_overhead_bps(15 * 8 * 5_000, fps=15, edge_id="uav-1")
     assert spent_bps <= aside_bps <= 1.2 * spent_bps
@@ -370,7 +375,7 @@ def test_two_threads_keep_one_account():
             for number in range(1_500):
                 now_ns = NOW_NS + number * 1_000_000
                 if rig.sender.still_allowance_bytes(now_ns, still=still()) > 200:
-                    rig.sender.still(rig.sender.envelope(still(200, sequence=number)), now_ns=now_ns)
+                    rig.sender.still(still(200, sequence=number), now_ns=now_ns)
                 rig.sender.outcome("deferred", f"reason{number % 20}")
         except BaseException as error:  # noqa: BLE001
             errors.append(error)
@@ -386,7 +391,7 @@ def test_two_threads_keep_one_account():
         now_ns = NOW_NS + number * 1_000_000
         rig.sender.base(unit(number, 500), now_ns=now_ns)
         if number % 10 == 0:
-            rig.sender.status(report, now_ns=now_ns)
+            send_status(rig, report, now_ns=now_ns)
     thread.join()
     assert errors == []
     assert rig.ledger.line_bytes == rig.out.line_bytes(keys)
@@ -403,10 +408,10 @@ def test_two_threads_keep_one_account():
 def test_behind_the_last_report_goes_nothing():
     """A ground has closed the session: what a slow thread still had would be sent, counted and never received."""
     rig = Rig()
-    rig.sender.still(rig.sender.envelope(still()), now_ns=NOW_NS)
-    rig.sender.status(status, now_ns=NOW_NS, last=True)
+    rig.sender.still(still(), now_ns=NOW_NS)
+    send_status(rig, status, now_ns=NOW_NS, last=True)
     before = rig.ledger.line_bytes, len(rig.out.puts)
-    rig.sender.still(rig.sender.envelope(still(sequence=1)), now_ns=NOW_NS)
+    rig.sender.still(still(sequence=1), now_ns=NOW_NS)
     rig.sender.metadata(Channel.TRACKS, lambda _at_ns: bytes(40), now_ns=NOW_NS)
     assert (rig.ledger.line_bytes, len(rig.out.puts)) == before
     assert rig.ledger.outcomes("sent") == {"utility": 1}
@@ -431,19 +436,19 @@ def test_a_keyframe_is_weighed_against_the_window(fits):
         rig.sender.base(unit(index, int(rng.integers(4_900, 5_100))), now_ns=now_ns)
     now_ns += SECOND_NS // 15
     if not fits:
-        rig.sender.still(rig.sender.envelope(still(15_000)), now_ns=now_ns)
-    assert rig.sender.keyframe_fits(20_000, now_ns=now_ns) is fits
+        rig.sender.still(still(15_000), now_ns=now_ns)
+    assert rig.sender.budget.keyframe_fits(20_000, now_ns=now_ns) is fits
 
 
 def test_a_second_copy_has_the_same_number_and_bytes_and_is_counted():
     """The ground would show it twice; or the budget and the account would not hold what crossed the line."""
     rig = Rig()
-    envelopes = [rig.sender.envelope(still(400, sequence=sequence)) for sequence in range(3)]
-    for number, envelope in enumerate(envelopes):
-        rig.sender.still(envelope, now_ns=NOW_NS + number * 1_000_000)
+    stills = [still(400, sequence=sequence) for sequence in range(3)]
+    for number, one in enumerate(stills):
+        rig.sender.still(one, now_ns=NOW_NS + number * 1_000_000)
     now_ns = NOW_NS + 2_000_000
     line_bytes, allowance = rig.ledger.line_bytes, rig.sender.still_allowance_bytes(now_ns)
-    rig.sender.still(envelopes[1], now_ns=now_ns, copy="again")
+    rig.sender.still(stills[1], now_ns=now_ns, copy="again")
     (_, data, attachment, _), (_, again, second, _) = rig.out.puts[1], rig.out.puts[3]
     header, copy = RoiHeader.parse(attachment, data), RoiHeader.parse(second, again)
     assert data == again
@@ -460,11 +465,11 @@ def test_a_second_copy_does_not_confuse_the_pacer():
     pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
     pacer.link(True, now_ns=NOW_NS)
     rig = Rig(pacer=pacer)
-    envelopes = [rig.sender.envelope(still(400, sequence=sequence)) for sequence in range(3)]
-    for number, envelope in enumerate(envelopes):
+    stills = [still(400, sequence=sequence) for sequence in range(3)]
+    for number, one in enumerate(stills):
         rig.sender.base(unit(number), now_ns=NOW_NS + number * 66_000_000)
-        rig.sender.still(envelope, now_ns=NOW_NS + number * 66_000_000)
-    rig.sender.still(envelopes[0], now_ns=NOW_NS + 1_300_000_000, copy="again")
+        rig.sender.still(one, now_ns=NOW_NS + number * 66_000_000)
+    rig.sender.still(stills[0], now_ns=NOW_NS + 1_300_000_000, copy="again")
     report = feedback(sequence=0, send_ns=NOW_NS, base_sequence=2, still_sequence=2)
     sent = (rig.sender.base_sequence, rig.sender.still_sequence)
     pacer.on_report(PrimaryReceiver().judge(report, sent=sent, now_ns=NOW_NS + 1_400_000_000))
@@ -475,9 +480,9 @@ def test_a_second_copy_does_not_confuse_the_pacer():
 def test_a_stored_still_has_the_bytes_that_it_would_have_had():
     """The ground could not place what comes back after an outage."""
     rig = Rig()
-    envelope = rig.sender.envelope(still(400))
-    rig.sender.still(envelope, now_ns=NOW_NS)
-    stored = rig.sender.store_still(envelope, now_ns=NOW_NS)
+    one = still(400)
+    rig.sender.still(one, now_ns=NOW_NS)
+    stored = rig.sender.store_still(one, now_ns=NOW_NS)
     (_, data, attachment, encoding) = rig.out.puts[0]
     assert (stored.payload, stored.encoding) == (data, encoding)
     sent = RoiHeader.parse(attachment, data)
@@ -489,8 +494,8 @@ def test_the_time_of_a_frame_that_was_sent_is_not_sent_again():
     rig = Rig()
     rig.sender.base(unit(3), now_ns=NOW_NS)
     for one in (still(), still(frame_index=4), still(parameters={"ask": 1})):
-        rig.sender.still(rig.sender.envelope(one), now_ns=NOW_NS)
-    stored = rig.sender.store_still(rig.sender.envelope(still()), now_ns=NOW_NS)
+        rig.sender.still(one, now_ns=NOW_NS)
+    stored = rig.sender.store_still(still(), now_ns=NOW_NS)
     base, *sent = [(attachment, data) for _, data, attachment, _ in rig.out.puts]
     headers = [RoiHeader.parse(attachment, data) for attachment, data in sent]
     assert [one.capture_ns for one in headers] == [-1, NOW_NS, NOW_NS]
@@ -522,9 +527,9 @@ def test_no_unit_breaks_a_window_however_large_it_is(total_bps, fps, seed):
         sent = rig.sender.base(one, now_ns=now_ns)
         assert bool(sent) == rig.sender.holds(one)
         left_out += not sent
-        rig.sender.status(status, now_ns=now_ns, before_frames=rng.random() < 0.5)
+        send_status(rig, status, now_ns=now_ns, before_frames=rng.random() < 0.5)
         if (most_bytes := rig.sender.still_allowance_bytes(now_ns)) > 300:
-            rig.sender.still(rig.sender.envelope(still(most_bytes, sequence=index)), now_ns=now_ns)
+            rig.sender.still(still(most_bytes, sequence=index), now_ns=now_ns)
     assert rig.ledger.worst_window_bps.total <= total_bps
     assert len([row for row, *_ in rig.out.puts if row is Channel.BASE]) + left_out == 8 * fps
 

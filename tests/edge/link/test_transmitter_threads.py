@@ -37,7 +37,7 @@ class Rig:
     def still(self, number: int, size: int, *, now_ns: int = NOW_NS) -> None:
         """One of so many bytes."""
         still = replace(STILL, sequence=number, data=b"\xff" * size)
-        self.sender.still(self.sender.envelope(still), now_ns=now_ns)
+        self.sender.still(still, now_ns=now_ns)
 
     def backlog(self, size: int, *, now_ns: int = NOW_NS, offset: int = 0) -> int:
         """A chunk of so many bytes."""
@@ -47,7 +47,7 @@ class Rig:
 def test_a_chunk_that_lost_its_room_to_a_still_is_not_sent():
     """105000 bytes would go into a window of 100000."""
     rig = Rig()
-    rig.sender.end_base()
+    rig.sender.budget.end_base()
     for number in range(7):
         rig.still(number, 12_000)
     room = rig.sender.backlog_allowance_bytes(NOW_NS, reserve=0.0)
@@ -62,7 +62,7 @@ def test_a_chunk_that_lost_its_room_to_a_still_is_not_sent():
 def test_a_still_that_lost_its_room_waits_until_there_is_some():
     """A still and a chunk that were both admitted would exceed the window together."""
     rig = Rig()
-    rig.sender.end_base()
+    rig.sender.budget.end_base()
     assert rig.backlog(40_000)
     room = rig.sender.still_allowance_bytes(NOW_NS)
     assert room > 7_000
@@ -174,7 +174,7 @@ def test_room_for_the_backlog_leaves_what_base_and_stills_will_want():
     budget.record_base(3_000, now_ns=NOW_NS)
     room = budget.backlog_allowance(NOW_NS, reserve=0.0)
     assert 45_000 <= room <= 50_000, "the base's half of the coming window is not given away"
-    budget.record_backlog(20_000, now_ns=NOW_NS)
+    budget.record_other(20_000, now_ns=NOW_NS)
     assert budget.backlog_allowance(NOW_NS, reserve=0.0) <= room
     assert budget.backlog_allowance(NOW_NS + 3 * S, reserve=0.0) <= 50_000, "so may the next one"
     budget.end_base()

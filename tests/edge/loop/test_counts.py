@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
@@ -19,6 +20,7 @@ from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating import LoopClock
 from hvt_edge.perception.cpu_budget import CpuBudget
+from hvt_edge.stills.outbox import Outbox
 from hvt_edge.video.rate_model import FrameSkip
 from hvt_edge.video.stage import Action, FrameDecision
 from media.clips import framed, smooth_pictures
@@ -31,7 +33,7 @@ FRAMES = list(framed(smooth_pictures(40, size=SIZE)))
 class Unmoved:
     """Perception that finds nothing."""
 
-    latest_tracks, pending, any_requested, cpu_budget = None, 0, False, CpuBudget()
+    latest_tracks, outbox, analyzer = None, Outbox(), SimpleNamespace(cpu_budget=CpuBudget())
 
     def capture(self, frame):
         """Nobody asks for a still of it."""

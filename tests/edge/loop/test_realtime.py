@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
@@ -19,6 +21,7 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.perception.cpu_budget import CpuBudget
+from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.worker import SkippedUnits
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.stage import BaseStage
@@ -33,26 +36,27 @@ SIZE = (320, 192)
 class Out:
     """Counts base frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, sleep: Callable[[float], None] = time.sleep) -> None:
         self.units = 0
         self.takes_s = 0.0
+        self.sleep = sleep
 
     def put(self, channel, payload, *, attachment=None, encoding="") -> None:
         """One message."""
         self.units += channel is Channel.BASE
-        time.sleep(self.takes_s)
+        self.sleep(self.takes_s)
 
 
 class BlockedStills:
     """Decodes what it is given; sending its first still takes until it is released."""
 
     def __init__(self) -> None:
-        self.latest_tracks, self.pending, self.any_requested = None, 0, False
+        self.latest_tracks, self.outbox = None, Outbox()
         self.released, self.decoder = threading.Event(), BaseDecoder()
         self.frames: list[int] = []
         self.decoded = 0
         self.detected: list[int] = []
-        self.used, self.cpu_budget = True, CpuBudget()
+        self.used, self.analyzer = True, SimpleNamespace(cpu_budget=CpuBudget())
 
     def capture(self, frame):
         """Nobody asks for a still of it."""
@@ -109,11 +113,12 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
 @pytest.mark.timeout(60)
 def test_frames_missed_count_for_the_link_or_for_the_machine():
     """Who flies would buy a faster computer for a thin link."""
-    out, stills, counts = Out(), BlockedStills(), FrameCounts()
+    clock, stills, counts = SteppedTime(), BlockedStills(), FrameCounts()
+    out = Out(clock.pass_s)
     stills.released.set()
     frames = list(framed(smooth_pictures(6, size=SIZE)))
     with RealtimePace(
-        base_stage(out), stills, inbox=FeedbackInbox(), clock=SteadyClock(), fps=15, live=True, counts=counts,
+        base_stage(out), stills, inbox=FeedbackInbox(), clock=clock, fps=15, live=True, counts=counts,
         stop=threading.Event(), failures=Failures(time.time_ns),
     ) as pace:  # fmt: skip
         pace.step(frames[0], missed=4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
+from contextlib import closing
 from dataclasses import replace
 
 import cv2
@@ -328,8 +329,8 @@ def test_while_a_keyframe_is_due_stills_are_held():
     rig.run()
     assert rig.out.stills == []
     rig.keyframes.done(FRAMES[-1].capture_ns)
-    assert rig.stage.pending == 1
-    rig.stage.close()
+    assert len(rig.stage.outbox) == 1
+    rig.stage.chooser.close()
     assert rig.outcomes["dropped", "ended"] == 1
 
 
@@ -359,12 +360,14 @@ def test_what_the_ground_says_counts_and_no_opinion_does_not():
 def test_the_worker_takes_all_frames_in_order_and_finishes():
     """The last stills of a clip would be missing."""
     rig = Rig()
-    with StillWorker(
-        rig.stage,
-        results=list,
-        failures=Failures(time.time_ns),
-        clock=lambda: FRAMES[0].capture_ns,
-        finish_s=30,  # on a busy machine as well
+    with closing(
+        StillWorker(
+            rig.stage,
+            results=list,
+            failures=Failures(time.time_ns),
+            clock=lambda: FRAMES[0].capture_ns,
+            finish_s=30,  # on a busy machine as well
+        )
     ) as worker:
         for frame, unit in zip(FRAMES, UNITS, strict=True):
             while worker.queued > 1:  # it is not hurried
@@ -386,8 +389,8 @@ def test_stills_that_fail_stop_alone_and_go_on_from_a_keyframe(caplog):
             return super().detect(image_bgr)
 
     rig, failures, clock = Rig(detector=Broken()), Failures(time.time_ns), SteadyClock()
-    with StillWorker(
-        rig.stage, results=list, failures=failures, clock=clock, pause=RetryPause(SECOND_NS // 5)
+    with closing(
+        StillWorker(rig.stage, results=list, failures=failures, clock=clock, pause=RetryPause(SECOND_NS // 5))
     ) as worker:
         worker.take(FRAMES[0], UNITS[0])
         eventually(lambda: failures.parts, within_s=20, what="the failure is noticed")

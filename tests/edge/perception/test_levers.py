@@ -34,8 +34,8 @@ class Rig:
     ) -> bool:
         """Whether tracks are sent after a second in which this was measured."""
         sure_gain = gain if sure_gain is None else sure_gain
-        self.control.take_shadow(
-            Measured(comparisons, gain, sure_gain, hidden=4, misnamed_share=misnamed_share)
+        self.control.measured = Measured(
+            comparisons, gain, sure_gain, hidden=4, misnamed_share=misnamed_share
         )
         return self.second().tracks
 
@@ -60,12 +60,12 @@ def test_in_a_view_that_the_detector_does_not_know_its_tracks_have_no_credit():
     """A tenth of the budget went into guesses, because the ground guessed otherwise."""
     rig = Rig()
     assert rig.tracks(0.3)
-    rig.control.take_view(unlike=True)
+    rig.control.unlike = True
     assert not rig.tracks(0.3)
     assert rig.operating.now.levers.says.startswith(
         "no tracks: this view is unlike what the detector knows; "
     )
-    rig.control.take_view(unlike=False)
+    rig.control.unlike = False
     assert rig.tracks(0.3)
 
 
@@ -86,9 +86,9 @@ def test_it_says_who_does_not_see_them():
     """An operator would look for the fault in the video where the ground's model is the wrong one."""
     rig = Rig()
     for reported, who in ((True, "the ground overlooks"), (False, "the video hides")):
-        rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, reported=reported))
+        rig.control.measured = Measured(3.0, 0.5, 0.5, 16, reported=reported)
         assert rig.second().says.startswith(f"tracks: {who} 16 objects; ")
-    rig.control.take_shadow(Measured(3.0, 0.5, 0.5, 16, suppressed=4.2, misnamed=2.6))
+    rig.control.measured = Measured(3.0, 0.5, 0.5, 16, suppressed=4.2, misnamed=2.6)
     says = "tracks: the video hides 16 objects, shows 4 false, misnames 3; "
     assert rig.second().says.startswith(says)
 

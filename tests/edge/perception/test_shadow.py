@@ -13,6 +13,7 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Detections, Frame
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer, AnalyzerSettings
 from hvt_edge.perception.shadow import Detected, Shadow, ShadowGround, ShadowSettings
+from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
@@ -277,7 +278,7 @@ def test_another_scene_forgets_and_a_moving_camera_does_not():
 def test_a_thin_base_hides_what_a_rich_one_shows():
     """On real x265, the real detector and the drawn scene: else the levers would follow noise."""
     detector = open_detector(EMBEDDED_DETECTOR, threads=2, confidence=0.1)
-    with DemoSource(size=(320, 180), fps=FPS, fit="letterbox", seed=0, max_frames=12) as source:
+    with DemoSource("demo", SourceSettings(size=(320, 180), fps=FPS, max_frames=12), seed=0) as source:
         frames = list(source.frames(start_ns=0))
     gains = {kbps: _measured(detector, source, frames, kbps) for kbps in (40, 1_500)}
     assert gains[40] > gains[1_500] + 0.05, gains

@@ -40,7 +40,7 @@ def test_numbers_that_a_report_cannot_say_end_no_flight():
         transmitter=SimpleNamespace(
             base_sequence=0,
             still_sequence=-1,
-            status=lambda make, **_: sent.append(make(10**18).pack()) is None,
+            metadata=lambda _channel, make, **_: sent.append(make(10**18)) is None,
         ),
         session_id=7,
         ledger=Ledger(window_ns=10**9),

@@ -17,7 +17,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.video.hevc import BaseDecoder, nal_kind, nal_units, parameter_sets
 from hvt_edge.source.camera_stream import CameraDecoder, CameraUnits, rate_of, without_jumps
 from hvt_edge.source.coded_live import CodedLiveSource, CodedStreamGrabber
-from hvt_edge.source.contract import SeenUnit
+from hvt_edge.source.contract import SeenUnit, SourceSettings
 from hvt_edge.source.live import CameraPacket, Shot, SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_edge.video.encoders.passthrough import measure_camera
@@ -290,7 +290,9 @@ def test_a_picture_size_that_changes_within_the_first_connection_is_told_of(unit
     failures = Failures(time.time_ns)
     grabber, told = Turning([*units, *units, *turned]), False
     decoder, shown = BaseDecoder(), []
-    with CodedLiveSource(grabber, size=lambda size: size, fit="letterbox", failures=failures) as source:
+    with CodedLiveSource(
+        grabber, SourceSettings(size=lambda size: size, fps=15), failures=failures
+    ) as source:
         for frame in source.steps(start_ns=0):
             shown += [] if frame is None else [decoder.decode(frame.camera_unit.data)]
             said = [one.reason for one in failures.parts]

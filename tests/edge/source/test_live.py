@@ -15,12 +15,15 @@ from hvt_common.errors import NotYetError
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_edge.source import live
+from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.live import CameraClock, LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.resample import Gate
 from programs.rtsp_camera import RtspCamera
 
 MS = 1_000_000
+
+SMALL = SourceSettings(size=(64, 64), fps=25)
 
 
 @pytest.fixture
@@ -116,7 +119,7 @@ class SaysItsTimeLater:
 def test_a_camera_that_was_away_and_says_other_times_stops_no_picture(quick):
     """No frame would be due for four seconds, and units that are passed through would go back in time."""
     camera = SaysItsTimeLater()
-    with LiveSource(camera, size=(64, 64), fps=25, fit="letterbox", clock=lambda: camera.now_ns) as source:
+    with LiveSource(camera, SMALL, clock=lambda: camera.now_ns) as source:
         assert camera.ended.wait(60)
         assert source.passed_over == 0
         (*_, newest) = (next(source.steps(start_ns=0)) for _ in range(source.pending))
@@ -191,7 +194,7 @@ def test_an_error_that_nobody_expects_of_a_camera_costs_its_pictures_alone(monke
     camera, failures, waits = Faulty(ValueError("no such layout")), Failures(time.time_ns), []
     if where == "picture":
         monkeypatch.setattr(camera, "grab", raising_pictures(camera.grab))
-    with LiveSource(camera, size=lambda size: size, fps=25, fit="letterbox", failures=failures) as source:
+    with LiveSource(camera, SourceSettings(size=lambda size: size, fps=25), failures=failures) as source:
         for frame in source.steps(start_ns=0):
             waits += [] if frame is None else [frame.index]
             if source.restarts and len(waits) > 5:
@@ -217,7 +220,7 @@ def test_a_camera_whose_first_picture_fails_in_an_odd_way_is_waited_for():
     with pytest.raises(
         NotYetError, match=r"cam opens but delivers no picture \(ValueError: no such layout\)"
     ):
-        LiveSource(camera, size=(64, 64), fps=25, fit="letterbox")
+        LiveSource(camera, SMALL)
 
 
 def raising_pictures(grab):
@@ -267,7 +270,7 @@ def test_frames_that_come_in_bursts_are_all_taken_at_the_times_of_their_stamps()
     """Over UDP through a radio two of three frames would be lost, and the others seem to stand and leap."""
     camera, times = Bursts(), []
     with LiveSource(
-        camera, size=lambda size: size, fps=30, fit="letterbox", clock=lambda: camera.now_ns
+        camera, SourceSettings(size=lambda size: size, fps=30), clock=lambda: camera.now_ns
     ) as source:
         steps = source.steps(start_ns=0)
         for _ in range(6):

@@ -26,6 +26,7 @@ from av.video.reformatter import Interpolation
 
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.clock import SteadyClock
+from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.decoding import container
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.folder import sequence_files
@@ -492,7 +493,7 @@ def test_a_stream_that_is_joined_between_two_keyframes_plays_from_the_next(tmp_p
 
 def test_closing_ends_a_reader_that_waits(http_stream):
     """Ctrl-C would hang while the camera is silent."""
-    source = LiveSource(StreamGrabber(http_stream), size=(320, 180), fps=15, fit="letterbox")
+    source = LiveSource(StreamGrabber(http_stream), SourceSettings(size=(320, 180), fps=15))
     closer = threading.Timer(0.3, source.close)
     closer.start()
     list(source.frames(start_ns=0))

@@ -16,8 +16,10 @@ from hvt_common.values import Frame, Still, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import Candidate, TrackMemory
+from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox, OutboxSettings, OutboxStill
 from hvt_edge.stills.policy.base import CostModel, Request, Step
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Gate, Suppression
@@ -66,14 +68,18 @@ class Rig:
         view = View.fitted(SIZE, SIZE, fit="letterbox")
         self.steps: list[tuple[Sequence[Candidate], Step]] = []
         self.outbox = Outbox(OutboxSettings(max_pending=3))
+        shared = {
+            "outbox": self.outbox,
+            "maker": maker or StillMaker(),
+            "view": view,
+            "class_names": ("car",),
+        }
         self.chooser = Chooser(
             method or ByScore(),
-            outbox=self.outbox,
             suppression=Suppression.for_cooldown(cooldown),
-            maker=maker or StillMaker(),
             memory=self.memory,
-            view=view,
-            class_names=("car",),
+            on_demand=OnDemand(FrameRing(RingSettings(max_bytes=0)), line=None, **shared),
+            **shared,
             settings=ChooserSettings(fps=3, most_bytes=most_bytes, **settings),
             on_outcome=lambda outcome, reason: self.outcomes.update([(outcome, reason)]),
             observe=lambda candidates, step: self.steps.append((candidates, step)),

@@ -124,7 +124,6 @@ def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
             operating=rig.operating,
             session_id=7,
             keyframes=rig.keyframes,
-            on_demand=None,
             chooser=None,
             make_method=method,
             backlog=backlog,
@@ -141,11 +140,11 @@ def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
     rig.fly(0, 7)
     rig.report()
     rig.fly(7, 50, linked=False)
-    eventually(lambda: rig.backlog.numbers.stills >= 2, within_s=10, what="stills are kept")
+    eventually(lambda: rig.backlog.worker.numbers.stills >= 2, within_s=10, what="stills are kept")
     assert ask(rig.backlog) == ""
     rig.linked = True
     rig.finish()
-    assert rig.backlog.numbers.empty
+    assert rig.backlog.worker.numbers.empty
     kinds = [header.kind for header, _ in rig.out.backlog]
     assert kinds.index("still") > max(n for n, kind in enumerate(kinds) if kind == "base")
     rig.backlog.close()

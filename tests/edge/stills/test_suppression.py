@@ -138,7 +138,7 @@ def test_memory_tells_starts_sends_and_feedback():
     assert first.box_source_px == pytest.approx((150, 300, 270, 390))
     assert first.area_share == pytest.approx(80 * 60 / (1280 * 720))
     assert first.crop_area_px == pytest.approx(120 * 1.3 * 90 * 1.3, rel=0.03)
-    memory.record_sent(7, frame_index=5, now_ns=5 * SECOND, area_px=first.area_px)
+    memory.record_sent(first, frame_index=5, now_ns=5 * SECOND)
     memory.record_feedback(7, class_name="minivan", confidence=0.6, entropy_nats=1.1)
     memory.record_refused(7, now_ns=6 * SECOND)
     memory.record_feedback(8, class_name="ghost", confidence=0.6, entropy_nats=1.1)
@@ -176,7 +176,9 @@ def test_memory_forgets_the_dead():
     """An edge that flies for hours would grow without end."""
     memory = TrackMemory(forget_s=10.0, max_tracks=50)
     box = (100.0, 200.0, 180.0, 260.0)
-    memory.observe(tracks(0, dict.fromkeys(range(1, 41), box)), now_ns=0)
+    gone, *_ = memory.candidates(
+        tracks(0, dict.fromkeys(range(1, 41), box)), view=VIEW, class_names=(), now_ns=0
+    )
     assert len(memory) == 40
     memory.observe(tracks(1, {99: box}), now_ns=10 * SECOND)
     assert len(memory) == 41
@@ -184,7 +186,7 @@ def test_memory_forgets_the_dead():
     assert len(memory) == 1
     memory.observe(tracks(3, dict.fromkeys(range(100, 200), box)), now_ns=11 * SECOND)
     assert len(memory) == 50
-    memory.record_sent(1, frame_index=0, now_ns=0, area_px=1.0)
+    memory.record_sent(gone, frame_index=0, now_ns=0)
     assert len(memory) == 50
 
 

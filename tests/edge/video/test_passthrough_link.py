@@ -71,9 +71,7 @@ class Flight:
         self.reconfiguration = make_reconfiguration(
             self.operating, config, SIZE, self.transmitter, pacer=self.pacer
         )
-        rates = make_camera_rates(
-            config, stream, reconfiguration=self.reconfiguration, operating=self.operating, pacer=self.pacer
-        )
+        rates = make_camera_rates(config, stream, self.reconfiguration)
         self.stage = PassthroughStage(
             Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=stream.keyframe_s)),
             self.transmitter,
@@ -195,7 +193,7 @@ def test_a_budget_that_was_lowered_too_far_can_be_raised_again(adapt):
     assert got[8:15] == [0] * 7, "no window of 60 kbps holds its keyframes"
     assert got[:5] == [FPS] * 5
     assert got[18:] == [FPS] * 12
-    assert flight.transmitter.total_bps > 300_000
+    assert flight.transmitter.budget.total_bps > 300_000
 
 
 def test_without_reports_all_goes_out():

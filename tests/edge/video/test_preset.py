@@ -99,7 +99,7 @@ def test_a_step_opens_x265_at_the_same_rates_and_video_goes_on():
         operating,
         reconfiguration_settings(config, (320, 192)),
         open_encoder=encoder_opener(config, operating, size=(320, 192), headroom=1.0, presets=control),
-        transmitter=SimpleNamespace(set_rates=lambda *_rates, **_when: None),
+        budget=SimpleNamespace(set_total=lambda *_rates, **_when: None),
         split=None,
         presets=control,
     )

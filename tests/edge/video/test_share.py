@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_edge.operating import Levers, Operating
+from hvt_edge.operating import Levers, Operating, Rates
 from hvt_edge.perception.candidates import Candidate, ClassPosterior
 from hvt_edge.perception.crop import BaseLoss
 from hvt_edge.stills.policy.base import CostEstimate, Step
@@ -197,15 +197,15 @@ def test_reconfiguration_tells_the_split_how_many_frames_are_coded():
         ReconfigurationSettings(
             size=(1280, 720), nominal_fps=15, least_fps=2, edge_id="e", metadata_bps=0, min_budget_bps=50_000
         ),
-        open_encoder=lambda **rates: opened.append(rates),
-        transmitter=SimpleNamespace(set_rates=lambda *_rates, **_when: None),
+        open_encoder=opened.append,
+        budget=SimpleNamespace(set_total=lambda *_rates, **_when: None),
         split=split(300_000, most_sparse_share=0.9),
     )
     operating.pull(Levers(stills=False))
     reconfiguration.observe([], moment(0))
     for decimation, share in ((2, 0.9), (1, 1.0)):
         reconfiguration(decimation, SECOND)
-        assert opened[-1] == {"total_bps": 300_000, "base_bps": share * 300_000, "decimation": decimation}
+        assert opened[-1] == Rates(300_000, share * 300_000, decimation)
 
 
 def test_what_stills_leave_while_they_pause_goes_back_to_the_base():
@@ -217,8 +217,8 @@ def test_what_stills_leave_while_they_pause_goes_back_to_the_base():
     reconfiguration = EncoderReconfiguration(
         operating,
         bounds,
-        open_encoder=lambda **_rates: pytest.fail("only a keyframe opens it"),
-        transmitter=None,
+        open_encoder=lambda _rates: pytest.fail("only a keyframe opens it"),
+        budget=None,
         split=split(300_000, metadata_bps=8_000),
     )
     crowd = [car(number, lost=0.9, side=90) for number in range(1, 9)]

@@ -226,7 +226,7 @@ def test_a_keyframe_that_no_window_holds_is_coded_again_with_less_detail():
     tight.play(pictures)
     assert tight.kept.units
     assert BaseDecoder().decode(tight.kept.units[0]) is not None
-    assert tight.ledger.worst_window_bps.total <= tight.stage.transmitter.total_bps
+    assert tight.ledger.worst_window_bps.total <= tight.stage.transmitter.budget.total_bps
     assert tight.failures.parts == ()
 
 
@@ -239,7 +239,7 @@ def test_what_has_room_nowhere_is_left_out_said_and_followed_by_a_keyframe():
     (part,) = rig.failures.parts
     assert (part.part, part.working, part.count) == ("video", False, 3)
     assert "raise --budget, or lower --size" in part.reason
-    rig.stage.transmitter.set_rates(800_000, 400_000, 15, now_ns=START_NS)
+    rig.stage.transmitter.budget.set_total(800_000, 400_000, 15, now_ns=START_NS)
     rig.play(pictures)
     assert BaseDecoder().decode(rig.kept.units[0]) is not None, "it begins with a keyframe"
     assert rig.failures.parts[0].working

@@ -24,6 +24,7 @@ from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_edge.config import EdgeConfig
 from hvt_edge.loop.pose import open_pose
+from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.live import LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_edge.world import World
@@ -218,7 +219,7 @@ def read_keys(path: str) -> object:
         pytest.param(lambda: open_source("/dev/video97", size=(64, 64), fps=5), NotYetError, id="no device"),
         pytest.param(lambda: open_source("/dev/null", size=(64, 64), fps=5), UserError, id="no camera"),
         pytest.param(
-            lambda: LiveSource(Silent(), size=(64, 64), fps=5, fit="stretch"),
+            lambda: LiveSource(Silent(), SourceSettings(size=(64, 64), fps=5)),
             NotYetError,
             id="no picture yet",
         ),

@@ -17,7 +17,7 @@ from hvt_scene import Scene
 from hvt_scene.truth import Truth
 from hvt_study.cli import main
 from hvt_study.commands.detect import print_score
-from hvt_study.metrics.operating_point import calibration_error
+from hvt_study.metrics.operating_point import along_line, calibration_error, chance_error, fitted_line
 
 CLASSES = "car,van,truck,bus,motor,pedestrian,other"
 
@@ -258,3 +258,26 @@ def test_calibration_error_of_known_confidences() -> None:
     assert calibration_error(sure, right) == pytest.approx(0)
     assert calibration_error(sure, ~right) == pytest.approx(0.5)
     assert np.isnan(calibration_error(sure[:0], right[:0]))
+
+
+def test_the_line_of_the_others_is_what_makes_their_scores_true() -> None:
+    """Whether a calibration holds beyond its own sets could not be told."""
+    sure = np.repeat([0.2, 0.5, 0.8], 1000)
+    right = np.concatenate([np.arange(1000) < share for share in (59, 500, 941)])  # slope 2: twice as sure
+    slope, shift = fitted_line(sure, right)
+    assert (slope, shift) == (pytest.approx(2, abs=0.01), pytest.approx(0, abs=0.01))
+    assert calibration_error(along_line(sure, (slope, shift)), right) < 0.01 < calibration_error(sure, right)
+    assert along_line(sure, fitted_line(sure, sure > 0)).min() > 0.99, "all are right"
+    assert chance_error(sure) < 0.02 < chance_error(sure[::100]), "thirty boxes tell little"
+
+
+def test_of_several_sets_each_is_measured_with_the_line_of_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A figure of all sets together hides the one that is off."""
+    sets = [draw(tmp_path / name, moments=1) for name in "ab"]
+    assert main(["detect", *map(str, sets), "--out", str(tmp_path / "out"), "--provider", "cpu"]) == 0
+    cells = (line.split() for line in capsys.readouterr().out.splitlines())
+    rows = {one[1]: one[3::2] for one in cells if len(one) > 1 and one[1] in "ab"}
+    assert rows["a"] == rows["b"], "both hold the same picture"
+    assert len(rows["a"]) == 4, "boxes, error, error with the line of the other, error by chance"

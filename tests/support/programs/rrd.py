@@ -28,6 +28,8 @@ class ReadBox:
     label: str
     """Empty where there is none."""
     doubted: bool = False
+    word: str = ""
+    """What the viewer calls it."""
 
 
 class Recording:
@@ -119,11 +121,12 @@ class Recording:
         centres = self.latest(entity, f"{shape}:centers", frame) or []
         halves = self.latest(entity, f"{shape}:half_sizes", frame) or []
         before = self.latest(entity, "class_before", frame) or []
-        after = self.latest(entity, f"{shape}:class_ids", frame) or []
+        after = self.latest(entity, "class_now", frame) or []
+        shown = self.latest(entity, f"{shape}:class_ids", frame) or []
         confidences = self.latest(entity, "confidence_pct", frame) or []
         origins = self.latest(entity, "origin", frame) or [None] * len(ids)
         names = self._class_names(entity)
-        rows = zip(ids, centres, halves, before, after, confidences, origins, strict=True)
+        rows = zip(ids, centres, halves, before, after, shown, confidences, origins, strict=True)
         return {
             track: ReadBox(
                 box_px=(c[0] - h[0], c[1] - h[1], c[0] + h[0], c[1] + h[1]),
@@ -135,8 +138,9 @@ class Recording:
                 origin=origin,
                 label=words.get(track, ("",))[0],
                 doubted=layer == "doubted",
+                word=names[w],
             )
-            for track, c, h, b, a, p, origin in rows
+            for track, c, h, b, a, w, p, origin in rows
         }
 
     def _class_names(self, entity: str) -> dict[int, str]:

@@ -86,7 +86,6 @@ class Rig:
             operating=self.operating,
             session_id=SESSION,
             keyframes=self.keyframes,
-            on_demand=self.on_demand,
             chooser=self.chooser,
             make_method=method,
             backlog=None,
@@ -112,7 +111,7 @@ class Rig:
             pixels = picture(self.index)
             base = cv2.blur(cv2.resize(pixels, BASE, interpolation=cv2.INTER_AREA), (31, 31))
             tracks = tracks_at(self.index, {5: self.box(self.index)})
-            coded = not self.sender.leaves_out(self.now_ns)
+            coded = not self.budget.leaves_out(self.now_ns)
             seen = AnalyzedFrame(
                 Frame(self.index, self.now_ns, pixels, base), base if coded else None, tracks, detected=others
             )

@@ -211,17 +211,12 @@ class Rig:
             has_ground=self._has_ground,
             has_subscriber=lambda: self.watched,
             failures=self.failures,
-            session_id=session_id,
-            transmitter=self.sender,
             keyframes=self.keyframes,
             inbox=inbox or FeedbackInbox(),
             reconfiguration=make_reconfiguration(self.operating, config, SIZE, self.sender, pacer=pacer),
             clock=lambda: self.now_ns,
-            pacer=pacer,
             in_flight=self.in_flight,
-            outbox=self.outbox,
             stills=self.stills,
-            backlog=self.backlog,
         )
         self.before_link: Callable[[], None] = lambda: None
         """Called before the edge is told whether anybody is there."""
@@ -330,7 +325,7 @@ def link_of(sender: Transmitter, outbox: Outbox) -> BacklogLink:
         allowance_bytes=lambda now_ns, reserve: sender.backlog_allowance_bytes(now_ns, reserve=reserve),
         send=lambda chunk, now_ns: sender.backlog(chunk, now_ns=now_ns),
         round_trip_ns=lambda: sender.round_trip_ns,
-        total_bps=lambda: sender.total_bps,
+        total_bps=lambda: sender.budget.total_bps,
         stills_pending=lambda: outbox.any_pending,
         stills_in_flight=lambda: outbox.unacknowledged,
     )

@@ -30,6 +30,7 @@ from hvt_edge.config import EdgeConfig, check, check_rate
 from hvt_edge.control.link_control import LinkControl
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.operating import Rates
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
@@ -37,7 +38,7 @@ from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_byt
 from hvt_edge.video.encoders.registry import Encoder
 from hvt_edge.video.rate_model import LimitedFrameSkip
 from hvt_edge.wiring.link import make_budget, make_pacer
-from hvt_edge.wiring.video import first_decimation, make_encoder, make_frame_skip
+from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, make_frame_skip
 from rigs.kept import INFO
 from rigs.messages import feedback
 from rigs.world import make_base_stage, make_operating, make_reconfiguration, make_transmitter
@@ -199,7 +200,7 @@ class LiveFlight:
             config,
             size,
             self.transmitter,
-            open_encoder=lambda **rates: self._opened(size, **rates),
+            open_encoder=lambda rates: self._opened(size, rates),
             pacer=self.pacer,
         )
         self.backlog = None
@@ -226,23 +227,18 @@ class LiveFlight:
         self.link_control = LinkControl(
             has_ground=lambda: self.second >= self.joins_s,
             has_subscriber=lambda: False,
-            session_id=1,
-            transmitter=self.transmitter,
             keyframes=self.keyframes,
             inbox=FeedbackInbox(),
             reconfiguration=reconfiguration,
             clock=self._clock,
-            pacer=self.pacer,
             in_flight=in_flight,
-            outbox=outbox,
             stills=StillSender(
                 outbox, maker=StillMaker(), transmitter=self.transmitter, backlog=self.backlog
             ),
-            backlog=self.backlog,
             failures=self.failures,
         )
         self.stage = make_base_stage(
-            self._opened(size, total_bps=config.budget_bps, base_bps=config.base_bps, decimation=decimation),
+            self._opened(size, first_rates(config, decimation)),
             self.transmitter,
             keyframes=self.keyframes,
             first_keyframe_bytes=config.base_bps // 40,
@@ -265,17 +261,16 @@ class LiveFlight:
     def _clock(self) -> int:
         return self.now_ns
 
-    def _opened(self, size: tuple[int, int], *, total_bps: int, base_bps: int, decimation: int) -> Encoder:
+    def _opened(self, size: tuple[int, int], rates: Rates) -> Encoder:
         config = self.config
         if self.pictures[0] is not _PIXELS:
-            rates = {"total_bps": total_bps, "base_bps": base_bps, "decimation": decimation}
-            return make_encoder(config, size=size, preset="ultrafast", **rates)
+            return make_encoder(config, rates, size=size, preset="ultrafast")
         asked = encoder_settings(
             size=size,
-            fps=config.nominal_fps / decimation,
+            fps=config.nominal_fps / rates.decimation,
             preset=config.preset,
-            total_bps=max(total_bps - config.metadata_bps, base_bps),
-            base_bps=base_bps,
+            total_bps=max(rates.total_bps - config.metadata_bps, rates.base_bps),
+            base_bps=rates.base_bps,
             edge_id=config.edge_id,
             window_s=config.window,
         )
@@ -375,12 +370,7 @@ class LiveFlight:
             self.rates.append((self.second, self.pacer.rate_bps))
 
     def _status(self) -> None:
-        class Report:
-            @staticmethod
-            def pack() -> bytes:
-                return bytes(330)
-
-        self.transmitter.status(lambda _: Report(), now_ns=self.now_ns)  # type: ignore[arg-type,return-value]
+        self.transmitter.metadata(Channel.STATUS, lambda _: bytes(330), now_ns=self.now_ns)
 
     def _command(self, budget_bps: int) -> None:
         now = self.operating.now

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from functools import partial
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader, RoiHeader
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import View
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
@@ -18,7 +20,7 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import Operating
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
-from hvt_edge.perception.frame_ring import FrameRing
+from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
@@ -79,6 +81,7 @@ def make_transmitter(
 def make_base_stage(encoder: Any, transmitter: Transmitter, **parts: Any) -> BaseStage:
     """Of this encoder, without a copy and without a store."""
     plain = {"keyframes": Keyframes(), "local_copy": None, "first_keyframe_bytes": 5000}
+    plain["failures"] = Failures(time.time_ns)
     return BaseStage(encoder, transmitter=transmitter, **(plain | parts))
 
 
@@ -99,7 +102,7 @@ def make_reconfiguration(
     """Of a real encoder, with fixed shares."""
     plain = {"open_encoder": partial(make_encoder, config, size=size), "split": None, "pacer": None}
     settings = reconfiguration_settings(config, size)
-    return EncoderReconfiguration(operating, settings, transmitter=transmitter, **(plain | parts))
+    return EncoderReconfiguration(operating, settings, budget=transmitter.budget, **(plain | parts))
 
 
 def make_still_stage(
@@ -122,11 +125,10 @@ def make_still_stage(
     Grounds may request stills of what ``ring`` holds.
     """
     outbox, maker = Outbox() if outbox is None else outbox, maker or StillMaker()
-    on_demand = None
-    if ring is not None:
-        on_demand = OnDemand(
-            ring, outbox=outbox, maker=maker, view=view, class_names=class_names, line=transmitter
-        )
+    ring = FrameRing(RingSettings(max_bytes=0)) if ring is None else ring
+    on_demand = OnDemand(
+        ring, outbox=outbox, maker=maker, view=view, class_names=class_names, line=transmitter
+    )
     chooser = Chooser(
         method("M1"),
         outbox=outbox,
@@ -142,9 +144,7 @@ def make_still_stage(
     return StillStage(
         analyzer,
         chooser,
-        outbox=outbox,
         sender=StillSender(outbox, maker=maker, transmitter=transmitter, backlog=backlog),
-        transmitter=transmitter,
         keyframes=keyframes,
         reporter=reporter,
     )

@@ -3,11 +3,11 @@
 Not libswscale: its default rounding shifts levels by about two, and crops of odd sizes lose a column of chroma. A
 picture here is one uint8 array as FFmpeg lays out ``yuv420p``: (3/2 H, W), luma above, then Cb and Cr. H and W are
 multiples of `BLOCK_PX`; what is beyond the crop repeats its last row and column.
-
-Floats of 64 bits hold these whole numbers exactly, and multiply them faster than numpy's integers.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -21,12 +21,12 @@ BLOCK_PX = 16
 Planar = npt.NDArray[np.uint8]
 """(3/2 H, W) uint8, the planes Y, Cb and Cr one after the other."""
 
-_Floats = npt.NDArray[np.float64]
+_Whole = npt.NDArray[np.int32]
+"""Levels, their differences and sums; no product below leaves its range."""
 
-# 2^16 times ITU-R BT.601 with full range (JFIF), rows Y, Cb, Cr, columns B, G, R.
-_FORWARD = np.array([[7471, 38470, 19595], [32768, -21709, -11059], [-5329, -27439, 32768]], np.float64)
-# 2^16 times its inverse, rows B, G, R, columns Y, Cb, Cr.
-_BACK = np.array([[65536, 116130, 0], [65536, -22554, -46802], [65536, 0, 91881]], np.float64)
+# 2^16 times ITU-R BT.601 with full range (JFIF), each of B, G, R.
+_LUMA = 7471, 38470, 19595
+_CHROMA = (32768, -21709, -11059), (-5329, -27439, 32768)
 _GREY = 128
 
 
@@ -42,26 +42,32 @@ def to_planar(image_bgr: Image) -> Planar:
     wide, high = padded_size((width, height))
     # Repeated before the chroma is halved: a last odd column then counts twice, not with black.
     whole = cv2.copyMakeBorder(image_bgr, 0, high - height, 0, wide - width, cv2.BORDER_REPLICATE)
-    samples = cv2.transform(whole.astype(np.float64), _FORWARD)
-    luma = np.floor((samples[..., 0] + 2**15) / 2**16)
-    sums = samples[..., 1:].reshape(high // 2, 2, wide // 2, 2, 2).sum(axis=(1, 3))
-    chroma = np.floor((sums + 2**17) / 2**18) + _GREY
-    planar = np.concatenate((luma.ravel(), *chroma.reshape(-1, 2).T))
-    return np.asarray(np.clip(planar, 1, 255), np.uint8).reshape(high * 3 // 2, wide)
+    channels = [channel.astype(np.int32) for channel in cv2.split(whole)]
+    planar = np.empty((high * 3 // 2, wide), np.uint8)
+    luma, *chroma = _planes(planar)
+    luma[:] = np.maximum(_weighted(channels, _LUMA) + 2**15 >> 16, 1)
+    sums = [pairs[:, ::2] + pairs[:, 1::2] for pairs in (one[::2] + one[1::2] for one in channels)]
+    for plane, weights in zip(chroma, _CHROMA, strict=True):
+        plane[:] = np.clip((_weighted(sums, weights) + 2**17 >> 18) + _GREY, 1, 255)
+    return planar
+
+
+def _weighted(channels: Sequence[_Whole], weights: tuple[int, int, int]) -> _Whole:
+    blue, green, red = (one * weight for one, weight in zip(channels, weights, strict=True))
+    return blue + green + red
 
 
 def to_bgr(planar: Planar, *, size: tuple[int, int]) -> Image:
     """The picture again, cut to ``size`` (width, height)."""
-    luma, *chroma = _planes(planar)
-    samples = _bgr(luma.astype(np.float64), [plane.astype(np.float64) - _GREY for plane in chroma])
-    return np.asarray(np.clip(samples[: size[1], : size[0]], 0, 255), np.uint8)
+    luma, *chroma = (plane.astype(np.int32) for plane in _planes(planar))
+    samples = _bgr(luma, *(plane - _GREY for plane in chroma), size=size)
+    return np.asarray(np.clip(samples, 0, 255), np.uint8)
 
 
-def difference_bgr(planar: Planar, other: Planar, *, size: tuple[int, int]) -> _Floats:
-    """``planar - other`` as BGR, whole levels as float64 (H, W, 3), cut to ``size``; 0 where both are equal."""
+def difference_bgr(planar: Planar, other: Planar, *, size: tuple[int, int]) -> _Whole:
+    """``planar - other`` as BGR, (H, W, 3) in levels, cut to ``size``; 0 where both are equal."""
     pairs = zip(_planes(planar), _planes(other), strict=True)
-    luma, *chroma = (one.astype(np.float64) - two for one, two in pairs)
-    return _bgr(luma, chroma)[: size[1], : size[0]]
+    return _bgr(*(np.subtract(one, two, dtype=np.int32) for one, two in pairs), size=size)
 
 
 def filled_outside(planar: Planar, filling: Planar, *, size: tuple[int, int]) -> Planar:
@@ -80,17 +86,19 @@ def _planes(planar: Planar) -> tuple[Planar, Planar, Planar]:
     return planar[:high], chroma[0], chroma[1]
 
 
-def _bgr(luma: _Floats, chroma: list[_Floats]) -> _Floats:
-    # Whole levels, rounded half up.
-    samples = np.stack([16 * luma, *map(_enlarged, chroma)], axis=-1)
-    return np.asarray(np.floor((cv2.transform(samples, _BACK) + 2**19) / 2**20), np.float64)
+def _bgr(luma: _Whole, cb: _Whole, cr: _Whole, *, size: tuple[int, int]) -> _Whole:
+    # Rounded half up: the inverse of the above, 2^16 times, of 16 times the levels.
+    wide, high = size
+    y, cb, cr = (one[:high, :wide] for one in ((luma << 20) + 2**19, _enlarged(cb), _enlarged(cr)))
+    bgr = (y + 116130 * cb) >> 20, (y - 22554 * cb - 46802 * cr) >> 20, (y + 91881 * cr) >> 20
+    return np.asarray(cv2.merge(bgr), np.int32)
 
 
-def _enlarged(plane: _Floats) -> _Floats:
+def _enlarged(plane: _Whole) -> _Whole:
     # 16 times the plane in twice its width and height: 3 parts of the nearest sample, 1 of the next, both ways.
-    for axis in (0, 1):
-        plane = np.moveaxis(plane, axis, 0)
+    for _ in range(2):
         padded = np.concatenate((plane[:1], plane, plane[-1:]))
-        twice = np.stack((3 * plane + padded[:-2], 3 * plane + padded[2:]), axis=1)
-        plane = np.moveaxis(twice.reshape(-1, *plane.shape[1:]), 0, axis)
-    return np.ascontiguousarray(plane)
+        twice = np.empty((2 * plane.shape[0], plane.shape[1]), np.int32)
+        twice[::2], twice[1::2] = 3 * plane + padded[:-2], 3 * plane + padded[2:]
+        plane = twice.T
+    return plane

@@ -17,8 +17,6 @@ from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.link.budget import BASE_PEAK
-from hvt_edge.link.pacer import Pacer
-from hvt_edge.operating import Operating
 from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoders.qualification import Allowed, Measured, line_bytes
 from hvt_edge.video.reconfigure import EncoderReconfiguration
@@ -151,7 +149,7 @@ class LeastLink:
 class CameraRates:
     """Called before each of the camera's keyframes for the link, in place of `EncoderReconfiguration`.
 
-    What a ground has commanded holds from there on, before it is asked whether there is room. The floor of ``pacer``
+    What a ground has commanded holds from there on, before it is asked whether there is room. The floor of the pacer
     becomes what the camera needs, as far as the budget goes. ``needed(window_bytes)`` says how much that is;
     ``least_bps`` is ``--min-budget``, and ``surveyed_bytes`` the fullest window before the flight.
     """
@@ -160,19 +158,13 @@ class CameraRates:
         self,
         reconfiguration: EncoderReconfiguration,
         *,
-        operating: Operating,
-        pacer: Pacer | None,
         needed: Callable[[int], int],
         least_bps: int,
         surveyed_bytes: int,
         window_ns: int,
-        edge_id: str,
     ) -> None:
         self._reconfiguration = reconfiguration
-        self._operating = operating
-        self._pacer = pacer
         self._needed, self._least_bps, self._surveyed_bytes = needed, least_bps, surveyed_bytes
-        self._edge_id = edge_id
         self._window = FullestWindow(window_ns)
         self._newest_bytes = self._former_bytes = 0
         self._since_ns: int | None = None
@@ -180,7 +172,8 @@ class CameraRates:
     def observe(self, unit: AccessUnit) -> None:
         """Take in each unit of the camera, sent or not."""
         at_ns = unit.capture_ns
-        held_bytes = self._window.add(line_bytes(len(unit.data), self._edge_id), at_ns=at_ns)
+        size_bytes = line_bytes(len(unit.data), self._reconfiguration.settings.edge_id)
+        held_bytes = self._window.add(size_bytes, at_ns=at_ns)
         if self._since_ns is None or not 0 <= at_ns - self._since_ns < _MEMORY_NS:
             self._former_bytes, self._newest_bytes, self._since_ns = self._newest_bytes, 0, at_ns
         self._newest_bytes = max(self._newest_bytes, held_bytes)
@@ -188,12 +181,13 @@ class CameraRates:
     def __call__(self, decimation: int, now_ns: int) -> None:
         """The next unit is a keyframe, and was observed."""
         self._reconfiguration(decimation, now_ns)  # which may take a command
-        if self._pacer is None:
+        pacer = self._reconfiguration.pacer
+        if pacer is None:
             return
-        before_bps, budget_bps = self._pacer.rate_bps, self._operating.now.budget_bps
+        before_bps, budget_bps = pacer.rate_bps, self._reconfiguration.operating.now.budget_bps
         fullest_bytes = max(self._surveyed_bytes, self._former_bytes, self._newest_bytes)
         floor_bps = min(budget_bps, max(self._least_bps, self._needed(fullest_bytes)))
-        self._pacer.set_ceiling(budget_bps, floor_bps=floor_bps)
-        if self._pacer.rate_bps != before_bps:
+        pacer.set_ceiling(budget_bps, floor_bps=floor_bps)
+        if pacer.rate_bps != before_bps:
             self._reconfiguration(decimation, now_ns)
         self._reconfiguration.track_link(now_ns)

@@ -54,7 +54,8 @@ class Identity:
 
     track_ids: tuple[int, ...] = ()
     classes_before: tuple[str, ...] = ()
-    classes_after: tuple[str, ...] = ()
+    classes_now: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
     levels: tuple[int, ...] = ()
     """Levels of `BRIGHTNESS`."""
 
@@ -250,7 +251,7 @@ def _held(screen: _Screen, overlay: Overlay) -> _Screen:
 
 
 def _layers(overlay: Overlay, screen: _Screen) -> Iterator[tuple[Layer, dict[str, Any]]]:
-    reported, doubted = _reported(overlay), overlay.doubted
+    reported, doubted, words = _reported(overlay), overlay.doubted, overlay.words
     of_layer: dict[Layer, npt.NDArray[np.bool_]] = {
         "tracks": ~overlay.refined & ~reported & ~doubted,
         "reported": ~overlay.refined & reported & ~doubted,
@@ -265,6 +266,7 @@ def _layers(overlay: Overlay, screen: _Screen) -> Iterator[tuple[Layer, dict[str
                 tuple(overlay.track_ids[mask].tolist()),
                 tuple(overlay.base_classes[row] for row in rows),
                 tuple(overlay.classes[row] for row in rows),
+                tuple(words[row] for row in rows),
                 tuple(screen.levels[mask].tolist()),
             ),
             "confidences": tuple(screen.percents[mask].tolist()),
@@ -295,14 +297,14 @@ def _reported(overlay: Overlay) -> npt.NDArray[np.bool_]:
 
 def _labels(overlay: Overlay, screen: _Screen, size: tuple[int, int], chosen: Container[int]) -> list[Label]:
     # Labels of the tracks that a still renamed or doubts, or that were chosen, as far as there is room.
-    reported = _reported(overlay)
+    reported, shown = _reported(overlay), overlay.words
     words = []
     for row, track_id in enumerate(screen.ids.tolist()):
         renamed = overlay.base_classes[row] != overlay.classes[row]
         if not renamed and track_id not in chosen:
             continue
         mark = f" {REPORTED_MARK}" if reported[row] else ""
-        name = f"{overlay.base_classes[row]}?" if overlay.doubted[row] else overlay.classes[row]
+        name = f"{overlay.base_classes[row]}?" if overlay.doubted[row] else shown[row]
         certain = " ✓" if screen.levels[row] == _SURE else ""
         words.append(Word(row, f"{track_id} {name}{certain}{mark}"))
     centres, halves = screen.boxes[:, :2].astype(np.float64), screen.boxes[:, 2:].astype(np.float64)
@@ -315,7 +317,7 @@ def _label_components(overlay: Overlay, screen: _Screen, labels: Sequence[Label]
     return {
         "places": np.round(np.array([one.at_px for one in labels], np.float32).reshape(-1, 2)),
         "words": tuple(one.text for one in labels),
-        "inks": tuple((overlay.classes[one.row], int(screen.levels[one.row])) for one in labels),
+        "inks": tuple((overlay.words[one.row], int(screen.levels[one.row])) for one in labels),
     }
 
 

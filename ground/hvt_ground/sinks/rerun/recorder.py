@@ -337,9 +337,12 @@ class Recorder(SinkWriter[Event]):
         return rows
 
     def _coded(self, identity: Identity) -> CodedIdentity:
-        before = tuple(self._class_id(name, len(BRIGHTNESS) - 1) for name in identity.classes_before)
-        shown = zip(identity.classes_after, identity.levels, strict=True)
-        return CodedIdentity(identity.track_ids, before, tuple(self._class_id(*one) for one in shown))
+        before, now = (
+            tuple(self._class_id(name, len(BRIGHTNESS) - 1) for name in names)
+            for names in (identity.classes_before, identity.classes_now)
+        )
+        shown = zip(identity.words, identity.levels, strict=True)
+        return CodedIdentity(identity.track_ids, before, now, tuple(self._class_id(*one) for one in shown))
 
     def _class_id(self, name: str, level: int) -> int:
         if len(self._class_names) < MOST_CLASSES:

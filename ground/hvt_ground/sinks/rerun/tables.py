@@ -52,7 +52,8 @@ class CodedIdentity:
 
     track_ids: tuple[int, ...]
     before: tuple[int, ...]
-    after: tuple[int, ...]
+    now: tuple[int, ...]
+    words: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,10 +152,11 @@ def _shapes(shape: type[rr.Boxes2D | rr.Ellipses2D], rows: Sequence[npt.NDArray[
 
 def _identities(shape: type[rr.Boxes2D | rr.Ellipses2D], rows: Sequence[CodedIdentity]) -> Columns:
     lengths = [len(row.track_ids) for row in rows]
-    drawn = shape.columns(class_ids=np.array([i for row in rows for i in row.after], np.uint16))
+    drawn = shape.columns(class_ids=np.array([i for row in rows for i in row.words], np.uint16))
     values = rr.AnyValues.columns(
         track_id=pa.array([i for row in rows for i in row.track_ids], pa.uint32()),
         class_before=pa.array([i for row in rows for i in row.before], pa.uint16()),
+        class_now=pa.array([i for row in rows for i in row.now], pa.uint16()),
     )
     return [*drawn.partition(lengths), *values.partition(lengths)]
 

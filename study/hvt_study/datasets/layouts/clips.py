@@ -10,6 +10,7 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
+from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.folder import sequence_files
 from hvt_edge.source.resample import base_frame_count
 from hvt_edge.source.video import VideoSource
@@ -55,7 +56,8 @@ def _open_images(place: Path, images: Words[Path], options: Options) -> Sequence
 
 
 def _open(name: str, path: Path, options: Options) -> Sequence:
-    source = VideoSource(str(path), size=_ANY_SIZE, fps=NOMINAL_FPS, fit="letterbox", source_fps=options.fps)
+    settings = SourceSettings(size=_ANY_SIZE, fps=NOMINAL_FPS, source_fps=options.fps)
+    source = VideoSource(str(path), settings)
     size, fps = source.view.source_size, source.source_fps
     count, shown = source.shown_frames()
     source.close()

@@ -29,10 +29,11 @@ from hvt_common.units import Limit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.session_files import SessionFiles
-from hvt_ground.sinks.palette import GREY
+from hvt_ground.sinks.palette import GREY, SKY
 from hvt_ground.sinks.rerun.joined import join_recordings
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
+from programs.rrd import Recording
 from programs.small_disk import small_disk
 
 FRAMES, SIZE, TRACKS = 60, (320, 192), 6
@@ -201,11 +202,14 @@ def test_mcap_has_video_boxes_stills_and_events(recording, events, tmp_path):
     assert all(text.text.split()[0] == one["id"] for text, one in zip(boxes.texts, facts, strict=True))
 
 
-def test_what_is_doubted_has_no_name_in_any_picture(events, tmp_path):
+@pytest.mark.parametrize(
+    ("field", "word", "colour"), [("doubted", "something", GREY), ("vague", "vehicle", SKY)]
+)
+def test_what_is_a_guess_has_the_same_word_in_each_picture(field, word, colour, events, tmp_path):
     """A guess of an unknown view bore its class in Foxglove and in the video, and none on the page."""
     settings = RecorderSettings(tmp_path / "unknown.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
     overlays = [
-        replace(one, doubted=np.ones(len(one.track_ids), np.bool_))
+        replace(one, **{field: np.ones(len(one.track_ids), np.bool_)})
         for one in events
         if isinstance(one, Overlay)
     ]
@@ -219,13 +223,13 @@ def test_what_is_doubted_has_no_name_in_any_picture(events, tmp_path):
             if channel.topic == "/uav-1/tracks"
         ]
     words = {text.text.split()[1] for one in drawn for text in one.texts}
-    assert words == {"something"}
+    assert words == {word} == {box.word for box in Recording(settings.path).boxes(4).values()}
     colours = {
         (box.outline_color.r, box.outline_color.g, box.outline_color.b) for one in drawn for box in one.points
     }
-    assert colours == {tuple(part / 255 for part in GREY)}, "nor the colour of a class"
+    assert colours == {tuple(part / 255 for part in colour)}, "nor the colour of a class"
     facts = [{fact.key: fact.value for fact in box.metadata} for one in drawn for box in one.points]
-    assert {fact["doubted"] for fact in facts} == {"1"}
+    assert {fact["doubted"] for fact in facts} == {str(int(field == "doubted"))}
     assert {fact["class"] for fact in facts} <= {"car", "van", "truck", "bus"}
 
 

@@ -127,7 +127,7 @@ def flown(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, m
     tracks = tracks_of(0, [(10, 10, 50, 40)], confidences=confidence, classes=base)
     history = History(track_frames=10)
     history.add_tracks(tracks)
-    refiner = Refiner(mode, fps=15, vocabulary=words, calibrated=calibrated)
+    refiner = Refiner(mode, fps=15, vocabulary=words, calibrated=calibrated, vague_kinds=True)
     refiner.tilt.aslant = aslant
     for sequence, posterior in enumerate(posteriors):
         still = seen(sequence, 0, posterior, (10, 10, 50, 40), edge=1, side_px=side_px)
@@ -180,6 +180,25 @@ def test_seen_aslant_no_kind_of_vehicle_has_a_check_mark():
     assert flown(words, car, base=0, confidence=0.8, aslant=True).sure.tolist() == [False]
     person = AERIAL.index("pedestrian")
     assert flown(words, walker, base=person, confidence=0.8, aslant=True).sure.tolist() == [True]
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "aslant", "vague"),
+    [
+        ("car", {}, True, False),
+        ("bus", {}, True, True),
+        ("bus", {"bus": 0.7}, True, True),
+        ("bus", {"bus": 0.97}, True, False),
+        ("bus", {}, False, False),
+        ("pedestrian", {}, True, False),
+    ],
+)
+def test_seen_aslant_only_a_car_is_called_what_the_detector_says(name, said, aslant, vague):
+    """Of trucks, vans and buses aslant three of four are something else."""
+    words = Vocabulary(AERIAL, AERIAL)
+    stills = votes(words, said) if said else []
+    shown = flown(words, *stills, base=AERIAL.index(name), confidence=0.8, aslant=aslant)
+    assert (shown.classes, shown.vague.tolist()) == ((name,), [vague])
 
 
 def test_a_toss_up_leaves_the_class_as_it_is():

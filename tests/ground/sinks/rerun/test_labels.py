@@ -181,4 +181,10 @@ def test_the_log_says_what_a_still_did(tmp_path, changes, text):
 def test_the_colours_that_are_shown_stand_in_the_legend(tmp_path):
     """A stranger would not know that blue is a car."""
     read = recorded(tmp_path / "a.rrd", overlay(), overlay(1, base_classes=("bus", "car", "car", "car")))
-    assert set(read.rows("/base/legend", "Points2D:labels")[-1][2]) == {"car", "van", "other", "bus"}
+    assert set(read.rows("/base/legend", "Points2D:labels")[-1][2]) == {
+        "car",
+        "van",
+        "other",
+        "something",
+        "bus",
+    }
