@@ -220,7 +220,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             name="edge",
         )
         flight = Flight(edge, ground, folder=folder, console=console)
-        eventually(lambda: read_timing(folder / _TIMING), within_s=60, what="video")
+        eventually(lambda: read_timing(folder / _TIMING), what="video")
         flight.watch(_CALM_S)
         for loss in _losses(disk if mounted else None, removed=removed, ground=ground, relay=relay):
             flight.lose(loss)

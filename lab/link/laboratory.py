@@ -29,7 +29,6 @@ from programs.processes import eventually, free_ports
 Carrier = Literal["relay", "netns", "tun"]
 CARRIERS: tuple[Carrier, ...] = ("relay", "netns", "tun")
 
-_START_S = 150.0
 _TAKES_IN_S = 2.5
 """How long the ground may take in what is on its way when the edge has ended."""
 
@@ -88,13 +87,13 @@ def run(wanted: Run) -> Outcome:
             *sides["ground"], sys.executable, "-m", "hvt_ground.cli", "--timing", str(timing), "--listen", listen,
             *open_to_all, *keys["ground"], "--record", str(wanted.folder / "run.rrd"), *wanted.ground_arguments,
         ]))  # fmt: skip
-        ground.until("listening on", within_s=_START_S)
+        ground.until("listening on")
         edge = stack.enter_context(Started("edge", wanted.folder, [
             *sides["edge"], sys.executable, "-m", "hvt_edge.cli", "--connect", connect, "--wait", "60s",
             *keys["edge"], "--source", wanted.source, "--budget", wanted.scenario.budget,
             "--store-folder", str(wanted.folder / "store"), *wanted.edge_arguments,
         ]))  # fmt: skip
-        eventually(lambda: _playing(edge, timing), within_s=_START_S, what="a first frame reaches the ground")
+        eventually(lambda: _playing(edge, timing), what="a first frame reaches the ground")
         began_s = link.begin()
         with ResourceSampler({"edge": edge.process.pid, "ground": ground.process.pid}) as watch:
             _wait(began_s + script.lasts_s, edge, ground)

@@ -8,9 +8,9 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import check as check_ground
 from hvt_ground.extras import config_class
+from programs.processes import PATIENT_S, eventually
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 IMAGE_PATHS = {"/opt/hvt/router.py": DEPLOY / "router.py", "/opt/hvt/zenoh": DEPLOY / "zenoh"}
@@ -112,15 +113,14 @@ def test_the_commands_do_what_the_file_promises(
 
     check = [_here(word, port=free_port, recordings=tmp_path) for word in _health(compose)]
     with start("router") as router:
-        deadline_s = time.monotonic() + 30
-        while subprocess.run([sys.executable, *check[1:]], check=False, capture_output=True).returncode:
-            assert time.monotonic() < deadline_s, "the health check never passed"
+        passed = partial(subprocess.run, [sys.executable, *check[1:]], check=False, capture_output=True)
+        eventually(lambda: passed().returncode == 0, what="the health check passes")
         with start("ground", "--quiet", "--once") as ground:
             with start("edge", "--quiet", "--wait=60s", "--max-frames=30") as edge:
-                assert edge.wait(timeout=120) == 0
-            assert ground.wait(timeout=60) == 0
+                assert edge.wait(PATIENT_S) == 0
+            assert ground.wait(PATIENT_S) == 0
         router.send_signal(signal.SIGINT)
-        assert router.wait(timeout=3) == 0
+        assert router.wait(PATIENT_S) == 0
     sent = json.loads((tmp_path / "edge.json").read_text())
     received = json.loads((tmp_path / "ground.json").read_text())
     assert 0 < sent["frames"] == received["frames_decoded"]

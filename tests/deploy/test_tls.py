@@ -5,8 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings
 from programs.fleet_keys import Fleet
+from programs.processes import eventually
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 EDGES = ("rov-1", "uav-1")
@@ -82,13 +82,6 @@ class _Ground:
             self.session.put(EdgeKeys(edge).key(Channel.FEEDBACK), text)
 
 
-def _until(true: Callable[[], object], what: str, *, within_s: float = 60.0) -> None:
-    deadline_s = time.monotonic() + within_s
-    while not true():
-        assert time.monotonic() < deadline_s, f"not in time: {what}"
-        time.sleep(0.01)
-
-
 @contextmanager
 def _router(file: Path, endpoint: str) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, str(DEPLOY / "router.py"), "--zenoh-config", str(file), "--listen", endpoint]
@@ -118,27 +111,28 @@ def test_through_a_router_each_ground_gets_what_is_its_own(fleet: Fleet, free_po
 
         edges = {name: _Edge(opened(name, "edge"), name) for name in EDGES}
         base, guest = _Ground(opened("base", "ground")), _Ground(opened("guest", "ground"))
-        _until(lambda: all(edge.wanted() for edge in edges.values()), "the streams are wanted")
-        _until(
-            lambda: all(len(edge.session.info.links()) == links for edge in edges.values()), "all links stand"
+        eventually(lambda: all(edge.wanted() for edge in edges.values()), what="the streams are wanted")
+        eventually(
+            lambda: all(len(edge.session.info.links()) == links for edge in edges.values()),
+            what="all links stand",
         )
-        _until(lambda: EdgeKeys("uav-1").key(Channel.ALIVE) in guest.came, "the guest sees the edge")
+        eventually(lambda: EdgeKeys("uav-1").key(Channel.ALIVE) in guest.came, what="the guest sees the edge")
 
         def came(ground: _Ground, names: tuple[str, ...]) -> bool:
             for edge in edges.values():  # again: that one ground wants a stream says nothing of the other
                 edge.write()
             return set(ground.came) == _all(names)
 
-        _until(lambda: came(base, EDGES), "the ground has all rows of both")
-        _until(lambda: came(guest, ("uav-1",)), "the guest has all rows of its edge, and no more")
+        eventually(lambda: came(base, EDGES), what="the ground has all rows of both")
+        eventually(lambda: came(guest, ("uav-1",)), what="the guest has all rows of its edge, and no more")
         assert base.asked(Channel.INFO) == [b"info of rov-1", b"info of uav-1"]
         assert base.asked(Channel.CONTROL) == [b"control of rov-1", b"control of uav-1"]
         assert guest.asked(Channel.INFO) == [None, b"info of uav-1"]
         assert guest.asked(Channel.CONTROL) == [None, None]
         guest.report(b"guest")
         base.report(b"base")
-        _until(lambda: b"base" in edges["rov-1"].reports, "the ground's report arrives")
-        _until(lambda: set(edges["uav-1"].reports) == {b"base", b"guest"}, "both reports arrive")
+        eventually(lambda: b"base" in edges["rov-1"].reports, what="the ground's report arrives")
+        eventually(lambda: set(edges["uav-1"].reports) == {b"base", b"guest"}, what="both reports arrive")
         assert edges["rov-1"].reports == [b"base"]
 
 
@@ -156,12 +150,12 @@ def test_direct_either_side_may_listen(fleet: Fleet, free_port: int, listens: st
         open_session(fleet.settings("uav-1", "edge", **here)) as edge_session,
     ):
         ground, edge = _Ground(ground_session), _Edge(edge_session, "uav-1")
-        _until(edge.wanted, "the streams are wanted")
+        eventually(edge.wanted, what="the streams are wanted")
         edge.write()
-        _until(lambda: set(ground.came) == _all(("uav-1",)), "all rows arrive")
+        eventually(lambda: set(ground.came) == _all(("uav-1",)), what="all rows arrive")
         assert ground.asked(Channel.CONTROL) == [None, b"control of uav-1"]
         ground.report(b"base")
-        _until(lambda: edge.reports == [b"base"], "the report arrives")
+        eventually(lambda: edge.reports == [b"base"], what="the report arrives")
 
 
 @pytest.mark.parametrize(("who", "said"), [("base", b"control of uav-1"), ("guest", None)])
@@ -176,8 +170,9 @@ def test_who_asks_by_way_of_a_ground_has_its_own_rights(
         open_session(LinkSettings("client", connect=where, zenoh_config=fleet.file(who))) as client,
     ):
         edge = _Edge(edge_session, "uav-1")
-        _until(
-            lambda: query(client, Channel.INFO, keys=edge.keys, question=b"", timeout_s=1), "info is answered"
+        eventually(
+            lambda: query(client, Channel.INFO, keys=edge.keys, question=b"", timeout_s=1),
+            what="info is answered",
         )
         answer = query(client, Channel.CONTROL, keys=edge.keys, question=b"", timeout_s=4)
         assert answer == said
@@ -213,7 +208,7 @@ def test_a_router_says_who_is_not_named(fleet: Fleet, tmp_path: Path, free_port:
             lines: list[str] = []
             stream = router.stderr
             threading.Thread(target=lambda: lines.append(stream.readline()), daemon=True).start()
-            _until(lambda: lines, "the router says it")
+            eventually(lambda: lines, what="the router says it")
             assert (
                 f"'new-1' has a certificate of this CA, but {file} does not name it: what it sends is dropped"
                 in lines[0]

@@ -13,6 +13,7 @@ from hvt_ground.events import Event, Overlay, VideoSample
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
+from programs.processes import eventually
 from rigs.flight import Flight, Port, pipeline_of
 
 TO_THE_PICTURE, TO_THE_TRACKS = 10, 12
@@ -56,14 +57,6 @@ def walk():
     threading.setprofile(None)
 
 
-def wait_until_idle(session: GroundSession) -> None:
-    """All that was handed over is analyzed."""
-    end = time.monotonic() + 30
-    while not session.idle:
-        assert time.monotonic() < end
-        time.sleep(0.005)
-
-
 def test_a_frame_walks_through_few_files(walk: Walk) -> None:
     """Who looks for a fault in the picture would have to read half the ground."""
     flight, port, sink = Flight(8), Port(), Events()
@@ -76,14 +69,14 @@ def test_a_frame_walks_through_few_files(walk: Walk) -> None:
     for index in range(7):
         edge.handle(flight.base(index))
     assert edge.session is not None
-    wait_until_idle(edge.session)
+    eventually(lambda: edge.session.idle)
     walk.files.clear()
     sink.all.clear()
     before = sys.getprofile()
     sys.setprofile(walk.profile)
     edge.handle(flight.base(7))
     sys.setprofile(before)
-    wait_until_idle(edge.session)
+    eventually(lambda: edge.session.idle)
     assert [one.frame_index for one in sink.all if isinstance(one, VideoSample | Overlay)][:2] == [7, 7]
     receiving = walk.files.pop(threading.current_thread().name)
     analyzing = set[str]().union(*walk.files.values())  # worker and detector have a thread each

@@ -76,9 +76,9 @@ def test_video_is_recorded_while_the_detector_loads_and_boxes_come_with_it(compi
     assert state.edges[0].session.tracks == 0
     assert status_text(state).endswith("detector loading")
     compiler.done.set()
-    eventually(lambda: not models.loading, within_s=20, what="loaded")
+    eventually(lambda: not models.loading, what="loaded")
     sessions.handle(flight.base(FRAMES - 1))
-    eventually(lambda: sessions.session.perceived.tracks == 1, within_s=20, what="a box")
+    eventually(lambda: sessions.session.perceived.tracks == 1, what="a box")
     assert "loading" not in status_text(maker.make([("uav-1", sessions)]))
     sessions.close()
     outputs.close()
@@ -104,13 +104,13 @@ def test_a_run_that_ends_while_the_detector_loads_still_tells_of_its_flight(
         if index == fails_before:
             compiler.error = UserError("d.onnx is not a detector")
             compiler.done.set()
-            eventually(lambda: models.error is not None, within_s=20, what="it is known")
+            eventually(lambda: models.error is not None, what="it is known")
         if index < 2:
             sessions.handle(flight.base(index))
     models.give_up()
     closing = threading.Thread(target=sessions.close, daemon=True)
     closing.start()
-    closing.join(20)
+    closing.join(60)
     assert not closing.is_alive()
     content = summary(ended[0])
     assert (content["frames_decoded"], content["failure"]) == (2, "")

@@ -67,7 +67,7 @@ def flight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
                 *("--classifier", str(data / "models/mobilenet_v2_imagenet.onnx")),
                 *("--labels", str(data / "models/imagenet_labels_1001.txt")),
             )
-            summaries = edge.finish(within_s=240), ground.finish(within_s=30)
+            summaries = edge.finish(), ground.finish()
             stills = tap.messages
     file = folder / "flight.rrd"
     return Flight(
@@ -88,7 +88,7 @@ def wait_for_info(session: zenoh.Session) -> Info:
         answers.append(answer(session, "hvt/uav-1/info"))
         return answers[-1] is not None
 
-    eventually(answered, within_s=30, what="the edge answers info")
+    eventually(answered, what="the edge answers info")
     return Info.parse(answers[-1])
 
 

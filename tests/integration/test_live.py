@@ -78,33 +78,31 @@ def late(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Late:
         )
         edge.until("no ground yet")
         with joined(link.edge_endpoint) as third:
-            eventually(lambda: answer(third, "hvt/uav-1/info"), within_s=20, what="the edge answers info")
+            eventually(lambda: answer(third, "hvt/uav-1/info"), what="the edge answers info")
             tap = Tap(third, "hvt/uav-1/base")
-            eventually(lambda: any(one.frame_index > 10 for one in seen(tap)), within_s=60, what="it plays")
+            eventually(lambda: any(one.frame_index > 10 for one in seen(tap)), what="it plays")
             newest = seen(tap)[-1].frame_index
             request = ControlRequest(session_id=0, command=Command.KEYFRAME, arguments={})
             reply = ControlAnswer.parse(answer(third, "hvt/uav-1/control", request.pack()) or b"")
-            eventually(lambda: keyframes(tap, after=newest), within_s=20, what="a keyframe comes")
+            eventually(lambda: keyframes(tap, after=newest), what="a keyframe comes")
         first = link.ground(
             *ANALYSES, "--record", "first.rrd", "--timing", "first.csv", name="first", connects=True
         )
-        eventually(lambda: shown(folder / "first.csv") >= 30, within_s=60, what="the first ground's picture")
+        eventually(lambda: shown(folder / "first.csv") >= 30, what="the first ground's picture")
         first_stop_s = first.stop()
         second = link.ground(
             *ANALYSES, "--record", "second.rrd", "--timing", "second.csv", "--once", name="second"
         )
-        eventually(
-            lambda: shown(folder / "second.csv") >= 30, within_s=60, what="the second ground's picture"
-        )
+        eventually(lambda: shown(folder / "second.csv") >= 30, what="the second ground's picture")
         edge_stop_s = edge.stop()
         return Late(
             keyframe_answer=reply,
             keyframes=len(keyframes(tap, after=newest)),
             first_stop_s=first_stop_s,
             edge_stop_s=edge_stop_s,
-            first=first.finish(within_s=0),
-            second=second.finish(within_s=20),
-            edge=edge.finish(within_s=0),
+            first=first.finish(),
+            second=second.finish(),
+            edge=edge.finish(),
             folder=folder,
         )
 
@@ -202,9 +200,9 @@ def test_a_lockstep_edge_does_not_wait_for_a_dead_ground(link, long_scene):
         for name, frames in (("uav-1", LONG), ("uav-2", 300))
     )
     for name in ("uav-1", "uav-2"):
-        eventually(lambda name=name: f"{name}: " in served(ground), within_s=30, what=f"{name} is served")
+        eventually(lambda name=name: f"{name}: " in served(ground), what=f"{name} is served")
     ground.kill()
     assert stops.stop() <= STOPPED_WITHIN_S
     assert 0 < stops.finish()["frames"] < LONG
     # Two seconds for each of its frames would be ten minutes.
-    assert plays_on.finish(within_s=120)["frames"] == 300
+    assert plays_on.finish()["frames"] == 300

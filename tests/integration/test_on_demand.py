@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from hvt_ground.control import EdgeClient, EdgeTrack, RefusedError, RequestedStill
-from programs.processes import Link, eventually
+from programs.processes import PATIENT_S, Link, eventually
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
@@ -51,7 +51,7 @@ def refusal(ask) -> str:
 def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run ``hvt-ground`` with these words."""
     line = [sys.executable, "-m", "hvt_ground.cli", *words]
-    return subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=40, check=False)
+    return subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=PATIENT_S, check=False)
 
 
 def patiently(edge):
@@ -73,7 +73,7 @@ def a_track_and_its_still(edge) -> tuple[list[EdgeTrack], RequestedStill]:
                 raise
         return bool(found)
 
-    eventually(asked, within_s=20, what="a track lives long enough to be asked for")
+    eventually(asked, what="a track lives long enough to be asked for")
     return found[0]
 
 
@@ -90,7 +90,7 @@ def two_seconds_ago(edge):
             time.sleep(0.2)
         return bool(found)
 
-    eventually(asked, within_s=20, what="the edge has flown for two seconds")
+    eventually(asked, what="the edge has flown for two seconds")
     return found[0]
 
 
@@ -107,7 +107,7 @@ def flight(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
             *("--preset", "ultrafast", "--budget", "500kbps", "--video-share", "0.6", "--edge-id", "uav-1"),
             *("--method", "M5", "--detector", "motion", "--still-codec", "residual", "--cooldown", "0s"),
         )
-        eventually(lambda: "stills" in ground.said, within_s=40, what="the ground sees stills")
+        eventually(lambda: "stills" in ground.said, what="the ground sees stills")
         with EdgeClient.connect(link.ground_endpoint) as edges:
             one = edges["uav-1"]
             names = edges.names()
@@ -143,8 +143,8 @@ def flight(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
             told,
             nobody,
             folder,
-            edge=edge.finish(within_s=20),
-            ground=ground.finish(within_s=30),
+            edge=edge.finish(),
+            ground=ground.finish(),
         )
 
 
@@ -226,7 +226,7 @@ def test_video_alone_follows_objects_once_somebody_asks_for_them(tmp_path):
             *("--method", "M0", "--store", "0", "--edge-id", "uav-1"),
         )
         with EdgeClient.connect(link.ground_endpoint) as edges:
-            eventually(lambda: edges.names() == ["uav-1"], within_s=40, what="it flies")
+            eventually(lambda: edges.names() == ["uav-1"], what="it flies")
             one, said, listed = edges["uav-1"], [], []
 
             def tracked() -> bool:
@@ -236,5 +236,5 @@ def test_video_alone_follows_objects_once_somebody_asks_for_them(tmp_path):
                     said.append(str(error))
                 return bool(listed)
 
-            eventually(tracked, within_s=60, what="objects are followed")
+            eventually(tracked, what="objects are followed")
     assert any("request again in a second" in one for one in said)

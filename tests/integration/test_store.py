@@ -101,11 +101,10 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
         )  # fmt: skip
         eventually(
             lambda: not edge.alive or (timing.exists() and timing.read_text().count("\n") > 5),
-            within_s=60,
             what="the ground has frames",
         )
         relay.begin()
-        sent = edge.finish(within_s=150)
+        sent = edge.finish()
         ground.stop()
         said = ground.summary()
     assert not isinstance(said, list), "one session all the time"
@@ -134,11 +133,10 @@ def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, 
             "--detector", "motion", "--classifier", "none", "--record", str(tmp_path / "run.rrd")
         )
         first = link.edge(*arguments, name="first")
-        first.until("a ground listens", within_s=60)
+        first.until("a ground listens")
         ground.kill()
         eventually(
             lambda: (store / FILE_NAME).exists() and (store / FILE_NAME).stat().st_size > 300_000,
-            within_s=60,
             what="the edge keeps what it sees",
         )
         first.kill()
@@ -149,9 +147,7 @@ def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, 
             name="again",
         )  # fmt: skip
         link.edge(*arguments, name="second")
-        eventually(
-            lambda: (store / FILE_NAME).stat().st_size < 100_000, within_s=90, what="all of it has arrived"
-        )
+        eventually(lambda: (store / FILE_NAME).stat().st_size < 100_000, what="all of it has arrived")
         ground.stop()
         said = ground.summary()
     got = said[0] if isinstance(said, list) else said
@@ -183,10 +179,9 @@ def test_an_edge_that_is_stopped_counts_what_the_ground_has(tmp_path, scene):
             name="edge",
         )  # fmt: skip
         relay.begin()
-        edge.until("sending what was kept", within_s=60)
+        edge.until("sending what was kept")
         eventually(
             lambda: timing.exists() and timing.read_text().count("backlog-still") > 20,
-            within_s=30,
             what="some of it has come",
         )
         edge.stop()

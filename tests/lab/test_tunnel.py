@@ -160,10 +160,7 @@ class Datagrams:
 
     def until(self, true) -> None:
         """Wait until what has come is such."""
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not true(self.came):
-            assert time.monotonic() < deadline_s, f"came: {sorted(self.came)}"
-            time.sleep(0.01)
+        eventually(lambda: true(self.came), what=f"came: {sorted(self.came)}")
 
     def _listen(self, receiver: subprocess.Popen[str]) -> None:
         for line in receiver.stdout:
@@ -279,7 +276,6 @@ def test_what_breaks_on_the_way_is_heard_of():
             subprocess.run([*link.prefix("edge"), sys.executable, "-c", SHOUT, GROUND_HOST], check=False)
             eventually(
                 lambda: "link-tunnel" not in [thread.name for thread in threading.enumerate()],
-                within_s=PATIENCE_S,
                 what="the carrier ends",
             )
 

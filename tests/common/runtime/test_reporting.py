@@ -31,7 +31,7 @@ def test_a_summary_can_go_into_a_pipe(tmp_path):
     reader = threading.Thread(target=lambda: got.append(pipe.read_text()))
     reader.start()
     write_json(pipe, [{"edge": "uav-1"}])
-    reader.join(10)
+    reader.join(60)
     assert json.loads(got[0]) == [{"edge": "uav-1"}]
     assert pipe.is_fifo()
 

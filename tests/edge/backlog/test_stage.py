@@ -141,13 +141,13 @@ def test_a_store_that_cannot_be_written_costs_a_warning_and_no_frame(tmp_path, c
     with caplog.at_level(logging.WARNING):
         rig.play(0, 15, linked=True)
         rig.play(15, 25, linked=False)
-        eventually(lambda: rig.backlog.worker.failed, within_s=10, what="the disk has said no")
+        eventually(lambda: rig.backlog.worker.failed, what="the disk has said no")
         rig.play(25, 60, linked=False)
         rig.play(60, 80, linked=True)
         rig.play(80, 90, linked=False)
         (tmp_path / "file").unlink()
         rig.play(90, 150, linked=False)
-        eventually(lambda: not rig.backlog.worker.failed, within_s=10, what="it is tried again")
+        eventually(lambda: not rig.backlog.worker.failed, what="it is tried again")
         rig.play(150, 170, linked=False)
     rig.backlog.close()
     (failed, _works) = caplog.messages
@@ -207,6 +207,6 @@ def test_asking_for_the_video_of_an_empty_store_is_refused(tmp_path):
     assert not rig.backlog.send_video()
     rig.play(0, 5, linked=True)
     rig.play(5, 35, linked=False)
-    eventually(lambda: rig.backlog.worker.numbers.video_s > 1.9, within_s=10, what="the frames are on disk")
+    eventually(lambda: rig.backlog.worker.numbers.video_s > 1.9, what="the frames are on disk")
     assert rig.backlog.send_video()
     rig.backlog.close()

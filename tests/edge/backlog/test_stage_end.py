@@ -258,7 +258,7 @@ def test_an_error_in_the_stores_thread_ends_storing_alone(tmp_path):
     rig = Rig(tmp_path / "store", info=broken)
     rig.play(0, 7, reports=True)
     rig.store()
-    eventually(lambda: rig.backlog.worker.failed, within_s=10, what="it is noticed")
+    eventually(lambda: rig.backlog.worker.failed, what="it is noticed")
     rig.play(7, 12, reports=True)
     rig.backlog.close()
 

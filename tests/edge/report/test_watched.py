@@ -72,15 +72,15 @@ def test_a_camera_that_went_away_is_no_dead_process_and_is_said(tmp_path, addres
     with Link(tmp_path) as link:
         with RtspCamera(port) as camera:
             link.edge("--source", camera.url, "--store", "0", "--metrics", address, *SMALL)
-            eventually(lambda: asked(address, "/readyz")[0] == 200, within_s=60, what="pictures come")
-        eventually(lambda: "no picture for" in asked(address, "/readyz")[1], within_s=60, what="it is said")
+            eventually(lambda: asked(address, "/readyz")[0] == 200, what="pictures come")
+        eventually(lambda: "no picture for" in asked(address, "/readyz")[1], what="it is said")
         code, text = asked(address, "/healthz")
         assert code == 200
         assert text.startswith("ok; no picture for")
         assert "source: " in text
         assert asked(address, "/readyz")[0] == 503
         with RtspCamera(port):
-            eventually(lambda: asked(address, "/readyz")[0] == 200, within_s=60, what="pictures come again")
+            eventually(lambda: asked(address, "/readyz")[0] == 200, what="pictures come again")
 
 
 class Hanging(Source):
@@ -143,9 +143,7 @@ def test_a_loop_that_hangs_tells_nobody_that_it_lives(tmp_path, address, free_po
         thread.start()
         assert systemd.recv(64) == b"READY=1"
         assert systemd.recv(64) == b"WATCHDOG=1"
-        eventually(
-            lambda: asked(address, "/healthz") == (503, "it stands still\n"), within_s=60, what="it is said"
-        )
+        eventually(lambda: asked(address, "/healthz") == (503, "it stands still\n"), what="it is said")
         systemd.settimeout(0.1)
         with contextlib.suppress(TimeoutError):  # what it said before
             while True:
@@ -196,13 +194,12 @@ def test_a_machine_too_slow_to_detect_says_how_old_its_boxes_are(address, free_p
     thread = threading.Thread(target=Edge(config, stop=stop, world=SlowWorld()).run, daemon=True)
     thread.start()
     try:
-        eventually(lambda: state(address).get("detection_slow"), within_s=60, what="it is said")
+        eventually(lambda: state(address).get("detection_slow"), what="it is said")
         assert state(address)["boxes_age_s"] > 1
         assert state(address)["tracks"] >= 1
         assert series(asked(address, "/metrics")[1])["hvt_edge_boxes_age_seconds"] > 1
         eventually(
             lambda: "s old" in " ".join(status("--at", address)[1].replace("│", " ").split()),
-            within_s=60,
             what="`hvt-edge status` says it",
         )
         said: list[str] = []
@@ -211,7 +208,7 @@ def test_a_machine_too_slow_to_detect_says_how_old_its_boxes_are(address, free_p
             said.append(capsys.readouterr().err)
             return " s old: detection is too slow" in "".join(said)
 
-        eventually(told, within_s=60, what="the status line says it, too")
+        eventually(told, what="the status line says it, too")
     finally:
         stop.set()
         thread.join(60)

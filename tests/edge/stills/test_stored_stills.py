@@ -140,7 +140,7 @@ def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
     rig.fly(0, 7)
     rig.report()
     rig.fly(7, 50, linked=False)
-    eventually(lambda: rig.backlog.worker.numbers.stills >= 2, within_s=10, what="stills are kept")
+    eventually(lambda: rig.backlog.worker.numbers.stills >= 2, what="stills are kept")
     assert ask(rig.backlog) == ""
     rig.linked = True
     rig.finish()

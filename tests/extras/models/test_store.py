@@ -87,7 +87,7 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             if deed == "hold":
                 origin.begun.set()
-                origin.go_on.wait(20)
+                origin.go_on.wait(60)
             rest = body[start:]
             sent = rest[: int(number)] if deed == "cut" else rest
             if start:
@@ -333,12 +333,12 @@ def test_two_processes_fetch_one_model_once(origin: Origin, folder: Path) -> Non
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     first = start()
-    assert origin.begun.wait(20)
+    assert origin.begun.wait(60)
     second = start()
     assert second.stderr is not None
     assert any("another process fetches made" in line for line in iter(second.stderr.readline, ""))
     origin.go_on.set()
-    answers = [process.communicate(timeout=30)[0].strip() for process in (first, second)]
+    answers = [process.communicate(timeout=60)[0].strip() for process in (first, second)]
     assert [first.returncode, second.returncode] == [0, 0]
     assert answers == [str(folder / "made.onnx")] * 2
     assert len(origin.asked) == 1

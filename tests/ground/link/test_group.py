@@ -67,11 +67,9 @@ def test_each_edge_is_served_once_and_by_another_when_its_member_goes(sessions):
     """Two recordings of one flight, or none."""
     edges = EDGES[:12]
     with GroundGroup(sessions[0], "north", member="base-a") as first:
-        eventually(lambda: served(first, edges) == set(edges), within_s=20, what="it serves all alone")
+        eventually(lambda: served(first, edges) == set(edges), what="it serves all alone")
         with GroundGroup(sessions[1], "north", member="base-b") as second:
-            eventually(
-                lambda: first.members == second.members == ("base-a", "base-b"), within_s=20, what="both know"
-            )
+            eventually(lambda: first.members == second.members == ("base-a", "base-b"), what="both know")
             mine = {edge for edge in edges if owner_of(edge, first.members) == "base-a"}
             assert 0 < len(mine) < len(edges)
             assert served(first, edges) == mine
@@ -79,12 +77,10 @@ def test_each_edge_is_served_once_and_by_another_when_its_member_goes(sessions):
                 assert served(second, edges) == set(), "the former member has not released them"
             for edge in edges:
                 first.release(edge)
-            eventually(
-                lambda: served(second, edges) == set(edges) - mine, within_s=20, what="they have moved"
-            )
+            eventually(lambda: served(second, edges) == set(edges) - mine, what="they have moved")
             assert served(first, edges) == mine
             assert set(first.elsewhere) == set(edges) - mine
-        eventually(lambda: served(first, edges) == set(edges), within_s=20, what="they are back")
+        eventually(lambda: served(first, edges) == set(edges), what="they are back")
         assert not first.elsewhere
 
 
@@ -92,9 +88,9 @@ def test_a_claim_that_has_to_give_way_interrupts_nothing(sessions):
     """A recording would be split each time a link comes back and tokens arrive out of order."""
     edge = next(one for one in EDGES if owner_of(one, ("base-a", "base-b")) == "base-a")
     with GroundGroup(sessions[0], "north", member="base-a") as group:
-        eventually(lambda: group.serves(edge), within_s=20, what="it is served")
+        eventually(lambda: group.serves(edge), what="it is served")
         claim = sessions[1].liveliness().declare_token(GroupKeys("north").claim("base-b", edge))
-        eventually(lambda: edge in group.elsewhere, within_s=20, what="the other claim is known")
+        eventually(lambda: edge in group.elsewhere, what="the other claim is known")
         assert group.serves(edge)
         claim.undeclare()
 
@@ -107,14 +103,12 @@ def test_a_page_is_asked_for_until_it_is_known(sessions):
             sessions[1].liveliness().declare_token(key)
             for key in (keys.member("zz"), keys.claim("zz", "uav-1"))
         ]
-        eventually(lambda: group.elsewhere, within_s=20, what="the other is known")
+        eventually(lambda: group.elsewhere, what="the other is known")
         assert group.elsewhere["uav-1"].page == ""
         answers = sessions[1].declare_queryable(
             keys.member("zz"), lambda query: query.reply(keys.member("zz"), b"https://z/")
         )
-        eventually(
-            lambda: group.elsewhere["uav-1"].page == "https://z/", within_s=30, what="its page is known"
-        )
+        eventually(lambda: group.elsewhere["uav-1"].page == "https://z/", what="its page is known")
         for one in (*tokens, answers):
             one.undeclare()
 
@@ -143,7 +137,7 @@ def test_tokens_of_other_groups_and_nonsense_change_nothing(sessions):
                 "hvt-group/north/zz",
             )
         ]
-        eventually(lambda: "zz" in group.members, within_s=20, what="the last token has come")
+        eventually(lambda: "zz" in group.members, what="the last token has come")
         assert group.members == ("base-a", "zz")
         tokens += [
             sessions[1].liveliness().declare_token(f"hvt-group/north/m-{number}/uav-1")
@@ -152,11 +146,11 @@ def test_tokens_of_other_groups_and_nonsense_change_nothing(sessions):
         tokens += [
             sessions[1].liveliness().declare_token(f"hvt-group/north/n-{number}") for number in range(1200)
         ]
-        eventually(lambda: len(group.members) >= 1024, within_s=20, what="more than are taken")
+        eventually(lambda: len(group.members) >= 1024, what="more than are taken")
         assert len(group.members) == 1024
         for one in tokens:
             one.undeclare()
-        eventually(lambda: group.members == ("base-a",), within_s=20, what="it is gone")
+        eventually(lambda: group.members == ("base-a",), what="it is gone")
 
 
 def test_with_keys_grounds_form_a_group_and_edges_take_no_part(tmp_path):
@@ -177,13 +171,10 @@ def test_with_keys_grounds_form_a_group_and_edges_take_no_part(tmp_path):
             GroundGroup(base, "north", member="base-a") as first,
             GroundGroup(other, "north", member="base-b") as second,
         ):
-            eventually(
-                lambda: first.members == second.members == ("base-a", "base-b"), within_s=20, what="both know"
-            )
+            eventually(lambda: first.members == second.members == ("base-a", "base-b"), what="both know")
             token = EdgeKeys("uav-1").key(Channel.ALIVE)
             eventually(
                 lambda: [one.ok for one in base.liveliness().get(token, timeout=2)],
-                within_s=20,
                 what="the edge is there",
             )
             assert "zz-stolen" not in first.members

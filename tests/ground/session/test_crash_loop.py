@@ -98,7 +98,7 @@ def served(link: GroundLink, folder: Path, ended: list[str]) -> Iterator[tuple[E
         assert summary(session)["frames_decoded"] == FRAMES, summary(session)
         ended.append(session.failure)
 
-    eventually(link.ports, within_s=20, what="the edge is seen")
+    eventually(link.ports, what="the edge is seen")
     (port,) = link.ports()
     sessions = EdgeSessions(
         port,
@@ -143,14 +143,12 @@ def test_two_hundred_sessions_leave_nothing_behind(free_port: int, tmp_path: Pat
             for number in range(SESSIONS):
                 crashes = number % 2 == 1
                 edge.begin(number)
-                eventually(lambda: is_open(sessions, edge), within_s=60, what=f"{number} has begun")
+                eventually(lambda: is_open(sessions, edge), what=f"{number} has begun")
                 edge.end(crashes=crashes)
                 if crashes:
-                    eventually(lambda: sessions.session.is_whole, within_s=60, what=f"{number} has come")
+                    eventually(lambda: sessions.session.is_whole, what=f"{number} has come")
                 else:
-                    eventually(
-                        lambda before=number: len(ended) > before, within_s=60, what=f"{number} has ended"
-                    )
+                    eventually(lambda before=number: len(ended) > before, what=f"{number} has ended")
                 time.sleep(0.06)  # seven seconds of silence, by the fast clock
                 if number == WARM:
                     before = closed_and_used()
@@ -174,7 +172,7 @@ def closed_and_used() -> Use:
     def recording() -> int:
         return sum(one.name.startswith("hvt-recording of") for one in threading.enumerate())
 
-    eventually(lambda: recording() <= 1, within_s=60, what="all recordings but the open one are closed")
+    eventually(lambda: recording() <= 1, what="all recordings but the open one are closed")
     gc.collect()
     return Use()
 
@@ -182,9 +180,9 @@ def closed_and_used() -> Use:
 def stays(before: Use, after: Use) -> None:
     """Memory, threads and files are what they were."""
     most = before.rss_bytes + MOST_GROWTH_BYTES  # on a busy machine what was in hand goes a little later
-    eventually(lambda: Use(after.pid).rss_bytes < most, within_s=20, what="memory is given back")
-    eventually(lambda: Use(after.pid).threads <= before.threads + 2, within_s=20, what="threads have ended")
-    eventually(lambda: Use(after.pid).files <= before.files + 2, within_s=20, what="files are closed")
+    eventually(lambda: Use(after.pid).rss_bytes < most, what="memory is given back")
+    eventually(lambda: Use(after.pid).threads <= before.threads + 2, what="threads have ended")
+    eventually(lambda: Use(after.pid).files <= before.files + 2, what="files are closed")
 
 
 FLIGHT = ("--fps", "5", "--size", "640x360", "--max-frames", "10", "--detector", "motion")

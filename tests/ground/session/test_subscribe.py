@@ -63,7 +63,7 @@ def test_an_edge_that_was_not_asked_for_is_not_served(free_port):
     with ground_of("uav-*", free_port) as (ground, outsider):
         for edge in ("rover-1", "uav-1"):
             outsider.put(f"hvt/{edge}/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
-        eventually(lambda: served(ground), within_s=20, what="one is served")
+        eventually(lambda: served(ground), what="one is served")
         assert served(ground) == {"uav-1"}
 
 
@@ -71,7 +71,7 @@ def test_invented_names_do_not_lock_out_a_real_edge(link, caplog):
     """Somebody says 64 names, and the drone that starts afterwards is never shown, without a word."""
     ground, outsider = link
     invent(outsider, MAX_EDGES + 6)
-    eventually(lambda: ground.foreign == 6, within_s=20, what="all names have come")
+    eventually(lambda: ground.foreign == 6, what="all names have come")
     assert len(served(ground)) == MAX_EDGES
     lines = [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
     assert lines == [
@@ -82,7 +82,7 @@ def test_invented_names_do_not_lock_out_a_real_edge(link, caplog):
     ]
     first = ground.ports()[0]
     with outsider.liveliness().declare_token("hvt/uav-1/alive"):
-        eventually(lambda: "uav-1" in served(ground), within_s=20, what="the real one is served")
+        eventually(lambda: "uav-1" in served(ground), what="the real one is served")
         assert len(served(ground)) == MAX_EDGES
         assert first.edge not in served(ground)
         assert first.inbox.get(timeout_s=0.1) is not None, "what had come is still there"
@@ -95,19 +95,17 @@ def test_edges_that_are_there_or_fly_keep_their_place(link):
     tokens = [
         outsider.liveliness().declare_token(f"hvt/real-{number}/alive") for number in range(MAX_EDGES - 1)
     ]
-    eventually(lambda: len(served(ground)) == MAX_EDGES - 1, within_s=20, what="all are seen")
+    eventually(lambda: len(served(ground)) == MAX_EDGES - 1, what="all are seen")
     invent(outsider, 1)
-    eventually(lambda: "ghost-0" in served(ground), within_s=20, what="one more")
+    eventually(lambda: "ghost-0" in served(ground), what="one more")
     (ghost,) = [port for port in ground.ports() if port.edge == "ghost-0"]
     ghost.used.set()
     with outsider.liveliness().declare_token("hvt/late/alive"):
-        eventually(lambda: ground.foreign == 1, within_s=20, what="it is refused")
+        eventually(lambda: ground.foreign == 1, what="it is refused")
         assert "late" not in served(ground)
         ghost.used.clear()
         outsider.put("hvt/late/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
-        eventually(
-            lambda: "late" in served(ground), within_s=20, what="a flight has ended, so there is a place"
-        )
+        eventually(lambda: "late" in served(ground), what="a flight has ended, so there is a place")
         (late,) = [port for port in ground.ports() if port.edge == "late"]
         assert late.present.is_set()
     for token in tokens:
@@ -130,7 +128,7 @@ def test_another_version_of_the_wire_is_said_once(link, caplog, version, said):
     keys = EdgeKeys("uav-1")
     queryable = serve(outsider, Channel.INFO, keys=keys, answer=lambda _question: answer)
     with outsider.liveliness().declare_token(keys.key(Channel.ALIVE)):
-        eventually(lambda: served(ground) == {"uav-1"}, within_s=20, what="it is served")
+        eventually(lambda: served(ground) == {"uav-1"}, what="it is served")
         (port,) = ground.ports()
         answers: list[object] = []
 
@@ -142,7 +140,7 @@ def test_another_version_of_the_wire_is_said_once(link, caplog, version, said):
         def warnings() -> list[str]:
             return [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
 
-        eventually(answered_twice, within_s=20, what="it has answered")
+        eventually(answered_twice, what="it has answered")
         queryable.undeclare()
     assert not any(answers)
     assert warnings() == [said]
@@ -170,11 +168,11 @@ def test_a_ground_says_which_stills_it_reads(link):
         outsider, Channel.INFO, keys=keys, answer=lambda question: questions.append(question) or INFO.pack()
     )
     with outsider.liveliness().declare_token(keys.key(Channel.ALIVE)):
-        eventually(lambda: served(ground) == {"uav-1"}, within_s=20, what="it is served")
+        eventually(lambda: served(ground) == {"uav-1"}, what="it is served")
         (port,) = ground.ports()
         for count in (1, 2):
             port.query_info(7)
-            eventually(lambda count=count: len(questions) == count, within_s=20, what="it has asked")
+            eventually(lambda count=count: len(questions) == count, what="it has asked")
         queryable.undeclare()
     first, second = map(InfoRequest.parse, questions)
     assert first == second
@@ -200,7 +198,7 @@ def test_an_error_in_a_callback_reaches_the_edges_thread(free_port: int, capfd) 
     with ground_of("*", free_port, clock=clock) as (ground, outsider):
         for edge in ("uav-1", "uav-2"):
             outsider.put(f"hvt/{edge}/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
-        eventually(lambda: len(served(ground)) == 2, within_s=20, what="both are served")
+        eventually(lambda: len(served(ground)) == 2, what="both are served")
         one, other = sorted(ground.ports(), key=lambda port: port.edge)
         clock.broken = True
         outsider.put("hvt/uav-1/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
@@ -214,7 +212,7 @@ def test_an_error_in_a_callback_reaches_the_edges_thread(free_port: int, capfd) 
                 errors.append(str(error))
             return bool(errors)
 
-        eventually(failed, within_s=20, what="the error is handed over")
+        eventually(failed, what="the error is handed over")
         assert errors == ["the clock is gone"]
         one.raise_error()  # once
         other.raise_error()
@@ -246,7 +244,7 @@ def test_nothing_is_declared_in_a_callback(free_port: int) -> None:
             GroundLink(declarations, edges="*") as ground,  # type: ignore[arg-type]
             outsider.liveliness().declare_token("hvt/uav-1/alive"),
         ):
-            eventually(lambda: "uav-1" in served(ground), within_s=20, what="it is served")
+            eventually(lambda: "uav-1" in served(ground), what="it is served")
             assert declarations.threads == []
             tap = Tap(outsider, "hvt/uav-1/feedback")
 
@@ -254,7 +252,7 @@ def test_nothing_is_declared_in_a_callback(free_port: int) -> None:
                 ground.ports()[0].report(FEEDBACK)
                 return bool(tap.messages)
 
-            eventually(reported, within_s=20, what="the edge gets reports all the same")
+            eventually(reported, what="the edge gets reports all the same")
             assert declarations.threads == [threading.current_thread().name]
 
 
@@ -285,7 +283,7 @@ def test_an_edge_that_is_left_while_a_report_goes_out(free_port: int) -> None:
             left = EdgePort(session, "uav-1", clock=time.time_ns)
             worker = threading.Thread(target=report, args=(left,))
             worker.start()
-            assert reporting.wait(10)
+            assert reporting.wait(60)
             left.close()
             worker.join()
         next_port = EdgePort(session, "uav-2", clock=time.time_ns)
@@ -295,7 +293,7 @@ def test_an_edge_that_is_left_while_a_report_goes_out(free_port: int) -> None:
             next_port.report(FEEDBACK)
             return bool(other.messages)
 
-        eventually(reported, within_s=20, what="another edge gets reports all the same")
+        eventually(reported, what="another edge gets reports all the same")
         count = len(tap.messages)
         left.report(FEEDBACK)
         next_port.report(FEEDBACK)
@@ -304,7 +302,7 @@ def test_an_edge_that_is_left_while_a_report_goes_out(free_port: int) -> None:
         next_port.inbox.close()
         count = len(other.messages)
         next_port.report(FEEDBACK)
-        eventually(lambda: len(other.messages) > count, within_s=20, what="a ground that stops says its last")
+        eventually(lambda: len(other.messages) > count, what="a ground that stops says its last")
 
 
 def test_silent_edges_hold_up_nobody(free_port: int) -> None:
@@ -318,12 +316,12 @@ def test_silent_edges_hold_up_nobody(free_port: int) -> None:
     ):
         queryables = [outsider.declare_queryable(f"hvt/uav-{one}/info", asked.append) for one in range(8)]
         tokens = [outsider.liveliness().declare_token(f"hvt/uav-{one}/alive") for one in range(8)]
-        eventually(lambda: len(served(ground)) == 8, within_s=20, what="all are seen")
+        eventually(lambda: len(served(ground)) == 8, what="all are seen")
         began_s = time.monotonic()
         for port in ground.ports():
             port.request_info(INFO.session_id)
         took_s = time.monotonic() - began_s
-        eventually(lambda: len(asked) == 8, within_s=20, what="all are asked")
+        eventually(lambda: len(asked) == 8, what="all are asked")
         assert took_s < 4.0, "a second for each, where an answer is waited for"
         ports = {port.edge: port for port in ground.ports()}
         assert all(port.take_info() is None for port in ports.values())
@@ -331,7 +329,6 @@ def test_silent_edges_hold_up_nobody(free_port: int) -> None:
         late.reply("hvt/uav-3/info", replace(INFO, edge="uav-3").pack())
         eventually(
             lambda: (answer := ports["uav-3"].take_info()) is not None and answer[0].edge == "uav-3",
-            within_s=20,
             what="the answer is there when it comes",
         )
         for one in asked:
@@ -369,16 +366,16 @@ def test_in_a_group_an_edge_that_made_space_may_come_back_or_move(free_port: int
         tokens = [
             outsider.liveliness().declare_token(f"hvt/uav-{number}/alive") for number in range(MAX_EDGES)
         ]
-        eventually(lambda: len(link.ports()) == MAX_EDGES, within_s=30, what="all are served")
+        eventually(lambda: len(link.ports()) == MAX_EDGES, what="all are served")
         (first,) = [one for one in link.ports() if one.edge == "uav-0"]
         tokens[0].undeclare()  # type: ignore[no-untyped-call]
-        eventually(lambda: not first.present.is_set(), within_s=20, what="it is gone, without a picture")
+        eventually(lambda: not first.present.is_set(), what="it is gone, without a picture")
         tokens.append(outsider.liveliness().declare_token("hvt/new/alive"))
-        eventually(lambda: "new" in served(link), within_s=20, what="it has made space")
+        eventually(lambda: "new" in served(link), what="it has made space")
         assert len(link.ports()) == MAX_EDGES
         link.closed(first)
         group.elsewhere |= {"uav-0"} if moves else {"uav-1"}
         tokens.append(outsider.liveliness().declare_token("hvt/uav-0/alive"))
-        eventually(lambda: link.is_known("uav-0"), within_s=20, what="it is back")
-        eventually(lambda: ("uav-0" in served(link)) is not moves, within_s=20, what="it is where it belongs")
+        eventually(lambda: link.is_known("uav-0"), what="it is back")
+        eventually(lambda: ("uav-0" in served(link)) is not moves, what="it is where it belongs")
         assert len(link.ports()) == MAX_EDGES

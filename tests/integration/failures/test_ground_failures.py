@@ -14,7 +14,6 @@ from programs.rrd import Recording
 
 pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(240)]
 
-SOON_S = 60.0
 FLIGHT = (
     *("--source-fps", "10", "--fps", "10", "--size", "320x192", "--preset", "ultrafast"),
     *("--budget", "400kbps"),
@@ -42,9 +41,9 @@ def test_a_detector_that_fails_leaves_the_video_of_every_edge(link: Link, tmp_pa
         link.edge(*FLIGHT, "--source", str(source), "--detector", "motion", "--edge-id", name, name=name)
         for name, source in (("uav-1", bright), ("uav-2", dark))
     ]
-    ground.until("detector: ", within_s=SOON_S)
-    ground.until("detector FAILED at", within_s=SOON_S)
-    ground.until("detector: works again", within_s=SOON_S)
+    ground.until("detector: ")
+    ground.until("detector FAILED at")
+    ground.until("detector: works again")
     for one in (*edges, ground):
         assert one.alive
         one.stop()

@@ -64,12 +64,12 @@ def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, long_sce
     )
     flown = edges(link, long_scene)
     for name in EDGES:
-        ground.until(f"recording of {name} FAILED at", within_s=120)
+        ground.until(f"recording of {name} FAILED at")
     firsts = [min(small_disk.glob(f"hvt-{name}-*.rrd"), key=lambda one: len(one.name)) for name in EDGES]
     before = {path: path.read_bytes() for path in firsts}
     (small_disk / "ballast").unlink()
     for name in EDGES:
-        ground.until(f"recording of {name}: works again", within_s=60)
+        ground.until(f"recording of {name}: works again")
 
     def goes_on(name: str) -> bool:
         newest = max(small_disk.glob(f"hvt-{name}-*.rrd"), key=lambda one: one.stat().st_mtime)
@@ -77,10 +77,10 @@ def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, long_sce
             return len(Recording(newest).video()) > 10
         return False
 
-    eventually(lambda: all(map(goes_on, EDGES)), within_s=60, what="video is recorded again")
+    eventually(lambda: all(map(goes_on, EDGES)), what="video is recorded again")
     for edge in flown:
         edge.stop()
-    summaries = ground.finish(within_s=30)
+    summaries = ground.finish()
     for name, summary in zip(EDGES, summaries, strict=True):
         parts = {one["part"]: one for one in summary["failed"]}
         assert parts.keys() <= {f"recording of {name}", "recordings index"}, "the index is on that disk too"
@@ -111,16 +111,16 @@ def test_a_folder_that_goes_in_flight_costs_what_is_written_there(long_scene, li
     folder.mkdir()
     ground = link.ground(*ANALYSES, "--once", "--record", "flights", "--tracks", str(folder))
     flown = edges(link, long_scene)
-    eventually(lambda: len(list(folder.iterdir())) == 2, within_s=60, what="both tables are there")
+    eventually(lambda: len(list(folder.iterdir())) == 2, what="both tables are there")
     shutil.rmtree(folder)
     for name in EDGES:
-        ground.until(f"tracks table of {name} FAILED at", within_s=60)
+        ground.until(f"tracks table of {name} FAILED at")
     folder.mkdir()
     for name in EDGES:
-        ground.until(f"tracks table of {name}: works again", within_s=60)
+        ground.until(f"tracks table of {name}: works again")
     for edge in flown:
         edge.stop()
-    for name, summary in zip(EDGES, ground.finish(within_s=30), strict=True):
+    for name, summary in zip(EDGES, ground.finish(), strict=True):
         (failed,) = summary["failed"]
         assert (failed["part"], failed["working"]) == (f"tracks table of {name}", True)
         assert "cannot be written any further: it was removed" in ground.said

@@ -100,8 +100,8 @@ def test_a_port_that_another_program_holds_is_waited_for(opened, caplog):
         assert str(holder.port) in failed.reason
         assert len([one for one in caplog.messages if failed.reason in one]) == 1
         holder.let_go()
-        eventually(works, within_s=60, what="it works")
-        eventually(lambda: not failures.now, within_s=60, what="it says so")
+        eventually(works, what="it works")
+        eventually(lambda: not failures.now, what="it says so")
 
 
 @pytest.mark.parametrize("opened", [metrics, web, listener])
@@ -177,7 +177,7 @@ def test_a_camera_that_starts_later_is_waited_for(caplog):
         thread = threading.Thread(target=lambda: found.append(awaited.wait(stop)))
         thread.start()
         stack.enter_context(RtspCamera(port))
-        eventually(lambda: found, within_s=60, what="it is found")
+        eventually(lambda: found, what="it is found")
         thread.join()
         stack.enter_context(closing(found[0]))
         assert next(found[0].frames(start_ns=0)).index == 0
@@ -306,7 +306,7 @@ def test_an_autopilot_that_starts_later_is_waited_for(kind, caplog):
             send()
             return source.at(0, capture_ns=0) is not None
 
-        eventually(placed, within_s=60, what="there is a pose")
+        eventually(placed, what="there is a pose")
         assert not source.trouble
 
 
@@ -326,7 +326,7 @@ def test_a_whole_ground_waits_and_serves(link, scene):
     for part in ("listener", "web page", "metrics"):
         ground.until(f"{part}: works again")
     edge = link.edge("--source", str(scene), "--max-frames", "20", "--fps", "5", "--detector", "motion")
-    assert edge.wait(within_s=120) == 0
+    assert edge.wait() == 0
     ground.kill()
 
 
@@ -335,5 +335,5 @@ def test_an_edge_waits_for_its_camera_and_can_be_stopped(link):
     edge = link.edge("--source", "/dev/video97", "--detector", "motion")
     edge.until("/dev/video97 does not exist")
     edge.stop()
-    assert edge.wait(within_s=60) == 1
+    assert edge.wait() == 1
     assert "stopped before the source was there" in edge.said

@@ -82,7 +82,7 @@ class Fleet:
     def restart_router(self) -> None:
         """As kill -9 and a supervisor do."""
         self.router.kill()
-        self.router.wait(10)
+        self.router.wait(60)
         self.router = self._routed()
 
     def state(self, ground: str) -> dict[str, Any]:
@@ -106,12 +106,10 @@ class Fleet:
         assert not twice, f"{twice} are served twice: {found}"
         return dict(found)
 
-    def all_served(self, *grounds: str, within_s: float = MOVED_S) -> float:
+    def all_served(self, *grounds: str) -> float:
         """Wait until each edge is served by one of these; return how long that took."""
         began_s = time.monotonic()
-        eventually(
-            lambda: self.served(*grounds).keys() == set(EDGES), within_s=within_s, what=f"all at {grounds}"
-        )
+        eventually(lambda: self.served(*grounds).keys() == set(EDGES), what=f"all at {grounds}")
         return time.monotonic() - began_s
 
     def close(self) -> None:
@@ -120,7 +118,7 @@ class Fleet:
             if one.alive:
                 one.kill()
         self.router.kill()
-        self.router.wait(10)
+        self.router.wait(60)
 
 
 def test_a_fleet_outlives_its_router_a_ground_and_a_link(star, tmp_path, monkeypatch):
@@ -128,7 +126,8 @@ def test_a_fleet_outlives_its_router_a_ground_and_a_link(star, tmp_path, monkeyp
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     fleet = Fleet(star, tmp_path)
     try:
-        took_s = {"start": fleet.all_served(*GROUNDS, within_s=90)}
+        fleet.all_served(*GROUNDS)
+        took_s = {}
         first = fleet.served(*GROUNDS)
         assert fleet.state(GROUNDS[0])["elsewhere"].keys() | {
             edge for edge, ground in first.items() if ground == GROUNDS[0]
@@ -142,7 +141,6 @@ def test_a_fleet_outlives_its_router_a_ground_and_a_link(star, tmp_path, monkeyp
             lambda: (
                 pages == {edge: one["page"] for edge, one in fleet.state(GROUNDS[0])["elsewhere"].items()}
             ),
-            within_s=MOVED_S,
             what="the pages of the others are known",
         )
         fleet.restart_router()
@@ -159,10 +157,10 @@ def test_a_fleet_outlives_its_router_a_ground_and_a_link(star, tmp_path, monkeyp
         star.set_link(cut, down=False)
         eventually(
             lambda: all(fleet.state(name) for name in rest) and fleet.state(last[0])["elsewhere"],
-            within_s=MOVED_S,
             what="the other takes part again",
         )
         took_s["link back"] = fleet.all_served(*rest)
+        assert max(took_s.values()) < MOVED_S
         print({name: round(took, 1) for name, took in took_s.items()})  # with pytest -s
         assert [one for one in EDGES if not fleet.edges[one].alive] == []
         for name in rest:

@@ -53,7 +53,7 @@ def flight(fleet: Fleet, scene: Path, tmp_path_factory: pytest.TempPathFactory) 
             *("--preset", "ultrafast", "--budget", "500kbps", "--video-share", "0.6", "--cooldown", "0s"),
             *("--method", "M5"),
         )
-        eventually(lambda: "stills" in ground.said, within_s=40, what="the ground sees pictures")
+        eventually(lambda: "stills" in ground.said, what="the ground sees pictures")
         yield Flight(fleet, endpoint, edge, ground)
     finally:
         for one in running:

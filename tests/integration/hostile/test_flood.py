@@ -136,9 +136,9 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         edge = link.edge("--source", str(long_scene), *_EDGE, listens=True)
         with joined(link.edge_endpoint) as to_edge, joined(link.ground_endpoint) as to_ground:
             base, reports = Tap(to_edge, "hvt/uav-1/base"), Tap(to_ground, "hvt/uav-1/feedback")
-            eventually(lambda: len(base.messages) > 20 and reports.messages, within_s=60, what="it flies")
+            eventually(lambda: len(base.messages) > 20 and reports.messages, what="it flies")
             flight = Flight(link, long_scene, base, reports, ground, edge)
-            eventually(flight.shown(), within_s=30, what="the picture is shown")
+            eventually(flight.shown(), what="the picture is shown")
             time.sleep(3)  # what grows at the start has grown
             flight.growth = {"ground": Growth(ground), "edge": Growth(edge)}
             yield flight
@@ -167,9 +167,7 @@ def asked(flight: Flight) -> tuple[Flight, int]:
 
 
 def _is_back(flight: Flight, kind: str) -> None:
-    eventually(
-        flight.shown(), within_s=60, what=f"the picture is back after {kind}; it said\n{flight.ground.said}"
-    )
+    eventually(flight.shown(), what=f"the picture is back after {kind}; it said\n{flight.ground.said}")
 
 
 @pytest.mark.parametrize("kind", _TO_GROUND)
@@ -206,7 +204,6 @@ def test_questions_and_reports_leave_the_frame_loop_alone(asked):
                 (heard := answer(session, "hvt/uav-1/control", request)) is not None
                 and ControlAnswer.parse(heard).accepted
             ),
-            within_s=30,
             what="the edge answers again",
         )
 

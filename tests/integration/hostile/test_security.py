@@ -105,9 +105,7 @@ def refused(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
                 session,
                 stack.enter_context(Watch(session, settings, served=lambda _: True, patience_s=PATIENCE_S)),
             )
-        eventually(
-            lambda: all(watch.trouble for _, watch in watches.values()), within_s=40, what="all are explained"
-        )
+        eventually(lambda: all(watch.trouble for _, watch in watches.values()), what="all are explained")
         assert [list(ground.info.peers_zid()) for ground in grounds] == [[], [], []]
         return {
             name: _Refused(len(list(session.info.links())), watch.trouble)
@@ -169,13 +167,13 @@ def test_an_edge_cannot_write_as_another(
         forger.liveliness().declare_token(UAV2.key(Channel.ALIVE))
         serve(forger, Channel.INFO, keys=UAV2, answer=lambda _question: b"forged")
         own = declare_publisher(forger, Channel.STATUS, keys=UAV1)
-        eventually(lambda: own.matching_status.matching, within_s=20, what="the edge's own stream is wanted")
+        eventually(lambda: own.matching_status.matching, what="the edge's own stream is wanted")
         for row in (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.STATUS, Channel.FEEDBACK):
             forger.put(UAV2.key(row), b"forged")
         own.put(b"own")
-        eventually(lambda: came, within_s=20, what="the edge's own message")
+        eventually(lambda: came, what="the edge's own message")
         assert query(ground, Channel.INFO, keys=UAV2, question=b"", timeout_s=1) is None
-        eventually(lambda: "'uav-1' is linked" in caplog.text, within_s=20, what="the ground is told")
+        eventually(lambda: "'uav-1' is linked" in caplog.text, what="the ground is told")
         assert came == [UAV1.key(Channel.STATUS)]
     assert "or it runs under another id than its certificate says, and all it sends is dropped" in caplog.text
 
@@ -207,7 +205,7 @@ def test_watching_commanding_and_being_a_stranger(
                 lambda sample, name=name: came[name].append(sample.payload.to_bytes()),
             )
         publisher = declare_publisher(edge, Channel.STATUS, keys=UAV1)
-        eventually(_linked(*grounds.values()), within_s=20, what="all three are linked")
+        eventually(_linked(*grounds.values()), what="all three are linked")
         info = {
             name: query(ground, Channel.INFO, keys=UAV1, question=b"", timeout_s=2)
             for name, ground in grounds.items()
@@ -219,11 +217,9 @@ def test_watching_commanding_and_being_a_stranger(
         }
         assert control == {"base": b"done", "guest": None, "stranger": None}
         publisher.put(b"picture")
-        eventually(lambda: came["base"] and came["guest"], within_s=10, what="the two that may watch receive")
+        eventually(lambda: came["base"] and came["guest"], what="the two that may watch receive")
         assert came["stranger"] == []
-        eventually(
-            lambda: "'stranger' has a certificate" in caplog.text, within_s=20, what="the edge is told"
-        )
+        eventually(lambda: "'stranger' has a certificate" in caplog.text, what="the edge is told")
     assert (
         f"{fleet.file('uav-1')} does not name it: it gets no picture and no answer from here" in caplog.text
     )
@@ -277,7 +273,7 @@ def test_who_may_not_is_told_by_its_own_program_and_goes_on(told: dict[str, Runn
     """The operator waits for a picture and nothing comes; the engineer beside the drone sees only the drone's log."""
     before, _, after = TOLD[who].partition("ENDPOINT")
     process = told[who]
-    process.until(before, within_s=90)
+    process.until(before)
     process.until(after)
     assert process.alive
     process.stop()
@@ -336,10 +332,10 @@ def test_a_ground_that_gets_no_answer_on_control_is_told(
         open_session(LinkSettings("ground", connect=(endpoint,), zenoh_config=bold)) as session,
         GroundLink(session, edges="*") as link,
     ):
-        eventually(link.ports, within_s=20, what="the edge is seen")
+        eventually(link.ports, what="the edge is seen")
         (port,) = link.ports()
         for _ in range(3):
             port.request_keyframe()
             time.sleep(0.1)
-        eventually(lambda: "uav-1 does not answer on control" in caplog.text, within_s=10, what="it is said")
+        eventually(lambda: "uav-1 does not answer on control" in caplog.text, what="it is said")
     assert "this ground may lack the right to command it (hvt-ground keys list" in caplog.text

@@ -167,7 +167,7 @@ def fly():
     with open_session(LinkSettings("edge", (), (sys.argv[1],))) as session:
         subscriber = session.declare_subscriber("a", receive)
         session.put("a", b"")
-        heard.wait(30)
+        heard.wait(60)
 
 flight = threading.Thread(target=fly, daemon=True)
 flight.start()

@@ -97,9 +97,9 @@ def frame(page: Any) -> int:
     return int(page.locator("#age").get_attribute("data-frame") or -1)
 
 
-def shows(page: Any, *, after: int = -1, within_s: float = 20) -> int:
+def shows(page: Any, *, after: int = -1) -> int:
     """Wait until it shows a later frame."""
-    eventually(lambda: frame(page) > after, within_s=within_s, what="a picture is shown")
+    eventually(lambda: frame(page) > after, what="a picture is shown")
     return frame(page)
 
 
@@ -112,7 +112,7 @@ def test_the_picture_moves_at_the_rate_of_the_stream(page):
         seen.add(page.evaluate(_PIXELS))
         return len(seen) > 20
 
-    eventually(moved, within_s=20, what="other pixels")
+    eventually(moved, what="other pixels")
     assert frame(page) - first > 4 * (time.monotonic() - began_s), "a stream of 15, on a machine that is busy"
     assert "H.264" in page.inner_text("#rung") or "HEVC" in page.inner_text("#rung")
     assert int(page.locator("#age").get_attribute("data-ms")) < 3000
@@ -126,9 +126,9 @@ def test_boxes_are_drawn_on_the_frame_that_is_shown(page):
       const canvas = document.getElementById("boxes");
       return canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value);
     }"""
-    eventually(lambda: page.evaluate(drawn), within_s=20, what="a box is drawn")
+    eventually(lambda: page.evaluate(drawn), what="a box is drawn")
     page.locator("#objects-title").click()
-    eventually(lambda: page.locator("#tracks button").count(), within_s=10, what="the tracks are listed")
+    eventually(lambda: page.locator("#tracks button").count(), what="the tracks are listed")
 
 
 def test_a_click_brings_a_still_of_that_place(page):
@@ -137,13 +137,11 @@ def test_a_click_brings_a_still_of_that_place(page):
     page.locator("#boxes").click(position={"x": 300, "y": 150})
     image = page.locator("#answer-picture")
     image.wait_for(state="visible")
-    eventually(lambda: image.evaluate("one => one.naturalWidth") > 10, within_s=10, what="the still is shown")
+    eventually(lambda: image.evaluate("one => one.naturalWidth") > 10, what="the still is shown")
     assert re.search(r" at \d\d:\d\d:\d\d, .* pixels of the camera", page.inner_text("#answer-text"))
     strip = page.locator("#stills img")
-    eventually(strip.count, within_s=20, what="the strip shows stills")
-    eventually(
-        lambda: strip.first.evaluate("one => one.naturalWidth") > 4, within_s=10, what="its picture is loaded"
-    )
+    eventually(strip.count, what="the strip shows stills")
+    eventually(lambda: strip.first.evaluate("one => one.naturalWidth") > 4, what="its picture is loaded")
     page.locator("#stills button").first.click()
     assert page.locator("#large").is_visible()
     page.keyboard.press("Escape")
@@ -194,19 +192,15 @@ def test_what_an_operator_must_see_stands_on_the_picture(flight, page):
     for viewport in ({"width": 1440, "height": 900}, {"width": 390, "height": 844}):
         page.set_viewport_size(viewport)
         shows(page, after=frame(page))
-        eventually(lambda: page.inner_text("#standing").startswith("live, "), within_s=20, what="it is live")
-        eventually(lambda: page.inner_text("#recording") == "recording", within_s=20, what="it is recorded")
-        eventually(
-            lambda: "500 kbps" in page.inner_text("#on-link"), within_s=20, what="what the link carries"
-        )
+        eventually(lambda: page.inner_text("#standing").startswith("live, "), what="it is live")
+        eventually(lambda: page.inner_text("#recording") == "recording", what="it is recorded")
+        eventually(lambda: "500 kbps" in page.inner_text("#on-link"), what="what the link carries")
         bottom = page.locator("#controls").evaluate("one => one.getBoundingClientRect().bottom")
         assert bottom <= viewport["height"], "sign, picture and playback, without scrolling"
     page.locator("#pause").click()
-    eventually(lambda: page.inner_text("#standing").startswith("PAUSED "), within_s=5, what="it says so")
+    eventually(lambda: page.inner_text("#standing").startswith("PAUSED "), what="it says so")
     page.locator("#now").click()
-    eventually(
-        lambda: page.inner_text("#standing").startswith("live, "), within_s=10, what="it is live again"
-    )
+    eventually(lambda: page.inner_text("#standing").startswith("live, "), what="it is live again")
 
 
 @pytest.mark.nightly
@@ -258,7 +252,7 @@ def test_steps_back_and_to_the_picture_of_now(page):
     time.sleep(0.5)
     paused = frame(page)
     page.keyboard.press("ArrowLeft")
-    eventually(lambda: frame(page) <= paused - 40, within_s=10, what="an earlier picture is shown")
+    eventually(lambda: frame(page) <= paused - 40, what="an earlier picture is shown")
     assert "ago" in page.inner_text("#age")
     page.keyboard.press("l")
     shows(page, after=paused + 5)
@@ -274,7 +268,7 @@ def test_an_event_leads_to_its_picture(page):
     event.wait_for(timeout=60_000)
     newest = shows(page, after=frame(page) + 20)
     event.click()
-    eventually(lambda: frame(page) < newest - 10, within_s=10, what="the picture of that time")
+    eventually(lambda: frame(page) < newest - 10, what="the picture of that time")
     assert "ago" in page.inner_text("#age")
 
 
@@ -293,7 +287,7 @@ def test_nothing_jumps_while_the_picture_comes(flight):
     page = flight.page()
     shows(page)
     stills = page.locator("#stills li")
-    eventually(stills.count, within_s=20, what="a still")
+    eventually(stills.count, what="a still")
     page.locator("#stills").hover()
     newest = stills.first.locator("button")
     seen = newest.get_attribute("data-still")
@@ -310,7 +304,7 @@ def test_nothing_jumps_while_the_picture_comes(flight):
     assert page.evaluate("window.shift") < 0.1, page.evaluate("window.moved")
     page.mouse.move(5, 5)
     # Not their number: a strip that is full stays as long as it is.
-    eventually(lambda: newest.get_attribute("data-still") != seen, within_s=20, what="what came meanwhile")
+    eventually(lambda: newest.get_attribute("data-still") != seen, what="what came meanwhile")
     page.context.close()
 
 
@@ -324,16 +318,14 @@ def test_an_operator_sets_the_budget(flight):
 
     page.locator("#budget").fill("300")
     page.locator("#budget-form button").click()
-    eventually(lambda: said("300 kbps is in force"), within_s=60, what="the edge flies with it")
+    eventually(lambda: said("300 kbps is in force"), what="the edge flies with it")
     assert "300 kbps" in page.locator("#facts").text_content()
     page.locator("#budget").fill("10")
     page.locator("#budget-form button").click()
     refused = ("wait two seconds", "takes at least")
-    eventually(lambda: any(map(said, refused)), within_s=20, what="the edge's refusal")
+    eventually(lambda: any(map(said, refused)), what="the edge's refusal")
     page.reload()
     events = page.locator("#events li")
-    eventually(
-        lambda: "300 kbps" in events.first.inner_text(), within_s=20, what="the events that there were"
-    )
+    eventually(lambda: "300 kbps" in events.first.inner_text(), what="the events that there were")
     assert sum("300 kbps" in one for one in events.all_inner_texts()) == 1, "each stands there once"
     page.context.close()

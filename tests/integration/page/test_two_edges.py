@@ -74,12 +74,12 @@ def test_no_pixel_of_one_edge_stands_under_the_name_of_another(address, rung):
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page()
         page.goto(f"{address}#edge=flies&rung={rung}")
-        eventually(lambda: page.evaluate(_SHOWN)["drawn"], within_s=60, what="the first edge's picture")
+        eventually(lambda: page.evaluate(_SHOWN)["drawn"], what="the first edge's picture")
         page.locator('.edge[data-edge="silent"]').click()
         for _ in range(10):
             assert page.evaluate(_SHOWN) == {"drawn": False, "name": "silent"}
             time.sleep(0.1)
         assert page.inner_text("#objects-title") == "Tracks: not known yet"
         page.locator('.edge[data-edge="flies"]').click()
-        eventually(lambda: page.evaluate(_SHOWN)["drawn"], within_s=60, what="the first edge's picture again")
+        eventually(lambda: page.evaluate(_SHOWN)["drawn"], what="the first edge's picture again")
         browser.close()

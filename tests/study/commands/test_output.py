@@ -23,7 +23,7 @@ def test_who_waits_reads_a_line_while_all_is_still_opened(capsys):
         return bool(said)
 
     with RunProgress("flights", first_line_s=0.02) as flights:
-        eventually(read, within_s=20, what="the first line")
+        eventually(read, what="the first line")
         flights.update(0, 7)
         flights.update(7, 7)
     assert said == "flights: opening what they need\n"

@@ -23,9 +23,9 @@ from hvt_study.runs.run_settings import flown
 from hvt_study.runs.spec import ModelChoice
 from hvt_study.runs.video_shape import VideoShape
 from media.onnx_models import colour_classifier, colour_detector
+from programs.processes import PATIENT_S
 from studies.layouts import write_images, write_visdrone
 from studies.small_study import (
-    PATIENT_S,
     REGIME,
     SIZE,
     arguments,

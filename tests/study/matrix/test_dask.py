@@ -9,8 +9,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from programs.processes import eventually, free_ports
-from studies.small_study import PATIENT_S, REGIME, arguments, detector, flights, said, study, table, until
+from programs.processes import PATIENT_S, eventually, free_ports
+from studies.small_study import REGIME, arguments, detector, flights, said, study, table, until
 
 pytest.importorskip("distributed")
 pytestmark = pytest.mark.nightly
@@ -45,7 +45,7 @@ class Cluster:
         return (self._folder / "worker.log").read_text().count("Registered to") == 2
 
     def __enter__(self):
-        eventually(self.ready, within_s=PATIENT_S, what="two workers have found their scheduler")
+        eventually(self.ready, what="two workers have found their scheduler")
         return self
 
     def __exit__(self, *_):

@@ -9,7 +9,8 @@ import signal
 import psutil
 import pytest
 
-from studies.small_study import PATIENT_S, REGIME, arguments, entries, flights, said, study, table, until
+from programs.processes import PATIENT_S
+from studies.small_study import REGIME, arguments, entries, flights, said, study, table, until
 
 pytestmark = pytest.mark.nightly
 

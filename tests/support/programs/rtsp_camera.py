@@ -60,7 +60,7 @@ class RtspCamera:
     def close(self) -> None:
         """Hang up and stop listening, as when the power fails."""
         self._stop.set()
-        self._thread.join(10)
+        self._thread.join(60)
         self._server.close()
 
     def __enter__(self) -> Self:

@@ -29,7 +29,7 @@ _JSON = ("--log-format", "json")
 def asked(address: str, path: str) -> tuple[int, str]:
     """Status and text; 0 while nobody answers."""
     try:
-        with urllib.request.urlopen(f"http://{address}{path}", timeout=10) as answer:
+        with urllib.request.urlopen(f"http://{address}{path}", timeout=60) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         with error:
@@ -119,26 +119,23 @@ def fly_watched(folder: Path, scene: Path) -> WatchedFlight:
     watched = ("--wait", "60", "--metrics", at_edge, *store, *_JSON)
     with Link(folder) as link:
         edge = link.edge("--source", str(scene), "--method", "M5", "--cooldown", "0s", *SMALL, *watched)
-        eventually(lambda: state(at_edge), within_s=60, what="it answers")
+        eventually(lambda: state(at_edge), what="it answers")
         waiting = Told.by(at_edge)
         ground = link.ground(
             "--detector", "motion", "--classifier", "none", "--once", "--metrics", at_ground, *_JSON
         )
-        eventually(
-            lambda: (state(at_edge).get("link") or {}).get("round_trip_ms"), within_s=60, what="it flies"
-        )
-        eventually(lambda: state(at_edge)["frames"]["encoded"] > 10, within_s=60, what="frames")
+        eventually(lambda: (state(at_edge).get("link") or {}).get("round_trip_ms"), what="it flies")
+        eventually(lambda: state(at_edge)["frames"]["encoded"] > 10, what="frames")
         wanted = asked_metrics() - MAY_LACK
         with suppress(AssertionError):  # a test tells which are lacking
             eventually(
                 lambda: wanted <= with_value(asked(at_edge, "/metrics")[1] + asked(at_ground, "/metrics")[1]),
-                within_s=60,
                 what="all that is asked for has a value",
             )
         flying, there = Told.by(at_edge), asked(at_ground, "/metrics")[1]
         said = status("--at", at_edge), status("--at", at_edge, "--json")
         edge.stop()
-        summary = edge.finish(within_s=0)
+        summary = edge.finish()
         ground.finish()
         return WatchedFlight(
             waiting,

@@ -16,8 +16,6 @@ from hvt_study.report.data.table_file import read_results
 from media.onnx_models import colour_detector
 from programs.processes import eventually
 
-PATIENT_S = 200.0
-"""How long a study may take on a busy machine."""
 SIZE = (160, 96)
 REGIME = "80kbps"
 """So much that the share that DDS spends of it is still what this picture needs at the least."""
@@ -89,7 +87,7 @@ def said(folder: Path) -> str:
 
 def until(process: subprocess.Popen[str], true: Callable[[], object]) -> None:
     """Wait for something that happens while the process runs."""
-    eventually(lambda: true() or process.poll() is not None, within_s=PATIENT_S, what="a result is kept")
+    eventually(lambda: true() or process.poll() is not None, what="a result is kept")
     assert process.poll() is None, "it ended before"
 
 

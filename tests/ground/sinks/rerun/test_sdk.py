@@ -40,7 +40,7 @@ def test_many_recordings_leave_no_threads(tmp_path):
     recorded(0, 1)  # what is shared by all is there now
     before = threads()
     recorded(2, 3, 4, 5)
-    eventually(lambda: threads() <= before, within_s=20, what="no thread of the four is left")
+    eventually(lambda: threads() <= before, what="no thread of the four is left")
 
 
 def test_recordings_that_begin_and_end_at_once_do_not_stop_the_process(tmp_path):
