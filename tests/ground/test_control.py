@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -19,8 +18,10 @@ from hvt_common.transport.session import declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_fleet.commands import run
+from hvt_ground import control
 from hvt_ground.cli import main
 from hvt_ground.control import EdgeClient, RefusedError, RequestedStill
+from programs.processes import PATIENT_S
 from rigs import messages
 
 KEYS = EdgeKeys("uav-1")
@@ -48,22 +49,21 @@ HEADER = replace(
 
 
 class ScriptedEdge:
-    """Answers everything with ``answer``; for a still it publishes ``puts`` first."""
+    """Answers everything with ``answer``, and a little later publishes ``puts``, if it was asked for ``puts_at``."""
 
     def __init__(self, port: int) -> None:
         self.endpoint = f"tcp/127.0.0.1:{port}"
         self.answer, self.outcome = YES, YES
         self.puts: list[tuple[bytes, bytes]] = [(DATA, HEADER.pack(DATA))]
         self.asked: list[ControlRequest] = []
+        self.puts_at = "still"
         self.ends = False
-        self._publisher: zenoh.Publisher | None = None
-        self._status: zenoh.Publisher | None = None
 
     def control(self, question: bytes) -> bytes:
-        """Note the request; the stills come a little later, as they do."""
+        """Note the request."""
         request = ControlRequest.parse(question)
         self.asked.append(request)
-        if request.command == "still" and self.answer.accepted:
+        if request.command == self.puts_at and self.answer.accepted:
             threading.Timer(0.1, self._put).start()
         return (self.outcome if request.command == "still-outcome" else self.answer).pack()
 
@@ -73,30 +73,25 @@ class ScriptedEdge:
         if self.ends:
             self._status.put(replace(messages.STATUS, session_id=7, state="ended").pack())
 
-    def fly(self, up: threading.Event, stop: threading.Event) -> None:
-        """Listen, as an edge with --listen does."""
-        with open_session(LinkSettings("edge", listen=(self.endpoint,))) as session:
-            self._publisher = declare_publisher(session, Channel.ROI, keys=KEYS)
-            self._status = declare_publisher(session, Channel.STATUS, keys=KEYS)
-            serve(session, Channel.INFO, keys=KEYS, answer=lambda _question: INFO.pack())
-            serve(session, Channel.CONTROL, keys=KEYS, answer=self.control)
-            token = session.liveliness().declare_token(KEYS.key(Channel.ALIVE))
-            up.set()
-            stop.wait(60)
-            token.undeclare()
-            time.sleep(0.05)
+    def serve(self, session: zenoh.Session) -> None:
+        """As an edge does."""
+        self._publisher = declare_publisher(session, Channel.ROI, keys=KEYS)
+        self._status = declare_publisher(session, Channel.STATUS, keys=KEYS)
+        serve(session, Channel.INFO, keys=KEYS, answer=lambda _question: INFO.pack())
+        serve(session, Channel.CONTROL, keys=KEYS, answer=self.control)
 
 
 @pytest.fixture
-def edge(free_port) -> Iterator[ScriptedEdge]:
+def edge(free_port, monkeypatch) -> Iterator[ScriptedEdge]:
     """One that listens."""
-    scripted, up, stop = ScriptedEdge(free_port), threading.Event(), threading.Event()
-    thread = threading.Thread(target=scripted.fly, args=(up, stop))
-    thread.start()
-    assert up.wait(10)
-    yield scripted
-    stop.set()
-    thread.join(10)
+    monkeypatch.setattr(control, "_ANSWER_S", PATIENT_S)
+    scripted = ScriptedEdge(free_port)
+    with (
+        open_session(LinkSettings("edge", listen=(scripted.endpoint,))) as session,
+        session.liveliness().declare_token(KEYS.key(Channel.ALIVE)),
+    ):
+        scripted.serve(session)
+        yield scripted
 
 
 def test_the_still_of_the_number_is_the_one_that_is_returned(edge):
@@ -113,7 +108,7 @@ def test_the_still_of_the_number_is_the_one_that_is_returned(edge):
     ]
     with EdgeClient.connect(edge.endpoint) as edges:
         assert edges.names() == ["uav-1"]
-        still = edges["uav-1"].still(box=(10, 20, 96, 64), at_s=-1.5, quality_pct=90)
+        still = edges["uav-1"].still(box=(10, 20, 96, 64), at_s=-1.5, quality_pct=90, timeout_s=PATIENT_S)
     assert edge.asked[0].arguments == {"x": 10, "y": 20, "w": 96, "h": 64, "at_ms": -1500, "quality": 90}
     assert (still.edge, still.header, still.data) == ("uav-1", HEADER, DATA)
     assert cv2.PSNR(still.image_bgr, PICTURE) > 30
@@ -132,7 +127,7 @@ def test_a_still_that_cannot_be_one_is_a_sentence(edge, header):
     """A hostile edge could make the operator's machine decode anything, or end in a traceback."""
     edge.puts = [(DATA, header.pack(DATA))]
     with EdgeClient.connect(edge.endpoint) as edges, pytest.raises(UserError, match="cannot be decoded"):
-        edges["uav-1"].still()
+        edges["uav-1"].still(timeout_s=PATIENT_S)
 
 
 def test_refusals_are_the_edges_own_words(edge):
@@ -150,7 +145,7 @@ def test_a_still_that_was_given_up_is_not_waited_for(edge):
     edge.puts = []
     edge.outcome = replace(YES, accepted=False, reason="in 10 s the budget had no room for it")
     with EdgeClient.connect(edge.endpoint) as edges, pytest.raises(RefusedError, match="no room for it"):
-        edges["uav-1"].still(timeout_s=30)
+        edges["uav-1"].still(timeout_s=PATIENT_S)
     assert [one.command for one in edge.asked] == ["still", "still-outcome"]
     assert edge.asked[1].arguments == {"ask": 3}
 
@@ -159,15 +154,16 @@ def test_an_edge_that_ends_meanwhile_says_so(edge):
     """The operator would blame the budget or the link, and wait for an edge that has landed."""
     edge.puts, edge.ends = [], True
     with EdgeClient.connect(edge.endpoint) as edges, pytest.raises(UserError, match="uav-1 has ended"):
-        edges["uav-1"].still(timeout_s=30)
+        edges["uav-1"].still(timeout_s=PATIENT_S)
 
 
 def test_how_it_comes_is_said_before_it_comes(edge, tmp_path, capsys):
     """A picture that takes seconds, or shows less than was asked for, would be a riddle."""
-    edge.puts, edge.outcome = [], replace(YES, note="96x64 pixels at quality 40 come within about 3 s")
-    words = ["still", "--connect", edge.endpoint, "--timeout", "1.5s", "--out", str(tmp_path / "crop.png")]
-    assert main(words) == 2
-    assert "uav-1: 96x64 pixels at quality 40 come within about 3 s\n" in capsys.readouterr().out
+    edge.puts_at = "still-outcome"
+    edge.outcome = replace(YES, note="96x64 pixels at quality 40 come within about 3 s")
+    words = ["still", "--connect", edge.endpoint, "--timeout", "60s", "--out", str(tmp_path / "crop.png")]
+    assert main(words) == 0
+    assert capsys.readouterr().out.startswith("uav-1: 96x64 pixels at quality 40 come within about 3 s\n")
 
 
 def test_one_that_never_comes_ends_with_the_timeout(edge):
@@ -192,7 +188,18 @@ def test_an_answer_that_is_none_is_a_sentence(edge):
 def test_the_command_finds_the_only_edge_and_writes_the_file_as_it_came(edge, tmp_path, capsys):
     """The picture on disk would have lost twice; `--at -3s` would be taken for a flag."""
     out = tmp_path / "crop.jpg"
-    words = ["still", "--connect", edge.endpoint, "--track", "17", "--at", "-3s", "--out", str(out)]
+    words = [
+        "still",
+        "--connect",
+        edge.endpoint,
+        "--track",
+        "17",
+        "--at",
+        "-3s",
+        "--out",
+        str(out),
+        "--timeout=60s",
+    ]
     assert main(words) == 0
     assert out.read_bytes() == DATA
     assert edge.asked[0].arguments == {"track": 17, "at_ms": -3000}

@@ -162,12 +162,14 @@ class RealtimeWorker(PerceptionWorker):
         name: str,
         pass_over: Callable[[int, int], None] = lambda _frame_index, _capture_ns: None,
         take_late: Callable[[], bool] = lambda: False,
+        clock: Callable[[], float] = time.monotonic,
         finish_s: float = 1.5,
         leave_s: float = 1.0,
     ) -> None:
         super().__init__(analyze, step, read)
         self._pass_over = pass_over
         self._take_late = take_late
+        self._clock = clock
         self._finish_s = finish_s
         self._leave_s = leave_s
         self._lock = threading.Lock()
@@ -211,7 +213,7 @@ class RealtimeWorker(PerceptionWorker):
 
     def picture(self, picture: DecodedFrame) -> None:
         """Queue a frame; where the queue is full, or the oldest has waited for too long, that goes untracked."""
-        now_s = time.monotonic()
+        now_s = self._clock()
         with self._lock:
             queued_bytes = sum(one.picture.nbytes for one, _ in self._pictures) + picture.picture.nbytes
             while self._pictures and (
@@ -328,7 +330,7 @@ class RealtimeWorker(PerceptionWorker):
                 stepped = bool(self._steps) and self._steps[-1][0].frame_index > picture.frame_index
                 if newer or awaited or stepped or self._ending.is_set():
                     self._wake.set()
-                late = newer and time.monotonic() - came_s > _OLDEST_S
+                late = newer and self._clock() - came_s > _OLDEST_S
                 self.untracked += late
             if late:
                 self._pass_over(picture.frame_index, picture.capture_ns)
@@ -338,11 +340,11 @@ class RealtimeWorker(PerceptionWorker):
     def _do_jobs(self) -> None:
         # Do jobs that can wait, until something comes that cannot.
         while (jobs := self._jobs or self._last_jobs) and not self._given_up.is_set():
-            if self._wake.is_set() and time.monotonic() - self._job_step_s < _JOB_STEP_S:
+            if self._wake.is_set() and self._clock() - self._job_step_s < _JOB_STEP_S:
                 return
             if self._is_done(jobs[0]):
                 jobs.popleft().close()
-            self._job_step_s = time.monotonic()
+            self._job_step_s = self._clock()
 
 
 class LockstepWorker(PerceptionWorker):

@@ -16,12 +16,12 @@ from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.perception.worker import Job, RealtimeWorker
+from hvt_ground.perception.worker import Job
 from hvt_ground.sinks import QueuedSink
 from programs.processes import eventually
 from rigs.backlog_chunks import video_object
 from rigs.examples import refinement
-from rigs.flight import Flight, RedSquares, SameAnswer
+from rigs.flight import Flight, RedSquares, SameAnswer, patient_worker
 
 
 def test_work_that_was_never_begun_lets_its_recording_go():
@@ -34,7 +34,7 @@ def test_work_that_was_never_begun_lets_its_recording_go():
     def log(event) -> None:
         if event.frame_index == units[-1].frame_index:
             last_shown.set()
-            go_on.wait(timeout=20)
+            go_on.wait(timeout=60)
 
     perception = BacklogPerception(
         info,
@@ -46,18 +46,16 @@ def test_work_that_was_never_begun_lets_its_recording_go():
     )
     former = SessionBacklog(info, log=log, perception=perception, read=lambda _still: None)
     destination = Destination(lambda: users.append(former) or former, users.remove)
-    worker = RealtimeWorker(
-        lambda *_: None, lambda *_: None, lambda _stills: None, name="x", finish_s=0.1, leave_s=0.1
-    )
+    worker = patient_worker(lambda *_: None, lambda *_: None, lambda _stills: None, finish_s=0.1, leave_s=0.1)
     outcomes: list[bool | None] = []
     worker.submit(VideoJob(units, destination, worker=worker, done=outcomes.append))
-    assert last_shown.wait(timeout=20)
+    assert last_shown.wait(timeout=60)
     never = VideoJob(units, destination, worker=worker, done=outcomes.append)
     worker.submit(never)
     assert users == [former], "one that waits has nothing in hand"
     assert not worker.close(), "it is in the middle of a frame when the session ends"
     go_on.set()
-    eventually(lambda: not users, within_s=20, what="the boxes that were to be found hold nothing either")
+    eventually(lambda: not users, what="the boxes that were to be found hold nothing either")
     assert None not in outcomes
 
 
@@ -73,7 +71,7 @@ class SlowFile:
     def log(self, item: Event) -> None:
         """Write when there is a disk."""
         self.writing.set()
-        self.ready.wait(timeout=30)
+        self.ready.wait(timeout=60)
         if self.breaks.is_set():
             self.breaks.clear()
             raise OSError(28, "No space left on device")
@@ -118,7 +116,7 @@ class Outage:
 
     def video(self) -> VideoJob:
         """The edge sends its video, perhaps again."""
-        worker = RealtimeWorker(lambda *_: None, lambda *_: None, lambda _stills: None, name="x")
+        worker = patient_worker(lambda *_: None, lambda *_: None, lambda _stills: None)
         worker.close()
         return VideoJob(self.units, self._to, worker=worker, done=self.said.append)
 
@@ -131,7 +129,7 @@ class Outage:
     def hold(self) -> None:
         """The disk stops in the middle of an event."""
         self.sink.log(Notice(0, 0, "info", "held"))
-        assert self.file.writing.wait(timeout=20)
+        assert self.file.writing.wait(timeout=60)
 
     def fill(self, count: int) -> None:
         """So many live events come while the disk stands still."""
@@ -166,7 +164,7 @@ def test_what_was_stored_is_acknowledged_when_it_is_written(kind):
     finish(getattr(outage, kind)())
     assert outage.said == [], "it stands in a queue"
     outage.file.ready.set()
-    eventually(lambda: outage.said == [True], within_s=20, what="it is written")
+    eventually(lambda: outage.said == [True], what="it is written")
     outage.sink.close()
 
 
@@ -179,9 +177,9 @@ def test_stored_things_do_not_press_into_a_queue_that_is_half_full(kind):
     finish(getattr(outage, kind)())
     assert outage.said == [None], "it is to come again"
     outage.file.ready.set()
-    eventually(lambda: outage.sink.idle, within_s=20, what="the disk has kept up")
+    eventually(lambda: outage.sink.idle, what="the disk has kept up")
     finish(getattr(outage, kind)())
-    eventually(lambda: outage.said == [None, True], within_s=20, what="the second time it is written")
+    eventually(lambda: outage.said == [None, True], what="the second time it is written")
     assert outage.file.frames == (list(range(30)) if kind == "video" else [])
     outage.sink.close()
 
@@ -197,10 +195,10 @@ def test_a_stretch_that_meets_a_full_queue_halfway_goes_on_where_it_was():
     finish(job)
     assert outage.said == []
     outage.file.ready.set()
-    eventually(lambda: outage.said == [None], within_s=20, what="it is to come again")
-    eventually(lambda: outage.sink.idle, within_s=20, what="the disk has kept up")
+    eventually(lambda: outage.said == [None], what="it is to come again")
+    eventually(lambda: outage.sink.idle, what="the disk has kept up")
     finish(outage.video())
-    eventually(lambda: outage.said == [None, True], within_s=20, what="the rest is written")
+    eventually(lambda: outage.said == [None, True], what="the rest is written")
     assert outage.file.frames == list(range(30))
     assert outage.backlog.totals.frames == 30
     outage.sink.close()
@@ -215,10 +213,10 @@ def test_what_a_failing_disk_took_along_is_new_when_it_comes_again(kind, monkeyp
     finish(getattr(outage, kind)())
     outage.file.breaks.set()
     outage.file.ready.set()
-    eventually(lambda: outage.said == [None], within_s=20, what="it is lost")
+    eventually(lambda: outage.said == [None], what="it is lost")
     assert (outage.backlog.totals.frames, outage.backlog.totals.stills) == (0, 0)
-    eventually(outage.sink.is_open, within_s=20, what="there is a file again")
+    eventually(outage.sink.is_open, what="there is a file again")
     finish(getattr(outage, kind)())
-    eventually(lambda: outage.said == [None, True], within_s=20, what="it is written")
+    eventually(lambda: outage.said == [None, True], what="it is written")
     assert len(outage.file.written) == (30 if kind == "video" else 1)
     outage.sink.close()

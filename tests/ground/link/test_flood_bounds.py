@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import replace
 
 import pytest
@@ -13,9 +12,8 @@ from hvt_ground.events import MessageTiming, Notice
 from hvt_ground.link.reassemble import Arrival
 from hvt_ground.link.receiver import BasePacket
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.perception.worker import RealtimeWorker
 from hvt_ground.session.session import GroundSession
-from rigs.flight import Flight, pipeline_of
+from rigs.flight import Flight, patient_worker, pipeline_of
 
 BOX = {1: (30.0, 60.0, 62.0, 96.0)}
 SECOND_NS = 1_000_000_000
@@ -161,18 +159,17 @@ def test_stills_that_wait_to_be_read_have_a_bound_in_bytes():
 
     def read(_stills) -> None:
         begun.set()
-        busy.wait(20)
+        busy.wait(60)
 
-    worker = RealtimeWorker(lambda *_: None, lambda *_: None, read, name="test")
+    worker = patient_worker(lambda *_: None, lambda *_: None, read)
     flight = Flight(2)
     header = RoiHeader.parse(*((one := flight.still(1, 0)).attachment, one.payload))
     try:
         worker.still(ReceivedStill(header, b"x"))
-        assert begun.wait(10)
+        assert begun.wait(60)
         for _ in range(64):
             worker.still(ReceivedStill(header, bytes(2**20)))
         assert worker.dropped["overflow"] == 32
     finally:
         busy.set()
-        time.sleep(0.05)
         worker.close()

@@ -15,11 +15,10 @@ from hvt_common.values import Detections
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.detector_thread import DetectorThread
 from hvt_ground.perception.pipeline import DecodedFrame
-from hvt_ground.perception.worker import RealtimeWorker
 from hvt_ground.wiring import Models
 from hvt_ground.wiring.perception import make_pipeline
 from programs.processes import eventually
-from rigs.flight import Flight, NothingSeen
+from rigs.flight import Flight, NothingSeen, patient_worker
 
 PICTURE = np.zeros((192, 320, 3), np.uint8)
 
@@ -30,7 +29,7 @@ def test_who_asks_often_starves_no_other():
 
     def detect(name):
         def run(_image):
-            assert go.wait(timeout=20)
+            assert go.wait(timeout=60)
             order.append((name, threading.current_thread().name))
             return Detections.none()
 
@@ -38,10 +37,10 @@ def test_who_asks_often_starves_no_other():
 
     begun = [thread.submit(PICTURE, detect(name)) for name in ("often", "seldom", "often")]
     go.set()
-    begun[0].found.result(timeout=20)
+    begun[0].found.result(timeout=60)
     begun.append(thread.submit(PICTURE, detect("now")))
     for one in begun:
-        one.found.result(timeout=20)
+        one.found.result(timeout=60)
     assert order == [(name, "hvt-detector") for name in ("often", "seldom", "often", "now")]
 
 
@@ -51,7 +50,7 @@ def test_the_thread_ends_with_its_sessions():
     class Session:
         def __init__(self):
             self.thread, self.ran_in = DetectorThread(), None
-            self.thread.submit(PICTURE, self.detect).found.result(timeout=20)
+            self.thread.submit(PICTURE, self.detect).found.result(timeout=60)
 
         def detect(self, _image):
             self.ran_in = threading.current_thread()
@@ -59,7 +58,7 @@ def test_the_thread_ends_with_its_sessions():
 
     ran_in = Session().ran_in
     gc.collect()
-    ran_in.join(timeout=20)
+    ran_in.join(timeout=60)
     assert not ran_in.is_alive()
 
 
@@ -72,8 +71,8 @@ def test_who_follows_tracks_goes_before_the_detector():
         nice[name] = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
         return result
 
-    DetectorThread().submit(PICTURE, lambda _: note("detector", Detections.none())).found.result(timeout=20)
-    worker = RealtimeWorker(lambda *_: note("worker"), lambda *_: None, lambda _: None, name="x")
+    DetectorThread().submit(PICTURE, lambda _: note("detector", Detections.none())).found.result(timeout=60)
+    worker = patient_worker(lambda *_: note("worker"), lambda *_: None, lambda _: None)
     worker.picture(DecodedFrame(0, 0, 0, PICTURE))
     worker.close()
     assert nice["worker"] < nice["detector"] or nice["worker"] == 19, "the tests themselves may give way"
@@ -84,7 +83,7 @@ def test_a_picture_that_nobody_wants_any_more_is_not_searched_and_an_error_ends_
     thread, go, ran = DetectorThread(), threading.Event(), []
 
     def fails(_image):
-        assert go.wait(timeout=20)
+        assert go.wait(timeout=60)
         raise OSError("broken")
 
     def runs(_image):
@@ -94,7 +93,7 @@ def test_a_picture_that_nobody_wants_any_more_is_not_searched_and_an_error_ends_
     first, gone, last = (thread.submit(PICTURE, detect) for detect in (fails, runs, runs))
     gone.found.cancel()
     go.set()
-    last.found.result(timeout=20)
+    last.found.result(timeout=60)
     assert isinstance(first.found.exception(), OSError)
     assert ran == [1]
 
@@ -111,6 +110,4 @@ def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, run
     pipeline = make_pipeline(config, models, info=info, emit=lambda _: None)
     pipeline.analyze(DecodedFrame(0, 0, 0, PICTURE), hurry=False)
     assert network.runs == runs
-    eventually(
-        lambda: not models.loading, within_s=60, what="the models are loaded: no process ends meanwhile"
-    )
+    eventually(lambda: not models.loading, what="the models are loaded: no process ends meanwhile")

@@ -115,7 +115,7 @@ def test_a_slow_detector_holds_no_list_up_and_its_boxes_lie_where_objects_are_no
     class Slow(RedSquares):
         def detect(self, image_bgr):
             taken.release()
-            assert release.acquire(timeout=20)
+            assert release.acquire(timeout=60)
             return super().detect(image_bgr)
 
     rig, at_once = Rig(detect_every=5, detector=Slow(), detector_thread=DetectorThread()), Rig(detect_every=5)
@@ -124,10 +124,10 @@ def test_a_slow_detector_holds_no_list_up_and_its_boxes_lie_where_objects_are_no
         rig.pipeline.analyze(picture, hurry=False, news=news)
         at_once.pipeline.analyze(picture, hurry=False)
         if picture.frame_index % 5 == 0:
-            assert taken.acquire(timeout=20), "else the next would take its place"
+            assert taken.acquire(timeout=60), "else the next would take its place"
         if picture.frame_index % 5 == 2:  # what began two pictures ago
             release.release()
-            eventually(lambda: rig.pipeline.searching is False, within_s=20, what="it is found")
+            eventually(lambda: rig.pipeline.searching is False, what="it is found")
     lists, expected = rig.of(Overlay), at_once.of(Overlay)
     assert [one.frame_index for one in lists] == list(range(30))
     assert {one.looked_ns for one in lists} == {None}
@@ -145,7 +145,7 @@ def test_lists_of_a_detector_that_is_a_second_behind_are_old(pictures):
 
     class Hangs(NothingSeen):
         def detect(self, image_bgr):
-            release.acquire(timeout=20)
+            release.acquire(timeout=60)
             return super().detect(image_bgr)
 
     rig = Rig(detect_every=5, detector=Hangs(), detector_thread=DetectorThread())
@@ -168,7 +168,7 @@ def test_a_picture_that_waits_for_the_detector_gives_way_to_the_newest(pictures)
 
     class Other(NothingSeen):
         def detect(self, image_bgr):
-            assert go.wait(timeout=20)
+            assert go.wait(timeout=60)
             return super().detect(image_bgr)
 
     class Watched(NothingSeen):
@@ -189,7 +189,7 @@ def test_a_picture_that_waits_for_the_detector_gives_way_to_the_newest(pictures)
     for picture in pictures[5:9]:
         rig.pipeline.analyze(picture, hurry=False, news=news)
     go.set()
-    eventually(lambda: not rig.pipeline.searching, within_s=20, what="it is searched")
+    eventually(lambda: not rig.pipeline.searching, what="it is searched")
     np.testing.assert_array_equal(seen, [as_bgr(pictures[index].picture) for index in (0, 8)])
     assert rig.pipeline.detections_run == 2
 
@@ -200,7 +200,7 @@ def test_what_is_found_after_the_list_is_out_counts_though_nothing_comes(picture
 
     class BlindAtLast(RedSquares):
         def detect(self, image_bgr):
-            assert release.acquire(timeout=20)
+            assert release.acquire(timeout=60)
             return super().detect(image_bgr if rig.pipeline.detections_run == 1 else np.zeros_like(image_bgr))
 
     rig = Rig(detect_every=5, detector=BlindAtLast(), detector_thread=DetectorThread())

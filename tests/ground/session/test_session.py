@@ -16,28 +16,21 @@ from hvt_common.protocol.messages import Info, PoseEncoder
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Pose
 from hvt_ground.perception.detector_thread import DetectorThread
-from hvt_ground.perception.worker import LockstepWorker, RealtimeWorker
+from hvt_ground.perception.worker import LockstepWorker
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
-from rigs.flight import Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
+from programs.processes import PATIENT_S, eventually
+from rigs.flight import Flight, Port, RedSquares, SameAnswer, patient_worker, pipeline_of, square_box
 from rigs.handled import WatchedInbox, check, end
-
-
-def wait_for(condition, *, timeout_s: float = 30) -> None:
-    """Poll until true; a test that waits in vain fails here."""
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.005)
 
 
 class Rig:
     """A receiver with a port; sessions without a recording."""
 
     def __init__(
-        self, *, detector=None, thread=None, reader=None, clock=None, drain_s=1.0, worker_of=None, **patience
+        self, *, detector=None, thread=None, reader=None, clock=None, worker_of=patient_worker, **patience
     ) -> None:
         self.port = Port()
         self.port.inbox = self.inbox = WatchedInbox()
@@ -49,7 +42,7 @@ class Rig:
         self.receiver = EdgeSessions(
             self.port, open_session=self._open, on_ended=self.ended.append, clock=clock, **patience
         )
-        self.thread = EdgeThread(self.receiver, drain_s=drain_s)
+        self.thread = EdgeThread(self.receiver, drain_s=PATIENT_S)
 
     def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
         session = GroundSession(
@@ -59,7 +52,7 @@ class Rig:
             ),
             clock=time.time_ns,
             reports=reports,
-            worker_of=self.worker_of,
+            worker_of=None if info.pace == "lockstep" else self.worker_of,
         )
         self.opened.append(session)
         return session
@@ -71,9 +64,9 @@ class Rig:
 
     def settle(self) -> None:
         """All that was put has been handled and seen."""
-        wait_for(lambda: self.inbox.handled or self.broken)
+        eventually(lambda: self.inbox.handled or self.broken)
         for session in self.opened:
-            wait_for(lambda one=session: one.idle or self.broken)
+            eventually(lambda one=session: one.idle or self.broken)
         check(self.thread)
 
     @property
@@ -123,7 +116,7 @@ def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
         )
         assert session.ledger.line_bytes == expected
         assert session.perceived.tracks >= 1
-        wait_for(lambda: rig.port.reports and rig.port.reports[-1].last_frame_index == 29)
+        eventually(lambda: rig.port.reports and rig.port.reports[-1].last_frame_index == 29)
         last = rig.port.reports[-1]
         assert (last.base_messages, last.roi_messages, last.lost, last.corrupt) == (30, 2, 0, 0)
         assert last.session_id == flight.session_id
@@ -188,7 +181,7 @@ def test_the_end_waits_for_the_last_tracks():
         rig.settle()
         assert not rig.receiver.idle
         rig.put(flight.step(2, {31: square_box(2)}))
-        wait_for(lambda: rig.ended)
+        eventually(lambda: rig.ended)
         rig.settle()
         (session,) = rig.ended
         assert (session.steps_received, session.pipeline.steps_used) == (1, 1)
@@ -202,7 +195,7 @@ def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
         rig.settle()
         session = rig.receiver.session
         assert session.frames_decoded == 3
-        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        eventually(lambda: rig.port.keyframe_requests >= 1)
         rig.put(*bases(flight, *range(14, 30)))
         rig.settle()
         assert session.frames_decoded == 3 + 10
@@ -235,7 +228,7 @@ def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
         assert rig.receiver.receiver.unusable == 3
         rig.put(broken)
         rig.settle()
-        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        eventually(lambda: rig.port.keyframe_requests >= 1)
         rig.put(flight.base(3))  # the very unit, whole this time
         rig.settle()
         assert session.frames_decoded == 4
@@ -277,10 +270,10 @@ def test_a_still_that_never_came_is_reported_missing(flight):
         rig.port.flight = flight
         rig.put(*bases(flight, 0, 1, 2), flight.still(1, 1), flight.still(2, 4))
         rig.settle()
-        wait_for(lambda: rig.port.reports[-1].missing_stills == (0, 2, 3))
+        eventually(lambda: rig.port.reports[-1].missing_stills == (0, 2, 3))
         rig.put(flight.still(0, 2))
         rig.settle()
-        wait_for(lambda: rig.port.reports[-1].missing_stills == (0, 3))
+        eventually(lambda: rig.port.reports[-1].missing_stills == (0, 3))
         assert rig.port.reports[-1].still_sequence == 4
 
 
@@ -321,7 +314,7 @@ def test_a_session_that_the_edge_does_not_know_ends_nothing():
         for index in range(8):
             rig.put(forged.base(index))
             rig.settle()
-        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        eventually(lambda: rig.port.keyframe_requests >= 1)
         rig.put(*bases(flight, *range(5, 30)))
         rig.settle()
         assert rig.opened == [session := rig.receiver.session]
@@ -380,7 +373,7 @@ def test_a_session_ends_when_all_of_it_has_arrived(flight):
         rig.settle()
         assert not rig.receiver.idle
         rig.put(flight.still(3, 0))
-        wait_for(lambda: rig.ended)
+        eventually(lambda: rig.ended)
         (session,) = rig.ended
         assert (session.frames_received, session.stills_received) == (6, 1)
         requested = rig.port.requested
@@ -396,7 +389,7 @@ def test_a_session_whose_rest_is_lost_ends_after_two_seconds(flight):
         rig.port.flight = flight
         began = time.monotonic()
         rig.put(*bases(flight, 0, 1), flight.status(base=9, state="ended"))
-        wait_for(lambda: rig.ended)
+        eventually(lambda: rig.ended)
         assert time.monotonic() - began >= 2.0
 
 
@@ -441,12 +434,12 @@ def test_a_lost_answer_does_not_lose_the_flight(flight):
     """Where the link loses the one answer to ``info``, nothing of the whole flight would be shown."""
     with Rig() as rig:
         rig.put(*bases(flight, 0, 1, 2))  # nobody answers yet
-        wait_for(lambda: rig.port.requested >= 3)
+        eventually(lambda: rig.port.requested >= 3)
         rig.settle()
         assert rig.receiver.idle
         rig.port.flight = flight
         rig.put(*bases(flight, 3, 4))
-        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        eventually(lambda: rig.port.keyframe_requests >= 1)
         rig.put(*bases(flight, *range(5, 30)))
         rig.settle()
         assert rig.receiver.session.info.session_id == flight.session_id
@@ -460,12 +453,12 @@ def test_a_flight_goes_on_after_an_outage(flight):
         rig.put(*bases(flight, *range(6)))
         rig.settle()
         rig.port.present.clear()
-        wait_for(lambda: rig.ended)
+        eventually(lambda: rig.ended)
         assert rig.receiver.idle
         rig.port.present.set()
         requests = rig.port.keyframe_requests
         rig.put(*bases(flight, *range(6, 10)))  # not one is missing, but the decoder has been closed
-        wait_for(lambda: rig.port.keyframe_requests > requests)
+        eventually(lambda: rig.port.keyframe_requests > requests)
         rig.put(*bases(flight, *range(10, 30)))
         rig.settle()
         assert rig.receiver.session is not None
@@ -478,7 +471,7 @@ def test_slow_detection_never_holds_up_decoding(flight):
         rig.port.flight = flight
         began = time.monotonic()
         rig.put(*bases(flight, *range(30)))
-        wait_for(lambda: rig.opened and rig.opened[0].frames_decoded == 30)
+        eventually(lambda: rig.opened and rig.opened[0].frames_decoded == 30)
         assert rig.opened[0].perceived.detections_run <= 2 + (time.monotonic() - began) / 0.3
         rig.settle()
     (session,) = rig.ended
@@ -495,7 +488,7 @@ def test_what_the_detector_finds_after_the_last_picture_names_its_tracks(flight)
             assert release.wait(timeout=60)
             return super().detect(image_bgr)
 
-    with Rig(detector=Hangs(), thread=DetectorThread()) as rig:
+    with Rig(detector=Hangs(), thread=DetectorThread(), worker_of=None) as rig:
         rig.port.flight = flight
         rig.put(flight.base(0), flight.still(0, 0))
         wait_for(lambda: rig.reader.had_base)
@@ -513,7 +506,7 @@ def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
             rig.put(flight.base(index), flight.still(index, index))
             if index % 10 == 9:  # on a busy machine more in a burst would be passed over
                 rig.settle()
-        wait_for(lambda: len(rig.reader.had_base) == 20)
+        eventually(lambda: len(rig.reader.had_base) == 20)
         assert all(rig.reader.had_base)
         assert rig.receiver.session.perceived.refined >= 1  # a busy machine may lose the track between
 
@@ -527,7 +520,7 @@ def test_a_still_before_its_frame_waits_for_its_track(flight):
         assert rig.receiver.session.perceived.refined == 0
         rig.put(*bases(flight, *range(3, 12)))
         rig.settle()
-        wait_for(lambda: rig.receiver.session.perceived.refined == 1)
+        eventually(lambda: rig.receiver.session.perceived.refined == 1)
 
 
 def test_lockstep_sees_every_frame_and_answers_every_still():
@@ -571,7 +564,7 @@ def test_another_picture_size_under_the_same_session_is_not_shown(flight):
         rig.put(forged.base(3))
         rig.settle()
         assert rig.receiver.session.frames_decoded == 3
-        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        eventually(lambda: rig.port.keyframe_requests >= 1)
         rig.put(*bases(flight, *range(4, 30)))
         rig.settle()
         assert rig.receiver.session.last_frame_index == 29
@@ -579,12 +572,10 @@ def test_another_picture_size_under_the_same_session_is_not_shown(flight):
 
 def test_closing_keeps_what_has_arrived_and_ends(flight):
     """Ctrl-C would throw away the last second, or hang."""
-    # What a second or two are enough for is the machine's affair.
-    patient = partial(RealtimeWorker, name="uav-1", finish_s=20)
-    rig = Rig(detector=RedSquares(takes_s=0.05), drain_s=20, worker_of=patient)
+    rig = Rig(detector=RedSquares(takes_s=0.05))
     rig.port.flight = flight
     rig.put(flight.base(0))
-    wait_for(lambda: bool(rig.opened))
+    eventually(lambda: bool(rig.opened))
     rig.put(*bases(flight, *range(1, 30)))
     assert rig.thread.close(timeout_s=60)
     (session,) = rig.ended

@@ -42,17 +42,15 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path, caplog):
     os.mkfifo(pipe)  # opening it waits for a reader, writing for room
     failures = Failures(time.time_ns)
     sink = QueuedSink("tracks table", lambda: LineFile(pipe, ("a",)), failures=failures)
-    began_s = time.monotonic()
-    for _ in range(10_000):
+    for _ in range(10_000):  # one that waited would wait for ever
         sink.log("x" * 100 + "\n")
-    assert time.monotonic() - began_s < 5
     assert sink.missing == 10_000 - 4096
     assert "tracks table is too slow: 4096 events were dropped so far" in caplog.messages
     assert not sink.idle
     with pipe.open() as reader:
         sink.close()
         lines = reader.read().splitlines()
-    assert sink.join(time.monotonic() + 20)
+    assert sink.join(time.monotonic() + 60)
     assert lines == ["a", *["x" * 100] * 4096], "what was taken is written, in whole lines"
     assert failures.parts == (), "slow is not broken"
 
@@ -83,7 +81,7 @@ def test_one_that_never_answers_does_not_keep_the_ground_from_ending(tmp_path):
     assert not sink.ended
     assert [(one.part, one.working) for one in failures.parts] == [("tracks table", False)]
     with pipe.open():  # so that the test's own process has no thread left
-        eventually(lambda: sink.ended, within_s=20, what="the thread ends")
+        eventually(lambda: sink.ended, what="the thread ends")
 
 
 def test_a_sink_that_has_ended_keeps_nothing_of_what_made_it(tmp_path):
@@ -109,8 +107,8 @@ def test_what_sends_to_others_is_made_again_after_the_longest_pause(caplog):
 
     failures = Failures(time.time_ns)
     sink: QueuedSink[str] = Outputs(failures).open("CoT", cut, longest_pause_s=0.01)
-    eventually(lambda: len(tries) > 4, within_s=10, what="it is tried again")
-    assert sink.join(time.monotonic() + 5)
+    eventually(lambda: len(tries) > 4, what="it is tried again")
+    assert sink.join(time.monotonic() + 60)
     assert sum("tried again" in one.message for one in caplog.records) == 1
 
 
@@ -169,18 +167,18 @@ def test_a_viewer_that_is_killed_is_told_of_and_started_again(samples, tmp_path,
         recording = outputs.open("recording", lambda: Recorder(settings(tmp_path / "a.rrd")))
         live = outputs.open("live view", shown)
         feed(samples[:20], recording, live)
-        eventually(lambda: live.is_open() and live.idle, within_s=30, what="it is shown")
+        eventually(lambda: live.is_open() and live.idle, what="it is shown")
         os.kill(view.pid, signal.SIGKILL)
-        eventually(lambda: not listening(port), within_s=20, what="the viewer is dead")
-        eventually(lambda: _told(failures, live), within_s=20, what="that is noticed")
+        eventually(lambda: not listening(port), what="the viewer is dead")
+        eventually(lambda: _told(failures, live), what="that is noticed")
         (failed,) = failures.parts
         assert (failed.part, failed.reason) == ("live view", f"the viewer at {view.url} is gone")
         feed(samples[20:], recording, live)
-        eventually(live.is_open, within_s=30, what="it is started again")
+        eventually(live.is_open, what="it is started again")
         assert live.take_resumed(), "which asks for a keyframe"
         assert listening(port)
         assert failures.parts[0].working
-        outputs.close(within_s=20)
+        outputs.close(within_s=60)
     assert live.missing > 0
     assert recording.missing == 0
     assert len(Recording(tmp_path / "a.rrd").video()) == len(samples)
@@ -194,7 +192,7 @@ def test_a_recording_does_not_mind_that_a_viewer_is_gone(samples, tmp_path):
         live = Recorder(settings(None, live_url=view.url))
         live.log(samples[0])
         os.kill(view.pid, signal.SIGKILL)
-        eventually(lambda: not listening(port), within_s=20, what="the viewer is dead")
+        eventually(lambda: not listening(port), what="the viewer is dead")
         for number in range(30):  # while the SDK finds out that nobody takes what it sends
             with suppress(UserError):
                 live.log(samples[number + 1])

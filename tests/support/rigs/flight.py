@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -36,7 +37,9 @@ from hvt_ground.perception.stills.classify import FrameReadings, ObjectReading
 from hvt_ground.perception.stills.decode import DecodedStill
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary
+from hvt_ground.perception.worker import RealtimeWorker
 from media.clips import START_NS, framed, smooth_pictures
+from programs.processes import PATIENT_S
 from rigs import messages
 from rigs.examples import tracks_of
 
@@ -134,6 +137,12 @@ class DetectsAtOnce(DetectorThread):
         detection = Detection(image, detect)
         detection.run()
         return detection
+
+
+patient_worker = partial(
+    RealtimeWorker, name="test", clock=lambda: 0.0, finish_s=PATIENT_S, leave_s=PATIENT_S
+)
+"""No picture is too old for it, and at its end it leaves nothing, however busy the machine is."""
 
 
 def pipeline_of(
