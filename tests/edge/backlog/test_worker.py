@@ -53,7 +53,7 @@ class Link:
     def send(self, chunk: Chunk) -> int:
         """Send it."""
         self.entered.set()
-        self.full.wait(timeout=20)
+        self.full.wait(60)
         if self.gone:
             self.gone -= 1
             return 0
@@ -63,7 +63,7 @@ class Link:
 
 
 def worker_of(
-    path: Path, link: Link, *, info=INFO.pack, close_s: float = 5.0, send=None, session_id: int = 7
+    path: Path, link: Link, *, info=INFO.pack, close_s: float = 60.0, send=None, session_id: int = 7
 ) -> StoreWorker:
     """A store with its thread."""
     return StoreWorker(
@@ -84,7 +84,7 @@ def test_a_disk_that_hangs_costs_what_waits_and_says_so(tmp_path, caplog):
     disk = threading.Event()
 
     def slow() -> bytes:
-        disk.wait(timeout=20)
+        disk.wait(60)
         return INFO.pack()
 
     worker = worker_of(tmp_path / "store", Link(), info=slow, close_s=0.3)
@@ -94,7 +94,7 @@ def test_a_disk_that_hangs_costs_what_waits_and_says_so(tmp_path, caplog):
         worker.close()
     assert f"{taken - 1} frames and stills" in caplog.text, "one is being written"
     disk.set()
-    eventually(lambda: not len(worker.intake), within_s=10, what="the thread has gone on")
+    eventually(lambda: not len(worker.intake), what="the thread has gone on")
 
 
 def test_the_free_space_of_a_disk_that_hangs_is_unknown_and_holds_up_nobody(tmp_path, monkeypatch):
@@ -104,18 +104,18 @@ def test_the_free_space_of_a_disk_that_hangs_is_unknown_and_holds_up_nobody(tmp_
     def disk_usage(path):
         asked_by.add(threading.current_thread().name)
         if hangs.is_set():
-            on.wait(timeout=20)
+            on.wait(60)
         return measure(path)
 
     monkeypatch.setattr(shutil, "disk_usage", disk_usage)
     worker = worker_of(tmp_path / "not made yet", link)
-    eventually(lambda: worker.disk_free_bytes, within_s=10, what="the free space is known")
+    eventually(lambda: worker.disk_free_bytes, what="the free space is known")
     assert not any(asdict(worker.numbers).values()), "a summary tells of a store that was used"
     hangs.set()
     link.now_ns += 6 * S
     assert worker.disk_free_bytes is None
     on.set()
-    eventually(lambda: worker.disk_free_bytes, within_s=10, what="the free space is known")
+    eventually(lambda: worker.disk_free_bytes, what="the free space is known")
     worker.close()
     assert asked_by == {"hvt-store"}
 
@@ -126,7 +126,7 @@ def test_a_relative_folder_whose_place_is_gone_costs_the_store_alone(tmp_path, m
     tmp_path.rmdir()
     worker = worker_of(Path("store"), Link())
     worker.offer(UNIT)
-    eventually(lambda: worker.failed, within_s=10, what="it was tried")
+    eventually(lambda: worker.failed, what="it was tried")
     worker.close()
 
 
@@ -136,7 +136,7 @@ def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
     link.open = False
 
     def slow() -> bytes:
-        disk.wait(timeout=20)
+        disk.wait(60)
         return INFO.pack()
 
     with opened(tmp_path / "store", session_id=6) as folder:
@@ -147,9 +147,9 @@ def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
     worker.intake.end_segment()
     worker.intake.signal(video_first=True)
     disk.set()
-    eventually(lambda: worker.intake.idle, within_s=20, what="all is stored")
+    eventually(lambda: worker.intake.idle, what="all is stored")
     link.open = True
-    eventually(lambda: link.sent, within_s=20, what="an ended segment is sent")
+    eventually(lambda: link.sent, what="an ended segment is sent")
     assert link.sent[0][1].key[1] == "base", "before the still"
     assert not worker.offer(UNITS[0]) or worker.numbers.segments > 1
     worker.close()
@@ -165,7 +165,7 @@ def test_one_frame_is_not_nothing(tmp_path):
     worker = worker_of(tmp_path / "store", link)
     assert worker.numbers.empty
     worker.offer(UNIT)
-    eventually(lambda: not worker.numbers.empty, within_s=10, what="it is there")
+    eventually(lambda: not worker.numbers.empty, what="it is there")
     assert (worker.numbers.segments, worker.numbers.video_s) == (1, 0.0)
     worker.intake.end_segment()
     worker.close()
@@ -201,13 +201,13 @@ def test_a_link_that_is_full_does_not_hold_up_the_disk(tmp_path):
     link = Link()
     link.full.clear()
     worker = worker_of(tmp_path / "store", link)
-    assert link.entered.wait(timeout=10), "a chunk is being sent"
+    assert link.entered.wait(60), "a chunk is being sent"
     for unit in UNITS[:10]:
         worker.offer(shifted(unit, 50))
-    eventually(lambda: worker.numbers.segments == 2 and worker.intake.idle, within_s=10, what="it is kept")
+    eventually(lambda: worker.numbers.segments == 2 and worker.intake.idle, what="it is kept")
     assert link.sent == []
     link.full.set()
-    eventually(lambda: len(link.sent) > 3, within_s=10, what="it goes on")
+    eventually(lambda: len(link.sent) > 3, what="it goes on")
     worker.close()
 
 
@@ -218,12 +218,12 @@ def test_after_the_last_word_nothing_goes_out(tmp_path):
     link = Link()
     link.full.clear()
     worker = worker_of(tmp_path / "store", link)
-    assert link.entered.wait(timeout=10), "a chunk is being sent"
+    assert link.entered.wait(60), "a chunk is being sent"
     worker.send_no_more()
     link.full.set()
     for unit in UNITS[:10]:
         worker.offer(shifted(unit, 50))
-    eventually(lambda: worker.numbers.segments == 2 and worker.intake.idle, within_s=10, what="it is kept")
+    eventually(lambda: worker.numbers.segments == 2 and worker.intake.idle, what="it is kept")
     worker.close()
     assert len(link.sent) == 1, "the one that was under way"
 
@@ -235,7 +235,7 @@ def test_a_piece_whose_room_is_gone_comes_next_and_no_hole_is_left(tmp_path):
     link = Link()
     link.gone = 3
     worker = worker_of(tmp_path / "store", link)
-    eventually(lambda: len(link.sent) > 2, within_s=10, what="pieces go out")
+    eventually(lambda: len(link.sent) > 2, what="pieces go out")
     worker.close()
     offsets = [(chunk.offset, len(chunk.data)) for _, chunk in link.sent]
     assert [offset for offset, _ in offsets] == [
@@ -249,7 +249,7 @@ def test_where_live_stills_always_wait_a_trickle_goes_on(tmp_path):
         add_units(folder, UNITS)
     link = Link(live_waits=True)
     worker = worker_of(tmp_path / "store", link)
-    eventually(lambda: len(link.sent) == 1, within_s=10, what="the first piece")
+    eventually(lambda: len(link.sent) == 1, what="the first piece")
     for _ in range(400):
         before = len(link.sent)
         link.now_ns += S // 10
@@ -271,18 +271,16 @@ def test_a_folder_that_vanishes_in_mid_flight_is_made_again(tmp_path, caplog):
     worker = worker_of(store, link)
     for unit in UNITS[:10]:
         worker.offer(unit)
-    eventually(
-        lambda: worker.intake.idle and worker.numbers.video_s > 0.5, within_s=10, what="they are written"
-    )
+    eventually(lambda: worker.intake.idle and worker.numbers.video_s > 0.5, what="they are written")
     shutil.rmtree(store)
     with caplog.at_level(logging.WARNING):
         worker.offer(shifted(UNITS[0], 60))
-        eventually(lambda: worker.failed, within_s=10, what="it is noticed")
+        eventually(lambda: worker.failed, what="it is noticed")
         assert worker.numbers.empty
         assert not worker.offer(UNITS[0])
         assert not store.exists(), "the next try comes after a pause"
         link.now_ns += 2 * S
-        eventually(lambda: len(caplog.messages) == 2, within_s=10, what="it is tried again, and said")
+        eventually(lambda: len(caplog.messages) == 2, what="it is tried again, and said")
     assert [one.partition(": ")[0] for one in caplog.messages] == ["store", "store"], "once that, once this"
     (part,) = link.failures.parts
     assert (part.part, part.count, part.working) == ("store", 1, True)
@@ -301,15 +299,15 @@ def test_a_full_disk_stops_storing_alone_until_there_is_space(small_disk, caplog
         for unit in units:
             if not worker.offer(unit):
                 break
-            eventually(lambda: worker.intake.idle, within_s=10, what="it is taken")
-        eventually(lambda: worker.failed, within_s=10, what="the disk is full")
+            eventually(lambda: worker.intake.idle, what="it is taken")
+        eventually(lambda: worker.failed, what="the disk is full")
         stored = worker.numbers
         assert stored.segments >= 2
-        for _ in range(5):  # in vain: twice as long after each
+        for tries in (2, 3):  # in vain: twice as long after each
             link.now_ns += 100 * S
-            time.sleep(0.3)
+            eventually(lambda most=tries: link.failures.parts[0].count >= most, what="it is tried again")
         link.open = True
-        eventually(lambda: len({chunk.key for _, chunk in link.sent}) >= 2, within_s=10, what="it is sent")
+        eventually(lambda: len({chunk.key for _, chunk in link.sent}) >= 2, what="it is sent")
         link.open = False
         ranges = [
             AcknowledgedRange(session_id=7, kind="base", number=number, acknowledged_bytes=total)
@@ -318,15 +316,13 @@ def test_a_full_disk_stops_storing_alone_until_there_is_space(small_disk, caplog
         worker.intake.on_acknowledged(ranges, receiver_id=1)
         eventually(
             lambda: worker.numbers.segments == stored.segments - len(ranges),
-            within_s=10,
             what="it has arrived",
         )
         (small_disk / "filler").unlink()
         link.now_ns += 200 * S
-        eventually(lambda: not worker.failed, within_s=10, what="there is space")
+        eventually(lambda: not worker.failed, what="there is space")
     (part,) = link.failures.parts
     assert (part.part, part.working) == ("store", True)
-    assert part.count > 2
     assert "no space is left" in part.reason
     assert caplog.text.count("no space is left") == 1, "not at each try"
     worker.offer(shifted(UNITS[0], 1000))
@@ -342,13 +338,11 @@ def test_what_a_dying_run_had_kept_is_sent_by_the_next(tmp_path, caplog):
     with opened(store) as dying:
         add_stills(dying, {1: 1.0})
         worker = worker_of(store, link)
-        eventually(
-            lambda: "another edge uses it" in caplog.text, within_s=10, what="it found the folder taken"
-        )
+        eventually(lambda: "another edge uses it" in caplog.text, what="it found the folder taken")
         assert worker.numbers.empty
     link.now_ns += 2 * S
-    eventually(lambda: worker.numbers.stills == 1, within_s=10, what="it asked again")
-    eventually(lambda: link.sent, within_s=10, what="it is sent")
+    eventually(lambda: worker.numbers.stills == 1, what="it asked again")
+    eventually(lambda: link.sent, what="it is sent")
     worker.close()
 
 
@@ -364,12 +358,10 @@ def test_an_error_in_sending_stops_sending_alone(tmp_path, caplog):
     with opened(tmp_path) as store:
         add_stills(store, {1: 1.0, 2: 2.0, 3: 3.0})
     worker = worker_of(tmp_path, link, send=broken)
-    eventually(lambda: "what was stored is not sent" in caplog.text, within_s=10, what="it says so")
+    eventually(lambda: "what was stored is not sent" in caplog.text, what="it says so")
     assert worker.offer(UNITS[0]), "storing goes on"
     link.now_ns += 2 * S
-    eventually(
-        lambda: {1, 3} <= {chunk.key[2] for _, chunk in link.sent}, within_s=10, what="the others are sent"
-    )
+    eventually(lambda: {1, 3} <= {chunk.key[2] for _, chunk in link.sent}, what="the others are sent")
     worker.check()
     worker.close()
     (part,) = (one for one in link.failures.parts if one.part == "backlog")
@@ -408,7 +400,7 @@ def test_a_file_that_somebody_has_changed_ends_nothing(tmp_path, what):
     db.close()
     worker = worker_of(tmp_path, link, session_id=8)
     for _ in range(3):  # whatever had to wait for another try
-        eventually(lambda: worker.intake.idle, within_s=10, what="it reads")
+        eventually(lambda: worker.intake.idle, what="it reads")
         link.now_ns += 70 * S
     worker.offer(shifted(UNITS[0], 1000))
 
@@ -417,7 +409,7 @@ def test_a_file_that_somebody_has_changed_ends_nothing(tmp_path, what):
         link.now_ns += 70 * S
         return worker.offer(shifted(UNITS[0], 1000)) and worker.numbers.segments > 0
 
-    eventually(stores, within_s=20, what="frames are stored all the same")
+    eventually(stores, what="frames are stored all the same")
     worker.close()
 
 
@@ -429,15 +421,15 @@ def test_the_link_that_blocks_is_the_edges_own(tmp_path):
     def before_put(row: Channel) -> None:
         if row is Channel.BACKLOG:
             entered.set()
-            gate.wait(timeout=20)
+            gate.wait(60)
 
     rig.out.before_put = before_put
     rig.play(0, 21, reports=True)
     rig.play(21, 40, linked=False)
     rig.play(40, 90, linked=True, reports=True)
-    assert entered.wait(timeout=10), "a chunk is being sent"
+    assert entered.wait(60), "a chunk is being sent"
     rig.play(90, 110, linked=False)
-    eventually(lambda: rig.backlog.worker.numbers.video_s > 2.5, within_s=10, what="frames are stored")
+    eventually(lambda: rig.backlog.worker.numbers.video_s > 2.5, what="frames are stored")
     gate.set()
     assert {unit.frame_index for unit in rig.kept()} >= set(range(90, 110))
 
@@ -448,12 +440,12 @@ def test_what_was_sent_and_not_acknowledged_is_known_after_the_last_chunk(tmp_pa
     with opened(tmp_path) as store:
         add_stills(store, {3: 1.0})
     worker = worker_of(tmp_path, link)
-    eventually(lambda: link.sent, within_s=10, what="a chunk is sent")
+    eventually(lambda: link.sent, what="a chunk is sent")
     worker.send_no_more()
     sent_bytes = sum(len(chunk.data) for _, chunk in link.sent)
     time.sleep(0.3)  # turns in which nothing may be counted that does not leave
     assert worker.numbers.unacknowledged_bytes == sent_bytes == link.sent[0][1].total_bytes
     arrived = AcknowledgedRange(**still, acknowledged_bytes=sent_bytes)
     worker.intake.on_acknowledged([arrived], receiver_id=1)
-    eventually(lambda: not worker.numbers.unacknowledged_bytes, within_s=10, what="it has arrived")
+    eventually(lambda: not worker.numbers.unacknowledged_bytes, what="it has arrived")
     worker.close()

@@ -15,8 +15,7 @@ import pytest
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import StillResult
-from hvt_common.runtime.clock import SteadyClock
-from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
@@ -29,7 +28,7 @@ from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from hvt_edge.wiring.perception import make_analyzer
 from media.clips import framed, smooth_pictures
-from programs.processes import eventually
+from programs.processes import PATIENT_S, eventually
 from rigs.flight import CLASSES, SIZE, NothingSeen, RedSquares, square_box
 from rigs.world import Puts, make_still_stage, make_transmitter
 
@@ -366,12 +365,11 @@ def test_the_worker_takes_all_frames_in_order_and_finishes():
             results=list,
             failures=Failures(time.time_ns),
             clock=lambda: FRAMES[0].capture_ns,
-            finish_s=30,  # on a busy machine as well
+            finish_s=PATIENT_S,
         )
     ) as worker:
         for frame, unit in zip(FRAMES, UNITS, strict=True):
-            while worker.queued > 1:  # it is not hurried
-                time.sleep(0.001)
+            eventually(lambda: worker.queued < 2, what="it is not hurried")
             worker.take(frame, unit)
     assert rig.stage.analyzer.frames == 30
     assert [one.frame_index for one, _ in rig.out.stills] == [0, 15]
@@ -388,21 +386,22 @@ def test_stills_that_fail_stop_alone_and_go_on_from_a_keyframe(caplog):
                 raise RuntimeError("no memory")
             return super().detect(image_bgr)
 
-    rig, failures, clock = Rig(detector=Broken()), Failures(time.time_ns), SteadyClock()
+    rig, failures, now_ns = Rig(detector=Broken()), Failures(time.time_ns), FRAMES[0].capture_ns
     with closing(
-        StillWorker(rig.stage, results=list, failures=failures, clock=clock, pause=RetryPause(SECOND_NS // 5))
+        StillWorker(rig.stage, results=list, failures=failures, clock=lambda: now_ns, finish_s=PATIENT_S)
     ) as worker:
         worker.take(FRAMES[0], UNITS[0])
-        eventually(lambda: failures.parts, within_s=20, what="the failure is noticed")
+        eventually(lambda: failures.parts, what="the failure is noticed")
         assert not worker.take(FRAMES[1], UNITS[1]), "nothing is analyzed for a while"
         broken.clear()
-        eventually(lambda: not worker.full, within_s=20, what="the pause is over")
+        now_ns += 60 * SECOND_NS
+        assert not worker.full, "the pause is over"
         assert worker.take(FRAMES[2], UNITS[2]), "and is not decoded: units before it are missing"
         again = [replace(unit, keyframe=index == 3) for index, unit in enumerate(UNITS)]
         encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
         again[3:20] = [encoder.encode(frame, keyframe=frame.index == 3) for frame in FRAMES[3:20]]
         for index in range(3, 20):
-            eventually(lambda: worker.queued < 2, within_s=20, what="it is not hurried")
+            eventually(lambda: worker.queued < 2, what="it is not hurried")
             worker.take(FRAMES[index], again[index])
     (failed,) = failures.parts
     assert (failed.part, failed.count, failed.working) == ("stills", 1, True)

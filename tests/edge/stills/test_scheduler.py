@@ -306,18 +306,6 @@ def test_a_still_without_its_base_is_sent_once_more_and_only_once():
     assert rig.outcomes["sent", "again"] == 1
 
 
-def test_the_newer_still_of_a_track_makes_the_old_still_needless():
-    """Bits would go to the object as it was, while its present picture waits."""
-    rig = Rig(maker=BASE_CODED)
-    rig.consider({1: SMALL}, base=BLURRED)
-    assert rig.stills(100_000) == [1]
-    rig.outbox.on_undecodable(0)
-    rig.consider({1: SMALL}, base=BLURRED)
-    assert rig.stills(100_000) == [1]
-    assert [one.reason for one in rig.sent] == ["test", "test"]
-    assert rig.stills(100_000) == []
-
-
 def test_stills_of_other_codecs_are_never_sent_again():
     """A forged request would double what a ground already has."""
     rig = Rig(cooldown=60.0)

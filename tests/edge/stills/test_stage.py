@@ -32,7 +32,7 @@ from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from media.base_coded import StandIn
 from media.clips import framed, smooth_pictures
-from programs.processes import eventually
+from programs.processes import PATIENT_S, eventually
 from rigs.flight import CLASSES, SIZE, RedSquares, square_box
 from rigs.world import Puts, make_still_stage, make_transmitter
 
@@ -192,7 +192,7 @@ def test_frames_that_wait_are_bounded_in_bytes(coded_as_it_is):
 
     class Slow(RedSquares):
         def detect(self, image_bgr):
-            assert counted.wait(30)
+            assert counted.wait(60)
             return super().detect(image_bgr)
 
     frames = [replace(one, source_bgr=one.base_bgr) for one in FRAMES] if coded_as_it_is else FRAMES
@@ -206,8 +206,7 @@ def test_frames_that_wait_are_bounded_in_bytes(coded_as_it_is):
         max_bytes=4 * frame_bytes + 1,
     )
     worker.take(frames[0], UNITS[0])
-    while worker.queued:
-        time.sleep(0.001)
+    eventually(lambda: not worker.queued)
     offered = 1
     while not worker.full and offered < 16:
         worker.take(frames[offered], UNITS[offered])
@@ -248,22 +247,20 @@ def requested_beside(rig: Rig, blocking: Blocking) -> None:
     assert on_demand is not None
     now_ns = FRAMES[0].capture_ns
     worker = StillWorker(
-        rig.stage, results=list, failures=Failures(time.time_ns), clock=lambda: now_ns, finish_s=30
+        rig.stage, results=list, failures=Failures(time.time_ns), clock=lambda: now_ns, finish_s=PATIENT_S
     )
     try:
         for frame, unit in zip(FRAMES[:16], UNITS, strict=False):
-            eventually(
-                lambda: worker.queued < 2 or blocking.began.is_set(), within_s=20, what="it is not hurried"
-            )
+            eventually(lambda: worker.queued < 2 or blocking.began.is_set(), what="it is not hurried")
             if blocking.began.is_set():
                 break
             worker.take(frame, unit)
-        eventually(blocking.began.is_set, within_s=20, what="the other work has begun")
+        eventually(blocking.began.is_set, what="the other work has begun")
         before = len(rig.out.stills)
         worker.take(FRAMES[-1], None, late=True)
         _, frame_index = on_demand.request(OnDemandRequest(box_xywh_px=(40, 40, 96, 64)))
         assert frame_index == FRAMES[-1].index, "what the camera sees now, which nobody has analyzed"
-        eventually(lambda: len(rig.out.stills) > before, within_s=20, what="the requested still is there")
+        eventually(lambda: len(rig.out.stills) > before, what="the requested still is there")
         assert not blocking.released.is_set()
         assert rig.out.stills[-1][0].reason == "asked"
     finally:

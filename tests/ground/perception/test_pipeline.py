@@ -154,7 +154,7 @@ def test_lists_of_a_detector_that_is_a_second_behind_are_old(pictures):
         rig.pipeline.analyze(picture, hurry=False, news=news)
         if picture.frame_index == 0:
             release.release()
-            eventually(lambda: not rig.pipeline.searching, within_s=20, what="the first is searched")
+            eventually(lambda: not rig.pipeline.searching, what="the first is searched")
     rig.pipeline.pass_over(pictures[24].frame_index, pictures[24].capture_ns)
     rig.pipeline.edge_step(tracks_at(25, {7: (10.0, 10.0, 30.0, 30.0)}), capture_ns=pictures[25].capture_ns)
     due_ns = pictures[5].capture_ns
@@ -183,7 +183,7 @@ def test_a_picture_that_waits_for_the_detector_gives_way_to_the_newest(pictures)
     news.set()
     for one in (other, rig):
         one.pipeline.analyze(pictures[0], hurry=False, news=news)
-    eventually(lambda: not (other.pipeline.searching or rig.pipeline.searching), within_s=20, what="both see")
+    eventually(lambda: not (other.pipeline.searching or rig.pipeline.searching), what="both see")
     go.clear()
     other.pipeline.analyze(pictures[5], hurry=False, news=news)
     for picture in pictures[5:9]:
@@ -238,11 +238,11 @@ def test_while_the_detector_hangs_all_else_goes_on(flight, pictures, hangs_at):
     )
     if hangs_at:
         worker.picture(pictures[0])
-        eventually(lambda: worker.idle, within_s=20, what="the first is searched")
+        eventually(lambda: worker.idle, what="the first is searched")
     worker.picture(pictures[hangs_at])
     worker.step(tracks_at(hangs_at + 1, {7: square_box(hangs_at + 1)}), pictures[hangs_at + 1].capture_ns)
     worker.still(received(flight, hangs_at, 0))
-    eventually(lambda: rig.reader.had_base, within_s=20, what="the still is read")
+    eventually(lambda: rig.reader.had_base, what="the still is read")
     assert rig.of(Overlay)[-1].frame_index == hangs_at + 1
     assert rig.of(Overlay)[-1].origins
     assert not worker.idle

@@ -97,7 +97,7 @@ def ground(tmp_path: Path) -> Ground:
         Status.parse(item.payload), deferred={"cooldown": 3}, dropped={"base_good": 49, "too_large": 1}
     )
     ground.sessions.handle(replace(item, payload=report.pack()))
-    eventually(lambda: ground.opened[0].idle, within_s=60, what="the pictures are searched")
+    eventually(lambda: ground.opened[0].idle, what="the pictures are searched")
     return ground
 
 

@@ -491,7 +491,7 @@ def test_what_the_detector_finds_after_the_last_picture_names_its_tracks(flight)
     with Rig(detector=Hangs(), thread=DetectorThread(), worker_of=None) as rig:
         rig.port.flight = flight
         rig.put(flight.base(0), flight.still(0, 0))
-        wait_for(lambda: rig.reader.had_base)
+        eventually(lambda: rig.reader.had_base)
         assert not rig.receiver.idle
         release.set()
         rig.settle()

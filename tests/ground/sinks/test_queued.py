@@ -65,7 +65,7 @@ def test_one_that_waits_for_a_keyframe_has_it_asked_for_once():
     sink = QueuedSink("page", Waiting, failures=Failures(time.time_ns))
     for item, asks in (("shown", False), ("waits", True), ("shown", False)):
         sink.log(item)
-        eventually(lambda: sink.idle, within_s=20, what="it is taken")
+        eventually(lambda: sink.idle, what="it is taken")
         assert (sink.take_resumed(), sink.take_resumed()) == (asks, False)
     sink.close()
 

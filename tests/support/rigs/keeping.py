@@ -43,6 +43,7 @@ from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.backlog.assembly import BacklogAssembly
 from media.clips import START_NS, framed, smooth_pictures
+from programs.processes import eventually
 from rigs.kept import INFO, S, opened
 from rigs.messages import feedback
 from rigs.world import make_base_stage, make_operating, make_reconfiguration, make_transmitter
@@ -167,6 +168,8 @@ class Rig:
         inbox: FeedbackInbox | None = None,
     ) -> None:
         self.path, self.out, self.now_ns = folder, Out(), START_NS
+        self.looked_ns = START_NS
+        """When the store's thread looked at the clock."""
         self.linked = True
         self.keyframes = Keyframes(KeyframeSettings(interval_ns=60 * S))
         self.in_flight, self.outbox, self.ledger = BaseInFlight(), Outbox(), Ledger()
@@ -196,7 +199,7 @@ class Rig:
             link=link_of(self.sender, self.outbox),
             in_flight=self.in_flight,
             keyframes=self.keyframes,
-            clock=lambda: self.now_ns,
+            clock=self._clock,
             on_outcome=lambda *outcome: self.outcomes.append(outcome),
             failures=self.failures,
         )
@@ -231,6 +234,11 @@ class Rig:
             backlog=self.backlog,
         )
         self.coded: dict[int, bytes] = {}
+
+    def _clock(self) -> int:
+        if threading.current_thread().name == "hvt-store":
+            self.looked_ns = self.now_ns
+        return self.now_ns
 
     def play(self, first: int, end: int, *, linked: bool = True, reports: bool = False) -> None:
         """Frames of that stretch; a ground that ``reports`` does so after each seventh."""
@@ -290,7 +298,9 @@ class Rig:
         def turn() -> None:
             nonlocal turns
             turns += 1
-            time.sleep(0.005)  # the clock would run away from the thread that reads what was kept
+            time.sleep(0.005)
+            # The clock would run away from the thread that reads what was kept.
+            eventually(lambda: self.now_ns - self.looked_ns < S)
             self.now_ns += S // 10
             if reports and turns % 4 == 0:
                 self.report()

@@ -24,7 +24,7 @@ from hvt_fleet.link.diagnose import Watch, visit
 from hvt_fleet.link.probe import why_no_link
 from programs.fleet_keys import EXPIRED, Fleet
 from programs.outsider import joined
-from programs.processes import free_ports
+from programs.processes import eventually, free_ports
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def _server(answer: bytes | None) -> Iterator[int]:
         finally:
             stop.set()
             listening.shutdown(socket.SHUT_RDWR)
-            thread.join(5)
+            thread.join(60)
 
 
 # Probes of what is not Zenoh. Those of Zenoh with one fault each are in tests/integration/hostile/test_security.py.
@@ -157,10 +157,10 @@ def test_the_watch_explains_once_and_is_quiet_when_the_link_comes(
     settings = LinkSettings("edge", connect=(endpoint,), name="uav-1")
     with open_session(settings) as session, Watch(session, settings, served=lambda _: True) as watch:
         assert watch.trouble == ""
-        _until(lambda: watch.trouble)
+        eventually(lambda: watch.trouble)
         assert "nobody listens" in watch.trouble
         with open_session(LinkSettings("ground", listen=(endpoint,))):
-            _until(lambda: not watch.trouble)
+            eventually(lambda: not watch.trouble)
     lines = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     assert lines == [
         f"no link: {endpoint}: nobody listens on port {free_port} there: is the other side running?"
@@ -179,9 +179,9 @@ def test_a_second_link_that_does_not_come_is_said_once(
         open_session(LinkSettings("ground", listen=(endpoint,), zenoh_config=file)),
         open_session(settings) as session,
     ):
-        _until(session.info.links)
+        eventually(session.info.links)
         with Watch(session, settings, served=lambda _: True, patience_s=0.2) as watch:
-            _until(lambda: caplog.records)
+            eventually(lambda: caplog.records)
             time.sleep(0.6)
             assert watch.trouble == ""
     (said,) = [record.getMessage() for record in caplog.records]
@@ -197,19 +197,12 @@ def test_a_guest_with_one_link_is_no_half(
     own, other = f"tcp/127.0.0.1:{free_port}", f"tcp/127.0.0.1:{free_ports(1)[0]}"
     settings = LinkSettings("edge", listen=(own,), connect=(other,), name="uav-1", links=2)
     with open_session(LinkSettings("ground", listen=(other,), links=2)), open_session(settings) as session:
-        _until(lambda: len(session.info.links()) == 2)
+        eventually(lambda: len(session.info.links()) == 2)
         with Watch(session, settings, served=lambda _: True, patience_s=0.2) as watch, joined(own):
-            _until(lambda: len(session.info.links()) == 3)
+            eventually(lambda: len(session.info.links()) == 3)
             time.sleep(1.5)
             assert watch.trouble == ""
     assert not caplog.records
-
-
-def _until(true: object, *, within_s: float = 25.0) -> None:
-    deadline_s = time.monotonic() + within_s
-    while not true():  # type: ignore[operator]
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
 
 
 def _watching() -> bool:
@@ -218,7 +211,7 @@ def _watching() -> bool:
 
 def test_the_watch_ends_with_its_session_and_holds_nobody_up(fleet: Fleet) -> None:
     """Ctrl-C during a visit to a dead address has to end the program at once."""
-    _until(lambda: not _watching())
+    eventually(lambda: not _watching())
     visiting, gone = threading.Event(), threading.Event()
 
     def dead(_config: zenoh.Config) -> list[str]:
@@ -229,10 +222,10 @@ def test_the_watch_ends_with_its_session_and_holds_nobody_up(fleet: Fleet) -> No
     settings = fleet.settings("uav-1", "edge", connect=("tls/127.0.0.1:9",))
     with open_session(settings) as session:
         with Watch(session, settings, served=lambda _: True, patience_s=0.2, examine=dead):
-            assert visiting.wait(25)
+            assert visiting.wait(60)
         assert _watching(), "nobody has waited for the visit"
     gone.set()
-    _until(lambda: not _watching())
+    eventually(lambda: not _watching())
 
 
 # Keys, before the start

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -13,7 +12,9 @@ import zenoh
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.session import open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_fleet.link import duplicate_edge
 from hvt_fleet.link.duplicate_edge import living_edge
+from programs.processes import eventually
 from rigs.flight import Flight
 
 KEYS = EdgeKeys("uav-1")
@@ -58,21 +59,21 @@ def edge(
 
         serve(session, Channel.INFO, keys=KEYS, answer=answer)
         token = session.liveliness().declare_token(KEYS.key(Channel.ALIVE))
-        while not list(ground.liveliness().get(KEYS.key(Channel.ALIVE), timeout=20.0)):
-            time.sleep(0.02)
+        eventually(lambda: list(ground.liveliness().get(KEYS.key(Channel.ALIVE), timeout=20.0)))
         leaver = threading.Thread(target=lambda: left.wait(60) and token.undeclare(), daemon=True)
         leaver.start()
         yield left
         left.set()
-        leaver.join(5)
+        leaver.join(60)
 
 
-def test_an_edge_that_goes_on_is_found(ground, endpoint, info):
+def test_an_edge_that_goes_on_is_found(ground, endpoint, info, monkeypatch):
     """Two drones would fight for one screen."""
+    monkeypatch.setattr(duplicate_edge, "_LEAVING_S", 0.1)
     settings = LinkSettings("edge", connect=(endpoint,), name="uav-1")
     assert living_edge(settings, KEYS, patience=PATIENCE) is None
     with edge(ground, endpoint, info):
-        found = living_edge(settings, KEYS)
+        found = living_edge(settings, KEYS, patience=PATIENCE)
     assert found is not None
     assert found.pack() == info
 

@@ -108,7 +108,7 @@ def test_datagrams_are_of_seven_packets():
     """Larger ones are torn apart on the way, and lost as a whole."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(10)
+        receiver.settimeout(60)
         datagrams = Datagrams(Address(f"udp://127.0.0.1:{receiver.getsockname()[1]}"))
         assert datagrams.write(bytes(188 * 16)) == 188 * 16
         assert [len(receiver.recv(9000)) for _ in range(3)] == [1316, 1316, 376]

@@ -203,37 +203,47 @@ def test_a_full_disk_is_one_sentence(events):
     )
     for event in events:
         sink.log(event)
-    eventually(lambda: failures.now, within_s=10, what="the disk is full")
+    eventually(lambda: failures.now, what="the disk is full")
     assert "MPEG-TS file /dev/full cannot be written any further: No space left" in failures.now[0].reason
-    assert sink.join(time.monotonic() + 10)
+    assert sink.join(time.monotonic() + 60)
 
 
 def test_a_player_on_udp_has_it_live(events):
     """The very use of it: somebody watches."""
+    # The player ends where nothing comes for so long: this machine may be busy.
+    for patience_s in (2, 5, 20):
+        found = live(events, patience_s)
+        if len(found.video) >= FRAMES - 2 and len(found.klv) >= FRAMES - 4:
+            break
+    # A player that has not received the end does not know whether its last packets are whole.
+    assert len(found.video) >= FRAMES - 2
+    assert [units(data) for _, data in found.video[:-1]] == [
+        units(one.data) for one in samples_of(events)[: len(found.video) - 1]
+    ]
+    assert len(found.klv) >= FRAMES - 4
+    assert all(one.targets for one in found.klv)
+
+
+def live(events, patience_s: int) -> ReadStream:
+    """What a player on UDP has of them."""
     (port,) = free_ports(1)
     found: list[ReadStream] = []
-    options = {"timeout": "2000000", "fifo_size": "100000"}
+    options = {"timeout": f"{patience_s}000000", "fifo_size": "100000"}
     player = threading.Thread(
         target=lambda: found.append(read_stream(f"udp://127.0.0.1:{port}", format="mpegts", options=options))
     )
     player.start()
     addresses = Addresses()
     stream = live_stream(Address(f"udp://127.0.0.1:{port}"), platform=PLATFORM, fps=15, addresses=addresses)
-    eventually(lambda: _bound(port), within_s=10, what="the player listens")
+    eventually(lambda: _bound(port), what="the player listens")
     for event in events:
         stream.log(event)
         time.sleep(0.005)
     stream.close()
-    player.join(30)
+    player.join(60)
     assert len(found) == 1, "the player ended"
-    # A player that has not received the end does not know whether its last packets are whole.
-    assert len(found[0].video) >= FRAMES - 2
-    assert [units(data) for _, data in found[0].video[:-1]] == [
-        units(one.data) for one in samples_of(events)[: len(found[0].video) - 1]
-    ]
-    assert len(found[0].klv) >= FRAMES - 4
-    assert all(one.targets for one in found[0].klv)
     addresses.take(Address(f"udp://127.0.0.1:{port}"), edge="uav-2")
+    return found[0]
 
 
 def _bound(port: int) -> bool:

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from programs.processes import PATIENT_S
+
 
 class Autopilot:
     """Packs what an autopilot says several times a second, as MAVLink 2 unless it is asked for 1."""
@@ -89,7 +91,9 @@ def send(port: int) -> Iterator:
 def wait_for():
     """Wait for the pose to be as wanted, repeating what is to be said meanwhile."""
 
-    def wait_for(source, *, accept=lambda pose: pose is not None, say=lambda: None, limit_s: float = 8.0):
+    def wait_for(
+        source, *, accept=lambda pose: pose is not None, say=lambda: None, limit_s: float = PATIENT_S
+    ):
         until = time.monotonic() + limit_s
         while time.monotonic() < until:
             say()
