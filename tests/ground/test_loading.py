@@ -57,7 +57,9 @@ def compiler(monkeypatch: pytest.MonkeyPatch):
 
 def nothing(_info: object):
     """A program that takes nothing, in place of a recording."""
-    return lambda: SimpleNamespace(path=None, log=lambda _: None, close=lambda _=None: None)
+    return lambda: SimpleNamespace(
+        path=None, awaits_keyframe=False, log=lambda _: None, close=lambda _=None: None
+    )
 
 
 def test_video_is_recorded_while_the_detector_loads_and_boxes_come_with_it(compiler, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job
 from hvt_ground.sinks import QueuedSink
+from hvt_ground.sinks.contract import SinkWriter
 from programs.processes import eventually
 from rigs.backlog_chunks import video_object
 from rigs.examples import refinement
@@ -59,7 +60,7 @@ def test_work_that_was_never_begun_lets_its_recording_go():
     assert None not in outcomes
 
 
-class SlowFile:
+class SlowFile(SinkWriter[Event]):
     """Writes when the disk is ``ready``; ``breaks`` makes the next write fail."""
 
     path = None
