@@ -28,7 +28,7 @@ from hvt_web.viewers import Hub, Viewer, packed, text
 MOST_MESSAGE_BYTES = 4096
 MOST_VIEWERS = 64
 _MOST_MESSAGES_A_S = 30
-_WATCH_PAUSE_S = 0.2
+WATCH_PAUSE_S = 0.2
 _COOKIE_S = 30 * 86400
 _KINDS = {"js": "text/javascript", "css": "text/css", "html": "text/html", "svg": "image/svg+xml"}
 _FILES = {
@@ -144,7 +144,7 @@ class Site:
                 message = json.loads(await socket.receive_text())
                 self._obey(viewer, message)
                 if message["type"] != "time":  # each sends all that is known, and may have pictures made anew
-                    await asyncio.sleep(_WATCH_PAUSE_S)
+                    await asyncio.sleep(WATCH_PAUSE_S)
             except (WebSocketDisconnect, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError):
                 return
             now_s = time.monotonic()

@@ -43,7 +43,7 @@ from hvt_common.values import Image
 from hvt_common.video.still_codecs import StillError
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
 
-_ANSWER_S = 2.0
+ANSWER_S = 2.0
 _POLL_S = 0.3
 _OUTCOME_S = 0.5
 """Time between two queries of the outcome of a still that does not come."""
@@ -292,7 +292,7 @@ class RemoteEdge:
         return "" if outcome is None else outcome.note
 
     def _why_late(self) -> str:
-        alive = self._session.liveliness().get(self._keys.key(Channel.ALIVE), timeout=_ANSWER_S)
+        alive = self._session.liveliness().get(self._keys.key(Channel.ALIVE), timeout=ANSWER_S)
         if any(reply.ok is not None for reply in alive):
             return "the link is full, or has lost it"
         return "the edge is not there any more: it has ended, or its link is down"
@@ -317,7 +317,7 @@ class RemoteEdge:
 
     def _query(self, row: Channel, question: bytes) -> bytes | None:
         try:
-            return query(self._session, row, keys=self._keys, question=question, timeout_s=_ANSWER_S)
+            return query(self._session, row, keys=self._keys, question=question, timeout_s=ANSWER_S)
         except zenoh.ZError:
             return None
 
@@ -367,7 +367,7 @@ class EdgeClient:
 
     def names(self) -> list[str]:
         """The edges that are there now."""
-        replies = self._session.liveliness().get(selector(Channel.ALIVE), timeout=_ANSWER_S)
+        replies = self._session.liveliness().get(selector(Channel.ALIVE), timeout=ANSWER_S)
         keys = [parse_key(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None]
         return sorted({key[0] for key in keys if key is not None})
 

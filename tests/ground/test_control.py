@@ -84,7 +84,7 @@ class ScriptedEdge:
 @pytest.fixture
 def edge(free_port, monkeypatch) -> Iterator[ScriptedEdge]:
     """One that listens."""
-    monkeypatch.setattr(control, "_ANSWER_S", PATIENT_S)
+    monkeypatch.setattr(control, "ANSWER_S", PATIENT_S)
     scripted = ScriptedEdge(free_port)
     with (
         open_session(LinkSettings("edge", listen=(scripted.endpoint,))) as session,

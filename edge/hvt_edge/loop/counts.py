@@ -17,7 +17,7 @@ from hvt_common.values import Frame
 from hvt_edge.source.contract import Source
 from hvt_edge.video.stage import Action, FrameDecision
 
-_STAT = Path("/proc/stat")
+STAT = Path("/proc/stat")
 _GROUPS = Path("/proc/self/cgroup")
 _TOP = Path("/sys/fs/cgroup")
 _MOST_SHORT = 600
@@ -67,7 +67,7 @@ class CpuMeter:
         others = max(0.0, here.busy_s - last.busy_s - own_s) / wall_s
         taken = own_s / wall_s
         self.now = Cores(
-            needed=taken * scale, free=max(0.0, min(len(_cores()) - others, quota())), taken=taken
+            needed=taken * scale, free=max(0.0, min(len(usable_cores()) - others, quota())), taken=taken
         )
         if short:
             self._short = [*self._short[-_MOST_SHORT:], self.now]
@@ -81,7 +81,7 @@ class CpuMeter:
 
 def processors() -> float:
     """Processors that this process may use: those it may run on, or less by the limit of its control group."""
-    return min(len(_cores()), quota())
+    return min(len(usable_cores()), quota())
 
 
 def quota(groups: Path = _GROUPS, top: Path = _TOP) -> float:
@@ -114,14 +114,15 @@ def _limit(group: Path, files: Sequence[str]) -> float:
         return math.inf
 
 
-def _cores() -> set[int]:
+def usable_cores() -> set[int]:
+    """The processor cores that this process may run on."""
     return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
 
 
 def _sample() -> _Sample | None:
-    names = {f"cpu{core}" for core in _cores()}
+    names = {f"cpu{core}" for core in usable_cores()}
     try:
-        rows = [line.split() for line in _STAT.read_text(encoding="ascii").splitlines()]
+        rows = [line.split() for line in STAT.read_text(encoding="ascii").splitlines()]
         busy = sum(
             sum(int(value) for place, value in enumerate(row[1:9]) if place not in _IDLE)
             for row in rows

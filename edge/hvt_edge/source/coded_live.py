@@ -30,7 +30,7 @@ from hvt_edge.source.stream import StreamGrabber, camera_time_ns, is_stamped, pa
 
 _LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
 """A camera is surveyed before the flight until its second keyframe, within these."""
-_QUEUE_S, _LEAST_QUEUED, _MOST_QUEUED_BYTES = 1.0, 8, 8 * 2**20
+QUEUE_S, _LEAST_QUEUED, _MOST_QUEUED_BYTES = 1.0, 8, 8 * 2**20
 _IDLE_S = 1.0
 
 
@@ -151,7 +151,7 @@ class CodedLiveSource(LiveSource):
             self._number += 1
             self._queue.append(_Queued(self._number, capture_ns, packet))
             self._queued_bytes += len(packet.data)
-            most = max(_LEAST_QUEUED, round(_QUEUE_S * self.fps))
+            most = max(_LEAST_QUEUED, round(QUEUE_S * self.fps))
             if len(self._queue) > most or self._queued_bytes > _MOST_QUEUED_BYTES:
                 self.missed += len(self._queue)
                 self._queue.clear()

@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 _ANSWER_S = 1.0
 _ATTEMPT_S = 2.5
 """Limit of one attempt: a link that drops everything must not keep an edge from starting."""
-_LEAVING_S = 5.0
+LEAVING_S = 5.0
 """An edge that is shutting down still answers for so long; its successor is not refused because of it."""
 _PAUSE_S = 0.5
 
@@ -59,7 +59,7 @@ def living_edge(settings: LinkSettings, keys: EdgeKeys, *, patience: float = 1.0
     multiplies all time limits. Raises `UserError` where the settings cannot be used.
     """
     found = _attempt(settings, keys, patience)
-    until_s = time.monotonic() + patience * _LEAVING_S
+    until_s = time.monotonic() + patience * LEAVING_S
     while found is not None and time.monotonic() < until_s:
         time.sleep(_PAUSE_S)
         found = _attempt(settings, keys, patience)

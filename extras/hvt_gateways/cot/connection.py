@@ -55,9 +55,9 @@ _ADDR, _ADDRS = "PYTAK_MULTICAST_LOCAL_ADDR", "PYTAK_MULTICAST_LOCAL_ADDRS"
 _TTL: Final = "PYTAK_MULTICAST_TTL"
 _MOST_TTL: Final = 127
 """pytak packs it into a signed byte."""
-_CONNECT_S: Final = 5.0
-_SEND_S: Final = 10.0
-_END_S: Final = 1.0
+CONNECT_S: Final = 5.0
+SEND_S: Final = 10.0
+END_S: Final = 1.0
 _MOST_EVENTS: Final = 2048
 _SOCKET_BYTES: Final = 64 * 1024
 """The kernel's buffer: events in it cannot be replaced by newer ones."""
@@ -198,7 +198,7 @@ class CotConnection(SinkWriter[CotMessage]):
             if hurry is not None and hurry.is_set():
                 self._unsent.clear()
         self._notify()
-        self._thread.join(2 * _END_S)
+        self._thread.join(2 * END_S)
 
     def _notify(self) -> None:
         with suppress(RuntimeError):  # the loop has ended, and `_error` says why
@@ -226,7 +226,7 @@ class CotConnection(SinkWriter[CotMessage]):
             self._loop.close()
 
     async def _use(self) -> None:
-        reader, writer = await asyncio.wait_for(pytak.protocol_factory(self._settings), _CONNECT_S)
+        reader, writer = await asyncio.wait_for(pytak.protocol_factory(self._settings), CONNECT_S)
         tasks = []
         try:
             _bound_buffers(writer)
@@ -246,7 +246,7 @@ class CotConnection(SinkWriter[CotMessage]):
             await self._wake.wait()
             self._wake.clear()
             while (data := self._take()) is not None:
-                await asyncio.wait_for(_send_one(writer, data), _END_S if self._ending else _SEND_S)
+                await asyncio.wait_for(_send_one(writer, data), END_S if self._ending else SEND_S)
             if self._ending:
                 return
 
@@ -277,14 +277,14 @@ def _bound_buffers(writer: Any) -> None:
     made = writer.get_extra_info("socket")
     made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BYTES)
     if hasattr(socket, "TCP_USER_TIMEOUT"):  # a server that is gone without a word
-        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(_SEND_S * 1000))
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(SEND_S * 1000))
 
 
 async def _close(writer: Any) -> None:
     writer.close()
     if isinstance(writer, asyncio.StreamWriter):
         with suppress(Exception):  # it may be broken, which is why it is closed
-            await asyncio.wait_for(writer.wait_closed(), _END_S)
+            await asyncio.wait_for(writer.wait_closed(), END_S)
         writer.transport.abort()  # of a server that does not answer the farewell of TLS
     await asyncio.sleep(0)  # transports close in the loop's next round
 

@@ -37,10 +37,10 @@ class Machine:
         self.wall_s += seconds
         self.own_s += own_s
         self.others_s += others_s
-        ticks = os.sysconf("SC_CLK_TCK")
-        own, others = round(self.own_s * ticks), round(self.others_s * ticks)
+        hertz = os.sysconf("SC_CLK_TCK")
+        own, others = round(self.own_s * hertz), round(self.others_s * hertz)
         self.stat.write_text(
-            f"cpu 9 9 9 9 9 9 9 9 0 0\ncpu0 {own} 0 0 {7 * ticks} {8 * ticks} 0 0 {others} 0 0\n"
+            f"cpu 9 9 9 9 9 9 9 9 0 0\ncpu0 {own} 0 0 {7 * hertz} {8 * hertz} 0 0 {others} 0 0\n"
         )
 
 
@@ -50,7 +50,7 @@ def machine(tmp_path, monkeypatch) -> Machine:
     made = Machine(tmp_path / "stat")
     made.passes(0.0, own_s=0.0)
     clocks = SimpleNamespace(monotonic=lambda: made.wall_s, process_time=lambda: made.own_s)
-    for name, part in {"_STAT": made.stat, "time": clocks, "_cores": lambda: {0}}.items():
+    for name, part in {"STAT": made.stat, "time": clocks, "usable_cores": lambda: {0}}.items():
         monkeypatch.setattr(counts, name, part)
     return made
 

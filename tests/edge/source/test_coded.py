@@ -189,7 +189,7 @@ def units(tmp_path_factory) -> list[bytes]:
 @pytest.mark.timeout(60)
 def test_no_unit_of_a_live_camera_is_lost(free_port, units, monkeypatch):
     """Each one that is missing is a picture that stands still up to the next keyframe."""
-    monkeypatch.setattr(coded_live, "_QUEUE_S", 60.0)  # this machine may be busy for seconds
+    monkeypatch.setattr(coded_live, "QUEUE_S", 60.0)  # this machine may be busy for seconds
     even = count(SECOND_NS, SECOND_NS // 25).__next__
     with RtspCamera(free_port, units=units, clock_ns=even) as camera, coded(camera.url) as source:
         assert source.live

@@ -346,7 +346,7 @@ def test_nonsense_closes_that_connection_alone(local, message):
 def test_who_changes_what_is_shown_all_the_time_gets_a_few(local, monkeypatch, does, messages):
     """Each time pictures are made anew from their keyframe: one viewer would take the processor from all others."""
     done: list[str] = []
-    monkeypatch.setattr(site, "_WATCH_PAUSE_S", 60.0)
+    monkeypatch.setattr(site, "WATCH_PAUSE_S", 60.0)
     monkeypatch.setattr(Hub, does, lambda *_, **__: done.append(does))
     with joined(local) as viewer:
         for message in messages:

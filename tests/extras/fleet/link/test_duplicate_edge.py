@@ -69,7 +69,7 @@ def edge(
 
 def test_an_edge_that_goes_on_is_found(ground, endpoint, info, monkeypatch):
     """Two drones would fight for one screen."""
-    monkeypatch.setattr(duplicate_edge, "_LEAVING_S", 0.1)
+    monkeypatch.setattr(duplicate_edge, "LEAVING_S", 0.1)
     settings = LinkSettings("edge", connect=(endpoint,), name="uav-1")
     assert living_edge(settings, KEYS, patience=PATIENCE) is None
     with edge(ground, endpoint, info):

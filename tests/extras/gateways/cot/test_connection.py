@@ -88,7 +88,7 @@ class Server:
 @pytest.fixture(autouse=True)
 def patient(monkeypatch) -> None:
     """However busy this machine is, the server has time."""
-    for name in ("_CONNECT_S", "_SEND_S", "_END_S"):
+    for name in ("CONNECT_S", "SEND_S", "END_S"):
         monkeypatch.setattr(cot_connection, name, PATIENT_S)
 
 
@@ -366,7 +366,7 @@ def test_certificates_that_do_not_fit_are_said(port, fleet, tmp_path, server_nam
 
 def test_a_server_that_never_shakes_hands_does_not_hold_up_the_end(port, fleet, monkeypatch):
     """Ctrl-C would be answered with kill -9."""
-    monkeypatch.setattr(cot_connection, "_CONNECT_S", 0.3)
+    monkeypatch.setattr(cot_connection, "CONNECT_S", 0.3)
     server = Server(port, reads=False)
     try:
         sink, failures = sink_of(f"tls://127.0.0.1:{port}", keys(fleet))
