@@ -23,7 +23,7 @@ _WIDTH = 100
 _LINE_EVERY_S = 60
 _FIRST_LINE_S = 1.0
 """What cannot be done at all says so sooner."""
-_SOON_S = 10.0
+_SOON_S = 45.0
 """Nearer to the end seconds are not told: the last runs, which end as they will, are all of it."""
 _REMEMBERED = 64
 _LEAST = 4
@@ -164,12 +164,10 @@ class RunProgress:
     def _more(self, left_s: float, failed: int) -> str:
         words = [f"{failed} failed"] if failed else []
         if left_s:
-            amount = (
-                f"about {timedelta(seconds=round(left_s))}"
-                if left_s >= _SOON_S
-                else "less than half a minute"
+            soon = left_s < _SOON_S
+            words.append(
+                f"{'less than a minute' if soon else f'about {timedelta(seconds=round(left_s))}'} left"
             )
-            words.append(f"{amount} left")
         return ", ".join(words)
 
 

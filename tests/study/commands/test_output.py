@@ -50,7 +50,7 @@ def test_of_the_first_steps_nothing_is_concluded():
     assert time_left_s(deque([(20.0, 1), (20.1, 2)]), 80) == 0
 
 
-@pytest.mark.parametrize(("left_s", "says"), [(9.9, "less than half a minute"), (20.0, "about 0:00:20")])
+@pytest.mark.parametrize(("left_s", "says"), [(44.0, "less than a minute"), (50.0, "about 0:00:50")])
 def test_near_the_end_no_seconds_are_told(capsys, left_s, says):
     """Who waits would read of 14 seconds while four are left, or while forty are."""
     with RunProgress("flights", first_line_s=60) as flights:
