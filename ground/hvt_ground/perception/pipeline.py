@@ -252,7 +252,7 @@ class Pipeline:
             self._take_found(self._detection)
             own = self._own = self._parts.tracker.extrapolated(frame_index=self._now.picture_index)
             self._parts.fusion.take_own(own)
-            self._revise(own)
+            self._track_ids.add(self._revise(own).tracks.ids.tolist())
         return self.searching
 
     def pass_over(self, index: int, capture_ns: int) -> None:
