@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvt_edge.operating import LoopClock, Operating, base_rate_bps
+from hvt_edge.operating import LoopClock, Operating, Rates, base_rate_bps
 
 
 def operating() -> Operating:
@@ -15,7 +15,7 @@ def test_a_reader_has_one_moment():
     holder = operating()
     before = holder.now
     holder.command(budget_bps=200_000, video_share=None, method="M6")
-    holder.open(total_bps=150_000, base_bps=100_000, decimation=3)
+    holder.open(Rates(total_bps=150_000, base_bps=100_000, decimation=3), total_bps=150_000)
     assert (before.budget_bps, before.method, before.decimation) == (400_000, "M5", 1)
     now = holder.now
     assert (now.budget_bps, now.video_share, now.method) == (200_000, None, "M6")
