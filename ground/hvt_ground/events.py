@@ -18,6 +18,11 @@ from hvt_common.values import Boxes, Image, Pose, View
 VEHICLE = "vehicle"
 
 
+def shown_word(name: str, vague: bool, doubted: bool = False) -> str:  # noqa: FBT001, FBT002 - for `map`
+    """The word for people: that of the class, ``vehicle`` where it is vague, ``something`` where it is doubted."""
+    return "something" if doubted else VEHICLE if vague else name
+
+
 def _nowhere() -> npt.NDArray[np.bool_]:
     return np.zeros(0, np.bool_)
 
@@ -109,11 +114,8 @@ class Overlay:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """N names for people: that of the class, ``vehicle`` where it is vague, ``something`` where it is doubted."""
-        words = np.array(self.classes, object)
-        words[self.vague] = VEHICLE
-        words[self.doubted] = "something"
-        return tuple(words)
+        """N of `shown_word`."""
+        return tuple(map(shown_word, self.classes, self.vague.tolist(), self.doubted.tolist()))
 
     @property
     def firm(self) -> npt.NDArray[np.bool_]:
@@ -162,10 +164,17 @@ class Refinement:
     """The still says that the object is nothing of mine."""
     sure: bool = False
     """``class_after`` has a calibrated probability above .9."""
+    vague: tuple[bool, bool] = (False, False)
+    """Of the class before and after, as `Overlay.vague`."""
     shown_index: int = 0
     """The frame that the still shows; ``frame_index`` is the one at which it was known."""
     header: RoiHeader | None = None
     """The still's own message, in source pixels; None where nobody has it."""
+
+    @property
+    def words(self) -> tuple[str, str]:
+        """`shown_word` of the class before and after."""
+        return shown_word(self.class_before, self.vague[0]), shown_word(self.class_after, self.vague[1])
 
 
 @dataclass(frozen=True, slots=True)

@@ -190,14 +190,15 @@ def placed_tracks(overlay: Overlay) -> Iterator[PlacedTrack]:
     if places is None:
         return
     known = np.isfinite(places.places_deg).all(axis=1) & np.isfinite(places.ellipses[:, 0])
+    words = overlay.words
     for row in np.flatnonzero(known & ~overlay.doubted).tolist():
         latitude, longitude = places.places_deg[row].tolist()
         yield PlacedTrack(
             track_id=int(overlay.track_ids[row]),
             place=(latitude, longitude),
             error_m=float(places.ellipses[row, 0]),
-            name=overlay.words[row],
-            base_name=overlay.base_classes[row],
+            name=words[row],
+            base_name=words[row] if overlay.vague[row] else overlay.base_classes[row],
             confidence=float(overlay.confidences[row]),
             refined=bool(overlay.refined[row]),
             sure=bool(overlay.sure[row]),

@@ -24,7 +24,7 @@ from hvt_ground.perception.history import History
 from hvt_ground.perception.models import ModelSet
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.perception.stills.refine import Refiner
+from hvt_ground.perception.stills.refine import Refiner, ViewTilt
 from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 
@@ -46,6 +46,7 @@ class StretchTracker:
         detect_every: int,
         emit: Emit,
         trust: ViewTrust,
+        tilt: ViewTilt,
         guesses: Guesses | None,
     ) -> None:
         self._detector = detector
@@ -54,6 +55,7 @@ class StretchTracker:
         self._detect_every = detect_every
         self._emit = emit
         self._trust = trust
+        self._tilt = tilt
         self._guesses = guesses
         self._detected: int | None = None
         self.next_id = first_id
@@ -65,6 +67,7 @@ class StretchTracker:
             found = self._detector.detect(image_bgr) or Detections.none()
             self._trust.take(found)
             tracks = self._tracker.update(found, frame_index=frame_index, image_bgr=image_bgr)
+            self._tilt.take(tracks, self._detector.class_names, height_px=image_bgr.shape[0])
         else:
             tracks = self._tracker.predict(frame_index=frame_index, image_bgr=image_bgr)
         ids = tracks.ids + (self._first_id - 1)
@@ -86,6 +89,7 @@ class StretchTracker:
                 refined=np.zeros(len(tracks), np.bool_),
                 stored=True,
                 doubted=doubted,
+                vague=np.array([self._tilt.is_vague(name) for name in names], np.bool_),
             )
         )
 
@@ -94,8 +98,8 @@ class BacklogPerception:
     """Of one session. For one thread at a time.
 
     ``take_models`` gives detector and classifier, ``tracker_of`` makes a tracker for one stretch,
-    ``reader_of`` makes what names stills of detector and classifier; ``trust`` is of the session's view,
-    ``guesses_of`` of one stretch.
+    ``reader_of`` makes what names stills of detector and classifier; ``trust`` and ``tilt`` are of the session's
+    view, ``guesses_of`` of one stretch.
     """
 
     def __init__(
@@ -107,6 +111,7 @@ class BacklogPerception:
         reader_of: Callable[[FailingDetector, Classifier | None], StillReader],
         detect_every: int,
         trust: ViewTrust,
+        tilt: ViewTilt | None = None,
         guesses_of: Callable[[], Guesses | None] = lambda: None,
     ) -> None:
         self._info = info
@@ -115,6 +120,7 @@ class BacklogPerception:
         self._reader_of = reader_of
         self._detect_every = detect_every
         self._trust = trust
+        self.tilt = tilt or ViewTilt()
         self._guesses_of = guesses_of
         self._next_id = FIRST_TRACK_ID
 
@@ -128,6 +134,7 @@ class BacklogPerception:
             detect_every=self._detect_every,
             emit=emit,
             trust=self._trust,
+            tilt=self.tilt,
             guesses=self._guesses_of(),
         )
         try:
@@ -144,7 +151,7 @@ class BacklogPerception:
         vocabulary = Vocabulary(names, reader.class_names)
         stage = StillStage(
             reader,
-            Refiner("fuse", fps=info.fps, vocabulary=vocabulary),
+            Refiner("fuse", fps=info.fps, vocabulary=vocabulary, tilt=self.tilt),
             vocabulary=vocabulary,
             history=History(),
             fusion=Fusion(

@@ -19,6 +19,7 @@ from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.link.statistics import StillSequenceWindow
 from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.sinks import QueuedSink, Receipt
 
 _LEAST_IOU, _MOST_LATE = 0.4, 512
@@ -59,10 +60,11 @@ class BacklogTotals:
 class LateStills:
     """Stored stills name the tracks of stored video: each the one whose box it shows at its frame.
 
-    For one session and one thread. Stills come before the boxes of their frame.
+    For one session and one thread. Stills come before the boxes of their frame, and before its ``tilt`` is known.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, tilt: ViewTilt) -> None:
+        self._tilt = tilt
         self._stills: Newest[int, list[Refinement]] = Newest(_MOST_LATE)
         """Those of no track yet, by frame."""
         self._named: Newest[int, Refinement] = Newest(_MOST_LATE)
@@ -83,7 +85,8 @@ class LateStills:
             if shares[best] >= _LEAST_IOU:
                 self._named[tracks[best]] = still
                 before = overlay.base_classes[best]
-                yield replace(still, track_id=tracks[best], class_before=before)
+                vague = bool(overlay.vague[best]), self._tilt.vague_of(still)[1]
+                yield replace(still, track_id=tracks[best], class_before=before, vague=vague)
         stills = [self._named.get(track) for track in tracks]
         if not any(stills):
             yield overlay
@@ -91,12 +94,14 @@ class LateStills:
         classes = zip(overlay.classes, stills, strict=True)
         confidences = zip(overlay.confidences.tolist(), stills, strict=True)
         doubts = zip(overlay.doubted.tolist(), stills, strict=True)
+        guesses = zip(overlay.vague.tolist(), stills, strict=True)
         yield replace(
             overlay,
             classes=tuple(still.class_after if still else name for name, still in classes),
             confidences=np.array([s.confidence if s else own for own, s in confidences], np.float32),
             refined=np.array([still is not None for still in stills], np.bool_),
             doubted=np.array([s.doubted if s else own for own, s in doubts], np.bool_),
+            vague=np.array([self._tilt.vague_of(s)[1] if s else own for own, s in guesses], np.bool_),
         )
 
 
@@ -130,7 +135,7 @@ class SessionBacklog:
         self._frame_ns = round(SECOND_NS / info.fps)
         self._lock = threading.Lock()
         self._frames = SequenceWindow()
-        self._late = LateStills()
+        self._late = LateStills(ViewTilt() if perception is None else perception.tilt)
         self.totals = BacklogTotals()
         """Totals since the start."""
         self._news = BacklogTotals()

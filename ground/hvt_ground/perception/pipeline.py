@@ -12,7 +12,6 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.inference.class_names import VEHICLE_KINDS, kind_of
 from hvt_common.inference.detect import FailingDetector
 from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.scale_search import ScaleSearch
@@ -383,17 +382,8 @@ class Pipeline:
         self.trust.take(found)
         own = parts.tracker.update_late(found)
         self.objects_detected = int((own.seen_frames == own.frame_index).sum())
-        self.tilt.take(self._vehicles(own), height_px=self._base_size[1])
+        self.tilt.take(own, parts.vocabulary.names, height_px=self._base_size[1])
         return own
-
-    def _vehicles(self, own: Tracks) -> Boxes:
-        # Those that the detector has just seen.
-        names = self._parts.vocabulary.names
-        vehicles = np.array(
-            [kind_of(names[class_id]) in VEHICLE_KINDS for class_id in own.class_ids], np.bool_
-        )
-        seen: Boxes = own.boxes_xyxy_px[vehicles & (own.seen_frames == own.frame_index)]
-        return seen
 
     def _own_at(self, frame_index: int) -> Tracks:
         # Our tracker's list at a frame: as it was, or moved on from the newest frame.

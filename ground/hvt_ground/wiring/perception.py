@@ -23,7 +23,7 @@ from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.models import ModelFacts, Models
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader
-from hvt_ground.perception.stills.refine import Refiner
+from hvt_ground.perception.stills.refine import Refiner, ViewTilt
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 
 
@@ -34,8 +34,9 @@ def make_pipeline(
     info: Info,
     emit: Callable[[Event], None],
     trust: ViewTrust | None = None,
+    tilt: ViewTilt | None = None,
 ) -> Pipeline:
-    """The pipeline of one session; ``trust`` is of its view, and of what is stored of it too."""
+    """The pipeline of one session; ``trust`` and ``tilt`` are of its view, and of what is stored of it too."""
     detector, classifier = models.take()
     reader = _reader(config, detector, classifier, info=info)
     names, edge_classes = unified_names(detector.class_names, info.class_names)
@@ -50,7 +51,7 @@ def make_pipeline(
             fps=info.fps,
             vocabulary=vocabulary,
             calibrated=models.facts.stills_calibrated,
-            vague_kinds=config.detector == EMBEDDED_DETECTOR,
+            tilt=tilt or make_tilt(config),
         ),
         vocabulary=vocabulary,
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path, base_per_source=info.view.scale),
@@ -78,8 +79,13 @@ def make_trust(config: GroundConfig) -> ViewTrust:
     return ViewTrust(config.detector, hence="are drawn thin and unnamed")
 
 
+def make_tilt(config: GroundConfig) -> ViewTilt:
+    """How the camera looks in one session."""
+    return ViewTilt(vague_kinds=config.detector == EMBEDDED_DETECTOR)
+
+
 def make_backlog_perception(
-    config: GroundConfig, models: Models, *, info: Info, trust: ViewTrust
+    config: GroundConfig, models: Models, *, info: Info, trust: ViewTrust, tilt: ViewTilt | None = None
 ) -> BacklogPerception:
     """Make the analyzer of the stored video and stills of a session."""
     return BacklogPerception(
@@ -89,6 +95,7 @@ def make_backlog_perception(
         reader_of=lambda detector, classifier: _reader(config, detector, classifier, info=info),
         detect_every=detect_every(config.detect_every, fps=info.fps),
         trust=trust,
+        tilt=tilt or make_tilt(config),
         guesses_of=lambda: _guesses(models.facts, info),
     )
 

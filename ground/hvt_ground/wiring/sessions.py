@@ -29,7 +29,7 @@ from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.wiring.files import backlog_path, free_path, output_path
-from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline, make_trust
+from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline, make_tilt, make_trust
 
 S = TypeVar("S", bound=SinkWriter[Any])
 
@@ -124,14 +124,16 @@ class SessionFactory:
             sinks.append(self._outputs.open(one.part, one.open, wait_s=held_s, longest_pause_s=pause_s))
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
-        trust = make_trust(config)
+        trust, tilt = make_trust(config), make_tilt(config)
         return GroundSession(
             info,
             sinks=sinks,
-            pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit, trust=trust),
+            pipeline_of=lambda emit: make_pipeline(
+                config, models, info=info, emit=emit, trust=trust, tilt=tilt
+            ),
             clock=self._clock,
             reports=reports,
-            backlog_perception=make_backlog_perception(config, models, info=info, trust=trust),
+            backlog_perception=make_backlog_perception(config, models, info=info, trust=trust, tilt=tilt),
             locator=locator,
         )
 

@@ -17,6 +17,7 @@ from hvt_web.video.fmp4 import Fragment, Start
 from hvt_web.video.pictures import Pictures
 from hvt_web.viewers import EdgePage
 from media.moving_square import FPS, SIZE, STEP_PX, moving_square
+from rigs.examples import refinement
 from rigs.messages import INFO
 
 
@@ -160,3 +161,12 @@ def test_garbage_ends_nothing(samples):
     fed(made, [broken, replace(samples[6], data=b"")], {"h264", "hevc"})
     came = fed(made, samples, {"h264"}, number=2)
     assert len(shown(came)) >= 59
+
+
+def test_a_still_is_called_as_its_box_is():
+    """The strip said truck beside a box that said vehicle."""
+    hub = MagicMock(post=lambda act: act())
+    feed = SessionFeed(INFO, EdgePage("uav-1"), hub, clock=lambda: 0)
+    feed.log(refinement(class_after="truck", vague=(False, True)))
+    _, message, _ = hub.still.call_args.args
+    assert '"before":"car","after":"vehicle"' in message.replace(" ", "")

@@ -35,6 +35,7 @@ from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
 from hvt_ground.backlog.session_backlog import LateStills
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.perception.worker import Job
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
@@ -59,9 +60,14 @@ PICTURE = DecodedFrame(0, 0, 0, np.zeros((8, 8, 3), np.uint8))
 class Models:
     """Gives red-square detectors."""
 
+    def __init__(self, class_names=CLASSES):
+        self._class_names = class_names
+
     def take(self):
         """One for each."""
-        return RedSquares(), None
+        detector = RedSquares()
+        detector.class_names = self._class_names
+        return detector, None
 
 
 def settings(info: Info, path: Path, **changes) -> RecorderSettings:
@@ -77,7 +83,7 @@ def settings(info: Info, path: Path, **changes) -> RecorderSettings:
     )
 
 
-def look_of(info: Info, models=None, trust: ViewTrust | None = None) -> BacklogPerception:
+def look_of(info: Info, models=None, trust: ViewTrust | None = None, tilt=None) -> BacklogPerception:
     """What looks at kept things."""
     return BacklogPerception(
         info,
@@ -86,6 +92,7 @@ def look_of(info: Info, models=None, trust: ViewTrust | None = None) -> BacklogP
         reader_of=lambda _detector, _classifier: SameAnswer(),
         detect_every=3,
         trust=trust or ViewTrust("motion", hence=""),
+        tilt=tilt,
     )
 
 
@@ -304,6 +311,27 @@ def test_stored_video_of_an_unknown_view_is_doubted_as_it_is_live(flight):
     assert [one.doubted.tolist() for one in found[1:]] == [[False]] * 2 + [[True]] * 3
 
 
+def test_a_bus_of_stored_video_is_called_as_it_is_live(flight):
+    """Seen aslant it was a vehicle before the outage and after it, and a bus in the middle."""
+    found, decoder, tilt = [], BaseDecoder(), ViewTilt(vague_kinds=True)
+    perception = look_of(flight.info(), models=Models(("bus",)), tilt=tilt)
+    with perception.track(found.append) as tracker:
+        for unit in flight.units[:6]:
+            tilt.aslant = unit.frame_index >= 3
+            tracker.analyze(unit.frame_index, unit.capture_ns, decoder.decode(unit.data))
+    assert [one.words for one in found[1:]] == [("bus",)] * 2 + [("vehicle",)] * 3
+
+
+def test_stored_video_tells_the_tilt_of_its_view(flight):
+    """Of a session that is over nothing else does."""
+    perception, decoder, taken = look_of(flight.info()), BaseDecoder(), []
+    perception.tilt.take = lambda tracks, _names, *, height_px: taken.append((len(tracks), height_px))
+    with perception.track(lambda _: None) as tracker:
+        for unit in flight.units[:6]:
+            tracker.analyze(unit.frame_index, unit.capture_ns, decoder.decode(unit.data))
+    assert taken == [(1, 192)] * 2
+
+
 @pytest.mark.parametrize("compact_bytes", [6_000, 1 << 30])
 def test_a_filled_hole_survives_folding_and_the_footer(flight, tmp_path, compact_bytes):
     """Rows that come late would be lost or doubled where the append log is compacted, or when the file is closed."""
@@ -386,13 +414,25 @@ def test_stills_of_an_outage_name_the_tracks_of_its_video(flight, tmp_path, own)
 
 def test_a_still_names_its_own_track_and_no_guess_beside_it():
     """One named car in stored video made every guess around it as firm as itself."""
-    late = LateStills()
+    late = LateStills(ViewTilt())
     bus = Posterior("bus", 0.9, 0.3, np.array([0.1, 0.9], np.float32))
     late.take(replace(seen(0, 5, bus, (0.0, 0.0, 20.0, 20.0), edge=1).event, stored=True))
     boxes = np.array([(0, 0, 20, 20), (50, 50, 60, 60), (80, 80, 90, 90)], np.float32)
     doubted = np.array([True, True, False])
     *_, shown = late.named(overlay(5, boxes, stored=True, doubted=doubted))
     assert shown.words == ("bus", "something", "car")
+
+
+@pytest.mark.parametrize(("confidence", "word"), [(0.7, "vehicle"), (0.95, "bus")])
+def test_a_still_of_an_outage_is_called_as_the_box_that_it_names(confidence, word):
+    """Seen aslant the live picture said vehicle, and what came of the same view afterwards a kind of it."""
+    tilt = ViewTilt(vague_kinds=True)
+    late = LateStills(tilt)
+    bus = Posterior("bus", confidence, 0.3, np.array([1 - confidence, confidence], np.float32))
+    late.take(replace(seen(0, 5, bus, (0.0, 0.0, 20.0, 20.0), edge=1).event, stored=True))
+    tilt.aslant = True
+    still, shown = late.named(overlay(5, [(0, 0, 20, 20)], stored=True))
+    assert (still.words, shown.words, shown.classes) == (("car", word), (word,), ("bus",))
 
 
 def test_a_still_at_a_frame_that_is_known_speaks_on_its_track(flight, tmp_path):

@@ -278,9 +278,9 @@ def test_small_objects_are_looked_at_enlarged_and_less_often(pictures):
 
 
 def test_the_vehicles_that_are_seen_tell_the_tilt(pictures):
-    """Of kinds aslant every second one is wrong; those of tracks that are only carried on tell nothing."""
+    """Of kinds aslant every second one is wrong."""
     rig, taken = Rig(detect_every=3), []
-    rig.pipeline.tilt.take = lambda boxes, *, height_px: taken.append((len(boxes), height_px))
+    rig.pipeline.tilt.take = lambda tracks, _names, *, height_px: taken.append((len(tracks), height_px))
     for picture in pictures:
         rig.pipeline.analyze(picture, hurry=False)
     assert taken == [(1, 192)] * 10

@@ -13,7 +13,7 @@ the only clock here.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -21,10 +21,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.class_names import VEHICLE_KINDS, kind_of
-from hvt_common.values import Boxes, Tracks
+from hvt_common.values import Tracks
+from hvt_ground.events import Refinement
 from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.match import Matcher, Outcome, StillSeen, TrackMatch
-from hvt_ground.perception.stills.posterior import ClassEstimate, TrackPosterior
+from hvt_ground.perception.stills.posterior import SURE, ClassEstimate, TrackPosterior
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 
 Mode = Literal["replace", "fuse"]
@@ -63,8 +64,7 @@ class Refiner:
     a track that was detected but not confirmed then. A track's class is remembered for ``forget_s`` after its last
     frame, more than a lost track may take to be found again. ``iou`` is the least overlap of a still's box with a
     track's: half is the usual threshold of benchmarks, and boxes of two similar neighbours rarely reach it both.
-    ``calibrated``: what the reader of stills says are probabilities; else nothing is ever sure. ``vague_kinds``: seen
-    aslant, only of what it calls a car does the detector know what kind of vehicle it is.
+    ``calibrated``: what the reader of stills says are probabilities; else nothing is ever sure.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Refiner:
         fps: float,
         vocabulary: Vocabulary,
         calibrated: bool = False,
-        vague_kinds: bool = False,
+        tilt: ViewTilt | None = None,
         hold_s: float = 3.0,
         confirm_s: float = 1.0,
         forget_s: float = 10.0,
@@ -84,12 +84,11 @@ class Refiner:
         """Distinct tracks of the ground that a still has refined."""
         self.class_changes = 0
         """Stills after which the class shown was another than before."""
-        self.tilt = ViewTilt()
+        self.tilt = tilt or ViewTilt()
         """Of the view: aslant no kind of vehicle is sure."""
         self._mode = mode
         self._vocabulary = vocabulary
         self._calibrated = calibrated
-        self._vague_kinds = vague_kinds
         self._hold_frames = round(hold_s * fps)
         self._confirm_frames = round(confirm_s * fps)
         self._forget_frames = round(forget_s * fps)
@@ -166,7 +165,8 @@ class Refiner:
         base_classes = tuple(names[class_id] for class_id in tracks.class_ids)
         classes = list(base_classes)
         confidences = tracks.confidences.astype(np.float32)  # a copy
-        refined, doubted, sure, known = (np.zeros(len(tracks), np.bool_) for _ in range(4))
+        refined, doubted, sure = (np.zeros(len(tracks), np.bool_) for _ in range(3))
+        vague = np.array([self.tilt.is_vague(name) for name in classes], np.bool_)
         for row, track_id in enumerate(tracks.ids.tolist()):
             class_posterior = self._track_posteriors.get(track_id)
             if class_posterior is None:
@@ -175,8 +175,7 @@ class Refiner:
             classes[row], confidences[row], refined[row] = names[reading.class_id], reading.confidence, True
             doubted[row] = reading.class_id == self._vocabulary.nothing
             sure[row] = self._is_sure(reading)
-            known[row] = reading.sure
-        vague = np.array([self._is_vague(name) for name in classes], np.bool_) & ~known
+            vague[row] = self.tilt.is_vague(classes[row], known=reading.sure)
         return ShownClasses(base_classes, tuple(classes), confidences, refined, doubted, sure, vague)
 
     # One frame's stills.
@@ -253,13 +252,13 @@ class Refiner:
         track_id = int(tracks.ids[row])
         class_posterior = self._track_posteriors.get(track_id)
         if class_posterior is None:
-            before = int(tracks.class_ids[row])
+            before = ClassEstimate(int(tracks.class_ids[row]), 0.0)
             class_posterior = self._track_posteriors[track_id] = TrackPosterior(tracks.frame_index)
             self.tracks_refined += 1
             if len(self._track_posteriors) > MAX_TRACK_POSTERIORS:
                 self._track_posteriors.popitem(last=False)
         else:
-            before = self._read(class_posterior, tracks, row).class_id
+            before = self._read(class_posterior, tracks, row)
         newest = class_posterior.update(
             still.posterior,
             order=(still.event.shown_index, still.event.still_sequence),
@@ -268,23 +267,27 @@ class Refiner:
         )
         self._touch(track_id, class_posterior, still.event.shown_index)
         after = self._read(class_posterior, tracks, row)
-        self.class_changes += after.class_id != before
+        self.class_changes += after.class_id != before.class_id
         names = self._vocabulary.names
+        of_names = ((names[one.class_id], one.sure) for one in (before, after))
+        is_before_vague, is_after_vague = (self.tilt.is_vague(name, known=known) for name, known in of_names)
         event = replace(
             still.event,
             track_id=track_id,
-            class_before=names[before],
+            class_before=names[before.class_id],
             class_after=names[after.class_id],
             confidence=after.confidence,
             doubted=after.class_id == self._vocabulary.nothing,
             sure=self._is_sure(after),
+            vague=(is_before_vague, is_after_vague),
         )
         outcome: Outcome = "matched" if newest or self._mode == "fuse" else "superseded"
         return replace(still, event=event, outcome=outcome)
 
     def _unmatched(self, still: StillSeen, outcome: Outcome) -> StillSeen:
         doubted = self._vocabulary.says_nothing(still.posterior.class_name)
-        return replace(still, event=replace(still.event, doubted=doubted), outcome=outcome)
+        event = replace(still.event, doubted=doubted, vague=self.tilt.vague_of(still.event))
+        return replace(still, event=event, outcome=outcome)
 
     # The posterior of each track.
 
@@ -299,10 +302,6 @@ class Refiner:
         if not self._calibrated or not reading.sure or reading.class_id == self._vocabulary.nothing:
             return False
         return not (self.tilt.aslant and kind_of(self._vocabulary.names[reading.class_id]) in VEHICLE_KINDS)
-
-    def _is_vague(self, name: str) -> bool:
-        # Of 116 vehicles that were called a car aslant 104 were one, of 43 called a truck, van or bus 12 were.
-        return self._vague_kinds and self.tilt.aslant and name != "car" and kind_of(name) in VEHICLE_KINDS
 
     def _touch(self, track_id: int, class_posterior: TrackPosterior, frame_index: int) -> None:
         class_posterior.last_frame = max(class_posterior.last_frame, frame_index)
@@ -329,18 +328,22 @@ class ViewTilt:
     Seen from straight above they have one size wherever they are; seen aslant those higher up in the picture are
     farther away, and smaller. The median slope over pairs (Theil 1950, Sen 1968) of the logarithm of their size over
     the height in the picture is -.13 to .53 in eight views from above, .83 to 5.5 in twelve aslant
-    (docs/embedded-models.md). What kind of vehicle one is, no network here tells well aslant.
+    (docs/embedded-models.md). What kind of vehicle one is, no network here tells well aslant; ``vague_kinds``: the
+    detector knows it only of what it calls a car.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, vague_kinds: bool = False) -> None:
+        self._vague_kinds = vague_kinds
         self._seen: npt.NDArray[np.float64] = np.empty((0, 2))
         """(N, 2) height in the picture, 0 to 1, and logarithm of the size, oldest first."""
         self.aslant = False
         """False also while too few vehicles were seen to tell."""
 
-    def take(self, boxes_xyxy_px: Boxes, *, height_px: int) -> None:
-        """Take the vehicles that were detected in the next picture."""
-        boxes = boxes_xyxy_px.astype(np.float64)
+    def take(self, tracks: Tracks, class_names: Sequence[str], *, height_px: int) -> None:
+        """Take the tracks at the next picture, of which the vehicles that the detector has just seen count."""
+        seen = np.array([kind_of(class_names[one]) in VEHICLE_KINDS for one in tracks.class_ids], np.bool_)
+        seen &= tracks.seen_frames == tracks.frame_index
+        boxes = tracks.boxes_xyxy_px[seen].astype(np.float64)
         sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
         new = np.column_stack(((boxes[:, 1] + boxes[:, 3]) / 2 / height_px, np.log(sides.prod(axis=1)) / 2))
         self._seen = np.concatenate((self._seen, new))[-_MOST_BOXES:]
@@ -354,3 +357,16 @@ class ViewTilt:
         far = np.abs(apart) > _APART
         slope = float(np.median(larger[far] / apart[far]))
         self.aslant = slope >= (_STEEP_BELOW if self.aslant else _ASLANT_FROM)
+
+    def is_vague(self, name: str, *, known: bool = False) -> bool:
+        """Whether this is a vehicle, and its class rather a guess; ``known`` where stills agree on it."""
+        # Of 116 vehicles that were called a car aslant 104 were one, of 43 called a truck, van or bus 12 were.
+        if known or not (self._vague_kinds and self.aslant):
+            return False
+        return name != "car" and kind_of(name) in VEHICLE_KINDS
+
+    def vague_of(self, still: Refinement) -> tuple[bool, bool]:
+        """`Refinement.vague` of a still of no track, which speaks for itself."""
+        return self.is_vague(still.class_before), self.is_vague(
+            still.class_after, known=still.confidence > SURE
+        )

@@ -56,9 +56,10 @@ class StillRows:
 
     def refinement(self, refinement: Refinement) -> list[TableRow]:
         """The rows of a still; its pictures are written once, however many objects it shows."""
-        changed = refinement.class_before != refinement.class_after
+        before, after = refinement.words
+        changed = before != after
         text = event_text(refinement)
-        colour = class_colour(refinement.class_after) if changed else GREY
+        colour = class_colour(after) if changed else GREY
         if refinement.doubted:
             colour = AMBER
         rows = [TableRow(names.EVENTS, "text", LogText(text, "INFO", colour), len(text))]
@@ -107,7 +108,7 @@ class StillRows:
             return []
         self._pair_bytes += cost if dear else 0
         path = f"{names.STILLS}/{slot}"
-        words = Caption(caption(refinement), class_colour(refinement.class_after), frame_of(slot))
+        words = Caption(caption(refinement), class_colour(refinement.words[1]), frame_of(slot))
         rows = [TableRow(path, "caption", words)]
         for name, (data, size) in pictures:
             picture = PlacedJpeg(data, placed(slot, size, right=name == "still"))
@@ -228,11 +229,12 @@ def _verdict(refinement: Refinement) -> str:
     if refinement.doubted:
         return f"{refinement.class_before}? {refinement.class_after} {certainty}"
     certain = "✓ " if refinement.sure else ""
-    if refinement.class_before == refinement.class_after:
-        return f"{refinement.class_after} {certain}{certainty}"
+    before, after = refinement.words
+    if before == after:
+        return f"{after} {certain}{certainty}"
     if refinement.track_id is None:  # nothing was renamed by it
-        return f"{refinement.class_before}, by itself {refinement.class_after} {certainty}"
-    return f"{refinement.class_before} → {refinement.class_after} {certain}{certainty}"
+        return f"{before}, by itself {after} {certainty}"
+    return f"{before} → {after} {certain}{certainty}"
 
 
 def _jpeg(pixels: Image, *, quality_pct: int) -> bytes:

@@ -198,6 +198,13 @@ def test_remarks_say_what_is_known_and_where_the_still_is():
     assert "url" not in second.find("detail/link").attrib
 
 
+def test_the_remarks_of_a_vague_kind_of_vehicle_name_no_kind():
+    """The video of which they speak shows "vehicle" too."""
+    kinds = {"base_classes": ("truck", "van"), "classes": ("truck", "bus")}
+    events = Rig().says(overlay(**kinds, vague=np.array([True, True])))
+    assert [one.find("detail/remarks").text for one in events] == ["vehicle 0.87"] * 2
+
+
 def test_only_what_has_a_place_and_is_not_doubted_is_reported():
     """Objects would lie in the sea at 0° north, 0° east, or be what stills say that they are not."""
     places = overlay(ids=(1, 2, 3)).places

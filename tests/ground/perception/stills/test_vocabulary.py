@@ -16,7 +16,7 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.values import Posterior
 from hvt_edge.perception.crop import PADDING
 from hvt_ground.perception.fusion.fuse import unified_names
-from hvt_ground.perception.stills.refine import Refiner
+from hvt_ground.perception.stills.refine import Refiner, ViewTilt
 from hvt_ground.perception.stills.vocabulary import LEAST_SIDE_PX, Vocabulary, check_common
 from rigs.examples import seen, tracks_of
 
@@ -120,20 +120,32 @@ def test_a_class_that_the_classifier_cannot_say_is_left_alone():
     assert (shown.classes, shown.doubted.tolist()) == (("dog",), [False])
 
 
-def flown(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, mode="fuse", aslant=False):
+def flown(words, *posteriors, **how):
     """What is shown of a track after these stills."""
+    return told(words, *posteriors, **how)[0]
+
+
+def told(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, mode="fuse", aslant=False):
+    """The same, and the events of the stills."""
     from hvt_ground.perception.history import History
 
     tracks = tracks_of(0, [(10, 10, 50, 40)], confidences=confidence, classes=base)
     history = History(track_frames=10)
     history.add_tracks(tracks)
-    refiner = Refiner(mode, fps=15, vocabulary=words, calibrated=calibrated, vague_kinds=True)
-    refiner.tilt.aslant = aslant
+    refiner = Refiner(mode, fps=15, vocabulary=words, calibrated=calibrated, tilt=tilt_of(aslant))
+    events = []
     for sequence, posterior in enumerate(posteriors):
         still = seen(sequence, 0, posterior, (10, 10, 50, 40), edge=1, side_px=side_px)
         refiner.offer(still, now_frame=0)
-        refiner.settle(history, now_frame=0)
-    return refiner.shown(tracks)
+        events += [done.event for done in refiner.settle(history, now_frame=0)]
+    return refiner.shown(tracks), events
+
+
+def tilt_of(aslant):
+    """That of a view where no kind of vehicle but a car is known."""
+    tilt = ViewTilt(vague_kinds=True)
+    tilt.aslant = aslant
+    return tilt
 
 
 def votes(words, *answers):
@@ -197,8 +209,9 @@ def test_seen_aslant_only_a_car_is_called_what_the_detector_says(name, said, asl
     """Of trucks, vans and buses aslant three of four are something else."""
     words = Vocabulary(AERIAL, AERIAL)
     stills = votes(words, said) if said else []
-    shown = flown(words, *stills, base=AERIAL.index(name), confidence=0.8, aslant=aslant)
+    shown, events = told(words, *stills, base=AERIAL.index(name), confidence=0.8, aslant=aslant)
     assert (shown.classes, shown.vague.tolist()) == ((name,), [vague])
+    assert [one.words[1] for one in events] == ["vehicle" if vague else name] * len(stills)
 
 
 def test_a_toss_up_leaves_the_class_as_it_is():
