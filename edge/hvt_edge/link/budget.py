@@ -67,6 +67,10 @@ _PART_MARGIN = 1.03
 """So much smaller are frames of which a window holds a part more than its share: ``status`` goes beside them."""
 
 
+_Events = Sequence[tuple[int, int]]
+"""(time, line bytes), in order of time."""
+
+
 def frames_bps(base_bps: float, total_bps: float, *, fps: float, window_s: float) -> float:
     """B_v, or the less of which a window holds all frames that fall into it: of 2.5 a second three, not 2.5."""
     frames = window_s * fps
@@ -334,9 +338,7 @@ class RollingBudget:
         at_ns = self._first_fit_ns(self._events, self._total, line_bytes, at_ns)
         return at_ns if self.holds(line_bytes) else min(latest_ns, at_ns)
 
-    def _first_fit_ns(
-        self, events: Sequence[tuple[int, int]], limit: float, line_bytes: int, at_ns: int
-    ) -> int:
+    def _first_fit_ns(self, events: _Events, limit: float, line_bytes: int, at_ns: int) -> int:
         window_ns = self._settings.window_ns
         inside = [event for event in events if event[0] > at_ns - window_ns]
         held = sum(size for _, size in inside)
@@ -370,16 +372,18 @@ class RollingBudget:
         free = self._requested_free(now_ns)
         return max(0, int(min(free, self._loan.left_bytes(self._loan_bytes, now_ns=now_ns))))
 
-    def _requested_free(self, now_ns: int) -> float:
+    def _requested_free(self, now_ns: int, events: _Events | None = None) -> float:
         self._note_query(now_ns)
-        spent = sum(size for at_ns, size in self._events if at_ns > now_ns - self._settings.window_ns)
+        events = self._events if events is None else events
+        spent = sum(size for at_ns, size in events if at_ns > now_ns - self._settings.window_ns)
         free = self._total - spent - self._spare
-        return free if self._settings.yields else min(free, self._window_allowance(now_ns))
+        return free if self._settings.yields else min(free, self._window_allowance(now_ns, events))
 
     def _note_left(self, now_ns: int) -> None:
-        # At new rates the base's habits are known after a window.
+        # At new rates the base's habits are known after a window. What else went is no habit of it, and goes again
+        # behind a requested still.
         if now_ns >= self._old_peak[0]:
-            self._left.append((now_ns, self._requested_free(now_ns)))
+            self._left.append((now_ns, self._requested_free(now_ns, self._base_events)))
             while self._left[0][0] <= now_ns - _LEFT_WINDOWS * self._settings.window_ns:
                 self._left.popleft()
 
@@ -490,13 +494,15 @@ class RollingBudget:
         taken = sum(size for at_ns, size in self._base_events if at_ns > first_ns)
         return max(0.0, settings.base_bps * settings.window_ns / 8 / SECOND_NS - taken - borrowed)
 
-    def _window_allowance(self, now_ns: int) -> float:
+    def _window_allowance(self, now_ns: int, events: _Events | None = None) -> float:
         # The least room over every window that would contain a message sent now, beside base and metadata.
-        unspent, ahead_ns = self._unspent(now_ns)
+        unspent, ahead_ns = self._unspent(now_ns, events)
         beside = self._settings.metadata_bps / 8 / SECOND_NS * ahead_ns
         return float((unspent - self._burst - beside).min())
 
-    def _unspent(self, now_ns: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    def _unspent(
+        self, now_ns: int, events: _Events | None = None
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
         # The fullest windows end with a base frame: the one with the ``k``-th from now holds past bytes younger than
         # the window less the time until then, and ``k`` forecast frames. The first, ``k`` = 0, also holds what was
         # recorded for later, so the room is never more than any window has.
@@ -506,8 +512,9 @@ class RollingBudget:
         ahead_ns = due_ns - now_ns + (self._forecasts - 1) * self._step_ns + round(_ROUNDING * self._step_ns)
         ahead_ns[0] = 0
         spans_ns = np.maximum(self._settings.window_ns - ahead_ns, 0)
-        times_ns = np.array([at_ns for at_ns, _ in self._events], np.int64)
-        upto = np.cumsum([0, *(size for _, size in self._events)])
+        events = self._events if events is None else events
+        times_ns = np.array([at_ns for at_ns, _ in events], np.int64)
+        upto = np.cumsum([0, *(size for _, size in events)])
         spent = upto[-1] - upto[np.searchsorted(times_ns, now_ns - spans_ns, side="right")]
         return self._total - spent, ahead_ns
 

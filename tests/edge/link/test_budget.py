@@ -469,3 +469,24 @@ def test_where_a_camera_takes_all_that_a_budget_has_a_requested_still_is_refused
             room = max(room, budget.requested_allowance(now_ns + max(0, wait_ns)))
     assert most_bytes <= room
     assert most_bytes or cut_bps < 800_000
+
+
+@pytest.mark.parametrize("taker", ["still", "requested", "backlog"])
+def test_what_else_goes_beside_a_camera_takes_nothing_of_the_largest_requested_still(taker):
+    """A second closer look would be refused, or coded smaller, for the room that the first one took."""
+    budget = RollingBudget(BudgetSettings(400_000, 240_000, fps=25, yields=False))
+    most_bytes = []
+    for index in range(200):
+        now_ns = START_NS + index * SECOND_NS // 25
+        budget.record_base(900, now_ns=now_ns, keyframe=False)
+        if index < 50:
+            most_bytes.append(budget.most_requested_bytes)
+            continue
+        now_ns += SECOND_NS // 100
+        if taker == "still":
+            budget.record_still(budget.still_allowance(now_ns), now_ns=now_ns)
+        elif taker == "backlog":
+            budget.record_other(budget.backlog_allowance(now_ns, reserve=0.0), now_ns)
+        elif (free := budget.requested_allowance(now_ns)) >= 6_000:
+            budget.record_requested(free, now_ns=now_ns)
+    assert budget.most_requested_bytes == most_bytes[-1] > 10_000
