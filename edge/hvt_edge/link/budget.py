@@ -186,8 +186,8 @@ class RollingBudget:
         self._base_events: deque[tuple[int, int]] = deque()
         self._lent: deque[tuple[int, float]] = deque()
         """(time, bytes that a still took of what the base had left)."""
-        self._left: deque[tuple[int, float]] = deque()
-        """(time, room for a requested still) after each base frame of late, where the base does not yield."""
+        self._used: deque[tuple[int, float]] = deque()
+        """(time, bytes that no requested still had) after each base frame of late, where the base does not yield."""
         self._query_ns: int | None = None
         self._last_ns = 0
         self._last_base_ns: int | None = None
@@ -224,6 +224,7 @@ class RollingBudget:
         self._refill(now_ns)
         until_ns = max(now_ns, self._last_ns) + self._settings.window_ns
         self._old_peak = (until_ns, max(self._base_peak, self._peak_at(now_ns)))
+        self._used.clear()
         self._adopt(replace(self._settings, base_bps=base_bps, fps=fps))
         self._tokens = min(self._cap, self._tokens)
 
@@ -238,7 +239,6 @@ class RollingBudget:
             self._refill(now_ns)
             self._settings = replace(settings, total_bps=total_bps)
             self._total = total_bps * settings.window_ns / 8 / SECOND_NS
-            self._left.clear()
             self._events = [(at_ns, self._counted(size, then_bps)) for at_ns, size, then_bps in self._sent]
             if (base_bps, fps) != (settings.base_bps, settings.fps):
                 self.set_base(base_bps, fps, now_ns=now_ns)
@@ -274,7 +274,7 @@ class RollingBudget:
         self._base_steps.append(round(self.base_step_bytes) if keyframe else line_bytes)
         self._burst = self._recent_bursts()
         if not self._settings.yields:
-            self._note_left(now_ns)
+            self._note_used(now_ns)
 
     def end_base(self) -> None:
         """The source has given its last frame: from now on no room is kept for any."""
@@ -379,17 +379,20 @@ class RollingBudget:
         free = self._total - spent - self._spare
         return free if self._settings.yields else min(free, self._window_allowance(now_ns, events))
 
-    def _note_left(self, now_ns: int) -> None:
+    def _note_used(self, now_ns: int) -> None:
         # At new rates the base's habits are known after a window. What else went is no habit of it, and goes again
         # behind a requested still.
         if now_ns >= self._old_peak[0]:
-            self._left.append((now_ns, self._requested_free(now_ns, self._base_events)))
-            while self._left[0][0] <= now_ns - _LEFT_WINDOWS * self._settings.window_ns:
-                self._left.popleft()
+            self._used.append((now_ns, self._total - self._requested_free(now_ns, self._base_events)))
+            while self._used[0][0] <= now_ns - _LEFT_WINDOWS * self._settings.window_ns:
+                self._used.popleft()
 
     def _most_left(self) -> float:
-        # The most room that the camera has left a requested still of late: a still that needs more never goes.
-        return max((left for _, left in self._left), default=math.inf)
+        # The most room that the camera has left a requested still of late: a still that needs more never goes. In the
+        # first window its keyframe, which comes seldom, may leave none.
+        if not self._used or self._used[-1][0] - self._used[0][0] < self._settings.window_ns:
+            return math.inf
+        return self._total - min(used for _, used in self._used)
 
     def record_requested(self, line_bytes: int, *, now_ns: int) -> None:
         """Count a requested still, admitted by `requested_allowance`: what stills have not saved the base yields."""

@@ -490,3 +490,17 @@ def test_what_else_goes_beside_a_camera_takes_nothing_of_the_largest_requested_s
         elif (free := budget.requested_allowance(now_ns)) >= 6_000:
             budget.record_requested(free, now_ns=now_ns)
     assert budget.most_requested_bytes == most_bytes[-1] > 10_000
+
+
+@pytest.mark.parametrize("step_bps", [0, 100])
+def test_beside_large_keyframes_of_a_camera_a_requested_still_waits_and_is_not_refused(step_bps):
+    """In the first second, and behind each step of the link's rate, it would be told to raise the budget."""
+    budget = RollingBudget(BudgetSettings(800_000, 600_000, fps=25, yields=False))
+    most_bytes = []
+    for index in range(150):
+        now_ns = START_NS + index * SECOND_NS // 25
+        if step_bps and index % 10 == 0:
+            budget.set_total(800_000 + index * step_bps, 600_000, 25, now_ns=now_ns)
+        budget.record_base(2_000 if index % 50 else 30_000, now_ns=now_ns, keyframe=False)
+        most_bytes.append(budget.most_requested_bytes)
+    assert min(most_bytes) > 15_000
