@@ -328,7 +328,7 @@ class RealtimeWorker(PerceptionWorker):
                 newer = len(self._pictures) > 0
                 self._wake.clear()
                 stepped = bool(self._steps) and self._steps[-1][0].frame_index > picture.frame_index
-                if newer or awaited or stepped or self._ending.is_set():
+                if newer or awaited or self._stills or stepped or self._ending.is_set():
                     self._wake.set()
                 late = newer and self._clock() - came_s > _OLDEST_S
                 self.untracked += late

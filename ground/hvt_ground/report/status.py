@@ -156,9 +156,10 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     lossless = (
         "no gaps" if not content["gaps"] else f"{content['gaps']} gaps, {content['lost']} messages lost"
     )
+    changes = content["class_changes"]
     tracks = (
-        f"{content['tracks']}; stills met {content['tracks_refined']} of them and changed the ground's own class of "
-        f"{content['class_changes']}"
+        f"{content['tracks']}; stills met {content['tracks_refined']} of them and changed the ground's own class "
+        f"{changes} time{'s' * (changes != 1)}"
     )
     if not (content["tracks"] or content["detections_run"]):
         tracks = "not known: the detector has looked at no picture"

@@ -115,6 +115,30 @@ def test_detection_is_for_the_newest_picture():
     assert rig.finish() == [("picture", 0), ("hurry", 1), ("hurry", 2), ("picture", 3)]
 
 
+def test_a_still_that_comes_while_an_older_picture_is_tracked_waits_for_no_detection(flight):
+    """It waited until the detector was done with the next picture, or for good where that hangs."""
+    begun, go_on, waits = threading.Event(), threading.Event(), {}
+
+    def analyze(one: DecodedFrame, _hurry: object, news: threading.Event | None) -> None:
+        assert news is not None
+        waits[one.frame_index] = not news.is_set()
+        if one.frame_index == 0:
+            begun.set()
+            assert go_on.wait(timeout=60)
+        if one.frame_index == 1:
+            worker.still(still(flight, 1, 0))
+
+    worker = patient_worker(analyze, lambda _tracks, _at_ns: None, lambda _stills: None)
+    worker.picture(picture(0))
+    assert begun.wait(timeout=60)
+    for index in (1, 2):
+        worker.picture(picture(index))
+    go_on.set()
+    eventually(lambda: worker.idle, what="all is done")
+    assert worker.close()
+    assert not waits[2]
+
+
 @pytest.mark.parametrize("slow", [False, True])
 def test_in_lockstep_a_pose_counts_from_the_same_frame_on_however_long_perception_takes(slow):
     """The same flight received again would place the same tracks elsewhere."""

@@ -132,6 +132,8 @@ def test_who_gets_no_stills_reads_why(ground):
     assert content["stills"]["reasons"]["not_sent"] == {"base_good": 49, "cooldown": 3, "too_large": 1}
     said = "49 the video already shows well, 3 sent a moment ago, 1 too large for the budget"
     assert said in dict(table(content))["stills"]
+    met = dict(table(content | {"tracks": 3, "tracks_refined": 1, "class_changes": 2}))["tracks"]
+    assert met == "3; stills met 1 of them and changed the ground's own class 2 times"
     assert f"the edge did not send these stills: {said}" in [
         text for _, _, text in Recording(ground.path).events()
     ]
