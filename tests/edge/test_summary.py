@@ -29,7 +29,7 @@ def summary_of(
     now = SimpleNamespace(
         method="M6",
         levers=SimpleNamespace(
-            says="no tracks: the video hides 0 objects; stills: 2 of 3 objects named otherwise by the ground"
+            says="no tracks: the video hides 0 objects; stills: 2 of 3 objects named otherwise by their stills"
         ),
         preset="superfast",
         preset_says="preset superfast: veryfast would take 0.5 of a core",
@@ -74,7 +74,7 @@ def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
     said = [text for _, text in table(content)]
     assert (
         said[0]
-        == "auto, M6: no tracks: the video hides 0 objects; stills: 2 of 3 objects named otherwise by the ground"
+        == "auto, M6: no tracks: the video hides 0 objects; stills: 2 of 3 objects named otherwise by their stills"
     )
     assert said[1] == (
         "80 frames came: 9 sent, 1 left out by auto's 7.5 a second, 3 had no room in the budget, "

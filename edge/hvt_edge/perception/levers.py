@@ -103,7 +103,7 @@ class LeverControl:
         operating.pull(Levers(tracks=False))
 
     def take_answer(self, *, changed: bool) -> None:
-        """A ground has inspected a still; ``changed``: it now names the object otherwise than the edge does."""
+        """A ground has inspected a still; ``changed``: by it alone the object is another than the edge says."""
         self._changed.append(changed)
 
     def take_load(self, *, too_slow: bool, now_ns: int) -> None:
@@ -173,7 +173,7 @@ class LeverControl:
         if self.unlike:
             why = "this view is unlike what the detector knows"
         of_tracks = f"{'tracks' if tracks else 'no tracks'}: {why}"
-        renamed = f"{sum(self._changed)} of {len(self._changed)} objects named otherwise by the ground"
+        renamed = f"{sum(self._changed)} of {len(self._changed)} objects named otherwise by their stills"
         renamed = renamed if self._changed else "none was answered yet"
         details = "stills show details, " if self._settings.finer else "stills: "
         return f"{of_tracks}; {details if stills else 'stills paused: '}{renamed}"

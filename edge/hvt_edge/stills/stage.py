@@ -175,7 +175,7 @@ class StillStage:
         return self.levers.decide(now_ns)
 
     def _note_change(self, result: StillResult) -> None:
-        # A still changed something where the ground now calls the object other than the edge does.
+        # A still may change something where it alone shows the ground another object than the edge names.
         tracks = self.latest_tracks
         if self.levers is None or tracks is None:
             return

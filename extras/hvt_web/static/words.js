@@ -199,7 +199,7 @@ export function stillWords(still) {
   if (still.track === null && still.reason === "asked") return "a closer look"; // of a place, whatever is there
   const track = still.track === null ? "" : `track ${still.track}: `;
   if (still.unread) return `${track}${still.after}, not read${still.note ? ` (${still.note})` : ""}`;
-  if (still.doubted) return `${track}doubted, was ${still.before}`;
+  if (still.doubted) return `${track}doubted${still.before === still.after ? " as before" : `, was ${still.before}`}`;
   const sure = percent(still.sureness);
   return still.before === still.after || !still.before ? `${track}${still.after}, ${sure}` : `${track}${still.before} → ${still.after}, ${sure}`;
 }

@@ -132,7 +132,7 @@ def test_stills_of_a_source_much_finer_than_the_base_never_pause():
     rig = Rig(finer=True)
     assert rig.answers(60)
     assert rig.operating.now.levers.says.endswith(
-        "stills show details, 0 of 40 objects named otherwise by the ground"
+        "stills show details, 0 of 40 objects named otherwise by their stills"
     )
     rig.control.take_load(too_slow=True, now_ns=SECOND_NS)
     assert not rig.second().stills, "but on a machine that is too slow"
@@ -142,7 +142,7 @@ def test_stills_that_change_something_go_on():
     """The next one may be the one that matters."""
     rig = Rig()
     assert rig.answers(SETTINGS.most_answers, changed=5)
-    assert "stills: 5 of 40 objects named otherwise by the ground" in rig.operating.now.levers.says
+    assert "stills: 5 of 40 objects named otherwise by their stills" in rig.operating.now.levers.says
 
 
 def test_stills_go_on_where_the_base_misnames_and_no_tracks_tell():

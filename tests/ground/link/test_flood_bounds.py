@@ -98,11 +98,11 @@ def test_numbers_alone_are_no_event(rig, flight):
         "no tracks: not measured yet; stills: none was answered yet",
         (
             "no tracks: the video hides 2 objects, misnames 1; "
-            "stills: 1 of 2 objects named otherwise by the ground"
+            "stills: 1 of 2 objects named otherwise by their stills"
         ),
-        "tracks: the video hides 9 objects; stills: 1 of 2 objects named otherwise by the ground",
-        "tracks: the video hides 9 objects; stills paused: 1 of 40 objects named otherwise by the ground",
-        "tracks: the video hides 8 objects; stills paused: 1 of 40 objects named otherwise by the ground",
+        "tracks: the video hides 9 objects; stills: 1 of 2 objects named otherwise by their stills",
+        "tracks: the video hides 9 objects; stills paused: 1 of 40 objects named otherwise by their stills",
+        "tracks: the video hides 8 objects; stills paused: 1 of 40 objects named otherwise by their stills",
     ]
     for number, levers in enumerate(said):
         rig.session.status(replace(real, sequence=real.sequence + 1 + number, levers=levers), item)
@@ -111,11 +111,11 @@ def test_numbers_alone_are_no_event(rig, flight):
         "The edge sends no tracks: not measured yet. Stills are sent: none was answered yet.",
         (
             "The edge sends its tracks: the video hides 9 objects. "
-            "Stills are sent: 1 of 2 objects named otherwise by the ground."
+            "Stills are sent: 1 of 2 objects named otherwise by their stills."
         ),
         (
             "The edge sends its tracks: the video hides 9 objects. "
-            "Stills are paused: 1 of 40 objects named otherwise by the ground."
+            "Stills are paused: 1 of 40 objects named otherwise by their stills."
         ),
     ]
 

@@ -107,7 +107,7 @@ def test_the_page_reads_all_of_it_as_sentences(ground):
     (edge,) = state.edges
     every = dict.fromkeys(STILL_WORDS, 2)
     levers = (
-        "tracks: the video hides 31 objects; stills paused: 0 of 40 objects named otherwise by the ground"
+        "tracks: the video hides 31 objects; stills paused: 0 of 40 objects named otherwise by their stills"
     )
     session = replace(
         edge.session, still_outcomes=every, stills_not_sent=every, levers=levers, gaps=2, lost=3
@@ -119,7 +119,7 @@ def test_the_page_reads_all_of_it_as_sentences(ground):
     assert all(re.fullmatch(r"[A-Z].*[^.]\.", one) for one in shown["why"]), shown["why"]
     assert shown["why"][-2:] == [
         "The edge sends its tracks: the video hides 31 objects.",
-        "Stills are paused: 0 of 40 objects named otherwise by the ground.",
+        "Stills are paused: 0 of 40 objects named otherwise by their stills.",
     ]
 
 

@@ -226,10 +226,10 @@ def _verdict(refinement: Refinement) -> str:
         why = f"({refinement.note})" if refinement.note else "unread"
         return f"{refinement.class_after} {why}".strip()
     certainty = confidence_text(round(refinement.confidence * 100))
-    if refinement.doubted:
-        return f"{refinement.class_before}? {refinement.class_after} {certainty}"
     certain = "✓ " if refinement.sure else ""
     before, after = refinement.words
+    if refinement.doubted and before != after:
+        return f"{refinement.class_before}? {after} {certainty}"
     if before == after:
         return f"{after} {certain}{certainty}"
     if refinement.track_id is None:  # nothing was renamed by it
