@@ -29,7 +29,7 @@ def summary_of(
     now = SimpleNamespace(
         method="M6",
         levers=SimpleNamespace(
-            says="no tracks: the video hides 0 objects; stills: 2 of 3 objects named otherwise by their stills"
+            says="no tracks: the video hides 0 objects; stills: they name 2 of 3 otherwise"
         ),
         preset="superfast",
         preset_says="preset superfast: veryfast would take 0.5 of a core",
@@ -72,10 +72,7 @@ def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
         failed=(failure,),
     )
     said = [text for _, text in table(content)]
-    assert (
-        said[0]
-        == "auto, M6: no tracks: the video hides 0 objects; stills: 2 of 3 objects named otherwise by their stills"
-    )
+    assert said[0] == "auto, M6: no tracks: the video hides 0 objects; stills: they name 2 of 3 otherwise"
     assert said[1] == (
         "80 frames came: 9 sent, 1 left out by auto's 7.5 a second, 3 had no room in the budget, "
         "1 the link did not carry, 66 the processor had no time for; 5.3 s"

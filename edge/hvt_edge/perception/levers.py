@@ -164,7 +164,7 @@ class LeverControl:
         if self._too_slow:
             return "video alone: this machine is too slow for the detector"
         measured = self.measured
-        who = "the ground overlooks" if measured.reported else "the video hides"
+        who = "the ground misses" if measured.reported else "the video hides"
         hidden = f"{who} {_objects(measured.hidden)}"
         for count, what in ((measured.suppressed, "shows {} false"), (measured.misnamed, "misnames {}")):
             if round(count):
@@ -173,7 +173,7 @@ class LeverControl:
         if self.unlike:
             why = "this view is unlike what the detector knows"
         of_tracks = f"{'tracks' if tracks else 'no tracks'}: {why}"
-        renamed = f"{sum(self._changed)} of {len(self._changed)} objects named otherwise by their stills"
+        renamed = f"they name {sum(self._changed)} of {len(self._changed)} otherwise"
         renamed = renamed if self._changed else "none was answered yet"
         details = "stills show details, " if self._settings.finer else "stills: "
         return f"{of_tracks}; {details if stills else 'stills paused: '}{renamed}"

@@ -76,10 +76,10 @@ def test_each_part_of_an_edge_that_may_fail_has_a_name_for_people():
 def test_what_auto_decides_is_said_in_sentences():
     """``tracks: …; stills show details, …`` means nothing to who flies; a later edge's decision is said as it is."""
     assert lever_sentences(
-        "no tracks: not measured yet; stills show details, 1 of 2 objects named otherwise by their stills"
+        "no tracks: not measured yet; stills show details, they name 1 of 2 otherwise"
     ) == [
         "The edge sends no tracks: not measured yet.",
-        "Stills are sent for their details: 1 of 2 objects named otherwise by their stills.",
+        "Stills are sent for their details: they name 1 of 2 otherwise.",
     ]
     assert lever_sentences("video alone: this machine is too slow for the detector")[0].startswith(
         "Video alone"

@@ -7,6 +7,8 @@ from dataclasses import replace
 import pytest
 
 from hvt_common.protocol.edge_words import LEVER_WORDS, lever_decisions
+from hvt_common.protocol.messages import Status
+from hvt_common.protocol.messages.envelope import kinds
 from hvt_edge.operating import Operating
 from hvt_edge.perception.levers import LeverControl, LeverSettings, Measured
 
@@ -85,12 +87,25 @@ def test_tracks_follow_their_gain_and_do_not_flicker():
 def test_it_says_who_does_not_see_them():
     """An operator would look for the fault in the video where the ground's model is the wrong one."""
     rig = Rig()
-    for reported, who in ((True, "the ground overlooks"), (False, "the video hides")):
+    for reported, who in ((True, "the ground misses"), (False, "the video hides")):
         rig.control.measured = Measured(3.0, 0.5, 0.5, 16, reported=reported)
         assert rig.second().says.startswith(f"tracks: {who} 16 objects; ")
     rig.control.measured = Measured(3.0, 0.5, 0.5, 16, suppressed=4.2, misnamed=2.6)
     says = "tracks: the video hides 16 objects, shows 4 false, misnames 3; "
     assert rig.second().says.startswith(says)
+
+
+def test_what_it_says_has_room_in_a_report():
+    """The page would show a sentence without its end, and the half of a number."""
+    rig = Rig(finer=True)
+    crowd = Measured(3.0, -0.5, -0.5, hidden=99, suppressed=99, misnamed=99, reported=True)
+    rig.control.measured = crowd
+    assert rig.answers(SETTINGS.most_answers, changed=40)
+    says = rig.operating.now.levers.says
+    assert says.startswith(
+        "no tracks: the ground misses 99 objects, shows 99 false, misnames 99; stills show"
+    )
+    assert len(says) <= dict(kinds(Status))["levers"].max_bytes
 
 
 def test_one_picture_is_no_measurement_unless_it_is_plain():
@@ -131,9 +146,7 @@ def test_stills_of_a_source_much_finer_than_the_base_never_pause():
     """Details are what they are for there: no class changes, and an operator could read nothing."""
     rig = Rig(finer=True)
     assert rig.answers(60)
-    assert rig.operating.now.levers.says.endswith(
-        "stills show details, 0 of 40 objects named otherwise by their stills"
-    )
+    assert rig.operating.now.levers.says.endswith("stills show details, they name 0 of 40 otherwise")
     rig.control.take_load(too_slow=True, now_ns=SECOND_NS)
     assert not rig.second().stills, "but on a machine that is too slow"
 
@@ -142,7 +155,7 @@ def test_stills_that_change_something_go_on():
     """The next one may be the one that matters."""
     rig = Rig()
     assert rig.answers(SETTINGS.most_answers, changed=5)
-    assert "stills: 5 of 40 objects named otherwise by their stills" in rig.operating.now.levers.says
+    assert "stills: they name 5 of 40 otherwise" in rig.operating.now.levers.says
 
 
 def test_stills_go_on_where_the_base_misnames_and_no_tracks_tell():

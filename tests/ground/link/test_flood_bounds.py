@@ -96,13 +96,10 @@ def test_numbers_alone_are_no_event(rig, flight):
     real = Status.parse(item.payload)
     said = [
         "no tracks: not measured yet; stills: none was answered yet",
-        (
-            "no tracks: the video hides 2 objects, misnames 1; "
-            "stills: 1 of 2 objects named otherwise by their stills"
-        ),
-        "tracks: the video hides 9 objects; stills: 1 of 2 objects named otherwise by their stills",
-        "tracks: the video hides 9 objects; stills paused: 1 of 40 objects named otherwise by their stills",
-        "tracks: the video hides 8 objects; stills paused: 1 of 40 objects named otherwise by their stills",
+        ("no tracks: the video hides 2 objects, misnames 1; stills: they name 1 of 2 otherwise"),
+        "tracks: the video hides 9 objects; stills: they name 1 of 2 otherwise",
+        "tracks: the video hides 9 objects; stills paused: they name 1 of 40 otherwise",
+        "tracks: the video hides 8 objects; stills paused: they name 1 of 40 otherwise",
     ]
     for number, levers in enumerate(said):
         rig.session.status(replace(real, sequence=real.sequence + 1 + number, levers=levers), item)
@@ -111,11 +108,11 @@ def test_numbers_alone_are_no_event(rig, flight):
         "The edge sends no tracks: not measured yet. Stills are sent: none was answered yet.",
         (
             "The edge sends its tracks: the video hides 9 objects. "
-            "Stills are sent: 1 of 2 objects named otherwise by their stills."
+            "Stills are sent: they name 1 of 2 otherwise."
         ),
         (
             "The edge sends its tracks: the video hides 9 objects. "
-            "Stills are paused: 1 of 40 objects named otherwise by their stills."
+            "Stills are paused: they name 1 of 40 otherwise."
         ),
     ]
 

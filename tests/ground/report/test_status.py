@@ -106,9 +106,7 @@ def test_the_page_reads_all_of_it_as_sentences(ground):
     state = ground.maker.make([("uav-1", ground.sessions)])
     (edge,) = state.edges
     every = dict.fromkeys(STILL_WORDS, 2)
-    levers = (
-        "tracks: the video hides 31 objects; stills paused: 0 of 40 objects named otherwise by their stills"
-    )
+    levers = "tracks: the video hides 31 objects; stills paused: they name 0 of 40 otherwise"
     session = replace(
         edge.session, still_outcomes=every, stills_not_sent=every, levers=levers, gaps=2, lost=3
     )
@@ -119,7 +117,7 @@ def test_the_page_reads_all_of_it_as_sentences(ground):
     assert all(re.fullmatch(r"[A-Z].*[^.]\.", one) for one in shown["why"]), shown["why"]
     assert shown["why"][-2:] == [
         "The edge sends its tracks: the video hides 31 objects.",
-        "Stills are paused: 0 of 40 objects named otherwise by their stills.",
+        "Stills are paused: they name 0 of 40 otherwise.",
     ]
 
 
