@@ -8,6 +8,7 @@ import math
 import os
 import socket
 import ssl
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
@@ -548,5 +549,13 @@ def test_what_is_no_http_disturbs_nothing(local):
 
 def test_the_server_ends_while_viewers_watch(port):
     """The ground would hang at its end."""
-    with ExitStack() as viewers, WebPage(f"127.0.0.1:{port}", clock=time.time_ns):
-        viewers.enter_context(joined(port)).recv()
+    before = set(threading.enumerate())
+
+    def serves() -> bool:
+        return any(one.name == "hvt-web" for one in set(threading.enumerate()) - before)
+
+    with ExitStack() as viewers:
+        with WebPage(f"127.0.0.1:{port}", clock=time.time_ns):
+            viewers.enter_context(joined(port)).recv()
+            assert serves()
+        eventually(lambda: not serves(), what="its thread ends")
