@@ -48,8 +48,9 @@ _MOST_PORT = 65535
 
 _KEY = r"[\w.-]{0,32}(?:pass|pwd|pw|key|token|auth|secret|sig|user|cred|streamid|session|code)[\w.-]{0,32}"
 _PAIR = re.compile(rf"(?<![\w.-])({_KEY})=([^&\s\"'<>)\],;…]+)", re.IGNORECASE)
-_OPTION = re.compile(r"--[a-z-]+=")
-"""``--still-codec=webp`` is no pair: every ``webp`` in log and summary would be hidden."""
+_OPTION = re.compile(r"^--(?![a-z-]*(?:pass|pwd|pw|token|auth|secret|cred|key=))[a-z-]+=")
+"""``--still-codec=webp`` is no pair: every ``webp`` in log and summary would be hidden. One for a secret is a typing
+error, and none of ours."""
 _LEAST = 3
 """A secret of fewer characters would blot out half of every sentence; in an address it is hidden all the same."""
 _ANYWHERE = re.compile(r"([A-Za-z][A-Za-z0-9+.-]{0,15}:[/\\]{1,4})(?:[^\n]*@|[^\s\"'@]*@)")

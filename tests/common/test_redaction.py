@@ -213,3 +213,16 @@ def test_the_values_of_our_own_options_are_no_secrets():
     """``--still-codec=webp`` hid every webp, for ``code`` is in the name of the option."""
     words = ["--still-codec=webp", "--encoder=x265", "--source=rtsp://u:Zq9Zq9@cam/x"]
     assert Redaction(words).text("webp x265 Zq9Zq9") == "webp x265 …"
+
+
+@pytest.mark.parametrize(
+    ("word", "secret"),
+    [
+        ("--password=Zq9Zq9", "Zq9Zq9"),
+        ("--api-key=Zq9Zq9", "Zq9Zq9"),
+        ("--source=rtsp://u:Zq--rate=9@cam/x", "Zq--rate=9"),
+    ],
+)
+def test_a_secret_in_a_typing_error_or_with_dashes_is_hidden(word, secret):
+    """``unrecognized arguments: --password=…`` would tell it to who reads the log."""
+    assert secret not in Redaction([word]).text(f"unrecognized arguments: {word}; {secret}")
