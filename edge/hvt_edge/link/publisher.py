@@ -136,9 +136,8 @@ class ZenohLink:
         """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""
         try:
             self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
-            if (
-                channel is Channel.STATUS and self._listener is not None and self._loses
-            ):  # about once a second
+            # A status goes about once a second.
+            if channel is Channel.STATUS and self._listener is not None and self._loses:
                 self._listener.declare_again(there=self.has_ground())
         except zenoh.ZError as error:
             _log.debug("%s was not sent: %s", channel, error)

@@ -300,9 +300,8 @@ class RealtimeWorker(PerceptionWorker):
         while self._steps and not self._given_up.is_set() and not self._picture_before(self._steps[0][0]):
             self._step(*self._steps.popleft())
         if stills:
-            self._take_pictures(
-                hurry=True, awaited=True
-            )  # what came while the detector ran would wait as long again
+            # What came while the detector ran would wait as long again.
+            self._take_pictures(hurry=True, awaited=True)
             self._read(stills)
         if self._has_news():
             self._wake.set()
