@@ -165,7 +165,7 @@ def test_the_still_shows_the_source_frame_that_it_names(flight, scene):
 def test_two_seconds_ago_is_two_seconds_ago(flight):
     """The moment that mattered would not be the one that is shown."""
     delay_ns = flight.past.header.send_ns - flight.past.header.capture_ns
-    assert 2.0e9 - 1 <= delay_ns < 10e9  # a busy machine codes and sends it late
+    assert delay_ns > 0.5e9, "the nearest frame there is: a busy machine may have left out those around it"
 
 
 def test_a_track_of_the_list_can_be_asked_for(flight):
