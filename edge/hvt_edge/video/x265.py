@@ -176,8 +176,10 @@ class BaseEncoder:
         # closes that decoder holds the GIL and waits for the worker. PyAV is silent by default.
         self._to_yuv = VideoReformatter()
         self._workers = NewThreads()
+        self._spent = (0, 0)
+        """Once it is closed."""
         with self._workers:
-            self._context = _open(settings)
+            self._context: VideoCodecContext | None = _open(settings)
         self._tagger = RegionTagger() if settings.side_data else None
         self._count = 0
         self._caller_ns = self._wall_ns = 0
@@ -189,6 +191,7 @@ class BaseEncoder:
 
         ``regions`` need ``EncoderSettings.side_data``; where they overlap the deeper one counts.
         """
+        assert self._context is not None, "it is open"
         assert self._tagger is not None or not regions, "regions need EncoderSettings.side_data"
         began_ns, began_cpu_ns = time.perf_counter_ns(), time.thread_time_ns()
         picture = yuv_picture(self._to_yuv, frame.base_bgr)
@@ -213,8 +216,15 @@ class BaseEncoder:
     @property
     def spent(self) -> tuple[int, int]:
         """(processor time in nanoseconds, frames) so far; time by the clock where the system says no more."""
+        if self._context is None:
+            return self._spent
         workers_ns = self._workers.cpu_ns
         return self._wall_ns if workers_ns is None else self._caller_ns + workers_ns, self._count
+
+    def close(self) -> None:
+        """End x265's threads, and give back its memory: 12.5 MB for each of some frames of 1280x720."""
+        self._spent = self.spent
+        self._context = self._tagger = None
 
 
 def yuv_picture(

@@ -30,7 +30,7 @@ from hvt_edge.video.encoder_settings import (
 )
 from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
 from hvt_edge.video.encoders.qualification import Allowed, allowed, headroom_of, run_frames
-from hvt_edge.video.encoders.registry import X265, Encoder, open_encoder
+from hvt_edge.video.encoders.registry import X265, CheckedEncoder, Encoder, open_encoder
 from hvt_edge.video.rate_model import (
     LEAST_SIDE_PX,
     PROMPT,
@@ -192,10 +192,19 @@ def encoder_opener(
     headroom: float,
     presets: PresetControl | None,
 ) -> OpenEncoder:
-    """Opens encoders in flight, with the preset that is in force then."""
+    """Opens encoders in flight, with the preset that is in force then; the one before is closed first.
+
+    Two at a time would take 60 MB more at 1280x720, and a device that takes one session would refuse the second.
+    """
+    last: Encoder | None = None
 
     def open_for(rates: Rates) -> Encoder:
-        encoder = make_encoder(config, rates, size=size, preset=operating.now.preset, headroom=headroom)
+        nonlocal last
+        if isinstance(last, BaseEncoder | CheckedEncoder):
+            last.close()
+        last = encoder = make_encoder(
+            config, rates, size=size, preset=operating.now.preset, headroom=headroom
+        )
         if presets is not None and isinstance(encoder, BaseEncoder):
             presets.watch(lambda: encoder.spent)
         return encoder

@@ -14,7 +14,8 @@ from hvt_edge.operating import Operating
 from hvt_edge.video.encoder_settings import PresetControl, choose_preset, share_of
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.x265 import BaseEncoder
-from hvt_edge.wiring.video import encoder_opener, reconfiguration_settings
+from hvt_edge.wiring import video
+from hvt_edge.wiring.video import encoder_opener, make_encoder, reconfiguration_settings
 
 SECOND = 1_000_000_000
 MOST = 0.4
@@ -88,7 +89,7 @@ def test_it_does_not_step_to_and_fro(preset, frame_ms):
     assert Clockwork(preset).fly(600, frame_ms=frame_ms) == []
 
 
-def test_a_step_opens_x265_at_the_same_rates_and_video_goes_on():
+def test_a_step_opens_x265_at_the_same_rates_and_video_goes_on(monkeypatch):
     """Video would stop, or the step would never reach the encoder."""
     config = check(EdgeConfig(source="demo", method="M0", size=(320, 192), budget=300_000))
     operating = Operating(
@@ -104,11 +105,23 @@ def test_a_step_opens_x265_at_the_same_rates_and_video_goes_on():
         presets=control,
     )
     first = reconfiguration.open_again()
+    ended_first = []
+
+    def opened(*given, **settings):
+        with pytest.raises(AssertionError, match="it is open"):
+            first.encode(Frame(1, 0, picture, picture))
+        ended_first.append(True)
+        return make_encoder(*given, **settings)
+
+    monkeypatch.setattr(video, "make_encoder", opened)
     decoder, picture = BaseDecoder(), np.full((192, 320, 3), 90, np.uint8)
     assert reconfiguration(1, 0) is None
     assert decoder.decode_yuv(first.encode(Frame(0, 0, picture, picture), keyframe=True).data) is not None
     second = reconfiguration(1, 31 * SECOND)
     assert isinstance(second, BaseEncoder)
+    assert isinstance(first, BaseEncoder)
+    assert first.spent[1] == 1
+    assert ended_first == [True], "each takes 60 MB at 1280x720"
     assert operating.now.preset == "ultrafast"
     assert (operating.now.base_bps, operating.now.total_bps) == (280_000, 300_000)
     unit = second.encode(Frame(1, 0, picture, picture), keyframe=True)

@@ -77,6 +77,10 @@ class CheckedEncoder:
         self._begun = True
         return AccessUnit(frame.index, frame.capture_ns, data, keyframe=begins)
 
+    def close(self) -> None:
+        """Let go of it, and so of its device and memory."""
+        del self._encoder
+
 
 @dataclass(frozen=True, slots=True)
 class HardwareRow:
