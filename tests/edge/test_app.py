@@ -17,7 +17,7 @@ from hvt_edge.source.contract import Source
 from hvt_edge.world import World
 from media.pictures import write_scene
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.integration
 
 FPS, READING_S, FRAMES = 15.0, 0.5, 8
 

@@ -45,7 +45,6 @@ def stopped_at_once(monkeypatch):
     monkeypatch.setattr(Awaited, "wait", lambda awaited, _stop: awaited.part)
 
 
-@pytest.mark.timeout(120)
 @pytest.mark.parametrize("address", ADDRESSES)
 @pytest.mark.parametrize("form", FORMS)
 def test_no_sentence_has_the_password(free_port, tmp_path, capsys, address, form):

@@ -13,7 +13,7 @@ from hvt_edge.cli import main
 from hvt_edge.stills.policy.registry import METHODS
 from programs.processes import free_ports
 
-pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.integration, pytest.mark.realdata]
 
 FRAMES = 90
 """Six seconds."""

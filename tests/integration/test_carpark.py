@@ -24,7 +24,7 @@ from programs.outsider import Message, Tap, answer, joined
 from programs.processes import Link, eventually
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.realdata]
 
 FRAMES = 220
 """351 frames at 24 fps are 14.625 s: instants 0 … 219 at 15 fps."""

@@ -10,7 +10,7 @@ import pytest
 
 from programs.processes import Link, Running
 
-pytestmark = [pytest.mark.integration, pytest.mark.nightly, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.integration, pytest.mark.nightly]
 
 
 SAYS = "hvt-models fetch yolox-s"

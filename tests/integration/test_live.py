@@ -16,7 +16,7 @@ from programs.outsider import Tap, answer, joined
 from programs.processes import Link, Running, eventually
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.integration
 
 STOPPED_WITHIN_S = 15.0
 """Below the 20 s after which a lockstep edge gives its ground up, and the 60 s that one waits for its first."""

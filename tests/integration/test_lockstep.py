@@ -13,7 +13,7 @@ import pytest
 from programs.processes import Link
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.realdata]
 
 FRAMES = 60
 

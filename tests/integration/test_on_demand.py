@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from hvt_ground.control import EdgeClient, EdgeTrack, RefusedError, RequestedStill
-from programs.processes import PATIENT_S, Link, eventually
+from programs.processes import Link, eventually
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.integration
 
 PLACE = (300, 100, 200, 150)
 """x, y, width, height in source pixels."""
@@ -51,7 +51,7 @@ def refusal(ask) -> str:
 def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run ``hvt-ground`` with these words."""
     line = [sys.executable, "-m", "hvt_ground.cli", *words]
-    return subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=PATIENT_S, check=False)
+    return subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
 
 
 def patiently(edge):

@@ -22,7 +22,7 @@ from programs.outsider import Tap, joined
 from programs.processes import Link, Running, eventually
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.integration
 
 TESTS = Path(__file__).resolve().parents[2] / "tests" / "support"
 ROUTER = Path(__file__).resolve().parents[2] / "deploy" / "router.py"

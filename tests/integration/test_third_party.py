@@ -13,7 +13,7 @@ from media.third_party import BLOBS, ENCODERS, install
 from programs.processes import Link
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.integration
 
 FRAMES = 60
 

@@ -28,7 +28,6 @@ def verdicts(tmp_path_factory):
 
 @pytest.mark.integration
 @pytest.mark.nightly
-@pytest.mark.timeout(170)
 def test_a_kill_costs_next_to_nothing(verdicts):
     """The crash that one wants to look into would have taken its recording with it."""
     rows = {row["measure"]: row for row in rows_of(verdicts)}

@@ -298,7 +298,6 @@ def test_what_is_on_its_way_comes_by_time_and_is_bounded():
 
 
 @pytest.mark.realtime
-@pytest.mark.timeout(240)
 @pytest.mark.parametrize(
     ("carrier", "name", "transport"), [("tun", "burst-loss-udp", "udp"), ("netns", "steady-300k", "tcp")]
 )

@@ -32,7 +32,6 @@ def done(tmp_path, module, words, without):
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
 

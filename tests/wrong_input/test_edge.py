@@ -9,8 +9,6 @@ import pytest
 
 from media.third_party import PIXELS
 
-pytestmark = pytest.mark.timeout(60)
-
 
 @pytest.fixture
 def edge(refused, pictures, free_port):

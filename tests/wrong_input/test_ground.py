@@ -12,8 +12,6 @@ from hvt_common.redaction import redacted
 from hvt_common.transport.inbox import Received
 from media.onnx_models import colour_classifier, colour_detector
 
-pytestmark = pytest.mark.timeout(60)
-
 
 @pytest.fixture
 def ground(refused, free_port):

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.timeout(60)
-
 
 @pytest.fixture
 def program(refused, pictures, free_port):

@@ -9,13 +9,13 @@ import pytest
 
 from programs.refusal import checked, snapshot
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.integration
 
 
 def started(module: str, *words: str, folder) -> subprocess.CompletedProcess[str]:
     """Run a program to its end."""
     command = [sys.executable, "-m", module, *words]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize(

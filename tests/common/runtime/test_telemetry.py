@@ -30,7 +30,6 @@ def test_a_network_that_runs_leaves_and_sends_nothing(tmp_path):
         capture_output=True,
         check=False,
         text=True,
-        timeout=120,
     )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 0

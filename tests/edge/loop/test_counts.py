@@ -125,7 +125,6 @@ STEPS = st.lists(
 )
 
 
-@pytest.mark.timeout(300)
 @settings(max_examples=60, deadline=None)
 @given(steps=STEPS, source=st.sampled_from(["lockstep", "camera", "clip"]), decimation=st.integers(1, 3))
 def test_every_source_frame_is_in_one_group(steps, source, decimation):

@@ -22,7 +22,7 @@ from programs.processes import Link, eventually, free_ports
 from programs.rtsp_camera import RtspCamera
 from rigs.watched_flight import SMALL, STORE_BYTES, asked, series, state, status
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
+pytestmark = pytest.mark.integration
 
 
 @pytest.fixture

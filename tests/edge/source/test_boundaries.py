@@ -50,7 +50,6 @@ def camera():
     thread.join()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("path", ["whole", "cut"])
 def test_a_camera_plays_with_or_without_its_first_boundary(camera, path):
     """A camera that every browser shows would be refused."""
@@ -61,7 +60,6 @@ def test_a_camera_plays_with_or_without_its_first_boundary(camera, path):
     assert numbers == sorted(numbers)
 
 
-@pytest.mark.timeout(60)
 def test_a_page_is_no_camera(camera):
     """What is no picture would be searched for pictures for ever."""
     with pytest.raises(UserError, match=r"cannot be opened|holds no video"):

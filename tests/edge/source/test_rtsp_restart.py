@@ -12,7 +12,7 @@ from hvt_common.units import SECOND_NS
 from hvt_edge.source.opening import open_source
 from programs.gstreamer_camera import SIZE, GStreamerCamera, lacking
 
-pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -89,7 +89,6 @@ def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
     assert "nobody listens" in found["link"]["found"] or "refused" in found["link"]["found"], found["link"]
 
 
-@pytest.mark.timeout(120)
 def test_the_cameras_password_is_not_printed(free_port, capsys):
     """Whoever asks for help with the findings would give the camera away."""
     with RtspCamera(free_port) as camera:

@@ -11,7 +11,7 @@ from programs.processes import Link
 from programs.rrd import Recording
 from rigs.drawn_flight import FPS, fly, off_m
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.integration
 
 
 def test_the_pose_is_part_of_the_budget_and_of_both_accounts(drawn):

@@ -16,7 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from hvt_common.protocol.messages import WIRE_VERSION
 from programs.processes import Link, eventually, free_ports
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
+pytestmark = pytest.mark.integration
 
 EDGE = ("--fps", "5", "--size", "640x360", "--detector", "motion", "--method", "M0")
 
@@ -41,7 +41,7 @@ def series(address: str) -> dict[tuple[str, str], float]:
 def status(*arguments: str) -> subprocess.CompletedProcess[str]:
     """``hvt-ground status``."""
     command = [sys.executable, "-m", "hvt_ground.cli", "status", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.nightly

@@ -21,7 +21,7 @@ from programs.processes import Link, Running, eventually
 from programs.rtsp_camera import RtspCamera
 from programs.small_disk import small_disk
 
-pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration]
 
 SMALL = ("--size", "320x192", "--fps", "10", "--preset", "ultrafast", "--budget", "400kbps")
 

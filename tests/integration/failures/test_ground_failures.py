@@ -12,7 +12,7 @@ from media.onnx_models import failing_in_the_light
 from programs.processes import Link
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration]
 
 FLIGHT = (
     *("--source-fps", "10", "--fps", "10", "--size", "320x192", "--preset", "ultrafast"),

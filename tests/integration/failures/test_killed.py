@@ -18,7 +18,7 @@ from hvt_ground.recordings.row import RecordingRow
 from programs.processes import Link, eventually
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.integration
 
 """Generous: the machine may be busy with other tests."""
 EDGE = (

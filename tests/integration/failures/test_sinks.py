@@ -15,7 +15,7 @@ from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 from programs.processes import Link, Running, eventually
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.integration
 
 EDGES = ("uav-1", "uav-2")
 ANALYSES = ("--detector", "motion", "--classifier", "none")

@@ -19,7 +19,7 @@ from lab.link.carriers.star import Star
 from programs.processes import Running, eventually
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.realtime, pytest.mark.timeout(280)]
+pytestmark = [pytest.mark.integration, pytest.mark.realtime]
 
 ROUTER = Path(__file__).resolve().parents[3] / "deploy" / "router.py"
 EDGES = [f"uav-{number}" for number in range(1, 7)]

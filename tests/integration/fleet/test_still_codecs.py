@@ -9,7 +9,7 @@ from hvt_common.protocol.messages import Info, InfoRequest, RoiHeader
 from programs.outsider import Tap, answer, joined
 from programs.processes import Link, eventually
 
-pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.nightly, pytest.mark.integration]
 
 EDGE = (
     *("--source", "demo", "--edge-id", "uav-1", "--size", "640x360", "--fps", "5", "--preset", "ultrafast"),

@@ -23,7 +23,7 @@ from hvt_edge.keyframes import KeyframeSettings
 from programs.outsider import Tap, answer, joined
 from programs.processes import Link, Running, eventually
 
-pytestmark = [pytest.mark.integration, pytest.mark.nightly, pytest.mark.timeout(280)]
+pytestmark = [pytest.mark.integration, pytest.mark.nightly]
 
 _FLOODER = Path(__file__).with_name("flooder.py")
 _SECONDS = 2.5

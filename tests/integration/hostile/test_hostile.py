@@ -17,7 +17,7 @@ from programs.outsider import Message, Tap, answer, joined
 from programs.processes import Link, eventually
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.realtime, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.integration, pytest.mark.realtime]
 
 ROUNDS = 25
 """How often each kind of bad message is sent, a tenth of a second apart."""

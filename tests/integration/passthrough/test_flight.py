@@ -12,7 +12,7 @@ from media.hevc_camera import SIZE, packets_of, pictures_of, write_clip
 from programs.processes import Link, Running, eventually
 from programs.rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.integration
 
 
 def camera(clip: object) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ _CODERS = {
 def lacking() -> str:
     """Why there is no such camera on this machine; empty where there is."""
     try:
-        found = subprocess.run([_PYTHON, "-c", _CHECK], capture_output=True, timeout=60, check=False)
+        found = subprocess.run([_PYTHON, "-c", _CHECK], capture_output=True, check=False)
     except OSError:
         return f"there is no {_PYTHON}"
     packages = "python3-gi gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-ugly"

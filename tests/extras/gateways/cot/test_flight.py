@@ -13,7 +13,7 @@ from hvt_common.geodesy import metres_per_degree
 from programs.processes import Link, free_ports
 from rigs.drawn_flight import FPS, FRAMES, fly, off_m, receiving, scene
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.integration
 
 
 def test_atoms_stand_within_their_error_of_the_objects(drawn):

@@ -12,7 +12,7 @@ from hvt_common.video.hevc import nal_units
 from media.klv_reader import read_stream
 from rigs.drawn_flight import FRAMES, VIEW
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.integration
 
 
 def units(data: bytes) -> list[bytes]:

@@ -18,8 +18,6 @@ pytest.importorskip("pymavlink")
 from hvt_edge.loop.pose import open_pose
 from hvt_geo.pose.mavlink_transport import MAX_FRAME_BYTES, Address, Connection, FrameParser
 
-pytestmark = pytest.mark.timeout(60)
-
 
 def opened(address: str):
     """What listens."""

@@ -78,7 +78,6 @@ print("ended")
         capture_output=True,
         text=True,
         check=True,
-        timeout=120,
     )
     assert done.stdout == "ended\n"
     assert len(list(tmp_path.glob("*.rrd"))) == 8
