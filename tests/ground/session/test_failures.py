@@ -179,11 +179,21 @@ def test_a_session_that_fails_ends_alone_and_begins_anew(flight, tmp_path, caplo
     assert neighbour.decoded == [40]
 
 
+class Held(RetryPause):
+    """Lasts from a failure until it is over."""
+
+    over = False
+
+    def due(self, now_ns: int) -> bool:
+        """See there."""
+        return self.over or not self.pause_ns
+
+
 def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path, caplog):
     """A full disk would end the ground, or fill the log with a line a keyframe."""
     consumer = Consumer(tmp_path)
     consumer.broken = "opening"
-    rig = Rig(flight, consumer, pause=RetryPause(first_ns=SECOND_NS // 5, longest_ns=3600 * SECOND_NS))
+    rig = Rig(flight, consumer, pause=(pause := Held()))
     rig.put(0, 1, 10, 20, 30)  # four keyframes within the first pause
     assert consumer.tried == 1
     assert rig.sessions.idle
@@ -194,8 +204,7 @@ def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path,
     )
     requests = rig.port.keyframe_requests
     assert requests <= 1, "an edge is not asked for keyframes that nobody takes"
-    consumer.broken = ""
-    time.sleep(0.25)
+    consumer.broken, pause.over = "", True
     rig.put(*range(36, 40))
     assert consumer.tried == 2
     assert rig.decoded == [4]
