@@ -26,7 +26,7 @@ pytestmark = pytest.mark.integration
 
 TESTS = Path(__file__).resolve().parents[2] / "tests" / "support"
 ROUTER = Path(__file__).resolve().parents[2] / "deploy" / "router.py"
-"""Generous: the machine may be busy with other tests."""
+
 PLAYS = (
     *("--source", "scene", "--size", "320x180", "--fps", "10", "--preset", "ultrafast"),
     *("--budget", "300kbps"),

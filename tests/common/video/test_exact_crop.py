@@ -101,7 +101,7 @@ def slowly(
 
 
 @given(draw=st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_every_pixel_is_as_the_document_states_it(draw):
     """Who writes a ground in another language would ask for every still again."""
     width, height = draw.draw(st.integers(1, 70)), draw.draw(st.integers(1, 50))

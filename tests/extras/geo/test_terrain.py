@@ -28,7 +28,6 @@ from hvt_geo.terrain import Terrain
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.config import check
 from hvt_ground.extras import config_class
-from hvt_ground.link.statistics import CaptureClock
 from hvt_ground.poses import Locator
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.sinks import Outputs
@@ -331,7 +330,7 @@ def test_a_model_that_goes_in_flight_ends_no_flight(tmp_path, caplog):
         reports = ReceiverReports(
             lambda _report: None,
             clock=time.time_ns,
-            clock_offset=CaptureClock(ClockOffset()),
+            clock_offset=ClockOffset(),
             backlog=EdgeBacklog("uav-1", recordings=None),
         )
         session = factory.open_session(replace(INFO, edge="uav-1"), reports)

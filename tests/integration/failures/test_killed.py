@@ -20,7 +20,7 @@ from programs.rrd import Recording
 
 pytestmark = pytest.mark.integration
 
-"""Generous: the machine may be busy with other tests."""
+
 EDGE = (
     *(
         "--size",
