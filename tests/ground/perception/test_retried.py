@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 from onnx import helper, numpy_helper
 
 from hvt_common.protocol.messages import RoiHeader
+from hvt_common.runtime.failures import RetryPause
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.models import Models
@@ -55,8 +55,10 @@ def picture(index: int, *, value: int) -> DecodedFrame:
     return DecodedFrame(index, index * 66_000_000, index * 66_000_000, image)
 
 
-def test_the_picture_goes_on_without_boxes_and_they_come_back(tmp_path: Path, caplog) -> None:
+def test_the_picture_goes_on_without_boxes_and_they_come_back(tmp_path: Path, caplog, monkeypatch) -> None:
     """A detector that stumbles over one picture would end the flight."""
+    over = [False]
+    monkeypatch.setattr(RetryPause, "due", lambda *_: over[0])
     detector = fragile(colour_detector(tmp_path / "d.onnx", "yolox"), bright=220)
     classifier = fragile(colour_classifier(tmp_path / "c.onnx"), bright=1_000)
     config = check(
@@ -78,7 +80,7 @@ def test_the_picture_goes_on_without_boxes_and_they_come_back(tmp_path: Path, ca
     assert (failed.part, failed.working) == ("detector", False)
     assert "out of data bounds" in failed.reason
     assert failed.count == 1, "it is left alone for a while"
-    time.sleep(1.05)
+    over[0] = True
     assert max(boxes(index, 200) for index in range(12, 24)) >= 1, "it was opened again"
     assert models.failures.parts[0].working
     said = [one for one in caplog.records if one.name.endswith("failures")]

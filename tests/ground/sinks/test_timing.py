@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 import signal
 import subprocess
 import sys
@@ -97,6 +98,16 @@ def test_a_device_that_refuses_is_not_removed(tmp_path):
     with pytest.raises(UserError, match="No space left"):
         timing_table(Path("/dev/full"))
     assert Path("/dev/full").is_char_device()
+
+
+def test_a_folder_that_goes_is_noticed(tmp_path):
+    """A stick that was pulled out: all would be written to a file that is in no folder."""
+    (tmp_path / "stick").mkdir()
+    table = timing_table(tmp_path / "stick" / "t.csv")
+    shutil.rmtree(tmp_path / "stick")
+    with pytest.raises(UserError, match="cannot be written any further: it was removed"):
+        table.log("base,1\n")
+    table.close()
 
 
 WRITER = r"""

@@ -1,9 +1,8 @@
-"""Disks that fill and folders that go while a ground writes there: only what is written there suffers."""
+"""A disk that fills while a ground writes there: only what is written there suffers."""
 
 from __future__ import annotations
 
 import csv
-import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import suppress
@@ -14,6 +13,7 @@ import pytest
 from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 from programs.processes import Link, Running, eventually
 from programs.rrd import Recording
+from programs.small_disk import small_disk
 
 pytestmark = pytest.mark.integration
 
@@ -21,20 +21,12 @@ EDGES = ("uav-1", "uav-2")
 ANALYSES = ("--detector", "motion", "--classifier", "none")
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
+@pytest.fixture(name="small_disk")
+def _small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 8 MB, of which 1 MB is free."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = shutil.which("mount")
-    options = ["-t", "tmpfs", "-o", "size=8m", "hvt-test", str(disk)]
-    if mount is None or subprocess.run([mount, *options], check=False, capture_output=True).returncode:
-        pytest.skip("this user may not mount a small file system")
-    try:
+    with small_disk(tmp_path / "disk", size="8m") as disk:
         (disk / "ballast").write_bytes(bytes(7 << 20))
         yield disk
-    finally:
-        subprocess.run(["umount", "--lazy", str(disk)], check=True)
 
 
 def edges(link: Link, scene: Path) -> list[Running]:
@@ -102,29 +94,3 @@ def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, long_sce
         assert max(map(int, columns(table, "frame_index"))) > min(frames[1]), "the table went on"
     shown = [kind for kind in columns(link.folder / "timing.csv", "kind") if kind == "base"]
     assert len(shown) == sum(summary["frames"] for summary in summaries), "no line of any message is missing"
-
-
-@pytest.mark.nightly
-def test_a_folder_that_goes_in_flight_costs_what_is_written_there(long_scene, link):
-    """A stick that was pulled out would end the flight, or all would be written to a file that is in no folder."""
-    folder = link.folder / "tables"
-    folder.mkdir()
-    ground = link.ground(*ANALYSES, "--once", "--record", "flights", "--tracks", str(folder))
-    flown = edges(link, long_scene)
-    eventually(lambda: len(list(folder.iterdir())) == 2, what="both tables are there")
-    shutil.rmtree(folder)
-    for name in EDGES:
-        ground.until(f"tracks table of {name} FAILED at")
-    folder.mkdir()
-    for name in EDGES:
-        ground.until(f"tracks table of {name}: works again")
-    for edge in flown:
-        edge.stop()
-    for name, summary in zip(EDGES, ground.finish(), strict=True):
-        (failed,) = summary["failed"]
-        assert (failed["part"], failed["working"]) == (f"tracks table of {name}", True)
-        assert "cannot be written any further: it was removed" in ground.said
-        (recording,) = summary["recordings"]
-        assert len(Recording(link.folder / recording).video()) == summary["frames_decoded"], "all of it"
-        assert verified(link.folder / recording)
-    assert len(list(folder.iterdir())) == 2
