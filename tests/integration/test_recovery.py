@@ -1,14 +1,12 @@
-"""Processes that are killed and started again, a router that goes, two edges of one id, clocks that are set."""
+"""Two edges of one id, stills that are lost, clocks that are set.
+
+That a router goes is in fleet/test_group.py; that two edges of one id meet later in tests/ground/session.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +23,6 @@ from programs.rrd import Recording
 pytestmark = pytest.mark.integration
 
 TESTS = Path(__file__).resolve().parents[2] / "tests" / "support"
-ROUTER = Path(__file__).resolve().parents[2] / "deploy" / "router.py"
 
 PLAYS = (
     *("--source", "scene", "--size", "320x180", "--fps", "10", "--preset", "ultrafast"),
@@ -36,17 +33,9 @@ SEES = ("--detector", "motion", "--classifier", "none")
 
 
 @pytest.fixture(autouse=True)
-def long_scene(scene: Path, tmp_path: Path) -> None:
+def pictures(long_scene: Path, tmp_path: Path) -> None:
     """What the edges of a test play, from where they run."""
-    repeated(scene, tmp_path / "scene")
-
-
-def repeated(scene: Path, folder: Path) -> None:
-    """Three minutes of it, for a busy machine; at little cost."""
-    folder.mkdir()
-    pictures = sorted(scene.iterdir())
-    for number in range(6 * len(pictures)):
-        (folder / f"{number:06d}.jpg").symlink_to(pictures[number % len(pictures)])
+    (tmp_path / "scene").symlink_to(long_scene)
 
 
 def shown(folder: Path, *, name: str = "timing.csv") -> list[Arrival]:
@@ -57,45 +46,6 @@ def shown(folder: Path, *, name: str = "timing.csv") -> list[Arrival]:
 def more_is_shown(folder: Path, *, than: int, name: str = "timing.csv") -> None:
     """Wait until the picture has gone on for a second."""
     eventually(lambda: len(shown(folder, name=name)) >= than + 10, what="the picture goes on")
-
-
-# A router that goes
-
-
-@contextmanager
-def router(endpoint: str) -> Iterator[subprocess.Popen[str]]:
-    """deploy/router.py, as soon as it listens."""
-    command = [sys.executable, str(ROUTER), "--listen", endpoint]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            assert "listens on" in process.stdout.readline()
-            yield process
-        finally:
-            process.kill()
-
-
-@pytest.mark.nightly
-def test_both_sides_come_back_to_a_router_that_was_killed(link: Link):
-    """After a power cut at the relay station somebody would have to start everything again, in the right order."""
-    with router(link.ground_endpoint):
-        ground = link.start(
-            "hvt_ground.cli",
-            ["--connect", link.ground_endpoint, *SEES, "--record", "flights", "--timing", "timing.csv"],
-            name="ground",
-        )
-        edge = link.edge(*PLAYS)
-        more_is_shown(link.folder, than=0)
-    killed_s = time.time()
-    with router(link.ground_endpoint):
-        eventually(
-            lambda: sum(one.send_s > killed_s + 1.0 for one in shown(link.folder)) >= 10,
-            what="the picture is back",
-        )
-        edge.stop()
-        ground.stop()
-    sessions = {one["session"] for one in as_list(ground.finish())}
-    assert sessions == {edge.finish()["session"]}
 
 
 def as_list(summaries: Any) -> list[dict[str, Any]]:
@@ -125,27 +75,6 @@ def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
     third.stop()
     ground.stop()
     assert third.finish()["session"] in {one["session"] for one in as_list(ground.finish())}
-
-
-@pytest.mark.realtime
-def test_of_two_edges_that_meet_later_the_first_is_shown_and_the_other_named(link: Link):
-    """The picture would jump between two drones, or be another's, without a word."""
-    edges = {name: link.edge(*PLAYS, "--wait", "0s", name=name) for name in ("one", "two")}
-    for edge in edges.values():
-        edge.until("no ground yet")
-    ground = link.ground(*SEES, "--record", "flight.rrd", "--timing", "timing.csv")
-    ground.until("two edges call themselves uav-1")
-    more_is_shown(link.folder, than=20)
-    for edge in edges.values():
-        edge.kill()
-    ground.stop()
-    (seen,) = as_list(ground.finish())
-    said = [line for line in ground.said.splitlines() if "two edges call themselves uav-1" in line]
-    assert len(said) == 1
-    assert f"session {seen['session']} is shown" in said[0]
-    events = [text for _, _, text in Recording(link.folder / "flight.rrd").events()]
-    assert any("two edges call themselves uav-1" in text for text in events)
-    assert seen["unusable_messages"] > 0
 
 
 # Stills that are lost

@@ -11,8 +11,6 @@ from typing import Any
 import av
 import pytest
 
-from hvt_common.protocol.messages import parse_backlog_units
-from hvt_edge.backlog.disk import FILE_NAME, Store
 from hvt_edge.backlog.entry import FIRST_STORED
 from lab.link.carriers.relay import Relay
 from lab.link.timeline import LinkState, Phase, Script
@@ -57,16 +55,6 @@ def stills_taken(timing: Path) -> tuple[set[int], set[int]]:
             elif row["kind"] == "backlog-still" and row["shown_ns"] != "0":
                 past.add(int(row["sequence"]))
     return live, past
-
-
-def in_store(path: Path) -> tuple[set[int], set[int]]:
-    """Numbers of the stills that nobody has fetched yet, and of the frames."""
-    with Store(path, max_bytes=10**9, session_id=1, info=lambda: b"") as store:
-        store.enter()
-        segments = [parse_backlog_units(store.read(one)) for one in list(store.newest_segments())]
-        return {one.number for one in store.best_stills()}, {
-            unit.frame_index for units in segments for unit in units
-        }
 
 
 def admitted(sent: dict[str, Any]) -> set[int]:
@@ -121,41 +109,6 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
     assert {number for number in past if number >= FIRST_STORED} or dark_s < 5
     assert sent["worst_window_bps"]["total"] <= 800_000
     assert said["backlog_bytes"] == sent["backlog_bytes"] > 0
-
-
-@pytest.mark.nightly
-def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, scene):
-    """What a drone saw before its computer was started again would stay on it for ever."""
-    store = tmp_path / "store"
-    arguments = ["--source", str(scene), *EDGE, "--store-folder", str(store)]
-    with Link(tmp_path) as link:
-        ground = link.ground(
-            "--detector", "motion", "--classifier", "none", "--record", str(tmp_path / "run.rrd")
-        )
-        first = link.edge(*arguments, name="first")
-        first.until("a ground listens")
-        ground.kill()
-        eventually(
-            lambda: (store / FILE_NAME).exists() and (store / FILE_NAME).stat().st_size > 300_000,
-            what="the edge keeps what it sees",
-        )
-        first.kill()
-        stills, frames = in_store(store)
-        ground = link.ground(
-            "--detector", "motion", "--classifier", "none",
-            "--record", str(tmp_path / "again.rrd"), "--timing", str(tmp_path / "again.csv"),
-            name="again",
-        )  # fmt: skip
-        link.edge(*arguments, name="second")
-        eventually(lambda: (store / FILE_NAME).stat().st_size < 100_000, what="all of it has arrived")
-        ground.stop()
-        said = ground.summary()
-    got = said[0] if isinstance(said, list) else said
-    (recording,) = got["backlog"]["recordings"]
-    assert set(frames_shown([Path(recording)])) == frames
-    assert stills_taken(tmp_path / "again.csv")[1] == stills
-    assert len(stills) > 2
-    assert len(frames) > 5
 
 
 def test_an_edge_that_is_stopped_counts_what_the_ground_has(tmp_path, scene):

@@ -36,15 +36,6 @@ _EDGE = (
 )
 
 
-@pytest.fixture(scope="module")
-def long_scene(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The pictures of the scene over and over, for minutes."""
-    folder, pictures = tmp_path_factory.mktemp("long"), sorted(scene.iterdir())
-    for number in range(3000):
-        (folder / f"{number:06}.jpg").symlink_to(pictures[number % len(pictures)])
-    return folder
-
-
 class Growth:
     """How far a process's memory has risen since it was first asked for."""
 
