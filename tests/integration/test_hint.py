@@ -39,12 +39,3 @@ def test_both_sides_name_another_model_once(link, tmp_path):
     ground.finish()
     for side in (edge, ground):
         assert side.said.count(SAYS) == 1, side.said
-
-
-def test_who_chose_a_detector_gets_no_advice(link, tmp_path):
-    """He would be sent away from the detector that he trained for this view."""
-    edge, ground = fly(link, tmp_path / "sky", "motion", "--max-frames", "160")
-    edge.finish()
-    assert ground.finish()["detections_run"] >= 45
-    for side in (edge, ground):
-        assert SAYS not in side.said, side.said

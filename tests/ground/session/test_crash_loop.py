@@ -28,7 +28,7 @@ from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs
 from hvt_ground.wiring import Models, SessionFactory
 from programs.outsider import joined
-from programs.processes import Link, eventually
+from programs.processes import eventually
 from rigs.flight import Flight
 
 SESSIONS, WARM = 200, 59
@@ -183,31 +183,6 @@ def stays(before: Use, after: Use) -> None:
     eventually(lambda: Use(after.pid).rss_bytes < most, what="memory is given back")
     eventually(lambda: Use(after.pid).threads <= before.threads + 2, what="threads have ended")
     eventually(lambda: Use(after.pid).files <= before.files + 2, what="files are closed")
-
-
-FLIGHT = ("--fps", "5", "--size", "640x360", "--max-frames", "10", "--detector", "motion")
-"""Two seconds."""
-
-
-@pytest.mark.nightly
-@pytest.mark.timeout(1200)
-def test_sixty_flights_of_two_seconds(tmp_path: Path, scene: Path) -> None:
-    """The same with real edges, as processes that are started and end."""
-    flights, warm = 60, 20
-    with Link(tmp_path) as link:
-        ground = link.ground("--record", "recordings", "--detector", "motion", "--classifier", "none")
-        before = None
-        for number in range(flights):
-            edge = link.edge("--source", str(scene), *FLIGHT, name=f"edge-{number}")
-            assert edge.finish()["frames"] >= 1
-            if number == warm:
-                before = Use(ground.process.pid)
-        assert before is not None
-        stays(before, Use(ground.process.pid))
-        ground.stop()
-        sessions = ground.finish()
-    assert len(sessions) == flights
-    assert not any(one["failure"] for one in sessions)
 
 
 def is_open(sessions: EdgeSessions, edge: Restarted) -> bool:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from hvt_common.geodesy import metres_per_degree
-from programs.processes import Link, free_ports
-from rigs.drawn_flight import FPS, FRAMES, fly, off_m, receiving, scene
+from rigs.drawn_flight import FPS, FRAMES, off_m, scene
 
 pytestmark = pytest.mark.integration
 
@@ -88,29 +87,3 @@ def test_stills_are_where_the_remarks_say(drawn):
     }
     assert named
     assert all(one.is_absolute() and one.is_file() for one in named)
-
-
-@pytest.mark.nightly
-def test_without_a_pose_nothing_is_sent_and_it_is_said_once(tmp_path):
-    """A map without anything on it says nothing about why."""
-    (port,) = free_ports(1)
-    with receiving(port) as events, Link(tmp_path) as link:
-        *_, said = fly(
-            link, "--cot", f"udp://127.0.0.1:{port}", edge=("--max-frames", "210", "--size", "640x360")
-        )
-    assert events == []
-    assert said.count("its tracks are not reported, because it says no pose") == 1
-
-
-@pytest.mark.nightly
-def test_a_server_that_is_not_there_changes_nothing_else(tmp_path):
-    """The flight would wait for a map that nobody looks at."""
-    (port,) = free_ports(1)
-    with Link(tmp_path) as link:
-        _, summary, said = fly(
-            link, "--cot", f"tcp://127.0.0.1:{port}", edge=("--pose", "demo", "--pace", "lockstep")
-        )
-    assert summary["frames_decoded"] == FRAMES
-    (part,) = summary["failed"]
-    assert part["part"] == f"CoT tcp://127.0.0.1:{port}"
-    assert said.count("Connection refused; all else goes on, and it is tried again") == 1
