@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from hvt_ground.cli import main
 from hvt_ground.control import EdgeClient, EdgeTrack, RefusedError, RequestedStill
 from programs.processes import Link, eventually
 
@@ -34,8 +35,8 @@ class Flight:
     refusals: list[str]
     before_kbps: int
     after_kbps: int
-    told: subprocess.CompletedProcess[str]
-    nobody: subprocess.CompletedProcess[str]
+    told: tuple[int, str, str]
+    nobody: tuple[int, str, str]
     folder: Path
     edge: dict[str, Any]
     ground: dict[str, Any]
@@ -48,10 +49,11 @@ def refusal(ask) -> str:
     return str(caught.value)
 
 
-def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run ``hvt-ground`` with these words."""
-    line = [sys.executable, "-m", "hvt_ground.cli", *words]
-    return subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
+def command(*words: str) -> tuple[int, str, str]:
+    """``hvt-ground`` with these words: its exit code and both outputs."""
+    with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
+        code = main([*words])
+    return code, out.getvalue(), err.getvalue()
 
 
 def patiently(edge):
@@ -126,10 +128,9 @@ def flight(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
             one.set_budget(300_000)
             after = one.info().budget_bps
         connect = ("--connect", link.ground_endpoint)
-        told = command(
-            "still", *connect, "--box", "300,100,200,150", "--at", "-1s", "--out", "a.png", folder=folder
-        )
-        nobody = command("keyframe", *connect, "--edge", "uav-2", folder=folder)
+        out = ("--out", str(folder / "a.png"))
+        told = command("still", *connect, "--box", "300,100,200,150", "--at", "-1s", *out)
+        nobody = command("keyframe", *connect, "--edge", "uav-2")
         edge.stop()
         return Flight(
             names,
@@ -188,13 +189,14 @@ def test_what_cannot_be_had_is_refused_in_a_sentence(flight):
 
 def test_the_command_line_writes_the_picture(flight, scene):
     """An operator without Python could not ask."""
-    assert flight.told.returncode == 0, flight.told.stderr
-    assert "200x150 pixels at 300,100" in flight.told.stdout
-    index = int(flight.told.stdout.split("frame ")[1].split(",")[0])
+    code, told, err = flight.told
+    assert code == 0, err
+    assert "200x150 pixels at 300,100" in told
+    index = int(told.split("frame ")[1].split(",")[0])
     picture = cv2.imread(str(flight.folder / "a.png"))
     assert cv2.PSNR(picture, source(scene, index)) > 24
-    assert flight.nobody.returncode == 2
-    assert "edge 'uav-2' does not answer" in flight.nobody.stderr
+    assert flight.nobody[0] == 2
+    assert "edge 'uav-2' does not answer" in flight.nobody[2]
 
 
 def test_another_budget_holds(flight):

@@ -9,6 +9,8 @@ from datetime import datetime
 
 import pytest
 
+from hvt_edge.cli import main
+
 pytestmark = pytest.mark.integration
 
 JSON = ("--log-format", "json")
@@ -69,12 +71,10 @@ def test_a_line_of_one_edge_names_it():
     ("words", "said"),
     [(("--source", "none.mp4"), "none.mp4"), (("--source", "demo", "--metrics", "none"), "--metrics 'none'")],
 )
-def test_what_ends_a_start_is_one_object(tmp_path, words, said):
+def test_what_ends_a_start_is_one_object(capsys, words, said):
     """The one line that says why a service does not run would be the one that the collector drops."""
-    command = [sys.executable, "-m", "hvt_edge.cli", *words, *JSON]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    (line,) = lines(done.stderr)
+    assert main([*words, *JSON]) == 2
+    (line,) = lines(capsys.readouterr().err)
     assert said in line["message"]
     assert (line["level"], line["edge"]) == ("error", "edge-1")
 
