@@ -5,7 +5,9 @@ from __future__ import annotations
 import datetime as dt
 import json
 import socket
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -56,7 +58,8 @@ def test_the_forecast_has_perception_within_what_video_leaves(capsys, monkeypatc
     monkeypatch.setattr("hvt_fleet.edge_doctor.processors", lambda: 2.0)
     monkeypatch.setattr("hvt_fleet.edge_doctor.CpuMeter.measure", lambda *_, **__: None)
     monkeypatch.setattr("hvt_fleet.edge_doctor.detect_every", lambda *_, **__: 1e-6)
-    monkeypatch.setattr("hvt_fleet.edge_doctor._Checks._coded", lambda *_: (0.001, 200.0))
+    now = SimpleNamespace(monotonic=count(0, 0.001).__next__, process_time=count(0, 0.001).__next__)
+    monkeypatch.setattr("hvt_fleet.edge_doctor.time", now)
     _, findings = examined(capsys, "--source", str(scene), *CHEAP, "--connect", "tcp/127.0.0.1:9")
     found = findings["processor"]
     assert float(found["found"].split()[1]) <= 2
