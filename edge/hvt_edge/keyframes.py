@@ -81,6 +81,11 @@ class Keyframes:
             return self._requested_ns is not None or self._due_ns is not None or self._scheduled(now_ns)
 
     @property
+    def made_here(self) -> bool:
+        """Whether they come when the edge wants one; a camera makes its own."""
+        return self.settings.camera_every_s is None
+
+    @property
     def requested(self) -> bool:
         """Whether a keyframe is to come that somebody or something needs: not even a requested still goes before."""
         with self._lock:
@@ -119,7 +124,7 @@ class Keyframes:
 
     def require(self, now_ns: int) -> None:
         """The edge itself wants one, because something is to change with it; a camera's next one will do."""
-        if self.settings.camera_every_s is not None:
+        if not self.made_here:
             return
         with self._lock:
             self._add(now_ns)

@@ -23,7 +23,7 @@ from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.operating import LoopClock
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.stills.stage import StillStage
-from hvt_edge.video.passthrough import VideoStage
+from hvt_edge.video.stage import BaseStage
 
 _AHEAD_S = 1.0
 """The edge's lead over the ground, in media time: reports of the ground count so much later."""
@@ -44,7 +44,7 @@ class LockstepPace:
     perception beside the next frame's encoding; it is closed with the pace.
     """
 
-    base: VideoStage
+    base: BaseStage
     stills: StillStage
     _: KW_ONLY
     inbox: FeedbackInbox

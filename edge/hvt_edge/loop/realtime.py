@@ -15,7 +15,7 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.stills.worker import StillWorker
-from hvt_edge.video.passthrough import VideoStage
+from hvt_edge.video.stage import BaseStage
 
 _MOST_GAP_NS = SECOND_NS // 4
 """Of a clip that cannot be read in time so much is left out in a row, and no more, of its own time and of time as it
@@ -40,7 +40,7 @@ class RealtimePace:
     ``has_viewer()`` tells whether anybody subscribes to the video.
     """
 
-    base: VideoStage
+    base: BaseStage
     stills: StillStage
     _: KW_ONLY
     inbox: FeedbackInbox

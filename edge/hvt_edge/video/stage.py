@@ -156,9 +156,9 @@ class BaseStage:
     encoder_name: str = "x265"
     keyframes: Keyframes
     transmitter: Transmitter
-    local_copy: LocalCopy | None
-    first_keyframe_bytes: int
     failures: Failures
+    local_copy: LocalCopy | None = None
+    first_keyframe_bytes: int = 0
     regions: TrackRegions | None = None
     frame_skip: FrameSkip | None = None
     reconfigure: Callable[[int, int], Encoder | None] | None = None
@@ -243,8 +243,7 @@ class BaseStage:
             self.keyframes.done(now_ns)
         if decision.resumes and self.backlog is not None:
             self.backlog.resume()
-        if self.local_copy is not None:
-            self.local_copy.write(unit)
+        self._copy(unit)
         return unit
 
     @property
@@ -262,19 +261,17 @@ class BaseStage:
         if self.backlog is not None and decision.to_store:
             taken = self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
             if decision.to_link:  # a probe; what it builds on was not sent
-                self.transmitter.base(unit, now_ns=now_ns, after_hole=not unit.keyframe)
+                announced = self.keyframes.made_here
+                self.transmitter.base(unit, now_ns=now_ns, after_hole=not unit.keyframe, announced=announced)
             elif self.backlog.offline:
                 self.transmitter.store_base(unit, now_ns=now_ns)
             # On the way back none of it is on the line: the budget has to get room for the keyframe to go on with.
             return taken or decision.to_link
-        line_bytes = self.transmitter.base(unit, now_ns=now_ns)
+        line_bytes = self.transmitter.base(unit, now_ns=now_ns, announced=self.keyframes.made_here)
         if not line_bytes:
             self._leave_out(unit)
             return False
-        self.failures.works(_SIZE_PART)
-        if unit.keyframe:
-            self._keyframe_bytes = line_bytes
-            self.keyframes.note_cost(8 * SECOND_NS * line_bytes // self.transmitter.budget.total_bps)
+        self._note_sent(unit, line_bytes, now_ns=now_ns)
         return True
 
     def wants_keyframe(self, index: int) -> bool:
@@ -297,6 +294,17 @@ class BaseStage:
             coded = replace(frame, base_bgr=coarse.astype(np.uint8, copy=False))
             unit = self.encoder.encode(coded, keyframe=True, regions=[])
         return unit
+
+    def _copy(self, unit: AccessUnit) -> None:
+        if self.local_copy is not None:
+            self.local_copy.write(unit)
+
+    def _note_sent(self, unit: AccessUnit, line_bytes: int, *, now_ns: int) -> None:
+        del now_ns
+        self.failures.works(_SIZE_PART)
+        if unit.keyframe:
+            self._keyframe_bytes = line_bytes
+            self.keyframes.note_cost(8 * SECOND_NS * line_bytes // self.transmitter.budget.total_bps)
 
     def _leave_out(self, unit: AccessUnit) -> None:
         # Nothing has room for it: what follows cannot be shown before another keyframe.

@@ -42,7 +42,7 @@ from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Gate
 from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.video.encoder_settings import PresetControl, share_of
-from hvt_edge.video.passthrough import PassthroughStage, VideoStage
+from hvt_edge.video.passthrough import PassthroughStage
 from hvt_edge.video.rate_model import LimitedFrameSkip
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage, LocalCopy
@@ -253,14 +253,13 @@ class Video:
         )
         if config.passes_through:
             assert source.camera_stream is not None, "checked by as_the_camera_is"
-            rates = make_camera_rates(config, source.camera_stream, link.reconfiguration)
-            self.stage: VideoStage = PassthroughStage(
-                link.keyframes,
-                link.transmitter,
+            self.stage: BaseStage = PassthroughStage(
+                link.encoder,
+                keyframes=link.keyframes,
+                transmitter=link.transmitter,
                 failures=failures,
                 local_copy=local_copy,
-                reconfigure=rates,
-                observe=rates.observe,
+                rates=make_camera_rates(config, source.camera_stream, link.reconfiguration),
                 least_link=make_least_link(config, pacer=link.pacer, in_flight=link.in_flight),
                 admits=self.control.admits,
                 holder=self.control.holder,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 
 import av
@@ -15,57 +15,14 @@ from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.backlog.stage import State
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.source.opening import open_source
-from hvt_edge.video.passthrough import PassthroughStage, UnitInputs, decide_unit
-from hvt_edge.video.stage import Action, FrameDecision
+from hvt_edge.video.encoders.passthrough import Passthrough
+from hvt_edge.video.passthrough import PassthroughStage
 from media.clips import START_NS, hard_pictures, smooth_pictures
 from media.hevc_camera import SIZE, write_clip
 from rigs import keeping
 from rigs.world import Puts, make_transmitter
-
-LIVE, OFFLINE, RETURNING = State.LIVE, State.OFFLINE, State.RETURNING
-LEFT_OUT = FrameDecision(Action.HOLD)
-ANY, NO, YES = (False, True), (False,), (True,)
-
-
-def to(keyframe, **where) -> FrameDecision:
-    """A unit that goes somewhere."""
-    return FrameDecision(Action.CODE, keyframe, **where)
-
-
-# link, keyframe, after sent, after stored, admitted, probe due: what is decided. ANY: it does not matter.
-TABLE = [
-    (LIVE, YES, ANY, ANY, YES, ANY, to(True, to_link=True)),
-    (LIVE, NO, YES, ANY, YES, ANY, to(False, to_link=True)),
-    (LIVE, NO, NO, ANY, YES, ANY, LEFT_OUT),
-    (LIVE, ANY, ANY, ANY, NO, ANY, LEFT_OUT),
-    (RETURNING, YES, ANY, ANY, YES, ANY, to(True, to_link=True, resumes=True)),
-    (RETURNING, YES, ANY, ANY, NO, ANY, to(True, to_store=True)),
-    (RETURNING, NO, ANY, YES, ANY, ANY, to(False, to_store=True)),
-    (RETURNING, NO, ANY, NO, ANY, ANY, LEFT_OUT),
-    (OFFLINE, YES, ANY, ANY, NO, ANY, to(True, to_store=True)),
-    (OFFLINE, YES, ANY, ANY, YES, NO, to(True, to_store=True)),
-    (OFFLINE, YES, ANY, ANY, YES, YES, to(True, to_store=True, to_link=True)),
-    (OFFLINE, NO, ANY, YES, NO, ANY, to(False, to_store=True)),
-    (OFFLINE, NO, ANY, YES, YES, NO, to(False, to_store=True)),
-    (OFFLINE, NO, ANY, YES, YES, YES, to(False, to_store=True, to_link=True)),
-    (OFFLINE, NO, ANY, NO, ANY, ANY, LEFT_OUT),
-]
-
-
-def test_the_decision_is_as_its_table_says():
-    """A unit would be sent that builds on one which nobody has, or one be left out that could have gone."""
-    decided = {}
-    for link, *columns, decision in TABLE:
-        for row in product(*columns):
-            assert decided.setdefault((link, row), decision) == decision, "two lines of the table contradict"
-    assert len(decided) == 3 * 2**5
-    for (link, row), decision in decided.items():
-        keyframe, sent, stored, admitted, probe = row
-        inputs = UnitInputs(keyframe, sent, stored, admitted, link=link, probe_due=probe)
-        assert decide_unit(inputs) == decision, inputs
 
 
 class Rig:
@@ -75,7 +32,7 @@ class Rig:
         self,
         *,
         budget_bps: int = 800_000,
-        admits=lambda _now_ns: True,
+        admits=lambda _now_ns, *_size: True,
         holder=lambda _now_ns: "budget",
         copy=None,
         waits=True,
@@ -84,8 +41,9 @@ class Rig:
         self.now_ns = START_NS
         self.keyframes = Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=2.0))
         self.stage = PassthroughStage(
-            self.keyframes,
-            make_transmitter(
+            Passthrough(),
+            keyframes=self.keyframes,
+            transmitter=make_transmitter(
                 self.kept,
                 ledger=self.ledger,
                 budget=(budget_bps, budget_bps),
@@ -168,11 +126,11 @@ def test_a_unit_that_no_window_holds_costs_no_time(burst):
 def test_a_link_that_is_busy_for_a_moment_costs_nothing(burst):
     """Behind each large keyframe the picture would stand still up to the next."""
     busy_until = START_NS + 3 * SECOND_NS // 10
-    rig = Rig(admits=lambda now_ns: now_ns >= busy_until)
+    rig = Rig(admits=lambda now_ns, *_size: now_ns >= busy_until)
     assert rig.play(burst[:30]) == list(range(30))
     assert rig.now_ns >= busy_until
     busy = Rig(
-        admits=lambda now_ns: not 0 < now_ns - START_NS - SECOND_NS // 2 < 2 * SECOND_NS,
+        admits=lambda now_ns, *_size: not 0 < now_ns - START_NS - SECOND_NS // 2 < 2 * SECOND_NS,
         holder=lambda _now_ns: "link",
     )
     sent = busy.play(burst)
@@ -221,7 +179,12 @@ def test_an_outage_is_stored_from_keyframe_to_keyframe(tmp_path):
     frames = frames_of(tmp_path, smooth_pictures(90, size=SIZE), keyint=15)
     rig = keeping.Rig(tmp_path / "store")
     rig.stage = PassthroughStage(
-        rig.keyframes, rig.sender, failures=rig.failures, admits=rig.admits, backlog=rig.backlog
+        Passthrough(),
+        keyframes=rig.keyframes,
+        transmitter=rig.sender,
+        failures=rig.failures,
+        admits=rig.admits,
+        backlog=rig.backlog,
     )
     for frame in frames:
         rig.now_ns, rig.linked = frame.capture_ns, not 35 <= frame.index < 62

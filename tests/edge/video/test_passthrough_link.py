@@ -16,6 +16,7 @@ from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.source.contract import CameraStream, SeenUnit
+from hvt_edge.video.encoders.passthrough import Passthrough
 from hvt_edge.video.passthrough import PassthroughStage
 from hvt_edge.wiring.link import make_budget, make_camera_rates, make_least_link, make_pacer
 from media.clips import START_NS
@@ -71,13 +72,12 @@ class Flight:
         self.reconfiguration = make_reconfiguration(
             self.operating, config, SIZE, self.transmitter, pacer=self.pacer
         )
-        rates = make_camera_rates(config, stream, self.reconfiguration)
         self.stage = PassthroughStage(
-            Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=stream.keyframe_s)),
-            self.transmitter,
+            Passthrough(),
+            keyframes=Keyframes(KeyframeSettings(interval_ns=0, camera_every_s=stream.keyframe_s)),
+            transmitter=self.transmitter,
             failures=Failures(lambda: self.now_ns),
-            reconfigure=rates,
-            observe=rates.observe,
+            rates=make_camera_rates(config, stream, self.reconfiguration),
             least_link=make_least_link(config, pacer=self.pacer, in_flight=self.in_flight),
             admits=self.admits,
             pause=self.wait,
@@ -85,7 +85,7 @@ class Flight:
         self._reported_ns = START_NS
         self._first = True
 
-    def admits(self, now_ns: int) -> bool:
+    def admits(self, now_ns: int, _line_bytes: int, _coding_ns: int) -> bool:
         """As `LinkControl`."""
         if self.pacer is None:
             return True

@@ -178,9 +178,9 @@ class CameraRates:
             self._former_bytes, self._newest_bytes, self._since_ns = self._newest_bytes, 0, at_ns
         self._newest_bytes = max(self._newest_bytes, held_bytes)
 
-    def __call__(self, decimation: int, now_ns: int) -> None:
+    def at_keyframe(self, now_ns: int) -> None:
         """The next unit is a keyframe, and was observed."""
-        self._reconfiguration(decimation, now_ns)  # which may take a command
+        self._reconfiguration(1, now_ns)  # which may take a command
         pacer = self._reconfiguration.pacer
         if pacer is None:
             return
@@ -189,5 +189,5 @@ class CameraRates:
         floor_bps = min(budget_bps, max(self._least_bps, self._needed(fullest_bytes)))
         pacer.set_ceiling(budget_bps, floor_bps=floor_bps)
         if pacer.rate_bps != before_bps:
-            self._reconfiguration(decimation, now_ns)
+            self._reconfiguration(1, now_ns)
         self._reconfiguration.track_link(now_ns)
