@@ -17,6 +17,7 @@ from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, ObjectK
 from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import Entry
+from hvt_edge.link.transmitter import Chunk
 
 _log = logging.getLogger(__name__)
 
@@ -32,16 +33,6 @@ _MOST_AHEAD_BYTES = 256 * 1024
 _LEAST_CHUNK_BYTES = 600
 """A smaller one is mostly headers, unless it is the last."""
 _OTHER_RECEIVER_NS = 5 * SECOND_NS
-
-
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """Bytes of one object."""
-
-    key: ObjectKey
-    offset: int
-    total_bytes: int
-    data: bytes
 
 
 @dataclass(slots=True)

@@ -9,19 +9,18 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
 
 from hvt_common.protocol.messages import BacklogKind, BacklogStill, Feedback
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import FIRST_STORED, SEGMENT_NS, Entry
-from hvt_edge.backlog.outage import SILENCE_NS, BaseInFlight, Outage
+from hvt_edge.backlog.outage import SILENCE_NS, Outage
 from hvt_edge.backlog.worker import ChunkAllowance, IntakeStill, StoreWorker
 from hvt_edge.keyframes import Keyframes
+from hvt_edge.link.transmitter import Transmitter
 
 _STEADY_NS = 2 * SECOND_NS
 """The link is back for so long before stored objects are sent: the picture comes first."""
@@ -42,53 +41,35 @@ class State(Enum):
     RETURNING = "stills to the link; frames into the store, until the keyframe to go on with is made"
 
 
-@dataclass(frozen=True, slots=True)
-class BacklogLink:
-    """The link and the outbox, as functions, as far as the backlog needs them."""
-
-    has_subscriber: Callable[[], bool]
-    """Whether a ground subscribes to ``backlog``."""
-    allowance_bytes: Callable[[int, float], int]
-    """(now_ns, reserve) → payload that a chunk may have now (`Transmitter.backlog_allowance_bytes`)."""
-    send: Callable[[Chunk, int], int]
-    """(chunk, now_ns) → line bytes, 0 where its allowance is gone. May block while the link is full."""
-    round_trip_ns: Callable[[], int]
-    total_bps: Callable[[], int]
-    stills_pending: Callable[[], bool]
-    """Whether a live still waits for its allowance."""
-    stills_in_flight: Callable[[], int]
-    """How many were sent that no report has named."""
-
-
 class BacklogStage:
     """One for each run in real time.
 
     `store_still` is for the threads of stills, `on_feedback` for any, the rest for the frame loop.
 
-    ``in_flight`` holds what the transmitter has sent of the base; ``on_outcome`` is called for each stored still that
-    arrived. What else an outage loses is the outbox's: it takes its own for lost whenever `breaks` has grown.
+    ``has_subscriber()``: a ground subscribes to ``backlog``. ``stills_pending()``: a live still waits for its
+    allowance; ``stills_in_flight()``: how many were sent that no report has named. What an outage loses of stills is
+    the outbox's: it takes its own for lost whenever `breaks` has grown.
     """
 
     def __init__(
         self,
         store: Store,
+        line: Transmitter,
         *,
-        session_id: int,
         live: bool,
-        link: BacklogLink,
-        in_flight: BaseInFlight,
+        has_subscriber: Callable[[], bool],
+        stills_pending: Callable[[], bool],
+        stills_in_flight: Callable[[], int],
         keyframes: Keyframes,
         clock: Callable[[], int],
-        on_outcome: Callable[[str, str], None],
         failures: Failures,
     ) -> None:
         self._outage = Outage(live=live)
-        self._link = link
-        self._in_flight = in_flight
+        self._line = line
+        self._has_subscriber = has_subscriber
+        self._stills_pending, self._stills_in_flight = stills_pending, stills_in_flight
         self._keyframes = keyframes
         self._clock = clock
-        self._on_outcome = on_outcome
-        self._session_id = session_id
         self.state = State.LIVE
         self._linked = self._finishing = False
         self._back_ns = clock()
@@ -101,12 +82,12 @@ class BacklogStage:
         """How often the messages in flight have been taken for lost."""
         self.worker = StoreWorker(
             store,
-            session_id=session_id,
+            session_id=line.session_id,
             clock=clock,
             allowance=self.chunk_allowance,
-            send=lambda chunk: link.send(chunk, clock()),
-            round_trip_ns=link.round_trip_ns,
-            total_bps=link.total_bps,
+            send=lambda chunk: line.backlog(chunk, now_ns=clock()),
+            round_trip_ns=lambda: line.round_trip_ns,
+            total_bps=lambda: line.budget.total_bps,
             failures=failures,
             on_sent=self._note_sent,
         )
@@ -170,7 +151,7 @@ class BacklogStage:
         self.state = State.OFFLINE
 
     def _lose_in_flight(self) -> None:
-        units = self._in_flight.take()
+        units = self._line.in_flight.take()
         self.breaks += 1
         if (
             self.state is State.LIVE
@@ -216,7 +197,7 @@ class BacklogStage:
     @property
     def _unnamed(self) -> bool:
         # Whether something is not acknowledged, by a ground that does acknowledge.
-        return self._outage.reports and bool(len(self._in_flight) or self._link.stills_in_flight())
+        return self._outage.reports and bool(len(self._line.in_flight) or self._stills_in_flight())
 
     def end_in_flight(self) -> None:
         """The run ends: messages that no report has named are stored, and sent as stored ones."""
@@ -261,9 +242,9 @@ class BacklogStage:
 
     def _note_sent(self, entry: Entry) -> None:
         # A lower number was lost in an outage and counted when it was sent; a former run has its own ledger.
-        own = entry.session_id == self._session_id and entry.number >= FIRST_STORED
+        own = entry.session_id == self._line.session_id and entry.number >= FIRST_STORED
         if own and entry.kind is BacklogKind.STILL:
-            self._on_outcome("sent", "stored")
+            self._line.outcome("sent", "stored")
 
     # How chunks leave
 
@@ -274,8 +255,9 @@ class BacklogStage:
         if not self._outage.reports_now(now_ns):
             return None  # of who only listens nobody would know what has arrived
         # While a keyframe is to come nothing else takes its space; after the last frame none comes.
-        if not self._link.has_subscriber() or not (self._finishing or not self._keyframes.due(now_ns)):
+        if not self._has_subscriber() or not (self._finishing or not self._keyframes.due(now_ns)):
             return None
-        if not self._finishing and self._link.stills_pending():  # after the last frame none goes any more
-            return ChunkAllowance(min(_TRICKLE_BYTES, self._link.allowance_bytes(now_ns, 0.0)), trickle=True)
-        return ChunkAllowance(self._link.allowance_bytes(now_ns, 0.0 if self._finishing else _RESERVE))
+        trickle = not self._finishing and self._stills_pending()  # after the last frame none goes any more
+        reserve = 0.0 if trickle or self._finishing else _RESERVE
+        limit_bytes = self._line.backlog_allowance_bytes(now_ns, reserve=reserve)
+        return ChunkAllowance(min(_TRICKLE_BYTES, limit_bytes) if trickle else limit_bytes, trickle=trickle)

@@ -28,9 +28,10 @@ from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.runtime.process import lower_priority
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.backfill import Backfill, Chunk
+from hvt_edge.backlog.backfill import Backfill
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import MOST_UNIT_BYTES, Entry
+from hvt_edge.link.transmitter import Chunk
 
 _MOST_ACKNOWLEDGED_RANGES = 64
 """Limit for all grounds together, the newest of each object; one report names 16."""

@@ -11,7 +11,6 @@ from hvt_common.protocol.edge_words import FrameGroup
 from hvt_common.protocol.messages import Feedback
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox, PrimaryReceiver
 from hvt_edge.stills.stage import StillSender
@@ -39,7 +38,6 @@ class LinkControl:
     inbox: FeedbackInbox
     reconfiguration: EncoderReconfiguration
     clock: Callable[[], int]
-    in_flight: BaseInFlight
     stills: StillSender
     failures: Failures
 
@@ -130,7 +128,7 @@ class LinkControl:
             self.pacer.on_report(report)
             self.keyframes.note_round_trip(self.pacer.round_trip_ns)
         if report.primary:
-            self.in_flight.on_report(feedback.base_sequence)
+            self.transmitter.in_flight.on_report(feedback.base_sequence)
             self.stills.outbox.on_report(
                 feedback.still_sequence,
                 feedback.missing_stills,

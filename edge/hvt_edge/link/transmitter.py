@@ -19,7 +19,7 @@ same windows.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Protocol
 
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
@@ -31,13 +31,13 @@ from hvt_common.protocol.messages import (
     BaseHeader,
     CaptureTimes,
     Flags,
+    ObjectKey,
     PackedMessage,
 )
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Still
-from hvt_edge.backlog.backfill import Chunk
-from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, RollingBudget
+from hvt_edge.link.flight import BaseInFlight
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.stills import StillEnvelope
 
@@ -51,6 +51,16 @@ _CHUNK_S = 0.05
 """A chunk occupies the link so long at most, so a frame or a live still need not wait for it."""
 _GROWTH_BYTES = 16
 """Growth of a message that is made for a later moment: its two times."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Bytes of one stored object."""
+
+    key: ObjectKey
+    offset: int
+    total_bytes: int
+    data: bytes
 
 
 class Outlet(Protocol):
@@ -81,7 +91,7 @@ class Transmitter:
     lockstep: bool
     wait_until: Callable[[int], None]
     pacer: Pacer | None = None
-    in_flight: BaseInFlight | None = None
+    in_flight: BaseInFlight = field(default_factory=BaseInFlight)
     clock: Callable[[], int] | None = None
 
     def __post_init__(self) -> None:
@@ -125,8 +135,7 @@ class Transmitter:
             self.budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe and announced)
             if self.pacer is not None:
                 self.pacer.sent_base(self.base_sequence, line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
-            if self.in_flight is not None:
-                self.in_flight.sent(self.base_sequence, unit, now_ns=at_ns)
+            self.in_flight.sent(self.base_sequence, unit, now_ns=at_ns)
         self.base_waited_ns += max(0, at_ns - now_ns)
         self.wait_until(at_ns)
         self.outlet.put(

@@ -8,11 +8,11 @@ from hvt_common.protocol.channels import DELIVERIES, Channel, Direction
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
 from hvt_common.values import View
-from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.levers import LeverSettings
 from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder_settings import least_base_bps
@@ -127,13 +127,13 @@ def make_camera_rates(
     )
 
 
-def make_least_link(config: EdgeConfig, *, pacer: Pacer | None, in_flight: BaseInFlight) -> LeastLink | None:
+def make_least_link(config: EdgeConfig, line: Transmitter) -> LeastLink | None:
     """Make the bound on a camera's queued units; None if nothing measures the link."""
-    if pacer is None:
+    if (pacer := line.pacer) is None:
         return None
 
     def unreported_bytes() -> int:
-        return 0 if pacer.measured_round_trip_ns is None else in_flight.size_bytes
+        return 0 if pacer.measured_round_trip_ns is None else line.in_flight.size_bytes
 
     return LeastLink(config.floor_bps, unreported_bytes=unreported_bytes)
 

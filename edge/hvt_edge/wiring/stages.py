@@ -17,7 +17,6 @@ from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import fitted_class_names
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import EdgeConfig
 from hvt_edge.control.commands import Commands
 from hvt_edge.control.link_control import LinkControl
@@ -125,7 +124,6 @@ class Link:
         )
         self.encoder = open_encoder(Rates(config.budget_bps, base_bps, decimation))
         budget = make_budget(config, base_bps=base_bps, decimation=decimation)
-        self.in_flight = BaseInFlight()
         self.transmitter = Transmitter(
             flight.ends,
             ledger=flight.ledger,
@@ -135,7 +133,6 @@ class Link:
             lockstep=lockstep,
             wait_until=flight.loop_clock.wait_until,
             pacer=self.pacer,
-            in_flight=None if lockstep else self.in_flight,
             clock=None if lockstep else flight.loop_clock,
         )
         self.reconfiguration = EncoderReconfiguration(
@@ -197,11 +194,9 @@ class Stills:
         )
         self.backlog = make_backlog(
             config,
-            session_id=flight.session_id,
+            link.transmitter,
             live=flight.source.live,
             has_subscriber=partial(flight.ends.has_subscriber, Channel.BACKLOG),
-            transmitter=link.transmitter,
-            in_flight=link.in_flight,
             outbox=outbox,
             keyframes=link.keyframes,
             clock=clock,
@@ -247,7 +242,6 @@ class Video:
             inbox=flight.inbox,
             reconfiguration=link.reconfiguration,
             clock=flight.clock,
-            in_flight=link.in_flight,
             stills=stills.stage.sender,
             failures=failures,
         )
@@ -260,7 +254,7 @@ class Video:
                 failures=failures,
                 local_copy=local_copy,
                 rates=make_camera_rates(config, source.camera_stream, link.reconfiguration),
-                least_link=make_least_link(config, pacer=link.pacer, in_flight=link.in_flight),
+                least_link=make_least_link(config, link.transmitter),
                 admits=self.control.admits,
                 holder=self.control.holder,
                 pause=None if flight.lockstep else flight.loop_clock.pause,

@@ -14,8 +14,7 @@ from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.disk import Store
-from hvt_edge.backlog.outage import BaseInFlight
-from hvt_edge.backlog.stage import BacklogLink, BacklogStage
+from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
@@ -93,12 +92,10 @@ def check_store(config: EdgeConfig, *, live: bool) -> None:
 
 def make_backlog(
     config: EdgeConfig,
+    line: Transmitter,
     *,
-    session_id: int,
     live: bool,
     has_subscriber: Callable[[], bool],
-    transmitter: Transmitter,
-    in_flight: BaseInFlight,
     outbox: Outbox,
     keyframes: Keyframes,
     clock: Callable[[], int],
@@ -109,26 +106,22 @@ def make_backlog(
     max_bytes = config.store_bytes(live=live)
     if not max_bytes:
         return None
-    path = store_folder(config)
     oldest_ns = max(0, clock() - round(config.store_age * SECOND_NS))
     return BacklogStage(
-        Store(path, max_bytes=max_bytes, session_id=session_id, info=info, oldest_ns=oldest_ns, clock=clock),
-        session_id=session_id,
-        live=live,
-        link=BacklogLink(
-            has_subscriber=has_subscriber,
-            allowance_bytes=lambda now_ns, reserve: transmitter.backlog_allowance_bytes(
-                now_ns, reserve=reserve
-            ),
-            send=lambda chunk, now_ns: transmitter.backlog(chunk, now_ns=now_ns),
-            round_trip_ns=lambda: transmitter.round_trip_ns,
-            total_bps=lambda: transmitter.budget.total_bps,
-            stills_pending=lambda: outbox.any_pending,
-            stills_in_flight=lambda: outbox.unacknowledged,
+        Store(
+            store_folder(config),
+            max_bytes=max_bytes,
+            session_id=line.session_id,
+            info=info,
+            oldest_ns=oldest_ns,
+            clock=clock,
         ),
-        in_flight=in_flight,
+        line,
+        live=live,
+        has_subscriber=has_subscriber,
+        stills_pending=lambda: outbox.any_pending,
+        stills_in_flight=lambda: outbox.unacknowledged,
         keyframes=keyframes,
         clock=clock,
-        on_outcome=transmitter.outcome,
         failures=failures,
     )

@@ -15,7 +15,8 @@ from hvt_common.protocol.messages import (
     BacklogKind,
     parse_backlog_units,
 )
-from hvt_edge.backlog.backfill import Backfill, Chunk
+from hvt_edge.backlog.backfill import Backfill
+from hvt_edge.link.transmitter import Chunk
 from hvt_ground.backlog.assembly import BacklogAssembly, backlog_content
 from rigs.kept import UNITS, S, add_stills, add_units, opened, shifted
 

@@ -184,11 +184,9 @@ def test_only_live_sources_are_stored_unless_requested(tmp_path, monkeypatch, se
     rig = Rig(tmp_path / "other")
     backlog = make_backlog(
         config,
-        session_id=1,
+        rig.sender,
         live=live,
         has_subscriber=lambda: True,
-        transmitter=rig.sender,
-        in_flight=rig.in_flight,
         outbox=rig.outbox,
         keyframes=rig.keyframes,
         clock=lambda: START_NS,

@@ -17,9 +17,9 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.worker import ChunkAllowance, EndSegment, Intake, StoreWorker
+from hvt_edge.link.transmitter import Chunk
 from media.clips import START_NS
 from programs.processes import eventually
 from rigs.keeping import Rig

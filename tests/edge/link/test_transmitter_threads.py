@@ -14,8 +14,8 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BacklogKind, RoiHeader
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.transmitter import Chunk
 from rigs.keeping import STILL, Out
 from rigs.world import make_transmitter
 

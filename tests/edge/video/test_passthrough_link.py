@@ -12,7 +12,6 @@ from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import CameraUnit, Frame
-from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.source.contract import CameraStream, SeenUnit
@@ -60,14 +59,13 @@ class Flight:
         """Frames that the ground has got, by the second in which they were taken."""
         self.operating = make_operating(config)
         self.pacer = make_pacer(config, stream, SIZE)
-        self.ledger, self.in_flight = Ledger(), BaseInFlight()
+        self.ledger = Ledger()
         self.transmitter = make_transmitter(
             self,
             ledger=self.ledger,
             budget=make_budget(config, base_bps=config.base_bps, decimation=1),
             wait_until=lambda at_ns: self.wait(at_ns - self.now_ns),
             pacer=self.pacer,
-            in_flight=self.in_flight,
         )
         self.reconfiguration = make_reconfiguration(
             self.operating, config, SIZE, self.transmitter, pacer=self.pacer
@@ -78,7 +76,7 @@ class Flight:
             transmitter=self.transmitter,
             failures=Failures(lambda: self.now_ns),
             rates=make_camera_rates(config, stream, self.reconfiguration),
-            least_link=make_least_link(config, pacer=self.pacer, in_flight=self.in_flight),
+            least_link=make_least_link(config, self.transmitter),
             admits=self.admits,
             pause=self.wait,
         )
@@ -123,7 +121,7 @@ class Flight:
             lost=0,
         )
         self.pacer.on_report(counted(said, now_ns=at_ns, first=self._first))
-        self.in_flight.on_report(header.sequence)
+        self.transmitter.in_flight.on_report(header.sequence)
         self._first = False
 
     def fly(self, units, *, before=lambda _second: None) -> list[int]:

@@ -25,8 +25,7 @@ from hvt_common.protocol.messages import (
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit, Frame, Still
 from hvt_edge.backlog.disk import Store
-from hvt_edge.backlog.outage import BaseInFlight
-from hvt_edge.backlog.stage import BacklogLink, BacklogStage
+from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.link_control import LinkControl
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
@@ -34,7 +33,6 @@ from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxStill
@@ -172,7 +170,7 @@ class Rig:
         """When the store's thread looked at the clock."""
         self.linked = True
         self.keyframes = Keyframes(KeyframeSettings(interval_ns=60 * S))
-        self.in_flight, self.outbox, self.ledger = BaseInFlight(), Outbox(), Ledger()
+        self.outbox, self.ledger = Outbox(), Ledger()
         pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))) if adapt else None
         self.pacer = pacer
         self.sender = make_transmitter(
@@ -181,9 +179,7 @@ class Rig:
             budget=RollingBudget(BudgetSettings(*budget, fps=15, borrow_unused=borrow_unused)),
             session_id=session_id,
             pacer=pacer,
-            in_flight=self.in_flight,
         )
-        self.outcomes: list[tuple[str, str]] = []
         self.failures = Failures(lambda: self.now_ns)
         self.backlog = BacklogStage(
             Store(
@@ -194,13 +190,13 @@ class Rig:
                 clock=lambda: self.now_ns,
                 since_boot=lambda: ("a boot", self.now_ns - START_NS),
             ),
-            session_id=session_id,
+            self.sender,
             live=live,
-            link=link_of(self.sender, self.outbox),
-            in_flight=self.in_flight,
+            has_subscriber=lambda: True,
+            stills_pending=lambda: self.outbox.any_pending,
+            stills_in_flight=lambda: self.outbox.unacknowledged,
             keyframes=self.keyframes,
             clock=self._clock,
-            on_outcome=lambda *outcome: self.outcomes.append(outcome),
             failures=self.failures,
         )
         config = check(EdgeConfig(source="demo", size=SIZE, budget=budget[0], preset="ultrafast"))
@@ -218,7 +214,6 @@ class Rig:
             inbox=inbox or FeedbackInbox(),
             reconfiguration=make_reconfiguration(self.operating, config, SIZE, self.sender, pacer=pacer),
             clock=lambda: self.now_ns,
-            in_flight=self.in_flight,
             stills=self.stills,
         )
         self.before_link: Callable[[], None] = lambda: None
@@ -326,19 +321,6 @@ class Rig:
         now_s = (self.now_ns - START_NS) / S
         with opened(self.path, session_id=8, at_s=(now_s, now_s)) as folder:
             return {entry.number: entry.rank for entry in folder.best_stills()}
-
-
-def link_of(sender: Transmitter, outbox: Outbox) -> BacklogLink:
-    """As `hvt_edge.wiring` gives it to the backlog, with a ground that subscribes."""
-    return BacklogLink(
-        has_subscriber=lambda: True,
-        allowance_bytes=lambda now_ns, reserve: sender.backlog_allowance_bytes(now_ns, reserve=reserve),
-        send=lambda chunk, now_ns: sender.backlog(chunk, now_ns=now_ns),
-        round_trip_ns=lambda: sender.round_trip_ns,
-        total_bps=lambda: sender.budget.total_bps,
-        stills_pending=lambda: outbox.any_pending,
-        stills_in_flight=lambda: outbox.unacknowledged,
-    )
 
 
 def _pending(utility: float, now_ns: int) -> OutboxStill:

@@ -24,8 +24,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame, Image
 from hvt_edge.backlog.disk import Store
-from hvt_edge.backlog.outage import BaseInFlight
-from hvt_edge.backlog.stage import BacklogLink, BacklogStage
+from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, check, check_rate
 from hvt_edge.control.link_control import LinkControl
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
@@ -185,7 +184,7 @@ class LiveFlight:
         decimation = first_decimation(config, size)
         self.operating = make_operating(config, decimation=decimation)
         self.pacer = make_pacer(config, None, size)
-        in_flight, outbox = BaseInFlight(), Outbox()
+        outbox = Outbox()
         self.failures = Failures(self._clock)
         self.transmitter = make_transmitter(
             self,
@@ -193,7 +192,6 @@ class LiveFlight:
             budget=make_budget(config, base_bps=config.base_bps, decimation=decimation),
             wait_until=self._wait_until,
             pacer=self.pacer,
-            in_flight=in_flight,
         )
         reconfiguration = make_reconfiguration(
             self.operating,
@@ -207,21 +205,13 @@ class LiveFlight:
         if store is not None:
             self.backlog = BacklogStage(
                 Store(store, max_bytes=50_000_000, session_id=1, info=INFO.pack),
-                session_id=1,
+                self.transmitter,
                 live=True,
-                link=BacklogLink(
-                    has_subscriber=lambda: False,  # so that no thread sends chunks at times of its own
-                    allowance_bytes=lambda _now_ns, _reserve: 0,
-                    send=lambda _chunk, _now_ns: 0,
-                    round_trip_ns=lambda: SECOND_NS // 2,
-                    total_bps=lambda: config.budget_bps,
-                    stills_pending=lambda: False,
-                    stills_in_flight=lambda: 0,
-                ),
-                in_flight=in_flight,
+                has_subscriber=lambda: False,  # so that no thread sends chunks at times of its own
+                stills_pending=lambda: False,
+                stills_in_flight=lambda: 0,
                 keyframes=self.keyframes,
                 clock=self._clock,
-                on_outcome=lambda _outcome, _reason: None,
                 failures=self.failures,
             )
         self.link_control = LinkControl(
@@ -231,7 +221,6 @@ class LiveFlight:
             inbox=FeedbackInbox(),
             reconfiguration=reconfiguration,
             clock=self._clock,
-            in_flight=in_flight,
             stills=StillSender(
                 outbox, maker=StillMaker(), transmitter=self.transmitter, backlog=self.backlog
             ),
