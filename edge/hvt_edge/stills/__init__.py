@@ -3,5 +3,5 @@
 A still's walk: `stage` reports tracks and hands them to `scheduler`, which asks `policy`, merges
 neighbours (`merging`), crops and codes (`maker`, `crop_job`) what the budget allows, and puts it in the
 `outbox`, and `stage` hands it to the link's transmitter, or to the backlog while the link is away. `on_demand` serves
-what grounds request. `worker` is the thread of all this in real time.
+what grounds request, `requested_coding` codes it or says why not. `worker` is the thread of all this in real time.
 """

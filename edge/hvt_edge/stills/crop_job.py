@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 
-from hvt_common.values import Image, Still
-from hvt_common.video.base_crop import coded_size
+from hvt_common.values import Image, Still, View
+from hvt_common.video.base_crop import base_crop, coded_size
+from hvt_common.video.hevc import YuvPicture
 from hvt_common.video.still_codecs import StillCodec, psnr_y_db
 from hvt_edge.perception.crop import crop_box
 from hvt_edge.stills.policy.base import CostEstimate, Request
@@ -78,10 +80,42 @@ class CropJob:
     """The still as it will be, but for sequence, quality and data."""
     crop_bgr: Image
     """The crop of the source, at the size at which it is coded."""
-    base_crop_bgr: Image | None
+    base_crop_bgr: Image | None = None
     """The same place in the decoded base frame of the same source frame, at that size; None without one."""
-    alternative: Alternative | None
+    alternative: Alternative | None = None
     """None where the base was not at hand."""
+
+    @classmethod
+    def of(
+        cls, source_bgr: Image, crop_px: Crop, size: tuple[int, int], *, codec: StillCodec, **facts: Any
+    ) -> CropJob:
+        """Crop it to ``size`` (width, height), never larger than the crop; ``facts`` are those of the still."""
+        x1, y1, x2, y2 = crop_px
+        crop = source_bgr[y1:y2, x1:x2]
+        shrinks = size != (x2 - x1, y2 - y1)
+        pixels = cv2.resize(crop, size, interpolation=cv2.INTER_AREA) if shrinks else crop.copy()
+        header = Still(
+            sequence=0,
+            crop_source_px=crop_px,
+            codec=codec.name,
+            media_type=codec.media_type,
+            data=b"",
+            parameters=size_parameters(crop_px, size),
+            **facts,
+        )
+        return cls(header, np.asarray(pixels, np.uint8))
+
+    def beside(
+        self, base: Image | YuvPicture, *, view: View, min_gain_db: float, used: bool = False
+    ) -> CropJob:
+        """The same with what the base of its frame shows there; ``used``: the still builds on that."""
+        height, width = self.crop_bgr.shape[:2]
+        size, header = (width, height), self.header
+        shown = base_crop(base, view=view, crop_source_px=header.crop_source_px, size=size)
+        boxes = (header.box_source_px, *(box for _, box in header.also))
+        places = tuple(inner_box(box, header.crop_source_px, size) for box in boxes)
+        alternative = Alternative.of(shown, crop=self.crop_bgr, places=places, min_gain_db=min_gain_db)
+        return replace(self, base_crop_bgr=shown if used else None, alternative=alternative)
 
     @property
     def size_bytes(self) -> int:
@@ -96,9 +130,7 @@ class CropJob:
     def recoded(self, codec: StillCodec, *, reason: str) -> CropJob:
         """The same crop for another codec, without the base; the still must be closer than the base all the same."""
         header = replace(self.header, reason=reason, codec=codec.name, media_type=codec.media_type)
-        return CropJob(
-            header=header, crop_bgr=self.crop_bgr, base_crop_bgr=None, alternative=self.alternative
-        )
+        return replace(self, header=header, base_crop_bgr=None)
 
 
 def union_crop(
@@ -121,15 +153,6 @@ def expected_bytes(
         return cost.of(request.candidate)
     width, height = coded_size(union_crop(request, padding=padding, source_size=source_size))
     return cost.of_px(width * height)
-
-
-def crop_of(source_bgr: Image, crop_px: Crop, size: tuple[int, int]) -> Image:
-    """The pixels of a crop at ``size`` (width, height), never larger than the crop; a copy."""
-    x1, y1, x2, y2 = crop_px
-    crop = source_bgr[y1:y2, x1:x2]
-    if size != (x2 - x1, y2 - y1):
-        return np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return crop.copy()
 
 
 def size_parameters(crop_px: Crop, size: tuple[int, int]) -> dict[str, int | float | str]:

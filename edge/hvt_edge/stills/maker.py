@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from hvt_common.values import Frame, Image, Still, View
-from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop, coded_size
+from hvt_common.video.base_crop import MAX_SIDE_PX, coded_size
 from hvt_common.video.hevc import YuvPicture
 from hvt_common.video.still_codecs import (
     CodedCrop,
@@ -29,7 +29,7 @@ from hvt_common.video.still_codecs import (
     smallest_reaching,
 )
 from hvt_edge.perception.crop import PADDING
-from hvt_edge.stills.crop_job import Alternative, CropJob, crop_of, inner_box, size_parameters, union_crop
+from hvt_edge.stills.crop_job import CropJob, union_crop
 from hvt_edge.stills.policy.base import Request
 
 Allowance = Callable[[Still], int]
@@ -121,47 +121,37 @@ class StillMaker:
         size = coded_size(crop_px, max_side_px=self.max_side_px)
         if base is not None and size[0] < (crop_px[2] - crop_px[0]) * min(1.0, view.scale):
             return NoStill("base_good")  # shrunk below the base's own grid: the base has more pixels of it
-        crop = crop_of(frame.source_bgr, crop_px, size)
-        shown = alternative = None
-        if base is not None:
-            shown = base_crop(base, view=view, crop_source_px=crop_px, size=size)
-            boxes = (one.box_source_px for one in (lead, *request.also))
-            places = tuple(inner_box(box, crop_px, size) for box in boxes)
-            alternative = Alternative.of(shown, crop=crop, places=places, min_gain_db=self.min_gain_db)
-            if 0 < self.fidelity_db <= alternative.psnr_y_db:
-                return NoStill("base_good")
-        codec = self.without_base if shown is None else self.preferred
-        header = Still(
-            sequence=0,
+        job = CropJob.of(
+            frame.source_bgr,
+            crop_px,
+            size,
+            codec=self.without_base if base is None else self.preferred,
             frame_index=frame.index,
             capture_ns=frame.capture_ns,
             track_id=lead.track_id,
             box_source_px=lead.box_source_px,
-            crop_source_px=crop_px,
             class_name=lead.class_name,
             confidence=lead.confidence,
             reason=request.reason,
-            codec=codec.name,
             quality_pct=self.quality_pct,
-            data=b"",
-            media_type=codec.media_type,
-            parameters=size_parameters(crop_px, size),
             also=tuple((one.track_id, one.box_source_px) for one in request.also),
         )
-        return CropJob(header=header, crop_bgr=crop, base_crop_bgr=shown, alternative=alternative)
+        if base is None:
+            return job
+        job = job.beside(base, view=view, min_gain_db=self.min_gain_db, used=True)
+        good = job.alternative is not None and 0 < self.fidelity_db <= job.alternative.psnr_y_db
+        return NoStill("base_good") if good else job
 
     def code(self, job: CropJob, *, sequence: int, allowance: Allowance) -> Still | NoStill:
         """Code a crop so that ``allowance``, called with the very still that comes out, holds its data."""
-        header = replace(job.header, sequence=sequence)
-        codec = self.preferred
-        if job.base_crop_bgr is None or not codec.needs_base:
+        header, codec = replace(job.header, sequence=sequence), self.preferred
+        builds = job.base_crop_bgr is not None and codec.needs_base
+        made = self._fitted(codec if builds else self.without_base, job, header, allowance)
+        if builds and job.base_far_off:
+            if not isinstance(made, NoStill):
+                return self._cheaper(*made, job, header) or made[0]
             made = self._fitted(self.without_base, job, header, allowance)
-            return made if isinstance(made, NoStill) else made[0]
-        built = self._fitted(codec, job, header, allowance)
-        if isinstance(built, NoStill):
-            made = self._fitted(self.without_base, job, header, allowance) if job.base_far_off else built
-            return made if isinstance(made, NoStill) else made[0]
-        return (self._cheaper(*built, job, header) if job.base_far_off else None) or built[0]
+        return made if isinstance(made, NoStill) else made[0]
 
     def _fitted(
         self, codec: StillCodec, job: CropJob, header: Still, allowance: Allowance

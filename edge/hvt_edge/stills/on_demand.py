@@ -19,27 +19,23 @@ from hvt_common.protocol.messages import MAX_TRACKS_NOW, TrackNow
 from hvt_common.runtime.failures import reason_of
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Boxes, Image, Still, View
-from hvt_common.video.base_crop import MAX_REQUESTED_SIDE_PX, base_crop, coded_size
+from hvt_common.video.base_crop import MAX_REQUESTED_SIDE_PX, coded_size
 from hvt_common.video.hevc import YuvPicture
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.crop import MIN_SIDE_PX, crop_box
 from hvt_edge.perception.frame_ring import FrameRing, RingFrame
-from hvt_edge.stills.crop_job import Alternative, CropJob, crop_of, inner_box, size_parameters
+from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxStill, StillState
 from hvt_edge.stills.policy.base import CostModel
-from hvt_edge.stills.requested_coding import Capacity, CodedRequest, NothingCloser, code_requested
+from hvt_edge.stills.requested_coding import Capacity, RefusedError, code_requested
 
 ON_DEMAND = "asked"
 """The reason that such a still carries on the wire and in the ledger."""
 
 Box = tuple[float, float, float, float]
 Crop = tuple[int, int, int, int]
-
-
-class RefusedError(Exception):
-    """A request cannot be served; the text is one plain sentence for whoever requested it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,26 +104,20 @@ def crop_job_for(
     else:
         crop = _inside(request.box_xywh_px or (0, 0, width, height), (width, height))
         box, name, confidence = (*map(float, crop),), "", 0.0  # type: ignore[assignment]
-    size = coded_size(crop, max_side_px=MAX_REQUESTED_SIDE_PX)
-    codec = maker.without_base
-    header = Still(
-        sequence=0,
+    return CropJob.of(
+        frame.source_bgr,
+        crop,
+        coded_size(crop, max_side_px=MAX_REQUESTED_SIDE_PX),
+        codec=maker.without_base,
         frame_index=frame.frame_index,
         capture_ns=frame.capture_ns,
         track_id=-1 if request.track_id is None else request.track_id,
         box_source_px=box,
-        crop_source_px=crop,
         class_name=name,
         confidence=confidence,
         reason=ON_DEMAND,
-        codec=codec.name,
-        quality_pct=maker.quality_pct,
-        data=b"",
-        media_type=codec.media_type,
-        parameters=size_parameters(crop, size),
+        quality_pct=maker.quality_pct if request.quality_pct is None else request.quality_pct,
     )
-    pixels = crop_of(frame.source_bgr, crop, size)
-    return CropJob(header=header, crop_bgr=pixels, base_crop_bgr=None, alternative=None)
 
 
 def _row(frame: RingFrame, track_id: int) -> int:
@@ -181,7 +171,6 @@ class OnDemandStill(OutboxStill):
     """One that a ground requested."""
 
     number: int = -1
-    quality_pct: int = 0
     base: YuvPicture | Image | None = None
     """What the base shows of its frame; gone once it is coded."""
     ready: Still | None = None
@@ -191,13 +180,12 @@ class OnDemandStill(OutboxStill):
     link_busy: bool = False
     """The budget had room for it, and the link had not, when that was last tried."""
     on_demand: OnDemandRequest = OnDemandRequest()
-    frame_index: int = -1
-    capture_ns: int = 0
 
     def repeats(self, request: OnDemandRequest, capture_ns: int) -> bool:
         """Whether a request, for a frame of that time, is this one once more."""
-        near = abs(capture_ns - self.capture_ns) <= _AGAIN_NS
-        return request == self.on_demand and near and self.state is StillState.PENDING
+        if request != self.on_demand or self.state is not StillState.PENDING or self.job is None:
+            return False
+        return abs(capture_ns - self.job.header.capture_ns) <= _AGAIN_NS
 
 
 @dataclass(eq=False)
@@ -252,12 +240,11 @@ class OnDemand:
         with self._lock:
             last = self._last
             if last is not None and last.repeats(request, frame.capture_ns):
-                return last.number, last.frame_index
+                return last.number, last.crop.header.frame_index
         self._check_queue()
         if request.track_id is not None:
             self._want_tracks(frame.capture_ns)
         job = crop_job_for(request, frame, maker=self._maker, view=self.view, class_names=self.class_names)
-        quality_pct = self._maker.quality_pct if request.quality_pct is None else request.quality_pct
         with self._lock:
             self._check_queue()
             number = self._next_number
@@ -266,11 +253,8 @@ class OnDemand:
             pending = OnDemandStill(
                 *(job, None, float("inf"), None),
                 number=number,
-                quality_pct=quality_pct,
                 base=frame.base,
                 on_demand=request,
-                frame_index=frame.frame_index,
-                capture_ns=frame.capture_ns,
             )
             pending.behind = self.outbox.on_demand is not None
             self.outbox.offer_on_demand(pending)
@@ -348,29 +332,23 @@ class OnDemand:
         # Coding takes a moment, in which the window gets free.
         self.line.want_requested(min(round(expected), most_bytes), now_ns=now_ns)
         if pending.base is not None:
-            size, crop_px = (width, height), job.header.crop_source_px
-            shown = base_crop(pending.base, view=self.view, crop_source_px=crop_px, size=size)
-            place = inner_box(job.header.box_source_px, crop_px, size)
-            found = Alternative.of(shown, crop=job.crop_bgr, places=(place,), min_gain_db=0.0)
-            job = pending.job = replace(job, alternative=found)
+            pending.job = job = job.beside(pending.base, view=self.view, min_gain_db=0.0)
             pending.base = None
-        job = replace(job, header=replace(job.header, codec=codec.name, media_type=codec.media_type))
+        job = job.recoded(codec, reason=ON_DEMAND)
         capacity = Capacity(
             prompt_bytes=max(0, round(_PROMPT_SHARE * most_bytes) - _MARGIN_BYTES),
             most_bytes=max(0, most_bytes - _MARGIN_BYTES),
             total_bps=self.line.budget.total_bps,
         )
-        coded: CodedRequest | NothingCloser
         try:
-            coded = code_requested(job, codec=codec, quality_pct=pending.quality_pct, capacity=capacity)
+            pending.ready, note = code_requested(job, codec=codec, capacity=capacity)
         except Exception as error:  # noqa: BLE001 - the codec may be anybody's, and somebody waits
-            coded = NothingCloser(f"it could not be coded ({reason_of(error)})")
-        if isinstance(coded, NothingCloser):
-            self._give_up(pending, coded.reason, now_ns=now_ns)
+            failed = RefusedError(f"it could not be coded ({reason_of(error)})")
+            refused = error if isinstance(error, RefusedError) else failed
+            self._give_up(pending, str(refused), now_ns=now_ns)
             return False
-        pending.ready = coded.still
         with self._lock:
-            self._note(pending.number, note=coded.note)
+            self._note(pending.number, note=note)
         return True
 
     def _give_up(self, pending: OnDemandStill, reason: str, *, now_ns: int) -> None:

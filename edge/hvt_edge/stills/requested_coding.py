@@ -17,24 +17,25 @@ import numpy as np
 
 from hvt_common.units import bitrate_text
 from hvt_common.values import Image, Still
-from hvt_common.video.still_codecs import CodedCrop, StillCodec
+from hvt_common.video.still_codecs import CodedCrop, StillCodec, best_fitting
 from hvt_edge.stills.crop_job import CropJob, size_parameters
 
 _PLAIN_GAIN_DB = 2.0
 """A still that is closer to the source than the base by so much shows plainly more."""
 _LEAST_GAIN_DB = 0.3
 """With less it shows nothing more."""
+
+
+class RefusedError(Exception):
+    """A request cannot be served; the text is one plain sentence for whoever requested it."""
+
+
 _BEST_PCT = 95
 _STEP_PCT = 10
 _FLOOR_PCT = 20
 """Below it a smaller picture of better quality shows more."""
 _SHRINKS = (0.7, 0.5, 0.35, 0.25)
 _LEAST_SIDE = 8
-_TRIES = 4
-_FILLED = 0.85
-"""Share of the allowance from which no further try is made."""
-_FALLS_PER_PCT = 0.03
-"""Fall of the logarithm of a still's bytes for each percent of quality less: the start of a search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,21 +54,6 @@ class Capacity:
 
 
 @dataclass(frozen=True, slots=True)
-class CodedRequest:
-    """A coded still, and the note for its requester; empty if it comes as requested."""
-
-    still: Still
-    note: str
-
-
-@dataclass(frozen=True, slots=True)
-class NothingCloser:
-    """Why there is none, in a sentence."""
-
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
 class _Tried:
     coded: CodedCrop
     quality_pct: int
@@ -78,18 +64,19 @@ class _Tried:
         return len(self.coded.data)
 
 
-def code_requested(
-    job: CropJob, *, codec: StillCodec, quality_pct: int, capacity: Capacity
-) -> CodedRequest | NothingCloser:
-    """Code the crop of ``job``; its ``alternative`` is the base's crop, None if that is not known."""
+def code_requested(job: CropJob, *, codec: StillCodec, capacity: Capacity) -> tuple[Still, str]:
+    """Code the crop of ``job`` at its quality; ``alternative`` is the base's crop, None if that is not known.
+
+    Returns the still with a note for its requester, empty if it comes as requested; else raises `RefusedError`.
+    """
     tries = _Tries(job, codec)
-    wanted = tries.at(quality_pct)
+    wanted = tries.at(job.header.quality_pct)
     best = None
     for limit_bytes in (capacity.prompt_bytes, capacity.most_bytes):
         best = best or _as_good(tries, wanted, limit_bytes) or _lower(tries, wanted, limit_bytes)
     best = best or _shrunk(job, codec, capacity.most_bytes, wanted=wanted)
     if best is None:
-        return NothingCloser(_refusal(tries, wanted, capacity))
+        raise RefusedError(_refusal(tries, wanted, capacity))
     header = job.header
     still = replace(
         header,
@@ -101,7 +88,7 @@ def code_requested(
             **best.coded.parameters,
         },
     )
-    return CodedRequest(still, _note(best, wanted, capacity))
+    return still, _note(best, wanted, capacity)
 
 
 @dataclass(eq=False)
@@ -119,9 +106,8 @@ class _Tries:
     def at(self, quality_pct: int) -> _Tried:
         """Coded at this quality."""
         if quality_pct not in self.done:
-            pixels = self.job.crop_bgr if self.pixels is None else self.pixels
-            coded = self.codec.encode(pixels, quality_pct=quality_pct, base_bgr=None)
-            self.done[quality_pct] = _Tried(coded, quality_pct, (pixels.shape[1], pixels.shape[0]))
+            coded = self.codec.encode(self._coded_bgr, quality_pct=quality_pct, base_bgr=None)
+            self.done[quality_pct] = self._tried(coded, quality_pct)
         return self.done[quality_pct]
 
     def gain_db(self, one: _Tried) -> float:
@@ -143,34 +129,22 @@ class _Tries:
         return one is not None and self.gain_db(one) >= _LEAST_GAIN_DB
 
     def fitting(self, limit_bytes: int, *, most_pct: int) -> _Tried | None:
-        """The best quality up to ``most_pct`` that fits, or nearly that; found by the sizes of a few tries."""
-        low, high, best = _FLOOR_PCT, most_pct, None
-        for _ in range(_TRIES):
-            if low > high:
-                break
-            one = self.at(self._guess(limit_bytes, low, high))
-            if one.size_bytes <= limit_bytes:
-                best, low = one, one.quality_pct + 1
-                if one.size_bytes >= _FILLED * limit_bytes:
-                    break
-            else:
-                high = one.quality_pct - 1
-        return best
+        """The best quality up to ``most_pct`` that fits."""
+        found = best_fitting(
+            self.codec, self._coded_bgr, limit_bytes=limit_bytes, low_pct=_FLOOR_PCT, high_pct=most_pct
+        )
+        if found is None:
+            return None
+        self.done[found[1]] = one = self._tried(*found)
+        return one
 
-    def _guess(self, limit_bytes: int, low: int, high: int) -> int:
-        # The quality at which a line through the tries so far crosses the limit, aimed a little below it.
-        wanted = math.log(max(1, 0.95 * limit_bytes))
-        known = sorted((abs(math.log(one.size_bytes) - wanted), pct) for pct, one in self.done.items())
-        if not known:
-            return (low + high) // 2
-        nearest = self.done[known[0][1]]
-        falls = _FALLS_PER_PCT
-        if len(known) > 1:
-            other = self.done[known[1][1]]
-            steep = math.log(nearest.size_bytes / other.size_bytes)
-            falls = max(0.005, steep / (nearest.quality_pct - other.quality_pct))
-        guess = nearest.quality_pct + (wanted - math.log(nearest.size_bytes)) / falls
-        return min(high, max(low, math.floor(guess)))
+    @property
+    def _coded_bgr(self) -> Image:
+        return self.job.crop_bgr if self.pixels is None else self.pixels
+
+    def _tried(self, coded: CodedCrop, quality_pct: int) -> _Tried:
+        height, width = self._coded_bgr.shape[:2]
+        return _Tried(coded, quality_pct, (width, height))
 
 
 def _as_good(tries: _Tries, wanted: _Tried, limit_bytes: int) -> _Tried | None:

@@ -75,9 +75,7 @@ def test_a_still_that_is_pending_at_the_end_does_not_hold_up_what_was_stored(tmp
     rig.play(0, 21, reports=True)
     rig.play(21, 45, linked=False)
     rig.linked = True
-    rig.outbox.offer(
-        OutboxStill(CropJob(STILL, np.zeros((4, 4, 3), np.uint8), None, None), None, 1.0, rig.now_ns)
-    )
+    rig.outbox.offer(OutboxStill(CropJob(STILL, np.zeros((4, 4, 3), np.uint8)), None, 1.0, rig.now_ns))
     rig.finish()
     assert rig.backlog.worker.numbers.empty
     sizes = [len(data) for _, data in rig.out.backlog]
@@ -192,7 +190,7 @@ def test_what_may_be_sent_now_and_how_much(tmp_path):
     assert rig.backlog.chunk_allowance(rig.now_ns) is None, "a keyframe is to come"
     rig.play(60, 75, reports=True)
     assert rig.backlog.chunk_allowance(rig.now_ns) is not None
-    pending = OutboxStill(CropJob(STILL, np.zeros((4, 4, 3), np.uint8), None, None), None, 1.0, rig.now_ns)
+    pending = OutboxStill(CropJob(STILL, np.zeros((4, 4, 3), np.uint8)), None, 1.0, rig.now_ns)
     assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(5000), "50 ms of 800 kbps"
     rig.outbox.offer(pending)
     assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(1400, trickle=True)

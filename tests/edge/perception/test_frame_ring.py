@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from hvt_common.values import Frame
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
-from hvt_edge.stills.on_demand import OnDemandRequest, RefusedError, frame_for
+from hvt_edge.stills.on_demand import OnDemandRequest, frame_for
+from hvt_edge.stills.requested_coding import RefusedError
 from media.clips import START_NS
 from rigs.flight import tracks_at
 

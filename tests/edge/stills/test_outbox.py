@@ -26,7 +26,7 @@ HEADER = Still(0, 0, 0, 1, BOX, (0, 0, 10, 10), "car", 0.5, "test", "residual", 
 def crop(track: int = 1, *also: int, side: int = 10) -> CropJob:
     """A crop of ``3 * side * side`` bytes."""
     header = replace(HEADER, track_id=track, also=tuple((one, BOX) for one in also))
-    return CropJob(header, np.zeros((side, side, 3), np.uint8), None, None)
+    return CropJob(header, np.zeros((side, side, 3), np.uint8))
 
 
 def request_of(track: int, score: float, *also: int) -> Request:

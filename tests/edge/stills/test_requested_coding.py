@@ -15,7 +15,7 @@ from hvt_common.values import Image, Still
 from hvt_common.video.still_codecs import JpegCodec, psnr_y_db
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.stills.crop_job import Alternative, CropJob
-from hvt_edge.stills.requested_coding import Capacity, CodedRequest, NothingCloser, code_requested
+from hvt_edge.stills.requested_coding import Capacity, RefusedError, code_requested
 from media.clips import START_NS, hard_pictures
 from media.pictures import write_scene
 from rigs.closer_looks import LookFlight, RequestedLook
@@ -26,7 +26,7 @@ JPEG = JpegCodec()
 PLENTY = Capacity(prompt_bytes=100_000, most_bytes=150_000, total_bps=1_500_000)
 
 
-def job(base: Image | None) -> CropJob:
+def job(base: Image | None, *, quality_pct: int = 65) -> CropJob:
     """The crop, with what the base shows of it."""
     whole = (slice(0, SIZE[1]), slice(0, SIZE[0]))
     alternative = None
@@ -43,10 +43,10 @@ def job(base: Image | None) -> CropJob:
         confidence=0.0,
         reason="asked",
         codec="jpeg",
-        quality_pct=65,
+        quality_pct=quality_pct,
         data=b"",
     )
-    return CropJob(header=header, crop_bgr=CROP, base_crop_bgr=None, alternative=alternative)
+    return CropJob(header, CROP, alternative=alternative)
 
 
 def as_base(quality_pct: int) -> Image:
@@ -68,43 +68,44 @@ def test_what_comes_is_closer_to_the_source_than_the_video_and_fits(base_pct, wa
     """An operator who looks closer would see less than before, or wait for what never fits."""
     base = as_base(base_pct)
     capacity = Capacity(round(0.6 * most_bytes), most_bytes, total_bps=10 * most_bytes)
-    look = code_requested(job(base), codec=JPEG, quality_pct=wanted_pct, capacity=capacity)
-    if isinstance(look, NothingCloser):
-        assert "the video" in look.reason
+    try:
+        still, note = code_requested(job(base, quality_pct=wanted_pct), codec=JPEG, capacity=capacity)
+    except RefusedError as refused:
+        why = str(refused)
+    else:
+        why = ""
+    if why:
+        assert "the video" in why
         return
-    assert len(look.still.data) <= most_bytes
-    assert psnr_y_db(shown(look.still), CROP) > psnr_y_db(base, CROP)
-    full = "w" not in look.still.parameters
-    assert full or look.note, "fewer pixels are said before they come"
+    assert len(still.data) <= most_bytes
+    assert psnr_y_db(shown(still), CROP) > psnr_y_db(base, CROP)
+    full = "w" not in still.parameters
+    assert full or note, "fewer pixels are said before they come"
 
 
 def test_quality_goes_up_until_it_plainly_shows_more_and_down_before_pixels():
     """At the stills' usual quality it would be as good as the video, or small where it could be whole."""
     base = as_base(65)
-    better = code_requested(job(base), codec=JPEG, quality_pct=65, capacity=PLENTY)
-    assert isinstance(better, CodedRequest)
-    assert better.still.quality_pct > 65
-    assert psnr_y_db(shown(better.still), CROP) > psnr_y_db(base, CROP) + 1.5
+    better, _ = code_requested(job(base), codec=JPEG, capacity=PLENTY)
+    assert better.quality_pct > 65
+    assert psnr_y_db(shown(better), CROP) > psnr_y_db(base, CROP) + 1.5
     whole = len(JPEG.encode(CROP, quality_pct=65).data)
     thin = Capacity(round(0.5 * whole), round(0.7 * whole), total_bps=8 * whole)
-    lower = code_requested(job(as_base(10)), codec=JPEG, quality_pct=65, capacity=thin)
-    assert isinstance(lower, CodedRequest)
-    assert lower.still.quality_pct < 65
-    assert "w" not in lower.still.parameters
-    assert f"{SIZE[0]}x{SIZE[1]} pixels at quality {lower.still.quality_pct} come within about" in lower.note
+    lower, note = code_requested(job(as_base(10)), codec=JPEG, capacity=thin)
+    assert lower.quality_pct < 65
+    assert "w" not in lower.parameters
+    assert f"{SIZE[0]}x{SIZE[1]} pixels at quality {lower.quality_pct} come within about" in note
 
 
 def test_what_the_video_shows_as_well_is_refused_and_what_is_too_large_says_what_would_do():
     """The request would be answered by a copy of the picture, or by nothing for ten seconds."""
-    same = code_requested(job(CROP), codec=JPEG, quality_pct=65, capacity=PLENTY)
-    assert same == NothingCloser("the video already shows it as well as the source does")
-    large = code_requested(job(as_base(70)), codec=JPEG, quality_pct=65, capacity=Capacity(900, 1500, 15_000))
-    assert isinstance(large, NothingCloser)
-    assert "240x160 pixels take" in large.reason
-    assert "15 kbps carry 1.5 kB at once beside it: ask for a smaller region" in large.reason
-    full = code_requested(job(as_base(70)), codec=JPEG, quality_pct=65, capacity=Capacity(0, 0, 150_000))
-    assert isinstance(full, NothingCloser)
-    assert full.reason.endswith("150 kbps carry 0.0 kB at once beside it: raise the budget")
+    with pytest.raises(RefusedError, match=r"^the video already shows it as well as the source does$"):
+        code_requested(job(CROP), codec=JPEG, capacity=PLENTY)
+    with pytest.raises(RefusedError, match=r"^240x160 pixels take .* 15 kbps carry 1\.5 kB at once") as large:
+        code_requested(job(as_base(70)), codec=JPEG, capacity=Capacity(900, 1500, 15_000))
+    assert "at once beside it: ask for a smaller region" in str(large.value)
+    with pytest.raises(RefusedError, match=r"150 kbps carry 0\.0 kB at once beside it: raise the budget$"):
+        code_requested(job(as_base(70)), codec=JPEG, capacity=Capacity(0, 0, 150_000))
 
 
 @settings(max_examples=40, deadline=None)

@@ -27,7 +27,8 @@ from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.on_demand import OnDemandRequest, RefusedError
+from hvt_edge.stills.on_demand import OnDemandRequest
+from hvt_edge.stills.requested_coding import RefusedError
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from media.base_coded import StandIn

@@ -325,5 +325,5 @@ class Rig:
 
 def _pending(utility: float, now_ns: int) -> OutboxStill:
     """A still about to be coded."""
-    job = CropJob(STILL, np.zeros((4, 4, 3), np.uint8), None, None)
+    job = CropJob(STILL, np.zeros((4, 4, 3), np.uint8))
     return OutboxStill(job, None, utility, now_ns)
