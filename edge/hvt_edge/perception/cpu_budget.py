@@ -38,6 +38,8 @@ _BACK_S: Final = 5.0
 """In so long the budget doubles again."""
 _LOSS_NS: Final = SECOND_NS // 4
 """Frames lost within that are one loss."""
+_START_NS: Final = SECOND_NS
+"""Frames lost so soon say nothing: the first is the dearest to code, and all else begins beside it."""
 _MOST_QUEUED: Final = 3
 """With more frames behind the one in hand nothing is searched: they would wait as long again."""
 _NEWEST: Final = 0.3
@@ -130,6 +132,8 @@ class CpuBudget:
         None while the loop is ``late`` itself.
         """
         self._waits_ns = at_ns if self._waits_ns is None else self._waits_ns
+        if not self._newest_ns:
+            self._lost_ns = at_ns + _START_NS - _LOSS_NS
         if at_ns > self._newest_ns:
             grown = (at_ns - self._newest_ns) / SECOND_NS / _BACK_S if self._newest_ns else 0.0
             self._left = 1.0 if grown > -math.log2(self._left) else self._left * 2**grown

@@ -110,6 +110,15 @@ def test_each_frame_that_video_loses_halves_the_budget_and_it_comes_back():
     assert len(once.fly(10).looked) - looked > quiet / 6 - 2, "it has come back"
 
 
+def test_a_frame_lost_at_the_start_halves_nothing():
+    """A board's second boxes would come three seconds after its first ones."""
+    plain, starting = (
+        Rig(processors=0.5, video=0.3).fly(5, loses=lambda index, n=n: index < n) for n in (0, 8)
+    )
+    assert starting.lost == 8
+    assert starting.looked == plain.looked
+
+
 def test_a_camera_that_was_away_for_hours_goes_on():
     """Its first frame would end the flight: two to the power of that pause is no number."""
     budget = CpuBudget(fps=15, processors=4)
