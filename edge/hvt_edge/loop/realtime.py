@@ -24,6 +24,9 @@ _MOST_LATE_NS = SECOND_NS
 """A clip that is later than that, and not because of the link, is played slower."""
 _MOST_LINK_LATE_NS = 10 * SECOND_NS
 _LINK_BOUND_NS = SECOND_NS // 100
+_MOST_QUEUED_S = 0.5
+"""Of frames that wait for perception. Each of a longer queue is tracked through before a new one is searched: with a
+quarter of two cores boxes were 2.4 s old."""
 _BEHIND_SHARE = 0.5
 """Share of the time between two frames: beyond it the loop is late."""
 
@@ -66,6 +69,7 @@ class RealtimePace:
             detected=self.inbox.take_detected,
             failures=self.failures,
             clock=self.clock,
+            length=max(2, round(_MOST_QUEUED_S * self.fps)),
         )
 
     def step(self, frame: Frame | None, *, missed: int = 0) -> None:
