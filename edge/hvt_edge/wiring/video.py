@@ -194,7 +194,7 @@ def encoder_opener(
 ) -> OpenEncoder:
     """Opens encoders in flight, with the preset that is in force then; the one before is closed first.
 
-    Two at a time would take 60 MB more at 1280x720, and a device that takes one session would refuse the second.
+    Two at a time take 15 to 20 MB more at 1280x720 and twice the threads; a device of one session refuses the second.
     """
     last: Encoder | None = None
 
