@@ -130,8 +130,8 @@ class LinkControl:
         if report.primary:
             self.transmitter.in_flight.on_report(feedback.base_sequence)
             self.stills.outbox.on_report(
-                feedback.still_sequence,
-                feedback.missing_stills,
+                report.feedback.still_sequence,
+                report.feedback.missing_stills,
                 now_ns=now_ns,
                 round_trip_ns=0 if self.pacer is None else self.pacer.round_trip_ns,
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hvt_common.protocol.messages import Feedback, StillResult
 from hvt_edge.perception.shadow import Detected
@@ -50,11 +50,14 @@ class PrimaryReceiver:
     def judge(self, feedback: Feedback, *, sent: tuple[int, int], now_ns: int) -> Report:
         """Decide on a report; ``sent`` are the last sequences of base and stills that went out.
 
-        One that names what was never sent does not count.
+        One that names a base message that was never sent does not count. A still that was never sent is a forger's
+        at the ground: the report counts, and says nothing of stills.
         """
         with self._lock:
-            if feedback.base_sequence > sent[0] or feedback.still_sequence > sent[1]:
+            if feedback.base_sequence > sent[0]:
                 return Report(feedback, now_ns, primary=False)
+            if feedback.still_sequence > sent[1]:
+                feedback = replace(feedback, still_sequence=-1, missing_stills=())
             first = self._begins(feedback, sent, now_ns)
             if first is None:
                 return Report(feedback, now_ns, primary=False)

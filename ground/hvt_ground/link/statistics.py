@@ -45,6 +45,8 @@ _MOST_SENT = 512
 """Stills whose second copy is still known for one: those of the last seconds."""
 _NEVER_NS = -(2**64)
 """When a still was sent that has come with the backlog only."""
+_NEAR_STILLS = 256
+"""A still that is further from the highest number may be forged: it counts once another follows it."""
 _MISSED_NS = 6 * SECOND_NS
 """A still that has not come for so long does not come any more: reports need not name it for ever."""
 
@@ -71,7 +73,7 @@ class ReceptionStatistics:
     def __init__(self, *, lockstep: bool = False) -> None:
         self._lock = threading.Lock()
         self._lockstep = lockstep
-        self._base_sequence = self._still_sequence = -1
+        self._base_sequence = self._still_sequence = self._last_still = -1
         self._from_start = False
         self._missing: Newest[int, int] = Newest(MAX_MISSING_STILLS)
         """Sequence → when it was first missed."""
@@ -98,9 +100,14 @@ class ReceptionStatistics:
         """A still of this session has arrived."""
         with self._lock:
             self._missing.pop(sequence, None)
-            if sequence > self._still_sequence:
-                self._miss(self._still_sequence + 1, sequence, at_ns=arrived_ns)
+            if self._still_sequence < 0 or abs(sequence - self._still_sequence) <= _NEAR_STILLS:
+                if sequence > self._still_sequence:
+                    self._miss(self._still_sequence + 1, sequence, at_ns=arrived_ns)
+                    self._still_sequence = sequence
+            elif 0 < sequence - self._last_still <= _NEAR_STILLS:
                 self._still_sequence = sequence
+                self._missing.clear()
+            self._last_still = sequence
             self._note(size_bytes, arrived_ns)
 
     def backlog(self, *, size_bytes: int, arrived_ns: int) -> None:

@@ -99,8 +99,16 @@ def test_who_names_what_was_never_sent_does_not_count():
     """One invented number would let the edge forget what no ground has, or steer its rate."""
     primary = PrimaryReceiver()
     assert judged(primary, 1, 0, now_ns=0, base=101) == "ignored"
-    assert judged(primary, 1, 1, now_ns=0, still=101) == "ignored"
     assert judged(primary, 2, 0, now_ns=1, base=100, still=100) == "first", "the liar does not steer"
+
+
+def test_a_still_that_was_never_sent_ends_no_video():
+    """A ground names a forged still for long: taken for silent, it would be stored for in place of live video."""
+    forged = feedback(base_sequence=100, still_sequence=101, missing_stills=(99,))
+    report = PrimaryReceiver().judge(forged, sent=SENT, now_ns=0)
+    assert report.primary
+    named = report.feedback
+    assert (named.base_sequence, named.still_sequence, named.missing_stills) == (100, -1, ())
 
 
 def test_a_number_that_was_forged_is_believed_for_a_second():

@@ -155,6 +155,23 @@ def test_what_is_missing_is_bounded():
     assert len(missing(reception_statistics)) == MAX_MISSING_STILLS
 
 
+def test_a_forged_number_of_a_still_hides_no_true_one():
+    """Reports would name for ever what the edge never sent: it would take none of its stills for received."""
+    reception_statistics = ReceptionStatistics()
+    reception_statistics.base(header(0), size_bytes=500, arrived_ns=0)
+    for sequence in (0, 1, 4, 2**32 - 9, 5, 2):
+        reception_statistics.still(sequence, size_bytes=900, arrived_ns=0)
+    measured = reception_statistics.take(S)
+    assert (measured.still_sequence, measured.missing_stills) == (5, (3,))
+    for sequence in (2**32 - 8, 2**32 - 7):  # two that follow each other are believed, as after a long hole
+        reception_statistics.still(sequence, size_bytes=900, arrived_ns=S)
+    assert reception_statistics.take(S).still_sequence == 2**32 - 7
+    for sequence in (6, 8):
+        reception_statistics.still(sequence, size_bytes=900, arrived_ns=2 * S)
+    measured = reception_statistics.take(2 * S)
+    assert (measured.still_sequence, measured.missing_stills) == (8, ())
+
+
 class Progress(int):
     """A time that somebody reckons with just when a still comes in another thread."""
 
