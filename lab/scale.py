@@ -9,6 +9,7 @@ long it took until each edge was served again, and the router's processor time. 
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
@@ -164,7 +165,9 @@ def main(words: list[str]) -> None:
     elif words and words[0] == "edges":
         _edges(words[1], int(words[2]))
     else:
-        numbers = [int(one) for one in words]
+        parser = argparse.ArgumentParser(prog="python -m lab.scale", description=__doc__)
+        parser.add_argument("numbers", nargs="*", type=int, help="fleets: edges and grounds of each")
+        numbers = parser.parse_args(words).numbers
         table = Table()
         for name in (
             "edges, grounds",

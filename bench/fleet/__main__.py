@@ -8,6 +8,7 @@ that it took, their ratio, the share of frames passed over for lack of time at t
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
@@ -47,7 +48,9 @@ class Served(NamedTuple):
 
 def main(arguments: list[str]) -> int:
     """Print the table; it is also written to build/fleet.json."""
-    counts = [int(word) for word in arguments] or COUNTS
+    parser = argparse.ArgumentParser(prog="python -m bench.fleet", description=__doc__)
+    parser.add_argument("edges", nargs="*", type=int, default=COUNTS, help="fleets of so many edges")
+    counts = parser.parse_args(arguments).edges
     with open_source("demo", size=SIZE, fps=_FPS, max_frames=round(_SCENE_S * _FPS)) as source:
         units = coded([one.base_bgr for one in source.frames(start_ns=0)], fps=_FPS)
     console = Console(highlight=False)

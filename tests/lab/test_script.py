@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+import bench.fleet.__main__
+import lab.scale
 from hvt_common.errors import UserError
 from lab.link.script import LENGTHS, load_scenario, scenario_names
 
@@ -143,3 +145,12 @@ def test_an_unknown_scenario_is_answered_with_the_known():
     ):
         load_scenario("steady")
     assert LENGTHS == ("short", "full")
+
+
+@pytest.mark.parametrize("main", [lab.scale.main, bench.fleet.__main__.main])
+@pytest.mark.parametrize(("word", "code"), [("--help", 0), ("many", 2)])
+def test_a_measurement_says_what_it_takes(main, word, code):
+    """Who asks for its help would read a traceback."""
+    with pytest.raises(SystemExit) as ended:
+        main([word])
+    assert ended.value.code == code

@@ -174,7 +174,7 @@ class LeverControl:
             why = "this view is unlike what the detector knows"
         of_tracks = f"{'tracks' if tracks else 'no tracks'}: {why}"
         renamed = f"they name {sum(self._changed)} of {len(self._changed)} otherwise"
-        renamed = renamed if self._changed else "none was answered yet"
+        renamed = renamed if self._changed else "no answer yet"
         details = "stills show details, " if self._settings.finer else "stills: "
         return f"{of_tracks}; {details if stills else 'stills paused: '}{renamed}"
 

@@ -95,7 +95,7 @@ def test_numbers_alone_are_no_event(rig, flight):
     item = flight.status(base=3)
     real = Status.parse(item.payload)
     said = [
-        "no tracks: not measured yet; stills: none was answered yet",
+        "no tracks: not measured yet; stills: no answer yet",
         ("no tracks: the video hides 2 objects, misnames 1; stills: they name 1 of 2 otherwise"),
         "tracks: the video hides 9 objects; stills: they name 1 of 2 otherwise",
         "tracks: the video hides 9 objects; stills paused: they name 1 of 40 otherwise",
@@ -105,7 +105,7 @@ def test_numbers_alone_are_no_event(rig, flight):
         rig.session.status(replace(real, sequence=real.sequence + 1 + number, levers=levers), item)
     assert rig.session.levers == said[-1]
     assert [one.text for one in rig.events if isinstance(one, Notice)] == [
-        "The edge sends no tracks: not measured yet. Stills are sent: none was answered yet.",
+        "The edge sends no tracks: not measured yet. Stills are sent: no answer yet.",
         (
             "The edge sends its tracks: the video hides 9 objects. "
             "Stills are sent: they name 1 of 2 otherwise."
