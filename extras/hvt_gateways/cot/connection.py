@@ -29,6 +29,7 @@ with warnings.catch_warnings():
     from pytak.client_functions import get_ssl_ctx, get_tls_config
 
 from hvt_common.errors import UserError, absent
+from hvt_common.files import read_bytes
 from hvt_common.runtime.host_names import is_group
 from hvt_gateways.cot.event import CotMessage
 from hvt_ground.sinks import SinkWriter
@@ -117,12 +118,11 @@ def _check_multicast(settings: Mapping[str, str]) -> None:
 def _check_readable(name: str, settings: Mapping[str, str]) -> None:
     if name not in settings:
         return
-    path = settings[name].replace("%%", "%")
+    path = Path(settings[name].replace("%%", "%"))
     try:
-        with open(path, "rb"):  # noqa: PTH123 - a text from the environment
-            pass
+        read_bytes(path)
     except OSError as error:
-        raise absent(Path(path))(
+        raise absent(path)(
             f"{name} {path} cannot be read ({error.strerror}): give a file that is there"
         ) from None
 
@@ -136,7 +136,7 @@ def _check_key(settings: Mapping[str, str]) -> None:
         if path.suffix.lower() in (".p12", ".pfx"):
             if not os.access(path, os.W_OK):
                 raise UserError(f"{name} {path} can only be read, and pytak writes to it: give a copy")
-        elif b"ENCRYPTED" in path.read_bytes() and not settings.get(_PASSWORD):
+        elif b"ENCRYPTED" in read_bytes(path) and not settings.get(_PASSWORD):
             raise UserError(f"{name} {path} has an encrypted key: set {_PASSWORD}")
 
 

@@ -390,6 +390,7 @@ def test_a_server_that_never_shakes_hands_does_not_hold_up_the_end(port, fleet, 
         ({"TLS_CLIENT_KEY": "NOTES"}, "cannot use the certificate"),
         ({"TLS_CLIENT_CERT": "NOTES.p12"}, "cannot use the certificate"),
         ({"TLS_CLIENT_CAFILE": "NOTES"}, "cannot use the certificate"),
+        ({"TLS_CLIENT_KEY": "NOTES.large"}, "cannot be read (larger than 16 MB)"),
         ({"TLS_DONT_VERIFY": "perhaps"}, "cannot use the certificate"),
     ],
 )
@@ -397,6 +398,8 @@ def test_keys_that_cannot_be_used_end_the_start(fleet, tmp_path, changes, senten
     """It would be noticed in the air."""
     for name in ("NOTES", "NOTES.p12"):
         (tmp_path / name).write_text("no key")
+    with (tmp_path / "NOTES.large").open("wb") as file:
+        file.truncate(17_000_000)
     said = {name: str(tmp_path / one) if one.startswith("NOTES") else one for name, one in changes.items()}
     with pytest.raises(UserError) as refusal:
         check_connection("tls://takserver.example:8089", keys(fleet, **said))
