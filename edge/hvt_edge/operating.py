@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 from hvt_common.units import SECOND_NS
 
@@ -68,27 +69,10 @@ class OperatingPoint:
 class Operating:
     """Holds the newest point; thread-safe."""
 
-    def __init__(
-        self,
-        *,
-        budget_bps: int,
-        video_share: float | None,
-        base_bps: int,
-        method: str,
-        decimation: int,
-        preset: str = "",
-        preset_says: str = "",
-    ) -> None:
+    def __init__(self, *, budget_bps: int, **beginning: Any) -> None:
+        """Begin with the whole budget; ``beginning`` are further fields of `OperatingPoint`."""
         self._point = OperatingPoint(
-            budget_bps,
-            video_share,
-            method,
-            budget_bps,
-            base_bps,
-            decimation,
-            highest_budget_bps=budget_bps,
-            preset=preset,
-            preset_says=preset_says,
+            budget_bps=budget_bps, total_bps=budget_bps, highest_budget_bps=budget_bps, **beginning
         )
         self._lock = threading.Lock()
 

@@ -173,7 +173,7 @@ class Chooser:
     settings: ChooserSettings
     on_outcome: Callable[[str, str], None]
     on_demand: OnDemand
-    observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None
+    observe: Callable[[Sequence[Candidate], Step], None] | None = None
 
     def __post_init__(self) -> None:
         self.most_bytes = self.settings.most_bytes
@@ -219,7 +219,8 @@ class Chooser:
             source_bgr=analyzed.frame.source_bgr,
             base_bgr=analyzed.base_bgr,
         )
-        self.observe(candidates, step)
+        if self.observe is not None:
+            self.observe(candidates, step)
         for request in self._requests(self._unheld(candidates, now_ns=now_ns), step):
             self._crop(request, analyzed, now_ns=now_ns)
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 
 from hvt_edge.link.budget import RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import ReconfigurationTrigger
 from hvt_edge.operating import Operating, Rates, base_rate_bps
-from hvt_edge.perception.candidates import Candidate
-from hvt_edge.stills.policy.base import Step
 from hvt_edge.video.encoder_settings import PresetControl, least_base_bps, most_keyframe_bytes
 from hvt_edge.video.encoders.registry import Encoder
 from hvt_edge.video.share import FIRST_SHARE, Split
@@ -42,7 +39,7 @@ OpenEncoder = Callable[[Rates], Encoder]
 
 @dataclass(eq=False)
 class EncoderReconfiguration:
-    """Called before each keyframe for the link; observes decision steps, which may come from another thread.
+    """Called before each keyframe for the link.
 
     With a ``pacer`` the total is the rate that the link carries: the budget tracks it at each frame (`track_link`),
     the base stream where `ReconfigurationTrigger` finds it worth a keyframe. Between the two, stills yield
@@ -61,7 +58,6 @@ class EncoderReconfiguration:
 
     def __post_init__(self) -> None:
         self._trigger = ReconfigurationTrigger()
-        self._lock = threading.Lock()
         settings = self.settings
         self._least_base_bps = least_base_bps(settings.size, settings.least_fps, edge_id=settings.edge_id)
         now = self.operating.now
@@ -118,12 +114,6 @@ class EncoderReconfiguration:
         fps = settings.nominal_fps / max(now.decimation, self.least_decimation())
         return min(last_bytes, most_keyframe_bytes(settings.size, fps, base_bps))
 
-    def observe(self, candidates: Sequence[Candidate], step: Step) -> None:
-        """Take in all tracks of a decision step."""
-        if self.split is not None:
-            with self._lock:
-                self.split.observe(candidates, step)
-
     def wants_keyframe(self, now_ns: int) -> bool:
         """Whether rates are so far off that it is worth a keyframe of its own; once a second."""
         now = self.operating.now
@@ -131,7 +121,7 @@ class EncoderReconfiguration:
             return True
         if self.split is None or not self._moving:
             return False
-        with self._lock:
+        with self.split.lock:
             self._tell_split(now.decimation)
             return self.split.wants_keyframe(now_ns)
 
@@ -224,7 +214,7 @@ class EncoderReconfiguration:
         if not self._moving or self.split is None:
             return self._base_of_budget() if changed else now.base_bps
         total_bps = now.budget_bps if self.pacer is None else self.pacer.steady_bps
-        with self._lock:
+        with self.split.lock:
             self._tell_split(decimation)
             if changed or self.pacer is not None:
                 self.split.set_total(total_bps)

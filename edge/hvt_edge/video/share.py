@@ -8,6 +8,7 @@ keyframes only, and only where it differs enough to be worth that.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -54,7 +55,7 @@ class SplitSettings:
 
 
 class Split:
-    """Watches decision steps, and proposes a share at keyframes. Deterministic; not thread-safe."""
+    """Watches decision steps, which may come from another thread, and proposes a share at keyframes."""
 
     def __init__(
         self,
@@ -63,6 +64,8 @@ class Split:
         first_share: float = FIRST_SHARE,
         gain: ExpectedGain | None = None,
     ) -> None:
+        self.lock = threading.RLock()
+        """Held by whoever says something and asks for the share that follows."""
         self._settings = settings
         self._gain = gain or ExpectedGain()
         self.share = first_share
@@ -84,9 +87,10 @@ class Split:
             self._changed_ns = step.now_ns
         else:
             decay = math.exp(-max(0, step.now_ns - self._observed_ns) / 1e9 / self._settings.memory_s)
-        self._need_bytes = decay * self._need_bytes + (1 - decay) * need_bytes
-        self._shown = decay * self._shown + (1 - decay) * shown
-        self._observed_ns = step.now_ns
+        with self.lock:
+            self._need_bytes = decay * self._need_bytes + (1 - decay) * need_bytes
+            self._shown = decay * self._shown + (1 - decay) * shown
+            self._observed_ns = step.now_ns
 
     def set_total(self, total_bps: int) -> None:
         """Another budget from now on; the share stays as it is, unless x265 could not follow it any more."""

@@ -135,12 +135,13 @@ class Link:
             pacer=self.pacer,
             clock=None if lockstep else flight.loop_clock,
         )
+        self.split = make_split(config, size, first_share=beginning.share)
         self.reconfiguration = EncoderReconfiguration(
             self.operating,
             reconfiguration_settings(config, size),
             open_encoder=open_encoder,
             budget=budget,
-            split=make_split(config, size, first_share=beginning.share),
+            split=self.split,
             pacer=self.pacer,
             presets=presets,
         )
@@ -180,7 +181,7 @@ class Stills:
             ),
             on_outcome=link.transmitter.outcome,
             on_demand=on_demand,
-            observe=link.reconfiguration.observe,
+            observe=None if link.split is None else link.split.observe,
         )
         self.info = InfoReporter(
             config,

@@ -202,7 +202,7 @@ def test_reconfiguration_tells_the_split_how_many_frames_are_coded():
         split=split(300_000, most_sparse_share=0.9),
     )
     operating.pull(Levers(stills=False))
-    reconfiguration.observe([], moment(0))
+    reconfiguration.split.observe([], moment(0))
     for decimation, share in ((2, 0.9), (1, 1.0)):
         reconfiguration(decimation, SECOND)
         assert opened[-1] == Rates(300_000, share * 300_000, decimation)
@@ -223,7 +223,7 @@ def test_what_stills_leave_while_they_pause_goes_back_to_the_base():
     )
     crowd = [car(number, lost=0.9, side=90) for number in range(1, 9)]
     for number in range(60):
-        reconfiguration.observe(crowd, moment(number / 3, from_source=True))
+        reconfiguration.split.observe(crowd, moment(number / 3, from_source=True))
     assert not reconfiguration.wants_keyframe(30 * SECOND)
     operating.pull(Levers(stills=False))
     assert reconfiguration.wants_keyframe(30 * SECOND)
