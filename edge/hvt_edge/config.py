@@ -321,7 +321,6 @@ class EdgeConfig:
 
     @property
     def window_ns(self) -> int:
-        """The budget's window in nanoseconds."""
         return round(self.window * 1e9)
 
     @property

@@ -78,7 +78,6 @@ class Operating:
 
     @property
     def now(self) -> OperatingPoint:
-        """The point as it is now."""
         return self._point
 
     def start(self, now_ns: int) -> None:
@@ -93,7 +92,6 @@ class Operating:
         )
 
     def allow(self, total_bps: int) -> None:
-        """Allow this rate from now on."""
         self._set(total_bps=total_bps)
 
     def open(self, rates: Rates, *, total_bps: int) -> None:
@@ -128,7 +126,6 @@ class LoopClock:
         self._media_ns = 0
 
     def __call__(self) -> int:
-        """Nanoseconds."""
         return self._media_ns if self._lockstep else self._clock()
 
     def advance(self, capture_ns: int) -> None:

@@ -80,7 +80,6 @@ class Backfill:
 
     @property
     def in_flight(self) -> int:
-        """Objects with bytes under way."""
         return len(self._line)
 
     @property
@@ -90,7 +89,6 @@ class Backfill:
 
     @property
     def cached_bytes(self) -> int:
-        """The bytes of the object in memory."""
         return 0 if self._data is None else len(self._data[1])
 
     # What comes back

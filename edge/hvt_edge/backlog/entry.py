@@ -37,7 +37,6 @@ class Entry:
 
     @property
     def key(self) -> ObjectKey:
-        """Its key on the link."""
         return self.session_id, self.kind, self.number
 
     def __str__(self) -> str:
@@ -68,11 +67,9 @@ class OpenSegment:
 
     @property
     def span_ns(self) -> int:
-        """From its first frame to its last."""
         return self.last.capture_ns - self.first.capture_ns
 
     def ends_before(self, unit: AccessUnit) -> bool:
-        """Whether this unit begins another segment."""
         if unit.frame_index <= self.last.frame_index or unit.capture_ns <= self.last.capture_ns:
             return True
         if self.units >= _MOST_SEGMENT_UNITS or self.size_bytes + len(unit.data) > _MOST_SEGMENT_BYTES:
@@ -81,7 +78,6 @@ class OpenSegment:
         return unit.keyframe and (long or not self.first.keyframe)
 
     def append(self, unit: AccessUnit) -> None:
-        """It has been written."""
         self.last = unit
         self.size_bytes += len(unit.data)
         self.units += 1

@@ -33,7 +33,6 @@ class Outage:
         self.reports = True
 
     def reports_now(self, now_ns: int) -> bool:
-        """Whether a ground reports now."""
         reported_ns = self._reported_ns
         return reported_ns is not None and now_ns - reported_ns <= SILENCE_NS
 

@@ -96,7 +96,6 @@ class BacklogStage:
 
     @property
     def offline(self) -> bool:
-        """Whether the link is away."""
         return self.state is State.OFFLINE
 
     def before_frame(self, now_ns: int, *, linked: bool) -> bool:
@@ -208,7 +207,6 @@ class BacklogStage:
     # The threads of stills
 
     def store_still(self, still: BacklogStill, *, number: int, capture_ns: int, utility: float) -> None:
-        """Store a still."""
         self.worker.offer(IntakeStill(number, capture_ns, utility, still))
 
     # What comes back

@@ -85,7 +85,6 @@ class Intake:
         self._closed = False
 
     def __len__(self) -> int:
-        """Frames and stills that wait."""
         return self._queued
 
     @property
@@ -202,7 +201,6 @@ class StoreNumbers:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing is stored."""
         return not (self.stills or self.segments)
 
 
@@ -281,7 +279,6 @@ class StoreWorker:
 
     @property
     def numbers(self) -> StoreNumbers:
-        """The contents and the counts of the store."""
         store = self._store
         return StoreNumbers(
             stills=store.stills,

@@ -258,14 +258,12 @@ class _Reader:
         return value
 
     def needed(self, name: str, low: int, high: int) -> int:
-        """As `optional`, and must be given."""
         value = self.optional(name, low, high)
         if value is None:
             raise RefusedError(f"{self._command}: {name} is missing")
         return value
 
     def text(self, name: str) -> str:
-        """A word that must be given."""
         value = self._left.pop(name, None)
         if not isinstance(value, str):
             raise RefusedError(f"{self._command}: {name} is missing, or not a word")

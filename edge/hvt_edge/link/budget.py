@@ -99,7 +99,6 @@ class BudgetSettings:
 
     @property
     def still_bps(self) -> int:
-        """The rate of the stills' allowance."""
         return max(0, self.total_bps - self.base_bps - self.metadata_bps)
 
 
@@ -247,7 +246,6 @@ class RollingBudget:
 
     @property
     def total_bps(self) -> int:
-        """B_tot as it is now."""
         return self._settings.total_bps
 
     @property

@@ -51,7 +51,6 @@ class Flight:
 
     @property
     def oldest(self) -> Sent | None:
-        """The base message that has been on its way for longest."""
         return self._base[0] if self._base else None
 
     @property
@@ -60,7 +59,6 @@ class Flight:
         return sum(one.line_bytes for one in self._base) + sum(size for _, _, size in self._stills)
 
     def sent_base(self, sequence: int, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
-        """A base message goes out."""
         self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
         self._messages += 1
         self._last = (sequence, self._last[1])
@@ -70,7 +68,6 @@ class Flight:
         )
 
     def sent_still(self, sequence: int, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
-        """A still goes out."""
         self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
         self._messages += 1
         self._last = (self._last[0], sequence)
@@ -147,11 +144,9 @@ class BaseInFlight:
 
     @property
     def size_bytes(self) -> int:
-        """The bytes of the access units."""
         return self._size_bytes
 
     def sent(self, sequence: int, unit: AccessUnit, *, now_ns: int) -> None:
-        """An access unit goes out."""
         with self._lock:
             self._units.append((sequence, now_ns, unit))
             self._size_bytes += len(unit.data)

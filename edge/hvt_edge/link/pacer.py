@@ -88,12 +88,10 @@ class Pacer:
 
     @property
     def at_ceiling(self) -> bool:
-        """Whether the rate is the ceiling."""
         return self._controller.at_ceiling
 
     @property
     def backoffs(self) -> int:
-        """Number of times that the rate was lowered."""
         return self._controller.backoffs
 
     def set_ceiling(self, ceiling_bps: int, *, floor_bps: int | None = None) -> None:
@@ -104,7 +102,6 @@ class Pacer:
     # What goes out
 
     def sent_base(self, sequence: int, line_bytes: int, *, now_ns: int, keyframe: bool = False) -> None:
-        """A base message goes out."""
         with self._lock:
             self._last_sent_ns, self._last_bytes = now_ns, line_bytes
             if keyframe and self._started_ns is None:
@@ -112,7 +109,6 @@ class Pacer:
             self._flight.sent_base(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
 
     def sent_still(self, sequence: int, line_bytes: int, *, now_ns: int) -> None:
-        """A still goes out."""
         with self._lock:
             self._flight.sent_still(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
 
@@ -124,7 +120,6 @@ class Pacer:
     # What comes back
 
     def on_report(self, report: Report) -> None:
-        """Take in one report of this session."""
         feedback, now_ns = report.feedback, report.now_ns
         with self._lock:
             # Who takes no video says nothing of its link, also where somebody else does who reports nothing.
@@ -215,7 +210,6 @@ class Pacer:
             return silent or not self.at_ceiling or self._overdue_ns(now_ns) > self._slack_ns
 
     def admits_still(self, now_ns: int) -> bool:
-        """Whether a still may go now."""
         with self._lock:
             if self._reported_ns is None:
                 return self._may_start(now_ns)

@@ -113,20 +113,16 @@ class ZenohLink:
 
     @property
     def trouble(self) -> str:
-        """Why no ground can be reached, where the log has said it."""
         return self._watch.trouble
 
     @property
     def unusable(self) -> int:
-        """Messages from grounds that were skipped: damaged, foreign or of another version."""
         return 0 if self._listener is None else self._listener.unusable
 
     def has_ground(self) -> bool:
-        """Whether a ground subscribes to base, stills and status."""
         return all(self.has_subscriber(channel) for channel in _NEEDED)
 
     def has_subscriber(self, channel: Channel) -> bool:
-        """Whether somebody subscribes to this channel."""
         # Zenoh's own stub calls the status a bool.
         return bool(self._publishers[channel].matching_status.matching)  # type: ignore[attr-defined]
 
@@ -143,7 +139,6 @@ class ZenohLink:
             _log.debug("%s was not sent: %s", channel, error)
 
     def listen(self, answers: Answers) -> None:
-        """Answer grounds from now on; see `EdgeListener`."""
         self._listener = EdgeListener(
             self._session, self._keys, answers, failures=self._failures, clock=self._clock
         )

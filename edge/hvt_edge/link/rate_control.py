@@ -109,7 +109,6 @@ class LeastDelay:
 
     @property
     def empty(self) -> bool:
-        """Whether none was taken in."""
         return self._since_ns is None
 
 
@@ -140,7 +139,6 @@ class LossCount:
                 self._counts.popleft()
 
     def exceeds(self) -> bool:
-        """Whether too many are lost."""
         return bool(self._counts) and self._beyond(self._counts[0]) > 0
 
     def lasts(self) -> bool:

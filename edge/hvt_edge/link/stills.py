@@ -98,7 +98,6 @@ class StillEnvelope:
 
     @classmethod
     def of(cls, still: Still, *, session_id: int) -> StillEnvelope:
-        """Pack the header."""
         header = RoiHeader(
             session_id=session_id,
             send_delay_ns=0,

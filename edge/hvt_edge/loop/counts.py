@@ -115,7 +115,6 @@ def _limit(group: Path, files: Sequence[str]) -> float:
 
 
 def usable_cores() -> set[int]:
-    """The processor cores that this process may run on."""
     return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
 
 
@@ -168,7 +167,6 @@ class FrameCounts:
         return self.groups["processor"]
 
     def account(self, *, coded_fps: float, auto_fps: bool) -> FrameAccount:
-        """The outcome of each source frame so far."""
         return FrameAccount(dict(self.groups + self.source_groups), coded_fps, auto_fps)
 
     def drop(self, group: FrameGroup, count: int = 1) -> None:
@@ -220,11 +218,9 @@ class FrameCounts:
 
     @property
     def encode_ms(self) -> float:
-        """Mean of one frame."""
         return self.encode_ns / max(1, self.encoded) / 1e6
 
     def note(self, frame: Frame, *, encode_ns: int) -> None:
-        """This frame was encoded."""
         if self.first_capture_ns is None:
             self.first_capture_ns = frame.capture_ns
         self.last_index, self.last_capture_ns = frame.index, frame.capture_ns

@@ -52,9 +52,7 @@ class PoseSource(Protocol):
         """The guesses made at its opening, and their reasons: a sentence each."""
         ...
 
-    def close(self) -> None:
-        """Close open files and connections."""
-        ...
+    def close(self) -> None: ...
 
 
 class OpenPose(Protocol):

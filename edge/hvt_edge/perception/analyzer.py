@@ -110,7 +110,6 @@ class Analyzer:
 
     @property
     def view_unlike(self) -> bool:
-        """The view is unlike what the detector knows."""
         return self._trust is not None and self._trust.unlike
 
     @property

@@ -115,7 +115,6 @@ class CpuBudget:
 
     @property
     def plan(self) -> Plan:
-        """The plan now."""
         if math.isinf(self._processors):
             return Plan()
         return share_out(self._cores * self._left, self._costs, fps=self._fps)

@@ -55,7 +55,6 @@ class RingFrame:
 
     @property
     def base_bytes(self) -> int:
-        """Memory of the base picture."""
         return 0 if self.base is None else self.base.nbytes
 
     @property

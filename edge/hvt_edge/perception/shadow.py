@@ -166,7 +166,6 @@ class Shadow:
 
     @property
     def misnamed_share(self) -> float:
-        """Share of the shown objects that bear another class on the base."""
         return self.misnamed / self.shown if self.shown else 0.0
 
     @property
@@ -212,7 +211,6 @@ class Shadow:
 
     @property
     def measured(self) -> Measured:
-        """The measured gains of tracks."""
         return Measured(
             comparisons=self.comparisons,
             gain=self.gain,
@@ -287,7 +285,6 @@ class ShadowGround:
         return replace(plain.measured, sure_gain=sure.sure_gain, reported=reported)
 
     def take_detected(self, report: Detected) -> None:
-        """Take a ground's report of its own detector."""
         self._difference.take(report)
 
     def compare(self, seen: AnalyzedFrame) -> bool:

@@ -210,7 +210,6 @@ class EdgeState:
     failed: tuple[FailedPart, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
         found = asdict(self)
         found["frames"] |= {"account": self.frames.account.as_dict()}
         return found
@@ -257,12 +256,10 @@ class Heartbeat:
 
     @property
     def frames(self) -> FrameAccount:
-        """The outcome of each frame so far."""
         fps = self.config.nominal_fps / self.operating.now.decimation
         return self.counts.account(coded_fps=fps, auto_fps=self.config.auto_fps)
 
     def beat(self, phase: Phase) -> EdgeState:
-        """Make a state now."""
         self._due_ns = self.clock() + SECOND_NS
         self.state = self._made(phase)
         notify_systemd("WATCHDOG=1")

@@ -273,7 +273,6 @@ def in_vain(content: dict[str, Any]) -> bool:
 
 
 def title(content: dict[str, Any]) -> str:
-    """Of the table."""
     edge, why = content["edge"], content["unreached"]
     if in_vain(content):
         return f"{edge}: NOT SENT ({why}): 0 bytes received"

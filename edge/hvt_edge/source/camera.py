@@ -73,7 +73,6 @@ class CameraGrabber:
         self._ahead_ns = self._clock() - time.monotonic_ns()
 
     def restart(self) -> None:
-        """Open again after `SignalLost`."""
         self.close()
         self.open()
 
@@ -97,7 +96,6 @@ class CameraGrabber:
         return Shot(image, self._ahead_ns + round(buffer_ms * 1e6) if buffer_ms > 0 else None)
 
     def close(self) -> None:
-        """Let go of the device."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None

@@ -126,7 +126,6 @@ class ClipSource(Source):
         return self._running
 
     def close(self) -> None:
-        """Stop reading."""
         if self._running is not None:
             self._running.close()
             self._running = None

@@ -101,7 +101,6 @@ class DemoSource(Source):
         self.frame_count = self._count = min(whole, settings.max_frames or whole)
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """The scene from its beginning."""
         rate = exact_rate(self.fps)
         self._drop_pictures()
         self._request("image", 0.0)

@@ -96,7 +96,6 @@ class FolderSource(Source):
         self.frame_count = whole if settings.max_frames is None else min(whole, settings.max_frames)
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """The sequence from its beginning."""
         rate = exact_rate(self.fps)
         places = ((place * self._period_s, place) for place in range(len(self._files)))
         shown, image, frame = -1, self._first, None

@@ -141,7 +141,6 @@ class LiveSource(Source):
         return (frame for frame in self.steps(start_ns=start_ns) if frame is not None)
 
     def steps(self, *, start_ns: int) -> Iterator[Frame | None]:  # noqa: ARG002 - a camera has its own time
-        """See `Source`."""
         index = 0
         while index != self._limit:
             with self._news:

@@ -74,7 +74,6 @@ class StreamGrabber:
         return bool(self._container.duration)
 
     def restart(self) -> None:
-        """Open again after `SignalLost`."""
         self.close()
         self._start(_RESTART_S + self._read_s)
 
@@ -91,7 +90,6 @@ class StreamGrabber:
         return shot
 
     def close(self) -> None:
-        """Close the connection."""
         self._shots = iter(())
         if self._container is not None:
             self._container.close()

@@ -119,7 +119,6 @@ class CropJob:
 
     @property
     def size_bytes(self) -> int:
-        """Memory of the pixels."""
         return self.crop_bgr.nbytes + (0 if self.base_crop_bgr is None else self.base_crop_bgr.nbytes)
 
     @property

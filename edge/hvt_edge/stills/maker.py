@@ -105,7 +105,6 @@ class StillMaker:
 
     @property
     def codec_names(self) -> tuple[str, ...]:
-        """The codecs in use, without repetition."""
         return tuple(dict.fromkeys((self.preferred.name, self.without_base.name)))
 
     def crop(

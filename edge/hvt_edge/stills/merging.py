@@ -83,7 +83,6 @@ class _Board:
     """Empty where another has taken the still in."""
 
     def join(self) -> None:
-        """Join pairs while that saves bytes."""
         count = len(self.members)
         savings = np.full((count, count), -np.inf)
         for row in range(count):

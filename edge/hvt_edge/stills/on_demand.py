@@ -221,7 +221,6 @@ class OnDemand:
         self._ended = False
 
     def add(self, analyzed: AnalyzedFrame) -> None:
-        """Hold a frame with its tracks."""
         self._tracked = analyzed.tracked
         self.ring.add(analyzed.frame, analyzed.tracks, base=analyzed.base)
 

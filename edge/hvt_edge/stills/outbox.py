@@ -69,13 +69,11 @@ class OutboxStill:
 
     @property
     def still(self) -> Still:
-        """The coded still."""
         assert self.coded is not None, f"{self.state}: it is not coded"
         return self.coded
 
     @property
     def crop(self) -> CropJob:
-        """The crop of a pending still."""
         assert self.job is not None, f"{self.state}: its crop is gone"
         return self.job
 
@@ -86,7 +84,6 @@ class OutboxStill:
 
     @property
     def track_ids(self) -> set[int]:
-        """All its tracks."""
         return {self.track_id, *(track_id for track_id, _ in self.crop.header.also)}
 
 
@@ -145,7 +142,6 @@ class Outbox:
 
     @property
     def pending(self) -> tuple[OutboxStill, ...]:
-        """The pending stills of the method."""
         with self._lock:
             return tuple(self._pending.values())
 
@@ -157,7 +153,6 @@ class Outbox:
 
     @property
     def on_demand_pending(self) -> int:
-        """Number of pending stills that grounds requested."""
         return len(self._on_demand)
 
     @property
@@ -197,7 +192,6 @@ class Outbox:
             self._on_demand.append(new)
 
     def best(self) -> OutboxStill | None:
-        """The most useful pending still of the method."""
         with self._lock:
             return max(self._pending.values(), key=_order, default=None)
 

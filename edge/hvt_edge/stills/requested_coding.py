@@ -104,7 +104,6 @@ class _Tries:
     _gains: dict[int, float] = field(default_factory=dict)
 
     def at(self, quality_pct: int) -> _Tried:
-        """Coded at this quality."""
         if quality_pct not in self.done:
             coded = self.codec.encode(self._coded_bgr, quality_pct=quality_pct, base_bgr=None)
             self.done[quality_pct] = self._tried(coded, quality_pct)
@@ -125,7 +124,6 @@ class _Tries:
         return self._gains[one.quality_pct]
 
     def beats_base(self, one: _Tried | None) -> bool:
-        """Whether it shows more."""
         return one is not None and self.gain_db(one) >= _LEAST_GAIN_DB
 
     def fitting(self, limit_bytes: int, *, most_pct: int) -> _Tried | None:

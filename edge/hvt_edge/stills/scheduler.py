@@ -112,7 +112,6 @@ class Gate:
 
     @property
     def on(self) -> bool:
-        """Whether anything is ever refused."""
         return self.psnr_y_db > 0
 
     def good_enough(self, loss: BaseLoss) -> bool:

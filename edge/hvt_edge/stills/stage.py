@@ -204,11 +204,9 @@ class StillSender:
 
     @property
     def offline(self) -> bool:
-        """Whether the link is away, and stills are stored."""
         return self.backlog is not None and self.backlog.offline
 
     def allowance(self, now_ns: int, *, paced: bool) -> Allowance:
-        """Payload bytes that a still may take now."""
         return lambda still: self.transmitter.still_allowance_bytes(now_ns, still=still, paced=paced)
 
     def put(self, coded: OutboxStill, *, now_ns: int, store: bool) -> None:

@@ -105,7 +105,6 @@ class StillWorker:
 
     @property
     def queued(self) -> int:
-        """Frames that are not taken yet."""
         return self._frames.qsize()
 
     @property

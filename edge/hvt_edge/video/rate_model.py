@@ -194,7 +194,6 @@ class MeasuredFrameSkip(FrameSkip):
             self._quantisers.popleft()
 
     def at_keyframe(self, index: int) -> int:
-        """See `FrameSkip`."""
         if not self._may_decide(index):
             return self.decimation
         self.decimation = self._better()
@@ -203,7 +202,6 @@ class MeasuredFrameSkip(FrameSkip):
         return self.decimation
 
     def wants_keyframe(self, index: int) -> bool:
-        """See `FrameSkip`."""
         return self._own_keyframes and self._may_decide(index) and self._better() < self.decimation
 
     def _may_decide(self, index: int) -> bool:
@@ -228,15 +226,12 @@ class LimitedFrameSkip(FrameSkip):
         self._least_decimation = least_decimation
 
     def coded(self, index: int, *, keyframe: bool, mean_qp: float) -> None:
-        """See `FrameSkip`."""
         super().coded(index, keyframe=keyframe, mean_qp=mean_qp)
         self._preferred.coded(index, keyframe=keyframe, mean_qp=mean_qp)
 
     def at_keyframe(self, index: int) -> int:
-        """See `FrameSkip`."""
         self.decimation = max(self._preferred.at_keyframe(index), self._least_decimation())
         return self.decimation
 
     def wants_keyframe(self, index: int) -> bool:
-        """See `FrameSkip`."""
         return self._preferred.wants_keyframe(index)

@@ -69,7 +69,6 @@ class FrameDecision:
 
     @property
     def codes(self) -> bool:
-        """Whether the frame is encoded."""
         return self.action is Action.CODE
 
     @property

@@ -32,7 +32,6 @@ _AUTO_REST_S = 8.0
 
 
 def make_link_settings(config: EdgeConfig) -> LinkSettings:
-    """The edge's settings of Zenoh."""
     return LinkSettings(
         role="edge",
         listen=config.listen,
@@ -56,7 +55,6 @@ def channels_of(config: EdgeConfig, *, live: bool) -> tuple[Channel, ...]:
 
 
 def make_budget(config: EdgeConfig, *, base_bps: int, decimation: int) -> RollingBudget:
-    """B_tot and B_v over the rolling window."""
     return RollingBudget(
         BudgetSettings(
             total_bps=config.budget_bps,
@@ -91,7 +89,6 @@ def make_split(config: EdgeConfig, size: tuple[int, int], *, first_share: float)
 
 
 def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:
-    """The thresholds of tracks and stills."""
     return LeverSettings(tracks_bps=config.metadata_bps, finer=shows_details(config, view))
 
 

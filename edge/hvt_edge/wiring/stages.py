@@ -91,7 +91,6 @@ class Flight:
 
     @property
     def lockstep(self) -> bool:
-        """Whether windows go by in media time."""
         return self.config.pace == "lockstep"
 
 

@@ -301,7 +301,6 @@ def _qualify_camera(config: EdgeConfig, source: Source) -> None:
 
 
 def reconfiguration_settings(config: EdgeConfig, size: tuple[int, int]) -> ReconfigurationSettings:
-    """The bounds of the rates in flight."""
     return ReconfigurationSettings(
         size=size,
         nominal_fps=config.nominal_fps,

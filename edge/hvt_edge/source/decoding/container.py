@@ -149,7 +149,6 @@ def _is_film(stream: Any) -> bool:
 
 
 def without_stamps(stream: Any) -> bool:
-    """Whether the container has no time stamps at all."""
     return bool(stream.container.format.flags & _NO_STAMPS)
 
 
@@ -249,7 +248,6 @@ class _Reading:
         self._end_s: Fraction | None = None
 
     def frames(self) -> Iterator[av.VideoFrame]:
-        """The frames as they are decoded."""
         for packet in _packets(self._container, self._stream):
             if isinstance(packet, Exception):
                 self._ended = f"it breaks off ({cause_of(packet)})"

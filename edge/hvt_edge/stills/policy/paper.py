@@ -25,7 +25,6 @@ class VideoOnly:
     video_only: bool = field(default=True, init=False)
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:  # noqa: ARG002
-        """Never anything."""
         return []
 
 

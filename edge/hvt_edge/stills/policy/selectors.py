@@ -97,12 +97,10 @@ class SelectorMethod:
 
     @property
     def name(self) -> str:
-        """The selector's name."""
         return self.selector.name
 
     @property
     def video_only(self) -> bool:
-        """Selectors always want stills."""
         return False
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:

@@ -53,7 +53,6 @@ class HardwareEncoder:
         self._context = context
 
     def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
-        """See `Encoder`."""
         del regions
         picture = yuv_picture(self._to_yuv, frame.base_bgr, pixel_format=self._row.pixel_format)
         picture.pts = self._count
