@@ -16,7 +16,7 @@ from hvt_common.values import Image, Still, View
 from hvt_common.video.base_crop import base_crop, coded_size
 from hvt_common.video.hevc import YuvPicture
 from hvt_common.video.still_codecs import StillCodec, psnr_y_db
-from hvt_edge.perception.crop import crop_box
+from hvt_edge.perception.candidates import crop_box
 from hvt_edge.stills.policy.base import CostEstimate, Request
 
 Box = tuple[float, float, float, float]

@@ -28,7 +28,7 @@ from hvt_common.video.still_codecs import (
     psnr_y_db,
     smallest_reaching,
 )
-from hvt_edge.perception.crop import PADDING
+from hvt_edge.perception.candidates import PADDING
 from hvt_edge.stills.crop_job import CropJob, union_crop
 from hvt_edge.stills.policy.base import Request
 

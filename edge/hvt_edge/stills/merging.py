@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.video.base_crop import MAX_SIDE_PX
-from hvt_edge.perception.crop import crop_box
+from hvt_edge.perception.candidates import crop_box
 from hvt_edge.stills.policy.base import CostEstimate, Request
 
 ALSO_BYTES = 17.0

@@ -23,7 +23,7 @@ from hvt_common.video.base_crop import MAX_REQUESTED_SIDE_PX, coded_size
 from hvt_common.video.hevc import YuvPicture
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.analyzer import AnalyzedFrame
-from hvt_edge.perception.crop import MIN_SIDE_PX, crop_box
+from hvt_edge.perception.candidates import MIN_SIDE_PX, crop_box
 from hvt_edge.perception.frame_ring import FrameRing, RingFrame
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker

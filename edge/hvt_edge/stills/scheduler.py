@@ -12,8 +12,7 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 
 from hvt_common.values import Still, View
 from hvt_edge.perception.analyzer import AnalyzedFrame
-from hvt_edge.perception.candidates import Candidate, TrackMemory
-from hvt_edge.perception.crop import BaseLoss
+from hvt_edge.perception.candidates import BaseLoss, Candidate, TrackMemory
 from hvt_edge.stills.crop_job import CropJob, expected_bytes
 from hvt_edge.stills.maker import Allowance, NoStill, StillMaker
 from hvt_edge.stills.merging import group

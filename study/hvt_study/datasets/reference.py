@@ -20,7 +20,7 @@ from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
 from hvt_common.inference.labels import first_synonym
 from hvt_common.values import Boxes, Image
-from hvt_edge.perception.crop import PADDING, crop_box
+from hvt_edge.perception.candidates import PADDING, crop_box
 from hvt_edge.source.resample import Resizer
 from hvt_study.datasets.labels import FrameLabels, inside_frame
 from hvt_study.datasets.sequence import Sequence

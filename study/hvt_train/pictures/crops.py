@@ -13,7 +13,7 @@ import numpy.typing as npt
 from hvt_common.inference.detect import Detector
 from hvt_common.values import Boxes, Image
 from hvt_common.video.still_codecs import JpegCodec
-from hvt_edge.perception.crop import PADDING, crop_box
+from hvt_edge.perception.candidates import PADDING, crop_box
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import HELD_OUT_SEED, SOURCE_SIZE, TRAIN_SEED, Shot, shoot

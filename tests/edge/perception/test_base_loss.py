@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_edge.perception.crop import MOST_PSNR_DB, measure_loss
+from hvt_edge.perception.candidates import MOST_PSNR_DB, measure_loss
 
 
 def texture(size: tuple[int, int] = (60, 80)) -> np.ndarray:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from hvt_common.values import Tracks, View
-from hvt_edge.perception.candidates import TrackMemory, sharpness
-from hvt_edge.perception.crop import MOST_PSNR_DB, BaseLoss
+from hvt_edge.perception.candidates import MOST_PSNR_DB, BaseLoss, TrackMemory, sharpness
 from rigs.examples import tracks_of
 
 VIEW = View.fitted((1280, 720), (640, 360), fit="letterbox")

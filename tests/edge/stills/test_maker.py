@@ -16,7 +16,7 @@ from hvt_common.values import Frame, Still, View
 from hvt_common.video.base_crop import base_crop, coded_size
 from hvt_common.video.still_codecs import BaseMissingError, JpegCodec, still_codec
 from hvt_common.video.still_codecs.jpeg import jpeg_size
-from hvt_edge.perception.crop import crop_box
+from hvt_edge.perception.candidates import crop_box
 from hvt_edge.stills.maker import NoStill, StillMaker
 from hvt_edge.stills.policy.base import Request
 from media.base_coded import Hopeless, StandIn

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.values import Tracks, View
-from hvt_edge.perception.candidates import Candidate, TrackMemory, sharpness
-from hvt_edge.perception.crop import BaseLoss, measure_loss
+from hvt_edge.perception.candidates import BaseLoss, Candidate, TrackMemory, measure_loss, sharpness
 from hvt_edge.stills.scheduler import Gate, Suppression
 from media.clips import hard_pictures
 from rigs.examples import candidate, tracks_of

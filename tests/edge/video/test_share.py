@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_edge.operating import Levers, Operating, Rates
-from hvt_edge.perception.candidates import Candidate, ClassPosterior
-from hvt_edge.perception.crop import BaseLoss
+from hvt_edge.perception.candidates import BaseLoss, Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.video.reconfigure import EncoderReconfiguration, ReconfigurationSettings
 from hvt_edge.video.share import FIRST_SHARE, Split, SplitSettings

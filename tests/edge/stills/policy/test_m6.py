@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_edge.perception.candidates import Candidate, ClassPosterior
-from hvt_edge.perception.crop import BaseLoss
+from hvt_edge.perception.candidates import BaseLoss, Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.stills.policy.m6 import ExpectedGain
 from hvt_edge.stills.policy.registry import METHODS, method

@@ -14,7 +14,7 @@ from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, group_o
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.values import Posterior
-from hvt_edge.perception.crop import PADDING
+from hvt_edge.perception.candidates import PADDING
 from hvt_ground.perception.fusion.fuse import unified_names
 from hvt_ground.perception.stills.refine import Refiner, ViewTilt
 from hvt_ground.perception.stills.vocabulary import LEAST_SIDE_PX, Vocabulary, check_common
