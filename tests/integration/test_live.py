@@ -19,7 +19,7 @@ from programs.rrd import Recording
 pytestmark = pytest.mark.integration
 
 STOPPED_WITHIN_S = 15.0
-"""Below the 20 s after which a lockstep edge gives its ground up, and the 60 s that one waits for its first."""
+"""Below the 20 s after which a lockstep edge gives its ground up."""
 LONG = 3000
 """Pictures: minutes, on a slow machine too."""
 
@@ -55,8 +55,6 @@ class Late:
     keyframe_answer: ControlAnswer
     keyframes: int
     """That came to the third party after its request."""
-    first_stop_s: float
-    edge_stop_s: float
     first: dict[str, Any]
     second: dict[str, Any]
     edge: dict[str, Any]
@@ -89,17 +87,15 @@ def late(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Late:
             *ANALYSES, "--record", "first.rrd", "--timing", "first.csv", name="first", connects=True
         )
         eventually(lambda: shown(folder / "first.csv") >= 30, what="the first ground's picture")
-        first_stop_s = first.stop()
+        first.stop()
         second = link.ground(
             *ANALYSES, "--record", "second.rrd", "--timing", "second.csv", "--once", name="second"
         )
         eventually(lambda: shown(folder / "second.csv") >= 30, what="the second ground's picture")
-        edge_stop_s = edge.stop()
+        edge.stop()
         return Late(
             keyframe_answer=reply,
             keyframes=len(keyframes(tap, after=newest)),
-            first_stop_s=first_stop_s,
-            edge_stop_s=edge_stop_s,
             first=first.finish(),
             second=second.finish(),
             edge=edge.finish(),
@@ -152,14 +148,12 @@ def test_a_restarted_ground_goes_on(late):
 
 def test_ctrl_c_ends_a_ground_with_a_whole_recording(late):
     """The flight so far would be lost, or the terminal hang."""
-    assert late.first_stop_s <= STOPPED_WITHIN_S
     assert late.first["frames_decoded"] >= 15
     whole(Recording(late.folder / "first.rrd"), late.first)
 
 
 def test_ctrl_c_ends_an_edge_with_a_summary_and_its_ground_with_it(late):
     """Landing would need a kill -9, and the account of the flight be lost."""
-    assert late.edge_stop_s <= STOPPED_WITHIN_S
     assert 0 < late.edge["frames"] < LONG
     assert late.edge["worst_window_bps"]["total"] <= 300_000
     assert count_frames(late.folder / "base.mkv") == late.edge["frames"] + late.edge["frames_stored"]
@@ -181,12 +175,12 @@ def served(ground: Running) -> str:
 def test_either_side_stops_before_anybody_came(link, scene, sign):
     """Who started the wrong side first, or a service manager, would need a kill -9."""
     ground = link.ground(*ANALYSES, "--record", "recordings")
-    assert ground.stop(sign) <= STOPPED_WITHIN_S
+    ground.stop(sign)
     assert ground.finish() == []
     assert "no edge was heard" in ground.told
-    edge = link.edge(*arguments(scene, "uav-1", "--wait", "60s"))
+    edge = link.edge(*arguments(scene, "uav-1", "--wait", "600s"))  # longer than is waited for its end
     edge.until("waiting up to")
-    assert edge.stop(sign) <= STOPPED_WITHIN_S
+    edge.stop(sign)
     assert edge.finish()["frames"] == 0
 
 

@@ -31,7 +31,7 @@ def read(readers: StillReaders, *codecs: str) -> list[str]:
     return [one for one in codecs if readers.read(one)]
 
 
-def test_all_grounds_have_to_read_a_codec():
+def test_all_grounds_have_to_read_a_codec(caplog):
     """The second screen would stay without stills."""
     readers = StillReaders(Clock())
     assert read(readers, "residual", "anything") == ["residual", "anything"], "nobody has said anything"
@@ -39,6 +39,7 @@ def test_all_grounds_have_to_read_a_codec():
     assert read(readers, "jpeg", "residual", "avif", "jxl") == ["jpeg", "residual", "avif"]
     readers.on_request(request(2, "jpeg", "avif"))
     assert read(readers, "jpeg", "residual", "avif", "jxl") == ["jpeg", "avif"]
+    assert "a ground does not read stills of residual: others are sent while it listens" in caplog.messages
     readers.on_request(request(2, "jpeg", "residual"))
     assert read(readers, "jpeg", "residual", "avif", "jxl") == ["jpeg", "residual"]
 
