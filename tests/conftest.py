@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import os
+import resource
 import signal
 import sys
 import threading
@@ -40,6 +41,11 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 for ending in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
     if signal.getsignal(ending) is signal.SIG_IGN:
         signal.signal(ending, lambda *_: None)
+
+# Some shells give a process 256 descriptors, and five hundred connections to one page need more.
+files, most_files = resource.getrlimit(resource.RLIMIT_NOFILE)
+if 0 <= files < (wanted := 4096 if most_files < 0 else min(4096, most_files)):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most_files))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
