@@ -116,7 +116,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from hvt_train.report import print_drawn, print_real, print_speed  # noqa: PLC0415
+    from hvt_train.evaluate import print_drawn, print_real, print_speed  # noqa: PLC0415
 
     if not (arguments.drawn or arguments.real or arguments.speed):
         raise UserError("eval has nothing to do; give --drawn, --speed, or --real with --reference")

@@ -20,9 +20,8 @@ from hvt_common.inference.class_names import kind_of
 from hvt_common.inference.detect import open_detector
 from hvt_train.learning.calibration import NONE, Calibration, fit_calibration
 from hvt_train.learning.detector import DetectorNet
-from hvt_train.learning.export import metadata
+from hvt_train.learning.export import load_onnx, metadata
 from hvt_train.learning.loop import LoopSettings
-from hvt_train.learning.start import load_onnx
 from hvt_train.learning.train_detector import export_detector, train_detector
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import in_flight, save_picture, thin_kbps

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_scene.appearance import Appearance
-from hvt_scene.view.project import Floats
+from hvt_scene.view import Floats
 from hvt_scene.world.layout import MAIN_HALF_M, SIDE_HALF_M, WORLD_M, Layout, Tree
 
 CANOPY_SPAN = 2.1

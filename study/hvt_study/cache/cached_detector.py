@@ -21,8 +21,7 @@ from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.runtimes.model_file import files_of
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Detections, Image
-from hvt_study.cache.code_digest import DETECTING, code_digest
-from hvt_study.cache.results import file_digest, make_folder, read_whole, write_whole
+from hvt_study.cache.results import DETECTING, code_digest, file_digest, make_folder, read_whole, write_whole
 
 _PACKAGES = ("numpy", "opencv-python-headless", "onnxruntime", "onnxruntime-gpu", "openvino")
 """Those that may have a say in an answer, as far as they are installed."""
@@ -33,9 +32,7 @@ _digest_of_file = cache(file_digest)
 class CachedDetector(OnnxDetector):
     """The network that ``spec`` names, on one thread; its answers lie in ``folder``, which processes may share.
 
-    Raises:
-        UserError: as `hvt_common.inference.detect.open_detector`; or the folder cannot be made.
-        CacheError: from `detect`, it cannot be written any further.
+    Raises `UserError` as `hvt_common.inference.detect.open_detector`; `detect` raises `CacheError` on a full disk.
     """
 
     def __init__(self, spec: str, *, confidence: float, provider: str, folder: Path) -> None:

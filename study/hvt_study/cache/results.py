@@ -1,6 +1,7 @@
 """What is never worked out twice, whole or not at all: small files, named by the content that decides them.
 
 Each carries a checksum of its own. One that was cut off or changed is thrown away with a warning and made again.
+HVT's own code goes by its content: a version that stays the same through a hundred edits does not say what was run.
 """
 
 from __future__ import annotations
@@ -9,11 +10,67 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError
+
+DETECTING = ("hvt_common", "hvt_models")
+"""Has a say in what a detector finds."""
+FLYING = (*DETECTING, "hvt_codecs", "hvt_edge", "hvt_ground", "hvt_study")
+"""Has one in a flight and its figures."""
+_BESIDE = ("hvt_study/commands", "hvt_study/report")
+"""Has no say in a flight or in its figures."""
+_DIGITS = 16
+
+
+def flight_code() -> str:
+    """Of all that decides a flight and its figures: what flies, with the extras that have a say, and the study."""
+    return code_digest(*FLYING, without=_BESIDE)
+
+
+@cache
+def code_digest(*packages: str, without: tuple[str, ...] = ()) -> str:
+    """Of the Python files of these packages, as they are installed here; a process reads them once.
+
+    Args:
+        packages: names; a checkout and a wheel with the same files have the same digest.
+        without: folders, such as ``hvt_study/report``, that are passed over.
+    """
+    return tree_digest(_folders(packages), without=without)
+
+
+def tree_digest(folders: Iterable[Path], *, without: Collection[str] = ()) -> str:
+    """Hexadecimal; of the names and contents of all Python files below, in whatever order a disk lists them.
+
+    ``without`` names folders as `code_digest` does: from the last part of one of ``folders`` on.
+    """
+    digest = hashlib.sha256()
+    files = {
+        file.relative_to(folder.parent).as_posix(): file for folder in folders for file in _python(folder)
+    }
+    for name, file in sorted(files.items()):
+        if any(name.startswith(f"{folder}/") for folder in without):
+            continue
+        content = file.read_bytes()
+        digest.update(f"{name} {len(content)}\n".encode())
+        digest.update(content)
+    return digest.hexdigest()[:_DIGITS]
+
+
+def _folders(packages: Iterable[str]) -> Iterator[Path]:
+    for name in packages:
+        found = find_spec(name)
+        assert found is not None, f"{name} is a part of HVT"
+        yield from map(Path, found.submodule_search_locations or ())
+
+
+def _python(folder: Path) -> Iterator[Path]:
+    return (path for path in folder.rglob("*.py") if path.is_file())
+
 
 _log = logging.getLogger(__name__)
 
@@ -33,11 +90,7 @@ def content_key(*parts: object) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file's content, hexadecimal.
-
-    Raises:
-        UserError: it cannot be read.
-    """
+    """SHA-256 of a file's content, hexadecimal; `UserError` where it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -74,8 +127,7 @@ def read_whole(path: Path) -> bytes | None:
 def write_whole(path: Path, body: bytes) -> None:
     """Write it, whole or not at all, whenever the process dies; another one may be reading.
 
-    Raises:
-        CacheError: it cannot be written.
+    Raises `CacheError` where it cannot be written.
     """
     scratch = path.with_suffix(f".{os.getpid()}")
     try:
@@ -91,12 +143,7 @@ def write_whole(path: Path, body: bytes) -> None:
 
 
 class ResultCache:
-    """A folder of results, which JSON can hold. Several processes may use it at once.
-
-    Raises:
-        UserError: the folder cannot be made.
-        CacheError: from `put`, it cannot be written any further.
-    """
+    """A folder of results, which JSON can hold; several processes may use it. `UserError` where it cannot be made."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = make_folder(folder)

@@ -24,10 +24,10 @@ from hvt_ground.config import DETECTOR, NONE
 from hvt_study.datasets.class_map import joint_classes
 from hvt_study.datasets.layouts.uri import DATASETS, open_datasets
 from hvt_study.datasets.sequence import Sequence
-from hvt_study.matrix.accounting import ACCOUNTINGS
 from hvt_study.matrix.plan import StudyPlan, parse_regimes
 from hvt_study.matrix.pools import dask_pool, local_pool
 from hvt_study.matrix.tuning import tuned_methods
+from hvt_study.metrics.bits import ACCOUNTINGS
 from hvt_study.runs.methods import METHODS, Kind, chosen_methods, chosen_names
 from hvt_study.runs.spec import ModelChoice
 

@@ -19,14 +19,12 @@ from hvt_study.commands.arguments import (
     study_plan,
 )
 from hvt_study.commands.output import RunProgress, make_out
-from hvt_study.matrix.accounting import in_accounting
-from hvt_study.matrix.earlier import check_parameters, staying
-from hvt_study.matrix.plan import StudyPlan, first_runs
+from hvt_study.matrix.plan import StudyPlan, check_parameters, first_runs, staying
 from hvt_study.matrix.schedule import RunRow, in_order, run_all
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.table_file import RESULTS, read_results, write_results
-from hvt_study.report.example.choice import choose_run
+from hvt_study.report.example.choice import choose_run, load_example, save_example
 from hvt_study.report.example.fly_again import fly_again
-from hvt_study.report.example.store import load_example, save_example
 from hvt_study.report.write import write_report
 from hvt_study.runs.execute import run_spec
 
@@ -43,11 +41,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     Rows of an earlier table in ``--out`` stay, behind those of this study: of methods, budgets, sequences or
     conditions that this study does not have, and of runs that it was not given the time to do. What it did itself
-    takes the place of what was there. A table that cannot be read (an older version wrote it) is set aside.
-
-    Raises:
-        UserError: what was asked for cannot be done, an earlier table has the same methods with other parameters, or
-            every run failed.
+    takes the place of what was there. A table that cannot be read (an older version wrote it) is set aside. Raises
+    `UserError` where what was asked for cannot be done, an earlier table has the same methods with other parameters,
+    or every run failed.
     """
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     plan = study_plan(arguments, open_sequences(arguments))

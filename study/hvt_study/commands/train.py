@@ -31,8 +31,7 @@ from hvt_study.datasets.label_files import LOOKED_IN
 from hvt_study.datasets.labelled_pictures import LabelledPicture, find_pictures, read_image
 from hvt_study.datasets.labels import IGNORED, FrameLabels, inside_frame
 from hvt_study.metrics.detection import detection_score
-from hvt_study.metrics.frames import LabelledFrame
-from hvt_study.metrics.judged import judged
+from hvt_study.metrics.judged import LabelledFrame, judged
 from hvt_study.metrics.picture_score import above, picture_score
 
 _INSTALL = "torch onnx"

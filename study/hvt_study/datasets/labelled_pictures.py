@@ -23,10 +23,10 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Image
 from hvt_edge.source.folder import sequence_files
-from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.datasets.label_files import (
     LOOKED_IN,
     YAML,
+    YOLO_COLUMNS,
     Folders,
     VocFile,
     check_strange,
@@ -38,13 +38,15 @@ from hvt_study.datasets.label_files import (
     read_class_file,
     read_text,
     read_voc,
+    read_yolo,
     yaml_folders,
+    yolo_names,
 )
+from hvt_study.datasets.label_table import image_labels
 from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts
 from hvt_study.datasets.layouts.mot import open_mot
 from hvt_study.datasets.layouts.options import Options
-from hvt_study.datasets.visdrone_rows import image_labels
-from hvt_study.datasets.yolo_labels import YOLO_COLUMNS, read_yolo, yolo_names
+from hvt_study.datasets.sequence import NOMINAL_FPS
 
 _TRUTH = "gt/gt.txt"
 _SAME_SHAPE = 0.01
@@ -81,8 +83,7 @@ class LabelledPicture:
     def read(self, size: tuple[int, int]) -> FrameLabels | None:
         """The labels in the pixels of the picture, which is (width, height) large.
 
-        Raises:
-            UserError: names a file that cannot be read, or a picture of another shape than its labels say.
+        A `UserError` names a file that cannot be read, or a picture of another shape than its labels say.
         """
         if self.labels is None:
             return None

@@ -1,17 +1,130 @@
-"""What a dataset is made of: sequences that a flight can play, with labels by source frame."""
+"""What a dataset is made of: sequences with labels by source frame, and the clips that flights play.
+
+A clip is small, and it can be sent to another process: the pictures are read when they are played, one at a time,
+from the source or from a file of raw pixels that processes share (`stage_clip`).
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
 from hvt_common.units import exact_rate
+from hvt_common.values import Frame, Image, View
+from hvt_edge.source.contract import Source
 from hvt_edge.source.folder import sequence_files
+from hvt_edge.source.opening import open_source
+from hvt_edge.source.resample import Resizer, capture_time_ns
 from hvt_scene import CodeInView
-from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.labels import FrameLabels
+from hvt_study.datasets.virtual_camera import SCHEME, open_camera
+
+NOMINAL_FPS = 15.0
+"""Frames of a clip a second: the ground's list is judged at each of them, coded or not."""
+_ANY_SIZE = (64, 64)  # of base frames, which are made for each flight anew
+_MOST_SHARED_BYTES = 4 << 30
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """Pictures at `NOMINAL_FPS`, in a file that processes share, or read again from a large source."""
+
+    spec: str
+    """What ``--source`` takes, if it ends by itself: a video, a folder of images, ``demo``; or ``still:PICTURE``."""
+    source_size: tuple[int, int]
+    """(width, height) in pixels."""
+    frame_count: int
+    pixels: Path | None = None
+    """(frames, height, width, 3) uint8 BGR, raw; None where the source is read again."""
+    source_fps: float | None = None
+    """Rate at which the images of a folder were taken, or one that overrides a video's time stamps; None: 15 for a
+    folder, the video's own."""
+    seed: int = 0
+    """Of the demo's scene, or of the way of the camera over a picture."""
+
+    def images(self) -> Generator[Image, None, None]:
+        """Every picture, in order."""
+        if self.pixels is None:
+            yield from self._read()
+            return
+        wide, high = self.source_size
+        with self.pixels.open("rb") as file:  # not mapped: what is resident would grow with the clip
+            for _ in range(self.frame_count):
+                image = np.empty((high, wide, 3), np.uint8)
+                if file.readinto(image.data.cast("B")) < image.nbytes:
+                    return
+                yield image
+
+    def _read(self) -> Iterator[Image]:
+        if self.spec.startswith(SCHEME):
+            camera = open_camera(self.spec, fps=NOMINAL_FPS, seed=self.seed, annotated=False)
+            return islice(camera.images(), self.frame_count)
+        source = open_source(
+            self.spec,
+            size=_ANY_SIZE,
+            fps=NOMINAL_FPS,
+            max_frames=self.frame_count,
+            source_fps=self.source_fps,
+            seed=self.seed,
+        )
+        return (frame.source_bgr for frame in source.frames(start_ns=0))
+
+
+class FrameSource(Source):
+    """A clip as a source of the edge that gives only some of the frames; ``frame.index`` counts all of them."""
+
+    live = False
+
+    def __init__(self, clip: Clip, resizer: Resizer, *, frames: frozenset[int]) -> None:
+        self._clip, self._resizer, self._chosen = clip, resizer, frames
+        self.view: View = resizer.view
+        self.fps = NOMINAL_FPS
+        self.frame_count = len(frames)
+        self.class_names: tuple[str, ...] = ()
+
+    def frames(self, *, start_ns: int) -> Iterator[Frame]:
+        """The chosen frames from the beginning."""
+        rate = exact_rate(NOMINAL_FPS)
+        for index, image in enumerate(self._clip.images()):
+            if index in self._chosen:
+                capture_ns = capture_time_ns(index, fps=rate, start_ns=start_ns)
+                yield self._resizer.frame(np.asarray(image), index=index, capture_ns=capture_ns)
+
+
+def stage_clip(clip: Clip, *, folder: Path) -> Clip:
+    """The clip with its pixels in a file in ``folder``, which is there, so that every flight need not decode or draw.
+
+    The very same clip where it is large (over 4 GiB), or the disk is full; nothing is left behind then.
+    """
+    if not staged_bytes(clip):
+        return clip
+    path = folder / "clip.bgr"
+    count = 0
+    try:
+        with path.open("wb") as file, closing(clip.images()) as images:
+            for image in images:
+                file.write(np.ascontiguousarray(image).data)
+                count += 1
+    except OSError:
+        path.unlink(missing_ok=True)
+        return clip
+    if not count:
+        path.unlink()
+        return clip
+    return replace(clip, pixels=path, frame_count=min(count, clip.frame_count))
+
+
+def staged_bytes(clip: Clip) -> int:
+    """What `stage_clip` takes of its folder, if there is room; 0 where it leaves the clip as it is."""
+    wide, high = clip.source_size
+    size_bytes = clip.frame_count * wide * high * 3
+    return 0 if clip.pixels is not None or size_bytes > _MOST_SHARED_BYTES else size_bytes
 
 
 @dataclass(frozen=True, slots=True)

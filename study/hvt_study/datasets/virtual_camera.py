@@ -9,7 +9,7 @@ The same file and seed give the same pixels, always.
 Annotations are those of VisDrone-DET, in a text file of the same name beside the picture, or in ``annotations``
 where the picture lies in ``images``: ``x,y,w,h,score,category,truncation,occlusion``; category 0 is an ignored region
 and 11 is "others", of both of which nothing is asked. Or they are YOLO's, in ``labels`` beside ``images``
-(`hvt_study.datasets.yolo_labels`). Without such a file the clip has no exact labels.
+(`hvt_study.datasets.label_files`). Without such a file the clip has no exact labels.
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
-from hvt_study.datasets.label_files import class_file, keypoint_columns
+from hvt_study.datasets.label_files import class_file, keypoint_columns, read_yolo, yolo_names
+from hvt_study.datasets.label_table import image_labels
 from hvt_study.datasets.labels import IGNORED, FrameLabels, LabelDoubts
-from hvt_study.datasets.visdrone_rows import image_labels
-from hvt_study.datasets.yolo_labels import read_yolo, yolo_names
 
 SCHEME = "still:"
 """``still:FILE`` is a virtual camera over that picture, ``still:FILE@1.5`` one that sees 1.5 times its height."""
@@ -123,8 +122,7 @@ def read_annotations(
 class VirtualCamera:
     """Opens the picture; frames are drawn when asked for.
 
-    Raises:
-        UserError: no such picture, one that cannot be decoded or is too small, or damaged annotations.
+    Raises `UserError` for no such picture, one that cannot be decoded or is too small, or damaged annotations.
     """
 
     picture_path: Path

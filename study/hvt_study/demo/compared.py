@@ -2,26 +2,215 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import csv
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from hvt_archive.reading.recorded import read_recordings
 from hvt_common.errors import UserError
 from hvt_common.values import Image
+from hvt_common.video.hevc import BaseDecoder
 from hvt_scene import CodeInView
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.uri import open_dataset
-from hvt_study.demo.flown import Flown, read_flown
-from hvt_study.demo.legible import Legible, code_pictures, read_codes_of, stills_with_codes
 from hvt_study.demo.picture import Pair, Panel
 from hvt_study.metrics.classes import ClassScore
-from hvt_study.metrics.frames import FrameView
-from hvt_study.metrics.track_table_score import score
-from hvt_study.reading.reader import CodeReader
-from hvt_study.reading.score import Code, codes_to_read
+from hvt_study.metrics.judged import FrameView
+from hvt_study.metrics.track_table_score import read_tracks, score
+from hvt_study.reading.observer import INSIDE_SHARE
+from hvt_study.reading.score import LEAST_VISIBLE, Code, CodeReader, code_crop, codes_to_read, share_inside
+
+
+@dataclass(frozen=True, slots=True)
+class FlownStill:
+    """A still as it arrived."""
+
+    frame: int
+    """That it shows, from 1."""
+    place_base_px: tuple[float, float, float, float]
+    """x1 y1 x2 y2 of the whole picture in the base picture of that frame."""
+    image_bgr: Image
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """One flight."""
+
+    name: str
+    tracks: Mapping[int, FrameView]
+    """By frame, from 1; base pixels."""
+    pictures: Mapping[int, Image]
+    """Base pictures as decoded, by frame; those that the stream left out are missing."""
+    stills: tuple[FlownStill, ...]
+    total_bps: int
+
+
+def read_flown(folder: Path, name: str) -> Flown:
+    """The flight of the edge ``name`` from what hvt-edge and hvt-ground wrote into ``folder``.
+
+    Raises `UserError` where a file is missing or is not what it should be.
+    """
+    summary = _only(folder, f"{name}-edge.json")
+    try:
+        total_bps = int(json.loads(summary.read_text(encoding="utf-8"))["total_bps"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{summary} is no summary of hvt-edge ({error})") from None
+    return Flown(
+        name=name,
+        tracks=read_tracks(_only(folder, f"hvt-{name}-*.csv")),
+        pictures=_pictures(_only(folder, f"hvt-{name}-*.rrd")),
+        stills=tuple(_stills(_only(folder / "stills", f"hvt-{name}-*.csv"))),
+        total_bps=total_bps,
+    )
+
+
+def _only(folder: Path, pattern: str) -> Path:
+    found = sorted(folder.glob(pattern))
+    if len(found) != 1:
+        raise UserError(f"{folder} has {len(found)} files {pattern}: give the folder of one flight of each")
+    return found[0]
+
+
+def _pictures(path: Path) -> dict[int, Image]:
+    decoder = BaseDecoder()
+    decoded = ((one.frame_index, decoder.decode(one.data)) for one in read_recordings([path]).video)
+    return {frame + 1: picture for frame, picture in decoded if picture is not None}
+
+
+def _stills(path: Path) -> list[FlownStill]:
+    stills = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):  # a line an object, one picture
+            x, y, w, h = (float(row[one]) for one in "xywh")
+            image = cv2.imread(str(path.with_name(row["file"])), cv2.IMREAD_COLOR)
+            if image is not None:
+                place = (x, y, x + w, y + h)
+                stills[row["file"]] = FlownStill(
+                    int(row["frame_index"]) + 1, place, np.asarray(image, np.uint8)
+                )
+    return list(stills.values())
+
+
+_SOME_PICTURES = 6
+"""Of the base stream in which a code is read, spread over the time that it is whole in view: reading takes time."""
+_CONTEXT = 1.2
+"""Around a code where somebody looks at it, in its longer sides."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A still that shows a whole code."""
+
+    object_id: int
+    still: FlownStill
+    box_base_px: tuple[float, float, float, float]
+    """Of the code at the still's frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Legible:
+    """The objects whose codes were read right at least once, of one flight."""
+
+    video: frozenset[int]
+    stills: Mapping[int, Shown]
+    """By object, the first still that was read right."""
+
+    @property
+    def every(self) -> frozenset[int]:
+        """Either way."""
+        return self.video | self.stills.keys()
+
+
+def read_codes_of(
+    flown: Flown,
+    codes: Mapping[int, Code],
+    views: Sequence[Sequence[CodeInView]],
+    *,
+    base_per_source: float,
+    reader: CodeReader,
+) -> Legible:
+    """Read every still that holds a whole code, and each code in some base pictures."""
+    video = {
+        object_id
+        for object_id, code in codes.items()
+        if _in_video(flown, code, views, base_per_source=base_per_source, reader=reader)
+    }
+    read: dict[int, Shown] = {}
+    for shown in stills_with_codes(flown, codes, views, base_per_source=base_per_source):
+        if shown.object_id not in read:
+            (reading,) = reader.read([_still_crop(shown)])
+            if reading.text == codes[shown.object_id].text:
+                read[shown.object_id] = shown
+    return Legible(frozenset(video), read)
+
+
+def stills_with_codes(
+    flown: Flown,
+    codes: Mapping[int, Code],
+    views: Sequence[Sequence[CodeInView]],
+    *,
+    base_per_source: float,
+) -> Iterator[Shown]:
+    """Every still with each code that lies whole in it."""
+    for still in flown.stills:
+        place = np.array(still.place_base_px)
+        for one in _whole(codes, views, still.frame):
+            box = one.box_source_px * base_per_source
+            if share_inside(box, place) >= INSIDE_SHARE:
+                x1, y1, x2, y2 = box.tolist()
+                yield Shown(one.object_id, still, (x1, y1, x2, y2))
+
+
+def code_pictures(shown: Shown, base: Image) -> tuple[Image, Image]:
+    """The same roof for the eye: of a base picture, and of the still; each enlarged from what it is."""
+    x1, y1, x2, y2 = shown.box_base_px
+    reach = _CONTEXT * max(x2 - x1, y2 - y1) / 2
+    x, y = (x1 + x2) / 2, (y1 + y2) / 2
+    wide = (x - reach, y - reach, x + reach, y + reach)
+    return code_crop(base, wide), code_crop(shown.still.image_bgr, _in_still(shown.still, wide))
+
+
+def _in_video(
+    flown: Flown,
+    code: Code,
+    views: Sequence[Sequence[CodeInView]],
+    *,
+    base_per_source: float,
+    reader: CodeReader,
+) -> bool:
+    places = [
+        (frame, one)
+        for frame in flown.pictures
+        for one in views[frame - 1]
+        if one.object_id == code.object_id and one.visible >= LEAST_VISIBLE
+    ]
+    some = np.linspace(0, len(places) - 1, min(_SOME_PICTURES, len(places))).round().astype(int)
+    for frame, one in (places[number] for number in some.tolist()):
+        crop = code_crop(flown.pictures[frame], (one.box_source_px * base_per_source).tolist())
+        if reader.read([crop])[0].text == code.text:
+            return True
+    return False
+
+
+def _whole(codes: Mapping[int, Code], views: Sequence[Sequence[CodeInView]], frame: int) -> list[CodeInView]:
+    return [one for one in views[frame - 1] if one.visible >= LEAST_VISIBLE and one.object_id in codes]
+
+
+def _still_crop(shown: Shown) -> Image:
+    return code_crop(shown.still.image_bgr, _in_still(shown.still, shown.box_base_px))
+
+
+def _in_still(still: FlownStill, box_base_px: Sequence[float]) -> list[float]:
+    x1, y1, x2, _ = still.place_base_px
+    scale = still.image_bgr.shape[1] / (x2 - x1)
+    return [(value - start) * scale for value, start in zip(box_base_px, (x1, y1, x1, y1), strict=True)]
+
 
 _PAIRS = 6
 
@@ -80,7 +269,7 @@ class Compared:
 
 
 def compare_flown(folder: Path, names: Sequence[str], *, seed: int, with_reader: bool) -> Compared:
-    """Compare what edges of these names left in ``folder``; see `hvt_study.demo.flown.read_flown`."""
+    """Compare what edges of these names left in ``folder``; see `hvt_study.demo.compared.read_flown`."""
     flown = tuple(read_flown(folder, name) for name in names)
     (scene,) = open_dataset(f"demo:{seed},codes")
     assert scene.labels is not None, "a drawn scene says what is in it"

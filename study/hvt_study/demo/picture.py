@@ -14,8 +14,7 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.values import Image
 from hvt_study.datasets.labels import FrameLabels
-from hvt_study.metrics.frames import FrameView
-from hvt_study.metrics.judged import LEAST_IOU, matched_rows
+from hvt_study.metrics.judged import LEAST_IOU, FrameView, matched_rows
 
 _Colour = tuple[int, int, int]
 
@@ -60,8 +59,7 @@ class Pair:
 def write_picture(path: Path, panels: Sequence[Panel], pairs: Sequence[Pair]) -> None:
     """Write a PNG: the panels beside each other, a legend, and a pair below each.
 
-    Raises:
-        UserError: the file cannot be written.
+    Raises `UserError` where the file cannot be written.
     """
     columns = [np.vstack((_head(one.title), _panel(one))) for one in panels]
     picture = _beside(columns)

@@ -38,7 +38,7 @@ from hvt_edge.world import World
 from hvt_ground.config import GroundConfig
 from hvt_ground.wiring import Models
 from hvt_study.cache.cached_detector import CachedDetector
-from hvt_study.datasets.clip import NOMINAL_FPS, Clip, FrameSource
+from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, FrameSource
 from hvt_study.flights.flight_ground import GroundSide, InlineExecutor
 from hvt_study.flights.flight_link import START_NS, FlightInbox, FlightOutlet, MediaClock, frame_ns
 from hvt_study.metrics.observed import ObservedFrame
@@ -113,8 +113,7 @@ def picture_age_p95_ms(shown_ns: Sequence[tuple[int, int]], frames: int) -> floa
 def fly(plan: FlightPlan, *, detector: Detector, models: Models) -> FlightReport:
     """Fly once; ``detector`` serves the edge, ``models`` the ground.
 
-    Raises:
-        UserError: the edge refuses its settings.
+    Raises `UserError` where the edge refuses its settings.
     """
     saved_s = detector.saved_cpu_s if isinstance(detector, CachedDetector) else 0.0
     flight = Flight(
@@ -131,10 +130,8 @@ def fly(plan: FlightPlan, *, detector: Detector, models: Models) -> FlightReport
 def dry_run(plan: FlightPlan, *, detector: Detector) -> float:
     """Fly without a ground; return the line bits a second, headers and transport included.
 
-    Where nothing that a ground says matters (methods without stills), that is to the bit what `fly` spends.
-
-    Raises:
-        UserError: the edge refuses its settings.
+    Where nothing that a ground says matters (methods without stills), that is to the bit what `fly` spends. Raises
+    `UserError` where the edge refuses its settings.
     """
     flight = Flight(plan, detector=detector, make_ground=lambda _info, link: _NoGround(link))
     flight.run()
@@ -211,11 +208,7 @@ class Flight:
         """From the moment at which the edge answers grounds."""
 
     def run(self) -> None:
-        """Fly to the end of the clip.
-
-        Raises:
-            UserError: the edge refuses its settings.
-        """
+        """Fly to the end of the clip; `UserError` where the edge refuses its settings."""
         self._edge.run()
         self._pass_over(self.plan.clip.frame_count)
         self.ground.close()

@@ -16,7 +16,7 @@ from hvt_common.units import SECOND_NS
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import Answers
 from hvt_edge.perception.shadow import Detected
-from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.serial_link import SerialLink
 
 START_NS = 1_700_000_000_000_000_000

@@ -19,9 +19,8 @@ from typing import Any, Literal, TypeAlias
 from hvt_common.errors import UserError
 from hvt_edge.wiring import default_size
 from hvt_study.cache.results import FLIGHTS, ResultCache
-from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.datasets.layouts.uri import open_dataset
-from hvt_study.datasets.sequence import Sequence
+from hvt_study.datasets.sequence import NOMINAL_FPS, Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, open_camera
 from hvt_study.matrix.schedule import Pool
 from hvt_study.matrix.time_left import TimeLeft
@@ -138,10 +137,8 @@ def compare(
     """Fly everything; ``on_flights(done, of, left_s)`` is called at once and then each second.
 
     ``of`` is how many flights may be needed, ``left_s`` the time that they take, None while that is not known;
-    ``workers`` is how many the pool flies at a time.
-
-    Raises:
-        UserError: the clip, a detector or a rate cannot be used.
+    ``workers`` is how many the pool flies at a time. Raises `UserError` where the clip, a detector or a rate cannot
+    be used.
     """
     uri, sequence = _opened(plan)
     if plan.labels == "exact" and sequence.labels is None:

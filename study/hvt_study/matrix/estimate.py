@@ -8,8 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from hvt_common.errors import UserError
-from hvt_study.datasets.clip import staged_bytes
-from hvt_study.datasets.sequence import Sequence
+from hvt_study.datasets.sequence import Sequence, staged_bytes
 from hvt_study.matrix.plan import StudyPlan, first_runs
 from hvt_study.runs.execute import run_spec
 from hvt_study.runs.methods import METHODS, Kind, Method
@@ -77,8 +76,7 @@ def estimate(plan: StudyPlan, sequences: tuple[Sequence, ...], *, frame_s: float
 def time_of_a_frame(plan: StudyPlan) -> float:
     """Fly the first hybrid of the plan (or the first method) for two seconds, and return what a frame took.
 
-    Raises:
-        UserError: the first sequence or a model cannot be used, or the edge does not take the settings.
+    Raises `UserError` where the first sequence or a model cannot be used, or the edge does not take the settings.
     """
     specs = list(first_runs(replace(plan, sequences=plan.sequences[:1])))
     spec = next((one for one in specs if METHODS[one.method].kind is Kind.HYBRID), specs[0])

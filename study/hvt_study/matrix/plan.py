@@ -1,8 +1,14 @@
-"""Which runs a study takes: first those that decide what they spend, then video at each of their totals."""
+"""Which runs a study takes: first those that decide what they spend, then video at each of their totals.
+
+Of an earlier start in the same folder those rows stay that this one has nothing better for. Who adds a method, a
+budget or a sequence to ``--out`` gets a table of all, and who is interrupted loses no finished run. Of one run two
+rows never stand: what was flown now takes the place of what was flown before.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,8 +16,11 @@ from typing import Any, Literal
 from hvt_common.errors import UserError
 from hvt_common.units import parse_bitrate
 from hvt_edge.profiles import REGIMES
+from hvt_study.cache.results import content_key
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.runs.methods import METHODS, Kind, Method
-from hvt_study.runs.spec import ModelChoice, RunSpec, Target
+from hvt_study.runs.spec import ModelChoice, RunSpec, Target, said_run
+from hvt_study.runs.video_shape import SAME_TOTAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +61,7 @@ class StudyPlan:
 def parse_regimes(text: str) -> tuple[Regime, ...]:
     """``low,moderate,300kbps`` as regimes, in that order.
 
-    Raises:
-        UserError: a word that is neither the name of a regime nor a bitrate.
+    Raises `UserError` for a word that is neither the name of a regime nor a bitrate.
     """
     regimes: dict[str, Regime] = {}
     for word in (part.strip() for part in text.split(",")):
@@ -115,4 +123,59 @@ def spec_of(
         detect_every=plan.detect_every,
         target=target,
         tune=(plan.tune or {}).get(method.name, ()),
+    )
+
+
+RunRow = Mapping[str, Any]
+_CONDITIONS = ("dataset", "sequence", "regime", "budget_bps", "labels", "size", "max_frames", "detect_every")
+
+
+def staying(done: Iterable[RunRow], earlier: Iterable[RunRow]) -> list[dict[str, Any]]:
+    """Which earlier rows belong beside those that were done now, in their order, rates by the processed span.
+
+    Not those of which there is a newer one, whatever its parameters and whatever ran its networks; and no video at
+    the total of a run that spends something else by now.
+    """
+    done = list(done)
+    replaced = {(_place(row), row["method"]) for row in done}
+    totals = {_place(row): row["total_bps"] for row in done if not row["matched_to"]}
+    return [
+        row
+        for row in in_accounting(earlier, "span")
+        if (_place(row), row["method"]) not in replaced and _up_to_date(row, totals)
+    ]
+
+
+def check_parameters(plan: StudyPlan, earlier: Iterable[RunRow], *, out: Path) -> None:
+    """`UserError` where a table holds runs of a method of this study with other parameters: no report takes both."""
+    tunes = {method.name: list((plan.tune or {}).get(method.name, ())) for method in plan.methods}
+    for row in earlier:
+        known = said_run(row).get("tune")
+        if row["failed"] or known is None or known == tunes.get(row["method"], known):
+            continue
+        said = " ".join(known) or "its defaults"
+        raise UserError(
+            f"--out {out} holds runs of {row['method']} with {said}, which go into no table with others: "
+            "name another folder, or remove its results.parquet"
+        )
+
+
+def _up_to_date(row: RunRow, totals: Mapping[str, int | None]) -> bool:
+    if not row["matched_to"] or _place(row) not in totals:
+        return True
+    total, target = totals[_place(row)], row["target_bps"]
+    if not total or not target:
+        return False
+    return math.isclose(target, total, rel_tol=SAME_TOTAL)
+
+
+def _place(row: RunRow) -> str:
+    """Names a run that decides what it spends, by what it is and not by how: those that match its total share it."""
+    run = said_run(row)
+    if not run:
+        return str(row["key"])
+    whose = run.get("target") or run
+    models = {name: value for name, value in (run.get("models") or {}).items() if name != "provider"}
+    return content_key(
+        whose.get("method"), whose.get("still_codec"), models, [run.get(name) for name in _CONDITIONS]
     )

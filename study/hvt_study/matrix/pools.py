@@ -29,8 +29,7 @@ _GOES_ON = "finished runs are kept, and the same command goes on from there"
 def local_pool(jobs: int) -> Iterator[Executor]:
     """So many processes. On an error they end at once: what is finished is in the cache.
 
-    Raises:
-        UserError: a process was killed.
+    Raises `UserError` where a process was killed.
     """
     # Fresh processes: a fork would share threads and locks of what is open here.
     context = multiprocessing.get_context("spawn")
@@ -52,10 +51,8 @@ def local_pool(jobs: int) -> Iterator[Executor]:
 def dask_pool(address: str) -> Iterator[Executor]:
     """The workers behind a scheduler such as ``tcp://host:8786``; they have to see datasets, models and cache.
 
-    Runs of a worker that is lost go to others.
-
-    Raises:
-        UserError: Dask is not installed, no scheduler answers, or it or too many workers are lost.
+    Runs of a worker that is lost go to others. Raises `UserError` where Dask is not installed, no scheduler answers,
+    or it or too many workers are lost.
     """
     try:
         from distributed import Client, KilledWorker  # noqa: PLC0415 - an extra

@@ -12,9 +12,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any, Protocol
 
 from hvt_study.matrix.plan import StudyPlan, first_runs, matched_runs
-from hvt_study.runs.match_total import grid_target
 from hvt_study.runs.methods import Kind
 from hvt_study.runs.spec import RunSpec
+from hvt_study.runs.video_shape import grid_target
 
 RunRow = dict[str, Any]
 

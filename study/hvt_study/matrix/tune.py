@@ -64,8 +64,7 @@ class Tuned:
 def tunable(method: str, names: Iterable[str] = ()) -> dict[str, float]:
     """The parameters to search, with their defaults; all of the method's where none is named.
 
-    Raises:
-        UserError: the method has none, or not one of these.
+    Raises `UserError` where the method has none, or not one of these.
     """
     having = {
         name: {key: value for key, value in METHODS[name].parameters.items() if value > 0}
@@ -87,8 +86,7 @@ def split(
 ) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
     """(training, held out), by a hash of the name: the same sequences in every run, whatever else is in the set.
 
-    Raises:
-        UserError: there are not two sequences, or the share leaves one side empty.
+    Raises `UserError` where there are not two sequences, or the share leaves one side empty.
     """
     if len(sequences) < 2 or not 0 < held_out < 1:
         raise UserError(
@@ -115,8 +113,7 @@ def tune(
 ) -> Tuned:
     """Search; ``on_trial(number, worth, best)`` is called after each.
 
-    Raises:
-        UserError: the method cannot be flown with its defaults.
+    Raises `UserError` where the method cannot be flown with its defaults.
     """
     desk = _Desk(plan, method, pool)
     default = desk.mean_worth(train, ())

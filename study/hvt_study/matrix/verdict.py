@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from hvt_common.inference.store import EMBEDDED_DETECTOR
-from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.datasets.virtual_camera import SCHEME
 from hvt_study.matrix.compare import ComparePlan, CompareResult, CompareRow
 

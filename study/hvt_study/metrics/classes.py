@@ -19,8 +19,17 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hvt_study.metrics.frames import LabelledFrames
-from hvt_study.metrics.judged import LEAST_IOU, LIMITS_PX2, SIZES, Judged, Size, judged, matched_rows, of_size
+from hvt_study.metrics.judged import (
+    LEAST_IOU,
+    LIMITS_PX2,
+    SIZES,
+    Judged,
+    LabelledFrames,
+    Size,
+    judged,
+    matched_rows,
+    of_size,
+)
 
 _NOBODY = -1
 """Stands for the class of what has no partner."""

@@ -21,8 +21,7 @@ import numpy.typing as npt
 from faster_coco_eval import COCO
 from faster_coco_eval.core.faster_eval_api import COCOeval_faster
 
-from hvt_study.metrics.frames import LabelledFrames
-from hvt_study.metrics.judged import LARGEST_PX2, LIMITS_PX2, SIZES, Judged, Size, judged
+from hvt_study.metrics.judged import LARGEST_PX2, LIMITS_PX2, SIZES, Judged, LabelledFrames, Size, judged
 
 _MOST_BOXES: Final = 500
 _Precision = npt.NDArray[np.float64]

@@ -17,8 +17,7 @@ import numpy.typing as npt
 from scipy.stats import CensoredData, ecdf
 
 from hvt_study.datasets.labels import NO_ID
-from hvt_study.metrics.frames import LabelledFrames
-from hvt_study.metrics.judged import LEAST_IOU, Judged, judged, matched_rows
+from hvt_study.metrics.judged import LEAST_IOU, Judged, LabelledFrames, judged, matched_rows
 
 
 @dataclass(frozen=True, slots=True)

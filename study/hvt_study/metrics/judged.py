@@ -1,20 +1,21 @@
-"""What is judged of a frame: nothing in ignored regions, in one vocabulary, and only classes that the labels know.
+"""For each frame what was there, what the ground showed, and what of both is judged.
+
+All boxes are x1 y1 x2 y2 in source pixels. A frame is a frame of the source at 15 a second, coded or not. Nothing in
+ignored regions is judged, all in one vocabulary, and only classes that the labels know.
 
 Ignored regions go by the rule of VisDrone's own toolkit (``dropObjectsInIgr.m`` of the VisDrone2018-DET and MOT
 toolkits): a label or a box with half of its area or more in the ignored regions, taken together, is dropped before
-anything is matched. It counts neither for nor against anyone. A single object that is not asked for takes out the
-boxes on it, but neither labels in front of it nor the boxes that are on those. Every metric here goes by it, so that
-detection, classes and tracks are judged on the same objects.
+anything is matched. A single object that is not asked for takes out the boxes on it, but neither labels in front of
+it nor the boxes that are on those.
 
 Sizes are COCO's, 32 and 96 pixels squared (Lin et al. 2014, https://cocodataset.org/#detection-eval), in *source*
-pixels and not scaled: they mean the same object for every method, whatever its base size. The pilot's "small" is
-another one, a share of the frame: see `proxy`.
+pixels: they mean the same object for every method. The pilot's "small" is a share of the frame: see `proxy`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
@@ -23,8 +24,71 @@ from scipy.optimize import linear_sum_assignment
 
 from hvt_common.inference.class_names import MOVING
 from hvt_common.values import Boxes, iou
-from hvt_study.datasets.labels import FrameLabels, covered_share
-from hvt_study.metrics.frames import FrameView, LabelledFrames, rows_of
+from hvt_study.datasets.labels import NO_ID, FrameLabels, covered_share, no_boxes, no_ids
+
+Rows: TypeAlias = npt.NDArray[np.bool_] | npt.NDArray[np.intp]
+"""Which rows of parallel arrays: a mask, or indices."""
+
+
+def no_numbers() -> npt.NDArray[np.float32]:
+    """(0,) float32."""
+    return np.empty(0, np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameView:
+    """What the ground shows at one frame, N boxes; an empty one shows nothing."""
+
+    boxes_xyxy_px: Boxes = field(default_factory=no_boxes)
+    """(N, 4) float32, source pixels, inside the frame."""
+    ids: npt.NDArray[np.int64] = field(default_factory=no_ids)
+    """(N,) of the ground's tracks; `NO_ID` for plain detections."""
+    class_names: tuple[str, ...] = ()
+    """N names as shown, after refinement."""
+    confidences: npt.NDArray[np.float32] = field(default_factory=no_numbers)
+    """(N,) of the class that is shown, 0…1."""
+    names_before: tuple[str, ...] = ()
+    """N names without refinement: what the base stream says."""
+
+    def __post_init__(self) -> None:
+        counts = {len(self.boxes_xyxy_px), len(self.ids), len(self.class_names), len(self.confidences)}
+        assert counts == {len(self.names_before)}, "parallel arrays have one length"
+
+    @classmethod
+    def plain(
+        cls, boxes: npt.ArrayLike, names: Sequence[str], confidences: npt.NDArray[np.float32] | None = None
+    ) -> FrameView:
+        """Boxes of no track, which nothing has refined; without ``confidences`` all are sure."""
+        sure = np.ones(len(names), np.float32) if confidences is None else confidences
+        array, ids = np.asarray(boxes, np.float32).reshape(-1, 4), np.full(len(names), NO_ID, np.int64)
+        return cls(array, ids, tuple(names), sure, tuple(names))
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def rows(self, chosen: Rows) -> FrameView:
+        """Only these rows."""
+        return FrameView(
+            self.boxes_xyxy_px[chosen],
+            self.ids[chosen],
+            rows_of(self.class_names, chosen),
+            self.confidences[chosen],
+            rows_of(self.names_before, chosen),
+        )
+
+
+def rows_of(names: Sequence[str], chosen: Rows) -> tuple[str, ...]:
+    """The names of some rows."""
+    indices = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
+    return tuple(names[index] for index in indices.tolist())
+
+
+LabelledFrame: TypeAlias = tuple[FrameLabels, FrameView]
+"""What was there, and what was shown."""
+
+LabelledFrames: TypeAlias = Sequence[LabelledFrame]
+"""Of one sequence, in order; it may be empty."""
+
 
 LEAST_IOU = 0.5
 

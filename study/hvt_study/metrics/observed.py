@@ -1,4 +1,4 @@
-"""What a flight records of the ground at every frame, and the views of it that metrics take."""
+"""What a flight records of the ground at every frame and of its stills, and the views of it that metrics take."""
 
 from __future__ import annotations
 
@@ -11,8 +11,66 @@ import numpy.typing as npt
 
 from hvt_common.values import Boxes
 from hvt_study.datasets.labels import FrameLabels, no_boxes, no_ids
-from hvt_study.metrics.frames import FrameView, LabelledFrame, no_numbers
-from hvt_study.metrics.stills import RefinedObject, StillArrival
+from hvt_study.metrics.judged import FrameView, LabelledFrame, no_numbers
+
+
+@dataclass(frozen=True, slots=True)
+class StillArrival:
+    """One still at the ground. Times are media time, from the first frame's capture."""
+
+    sequence: int
+    """Of the edge; names the still."""
+    capture_s: float
+    """Capture of the frame that it was cut from."""
+    sent_s: float
+    """When it was handed to the link."""
+    arrived_s: float
+    """When its last bit was there."""
+    size_bytes: int
+    """Payload."""
+    line_bytes: int
+    """With header and transport."""
+    reason: str
+    """Why the edge's method sent it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Opinion:
+    """What a model says of one crop."""
+
+    class_name: str
+    confidence: float
+    """Of ``class_name``, 0…1."""
+    entropy_nats: float
+    """Of the whole posterior."""
+
+
+@dataclass(frozen=True, slots=True)
+class RefinedObject:
+    """One object in a still, and what the ground made of it; a still that shows several has one of these for each."""
+
+    still_sequence: int
+    track_id: int
+    """The ground's; `contract.NO_ID` where no track matched."""
+    at_s: float
+    """Media time at which the ground knew."""
+    name_before: str
+    """Shown for the track until then."""
+    name_after: str
+    area_share: float
+    """Of the object's box, of the base frame's area, 0…1."""
+    base: Opinion | None = None
+    """Of the object as the decoded base shows it; None where that was not asked or gave no answer."""
+    still: Opinion | None = None
+    """Of the object as the still shows it, by the same model."""
+
+
+def still_delays_ms(stills: Sequence[StillArrival]) -> tuple[float, float]:
+    """(median, 95th percentile) from the capture of a still's frame to its arrival; NaN without stills."""
+    if not stills:
+        return math.nan, math.nan
+    p50, p95 = np.percentile([1e3 * (one.arrived_s - one.capture_s) for one in stills], (50, 95)).tolist()
+    return p50, p95
 
 
 @dataclass(frozen=True, slots=True)

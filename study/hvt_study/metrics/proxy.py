@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvt_study.metrics.stills import Opinion, RefinedObject
+from hvt_study.metrics.observed import Opinion, RefinedObject
 
 SMALL_SHARE = 0.015
 

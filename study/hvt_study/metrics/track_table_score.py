@@ -17,7 +17,7 @@ from hvt_common.files import MOST_TABLE_BYTES, read_text
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.mot import read_truth_rows
 from hvt_study.metrics.classes import ClassScore, class_score
-from hvt_study.metrics.frames import FrameView
+from hvt_study.metrics.judged import FrameView
 
 _log = logging.getLogger(__name__)
 _MOST_HELD, _LEAST_GAPS = 15, 10

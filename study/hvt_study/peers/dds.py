@@ -21,13 +21,13 @@ from hvt_common.inference.detect import Detector
 from hvt_common.values import Frame
 from hvt_edge.link.budget import RollingBudget
 from hvt_edge.source.resample import Resizer
-from hvt_study.datasets.clip import NOMINAL_FPS, Clip, FrameSource
+from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, FrameSource
 from hvt_study.flights.flight import FlightReport, coded_frames, picture_age_p95_ms
 from hvt_study.flights.flight_link import START_NS, frame_ns
 from hvt_study.peers.dds_edge import DdsEdge, pass_rates
 from hvt_study.peers.dds_ground import DdsGround
 from hvt_study.peers.dds_line import Line
-from hvt_study.peers.dds_settings import DdsSettings
+from hvt_study.peers.dds_regions import DdsSettings
 from hvt_study.serial_link import LinkReport
 
 _LONGEST_TAIL_S = 30
@@ -50,10 +50,8 @@ def fly_dds(
     than with a stream that is shown as it comes: the delays of ``FlightReport.link`` are, for each coded frame, from
     capture to the arrival of the pass that completes it (segment, question, second pass, and the frames before it).
     ``picture_age_p95_ms`` is of the newest picture at the ground, that of a first pass, as in
-    `hvt_study.flights.flight.fly`.
-
-    Raises:
-        UserError: the budget is too small for two passes of this size and frame rate.
+    `hvt_study.flights.flight.fly`. Raises `UserError` where the budget is too small for two passes of this size and
+    frame rate.
     """
     settings = settings.resolved(budget_bps, size=size)
     rates = pass_rates(budget_bps, size=size, settings=settings, edge_id=edge_id)

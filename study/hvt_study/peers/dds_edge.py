@@ -16,10 +16,9 @@ from hvt_common.values import AccessUnit, Frame, Image
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.video.encoder_settings import VBV_S, EncoderSettings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.x265 import BaseEncoder
-from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.peers.dds_line import Line, header_bps
-from hvt_study.peers.dds_regions import Blocks, RegionRequest, block_grid, pasted
-from hvt_study.peers.dds_settings import DdsSettings
+from hvt_study.peers.dds_regions import Blocks, DdsSettings, RegionRequest, block_grid, pasted
 
 _KEYFRAME_DEBT_S = 10
 """x265 never takes back what the first keyframe costs beyond a frame's share: so much media time pays for it."""
@@ -39,11 +38,7 @@ class PassRates:
 
 
 def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings, edge_id: str) -> PassRates:
-    """Share out a budget of line bits a second.
-
-    Raises:
-        UserError: x265 cannot follow what is left for a pass.
-    """
+    """Share out a budget of line bits a second; `UserError` where x265 cannot follow what is left for a pass."""
     request_bps = settings.request_bps
     first_line = settings.share * (budget_bps - request_bps)
     second_line = budget_bps - request_bps - first_line

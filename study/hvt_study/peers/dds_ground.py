@@ -14,21 +14,21 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import AccessUnit, Detections, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder
-from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.datasets.labels import inside_frame
-from hvt_study.metrics.frames import FrameView
+from hvt_study.datasets.sequence import NOMINAL_FPS
+from hvt_study.metrics.judged import FrameView
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.peers.dds_edge import most_stored
 from hvt_study.peers.dds_line import Line
 from hvt_study.peers.dds_regions import (
     Blocks,
+    DdsSettings,
     RegionRequest,
     combined,
     pasted,
     requested_blocks,
     requested_boxes,
 )
-from hvt_study.peers.dds_settings import DdsSettings
 
 
 @dataclass(slots=True)

@@ -17,8 +17,7 @@ from hvt_common.errors import UserError
 from hvt_study.datasets.layouts.uri import open_datasets
 from hvt_study.reading.flight import ReadFlight, Readings
 from hvt_study.reading.observer import CHANNELS, Channel
-from hvt_study.reading.reader import CodeReader
-from hvt_study.reading.score import ChannelScore, Code, Evidence, channel_score
+from hvt_study.reading.score import ChannelScore, Code, CodeReader, Evidence, channel_score
 from hvt_study.runs.spec import ModelChoice, RunSpec
 
 READ_METHODS: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
@@ -140,8 +139,7 @@ class ReadResult:
 def compare_codes(plan: ReadPlan, *, on_flight: Callable[[int, int], None] = lambda *_: None) -> ReadResult:
     """Fly and read everything; ``on_flight(done, of)`` is called after each method at each rate over each scene.
 
-    Raises:
-        UserError: a scene has no codes, the reader is not installed, or models cannot be used.
+    Raises `UserError` where a scene has no codes, the reader is not installed, or models cannot be used.
     """
     scenes = [one for _, one in open_datasets((plan.dataset,))]
     if any(one.codes is None for one in scenes):

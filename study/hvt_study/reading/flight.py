@@ -20,18 +20,15 @@ from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
 from hvt_scene import CodeInView
 from hvt_study.cache.results import ResultCache, content_key
-from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.flights.flight import Flight
 from hvt_study.flights.flight_ground import GroundSide, SharedModels
 from hvt_study.reading.observer import CHANNELS, Channel, CodeObserver
-from hvt_study.reading.reader import CodeReader, Reading, code_crop
-from hvt_study.reading.score import LEAST_VISIBLE, Evidence, codes_to_read
-from hvt_study.runs.match_total import match, within
-from hvt_study.runs.materials import software_versions
-from hvt_study.runs.run_context import open_run_context
+from hvt_study.reading.score import LEAST_VISIBLE, CodeReader, Evidence, Reading, code_crop, codes_to_read
+from hvt_study.runs.run_context import open_run_context, software_versions
 from hvt_study.runs.run_settings import dry_run_bps, edge_flags, flight_plan
 from hvt_study.runs.spec import RunSpec
-from hvt_study.runs.video_shape import VideoShape
+from hvt_study.runs.video_shape import VideoShape, match, within
 from hvt_study.serial_link import SerialLink
 
 _EVERY_FRAMES = 5  # of the source, as of the base
@@ -55,8 +52,7 @@ class ReadFlight:
 class Readings:
     """Flights over one sequence that has codes, each flown and read once in the life of the cache.
 
-    Raises:
-        UserError: no code is in view long enough, or a model cannot be used.
+    Raises `UserError` where no code is in view long enough, or a model cannot be used.
     """
 
     def __init__(self, spec: RunSpec, *, reader: CodeReader, cache: Path) -> None:

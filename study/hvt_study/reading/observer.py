@@ -19,8 +19,7 @@ from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.stills.composite import composite
 from hvt_ground.perception.stills.decode import DecodedStill, decode_still
 from hvt_scene import CodeInView
-from hvt_study.reading.reader import CodeReader, code_crop, share_inside
-from hvt_study.reading.score import LEAST_VISIBLE, Code, Evidence
+from hvt_study.reading.score import LEAST_VISIBLE, Code, CodeReader, Evidence, code_crop, share_inside
 
 Channel = Literal["base", "stills", "composite"]
 CHANNELS: tuple[Channel, ...] = ("base", "stills", "composite")

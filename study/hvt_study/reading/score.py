@@ -1,4 +1,7 @@
-"""From readings to figures: which codes were read right at least once, how soon, and which were misread."""
+"""The reader, and from readings to figures: which codes were read right at least once, how soon, which misread.
+
+It is RapidOCR's text recognition, a network of others that is given a small picture and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,94 @@ import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import version
+from typing import Any
 
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.errors import needs_extra
+from hvt_common.values import Image
+from hvt_common.video.base_crop import resampled
 from hvt_scene import CodeInView
-from hvt_study.datasets.clip import NOMINAL_FPS
-from hvt_study.reading.reader import Reading
+from hvt_study.datasets.sequence import NOMINAL_FPS
+
+_HEIGHT_PX = 48  # of a line of text, as the network takes it
+_WIDTH_PX = 192
+_MARGIN = 0.15
+"""Of the shorter side of a box, around it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What the reader says of one picture."""
+
+    text: str
+    """Capitals and digits without spaces; empty where it reads nothing."""
+    confidence: float
+    """0…1, by its own account."""
+    picture_bgr: Image
+    """What it was read from, turned as it was read."""
+
+
+class CodeReader:
+    """Reads one line of text in each picture, whichever of the four ways it is turned.
+
+    The networks come in the package: nothing is fetched. Raises `UserError` where RapidOCR is not installed.
+    """
+
+    def __init__(self) -> None:
+        with needs_extra("'hvt[reading]'"):
+            rapidocr: Any = import_module("rapidocr")  # an extra that only this class needs
+        self._engine = rapidocr.RapidOCR(
+            params={
+                "Global.log_level": "critical",
+                "Rec.rec_img_shape": [3, _HEIGHT_PX, _WIDTH_PX],
+                "EngineConfig.onnxruntime.intra_op_num_threads": 1,
+                "EngineConfig.onnxruntime.inter_op_num_threads": 1,
+            }
+        )
+        self._engine.update_params(use_det=False, use_cls=False, use_rec=True)
+        self.name = f"rapidocr {version('rapidocr')}"
+
+    def read(self, crops: Sequence[Image]) -> list[Reading]:
+        """One reading of each crop, (h, w, 3) uint8 BGR: the more confident of the two ways in which it lies flat."""
+        turned = [picture for crop in crops for picture in _lying(crop)]
+        said = [self._line(picture) for picture in turned]
+        return [max(pair, key=lambda one: one.confidence) for pair in zip(said[::2], said[1::2], strict=True)]
+
+    def _line(self, picture: Image) -> Reading:
+        found = self._engine(picture)
+        text = "".join(found.txts or ("",)).upper().replace(" ", "")
+        return Reading(text, float((found.scores or (0.0,))[0]) if text else 0.0, picture)
+
+
+def code_crop(image: Image, box_px: Sequence[float]) -> Image:
+    """The part of a picture around a box x1 y1 x2 y2, its shorter side enlarged to what the reader takes.
+
+    Sub-pixel exact and cubic: the coarser picture gets its best chance.
+    """
+    x1, y1, x2, y2 = box_px
+    margin = _MARGIN * min(x2 - x1, y2 - y1)
+    width, height = x2 - x1 + 2 * margin, y2 - y1 + 2 * margin
+    step = min(width, height) / _HEIGHT_PX
+    size = max(_HEIGHT_PX, round(width / step)), max(_HEIGHT_PX, round(height / step))
+    return resampled(image, (x1 - margin, y1 - margin), (step, step), size)
+
+
+def _lying(crop: Image) -> tuple[Image, Image]:
+    """The crop with its longer side across, and the same upside down."""
+    flat = crop if crop.shape[1] >= crop.shape[0] else cv2.rotate(crop, cv2.ROTATE_90_CLOCKWISE)
+    return np.asarray(flat, np.uint8), np.asarray(cv2.rotate(flat, cv2.ROTATE_180), np.uint8)
+
+
+def share_inside(box_px: npt.NDArray[Any], place_px: npt.NDArray[Any]) -> float:
+    """How much of a box lies in a place, both x1 y1 x2 y2, 0…1."""
+    low, high = np.maximum(box_px[:2], place_px[:2]), np.minimum(box_px[2:], place_px[2:])
+    return float(np.clip(high - low, 0, None).prod() / (box_px[2:] - box_px[:2]).prod())
+
 
 LEAST_VISIBLE = 0.95
 """A code of which less is in the frame and under no crown cannot be asked for at that moment."""

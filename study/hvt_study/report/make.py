@@ -1,23 +1,25 @@
-"""From rows to a report: which tables and figures, in which order, and what is said between them."""
+"""From rows to a report: the answer in a sentence, tables and figures in their order, words between."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 
-from hvt_study.matrix.accounting import in_accounting
-from hvt_study.report.answer import DECIDES, REFERENCES, answer, forests
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.arms import RunRow, Setting, counts, sequence_of, settings
-from hvt_study.report.data.captions import time_of
-from hvt_study.report.data.document import Part, Report, Section, Table
-from hvt_study.report.data.intervals import ENOUGH
-from hvt_study.report.data.pairs import equal_quality, pairs
+from hvt_study.report.data.captions import ENOUGH, METRICS, time_of, written
+from hvt_study.report.data.document import Drawing, Part, Report, Section, Table
+from hvt_study.report.data.pairs import Pair, equal_quality, pairs
 from hvt_study.report.example.choice import Example
 from hvt_study.report.figures.curve_figures import codec_figure, utility_figure
 from hvt_study.report.figures.example_figures import crop_pictures, timeline_figure
-from hvt_study.report.figures.pair_figures import equal_figures
-from hvt_study.report.tables.appendix_tables import failed_table, metrics_table
-from hvt_study.report.tables.arm_tables import (
+from hvt_study.report.figures.pair_figures import difference_figures, equal_figures
+from hvt_study.report.tables import (
+    differences_table,
+    equal_table,
+    failed_table,
     matrix_table,
+    metrics_table,
     named_table,
     pilot_table,
     proxy_table,
@@ -25,8 +27,59 @@ from hvt_study.report.tables.arm_tables import (
     size_table,
     spent_table,
 )
-from hvt_study.report.tables.pair_tables import differences_table, equal_table
 from hvt_study.runs.spec import table_of
+
+DECIDES = "named_f1"
+"""The figure by which methods are held against video."""
+REFERENCES = ("M0", "M0-fps", "M0-best", "R0")
+
+
+def answer(found: Sequence[Setting]) -> Iterator[str | Drawing]:
+    """Against plain video at the same bits; of the first setting in a figure, too."""
+    metric = METRICS[DECIDES]
+    for setting in found:
+        plain = [pair for pair in pairs(setting, references=("M0",)) if pair.gaps(DECIDES)]
+        if not plain:
+            continue
+        best = max(plain, key=lambda pair: pair.interval(DECIDES).mean)
+        ahead = " ".join(filter(None, written(best.interval(DECIDES), metric, sign=True)))
+        yield (
+            f"{setting.name}, labels: {setting.labels}. The method furthest ahead of video at the same bits is "
+            f"{best.arm.name} in the {best.arm.regime} regime, {ahead} {metric.title} "
+            f"(n = {len(best.gaps(DECIDES))}). {_tally(plain)}"
+        )
+    for setting in found[:1]:
+        yield from forests(setting, name="answer")
+
+
+def forests(setting: Setting, *, name: str) -> Iterator[Drawing]:
+    """Paired differences, a figure a regime."""
+    yield from difference_figures(
+        setting, list(pairs(setting, references=REFERENCES)), name=name, column=DECIDES
+    )
+
+
+def _tally(found: Sequence[Pair]) -> str:
+    """Verdicts are of intervals, and intervals of enough sequences only."""
+    intervals = [pair.interval(DECIDES) for pair in found]
+    sure = [one for one in intervals if not math.isnan(one.low)]
+    few = len(found) - len(sure)
+    if not sure:
+        return (
+            f"That is no verdict: {_pairs(few, 'has', 'have')} fewer than {ENOUGH} sequences, of which an interval "
+            "says nothing."
+        )
+    ahead, behind = sum(one.low > 0 for one in sure), sum(one.high < 0 for one in sure)
+    left = f"; {few} more have fewer than {ENOUGH} sequences and are not counted" if few else ""
+    return (
+        f"Of {_pairs(len(sure), '', '')} the interval lies above 0 in {ahead}, below in {behind}, and holds 0 in "
+        f"{len(sure) - ahead - behind}{left}. No account is taken of how many were looked at."
+    )
+
+
+def _pairs(count: int, one: str, several: str) -> str:
+    return f"{count} pair{'' if count == 1 else 's'} of method and regime {one if count == 1 else several}".rstrip()
+
 
 _MATRICES = ("named_f1", "map_50", "hota")
 
@@ -34,11 +87,7 @@ _MATRICES = ("named_f1", "map_50", "hota")
 def make_report(
     rows: Sequence[RunRow], *, sweep: Table | None = None, example: Example | None = None
 ) -> Report:
-    """All of it, in order; nothing is read or written.
-
-    Raises:
-        UserError: two different runs count at one place.
-    """
+    """All of it, in order; nothing is read or written. `UserError` where two different runs count at one place."""
     found = settings(rows)
     accounting = next((str(row["accounting"]) for row in rows), "span")
     sections = (

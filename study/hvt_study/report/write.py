@@ -1,22 +1,88 @@
-"""From ``results.parquet`` and what else lies in studies' folders to one table, pages and figures."""
+"""From ``results.parquet`` and what else lies in studies' folders to one table, pages and figures.
+
+The HTML page needs no other file: style, drawings and pictures are in it, and nothing is loaded from the network. It
+takes the reader's light or dark, and prints on A4. The templates lie beside this file.
+"""
 
 from __future__ import annotations
 
+import base64
 import re
 import shutil
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from html import escape
 from pathlib import Path
 
+from jinja2 import Environment, PackageLoader, select_autoescape
+from markupsafe import Markup
+
 from hvt_common.errors import UserError, check_not_read
-from hvt_study.matrix.accounting import in_accounting
-from hvt_study.metrics.bits import Accounting
+from hvt_study.metrics.bits import Accounting, in_accounting
 from hvt_study.report.data.arms import settings
-from hvt_study.report.data.document import Drawing, Pictures, Report
+from hvt_study.report.data.document import Drawing, Pictures, Report, numbered
 from hvt_study.report.data.table_file import RESULTS, SWEEP, read_results, write_results
-from hvt_study.report.example.store import load_example, save_example
+from hvt_study.report.example.choice import load_example, save_example
 from hvt_study.report.make import make_report
-from hvt_study.report.pages.render import FIGURES, html_page, markdown_page
-from hvt_study.report.tables.appendix_tables import sweep_table
+from hvt_study.report.tables import sweep_table
+
+FIGURES = "figures"
+"""Folder of figures, beside the Markdown page."""
+_ID = re.compile(r'\bid="([^"]+)"')
+_REFERENCE = re.compile(r'(?:xlink:)?href="#([^"]+)"|url\(#([^)]+)\)')
+
+
+def html_page(report: Report) -> str:
+    """The whole page."""
+    return _rendered("report.html.j2", report)
+
+
+def markdown_page(report: Report) -> str:
+    """The whole page."""
+    return _rendered("report.md.j2", report)
+
+
+def inline_svg(drawing: Drawing) -> str:
+    """A drawing within a page: without what only files need, its names its own, its black the page's ink."""
+    svg = drawing.svg[drawing.svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg)
+    svg = _ID.sub(lambda found: f'id="{drawing.name}-{found[1]}"', svg)
+    svg = _REFERENCE.sub(lambda found: _renamed(drawing.name, found), svg)
+    svg = svg.replace("#000000", "currentColor").replace(
+        "'DejaVu Sans'", "system-ui, 'DejaVu Sans', sans-serif"
+    )
+    # What is black says nothing of its fill.
+    label = f'<svg fill="currentColor" role="img" aria-label="{escape(drawing.alternative)}"'
+    # The size in points would hold it back; its shape is in the viewBox.
+    head, rest = svg.split(">", 1)
+    head = re.sub(r'\s(width|height)="[^"]*"', "", head).replace("<svg", label, 1)
+    return f"{head}>{rest}".strip()
+
+
+def _renamed(name: str, found: re.Match[str]) -> str:
+    return f'href="#{name}-{found[1]}"' if found[1] else f"url(#{name}-{found[2]})"
+
+
+def _rendered(template: str, report: Report) -> str:
+    templates = Environment(
+        loader=PackageLoader("hvt_study.report"),
+        autoescape=select_autoescape(["html.j2"]),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    templates.filters |= {
+        "anchor": lambda text: re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-"),
+        "base64": lambda png: base64.b64encode(png).decode(),
+        "cell": lambda text: " ".join(text.split()).replace("|", "\\|"),  # only our own bars part cells
+        "short": lambda caption: re.split(r": |\. ", caption, maxsplit=1)[0],  # up to the first stop
+        "svg": lambda drawing: Markup(inline_svg(drawing)),  # noqa: S704 - made here, its text escaped
+    }
+    before: Counter[str] = Counter()
+    sections = [(section, numbered(section, before)) for section in report.sections]
+    return templates.get_template(template).render(report=report, sections=sections, figures=FIGURES)
+
 
 _OURS = re.compile(
     r"(?:(?:answer|timeline|(?:differences|equal-quality|utility|codecs)-\d+)(?:-[A-Za-z0-9.-]+)?\.(?:svg|pdf)"
@@ -30,10 +96,8 @@ def write_report(folder: Path, *, accounting: Accounting | None = None) -> None:
 
     Figures of an earlier report that this one does not have are removed.
 
-    ``accounting`` is what the pages divide rates by; None: what the table does.
-
-    Raises:
-        UserError: the table cannot be used, or the folder not be written.
+    ``accounting`` is what the pages divide rates by; None: what the table does. Raises `UserError` where the table
+    cannot be used, or the folder not be written.
     """
     rows = read_results(folder / RESULTS)
     report = make_report(
@@ -85,10 +149,8 @@ def join_studies(folders: Sequence[Path], out: Path) -> None:
     """Write one table of all their runs into ``out``; of a run that several have the first counts.
 
     Rates are in the accounting of the first table. The flight in pictures and the selector sweep are those of the
-    first folder that has one.
-
-    Raises:
-        UserError: a table cannot be used, two runs that differ are at one place, or ``out`` cannot be written.
+    first folder that has one. Raises `UserError` where a table cannot be used, two runs that differ are at one place,
+    or ``out`` cannot be written.
     """
     if len(folders) > 1:  # of one study a table of the same runs is written
         check_not_read(out / RESULTS, (folder / RESULTS for folder in folders), name="--out")

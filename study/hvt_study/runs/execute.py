@@ -13,15 +13,12 @@ from typing import Any, TypeVar
 
 from hvt_common.errors import FlightError, UserError
 from hvt_study.cache.results import FLIGHTS, CacheError, ResultCache, content_key
-from hvt_study.runs.columns import COLUMNS
-from hvt_study.runs.match_total import first_budget, match, within
-from hvt_study.runs.materials import Materials, open_materials
 from hvt_study.runs.methods import METHODS
-from hvt_study.runs.run_context import RunContext, open_run_context
+from hvt_study.runs.run_context import Materials, RunContext, open_materials, open_run_context
 from hvt_study.runs.run_settings import dry_run_bps, edge_flags, flown, settings
 from hvt_study.runs.scoring import figures
-from hvt_study.runs.spec import RunSpec, located
-from hvt_study.runs.video_shape import VideoShape, competing_sizes, search_shape
+from hvt_study.runs.spec import COLUMNS, RunSpec, located
+from hvt_study.runs.video_shape import VideoShape, competing_sizes, first_budget, match, search_shape, within
 
 RunRow = dict[str, Any]
 _T = TypeVar("_T")

@@ -13,11 +13,11 @@ from hvt_edge.config import check as check_edge
 from hvt_edge.profiles import REGIMES
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
-from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.flights.flight import FlightPlan, FlightReport, dry_run, fly
 from hvt_study.flights.flight_ground import SharedModels
 from hvt_study.peers.dds import fly_dds
-from hvt_study.peers.dds_settings import DdsSettings
+from hvt_study.peers.dds_regions import DdsSettings
 from hvt_study.runs.methods import METHODS, Kind
 from hvt_study.runs.run_context import RunContext
 from hvt_study.runs.spec import ModelChoice, RunSpec
@@ -71,8 +71,7 @@ def edge_flags(
 def flight_plan(spec: RunSpec, context: RunContext, *, budget_bps: int, shape: VideoShape) -> FlightPlan:
     """The flight of this run at a budget; its link carries what the regime allows, whatever the budget.
 
-    Raises:
-        UserError: the edge does not take these settings.
+    Raises `UserError` where the edge does not take these settings.
     """
     flags = ["--source", context.sequence.clip.spec, *edge_flags(spec, budget_bps=budget_bps, shape=shape)]
     config, _ = load(EdgeConfig, flags, program="hvt-edge", description="")

@@ -6,22 +6,22 @@ import math
 from typing import Any
 
 from hvt_common.protocol.channels import Channel
-from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.flights.flight import FlightReport
 from hvt_study.metrics.bits import bit_split, still_counts
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.first_correct import first_correct
-from hvt_study.metrics.frames import LabelledFrames
+from hvt_study.metrics.judged import LabelledFrames
 from hvt_study.metrics.observed import (
     arrivals,
     detected_frames,
     refined_frames,
     refined_objects,
     shown_times_s,
+    still_delays_ms,
 )
 from hvt_study.metrics.proxy import proxies
-from hvt_study.metrics.stills import still_delays_ms
 from hvt_study.metrics.tracking import continuity, tracking_score
 from hvt_study.runs.run_context import RunContext
 
@@ -46,7 +46,7 @@ _OPINIONS = {
 
 
 def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:
-    """Every metric column of `hvt_study.runs.columns.COLUMNS`; None where a run has none."""
+    """Every metric column of `hvt_study.runs.spec.COLUMNS`; None where a run has none."""
     labelled = _labelled(report, context)
     if context.sequence.one_target:
         labelled = {name: value if name in _SAYS_OF_ONE else None for name, value in labelled.items()}

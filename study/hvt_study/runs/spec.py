@@ -1,12 +1,14 @@
-"""What one run of the matrix is: everything that decides its result; and where its files lie for a process."""
+"""One run of the matrix: everything that decides its result, where its files lie for a process, and its row."""
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
@@ -123,3 +125,34 @@ def _model(spec: str, folder: Path) -> str:
     separators = (os.sep, os.altsep or os.sep)
     is_path = "." in spec or any(one in spec for one in separators)
     return str(folder / spec) if is_path and not spec.startswith("~") else spec
+
+
+Type = Literal["text", "int", "real", "yes"]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column, its type, what it says, and how the tables of the report show it."""
+
+    name: str
+    type: Type
+    group: str
+    """Of metrics; empty for what no table of the report shows."""
+    title: str
+    """In the head of a table."""
+    style: Literal["", "share", "kbps", "count", "seconds", "ms", "bytes", "rate", "nats"]
+    better: Literal["", "more", "less"]
+    over: Literal["", "mean", "median"]
+    """What is taken over sequences: waits may be infinite, which a mean does not survive."""
+    description: str
+    """``{time}`` stands for what rates are divided by."""
+
+
+def _columns() -> tuple[Column, ...]:
+    text = files("hvt_study.runs").joinpath("columns.csv").read_text(encoding="utf-8")
+    rows: list[dict[str, Any]] = list(csv.DictReader(text.splitlines()))
+    return tuple(Column(**row) for row in rows)
+
+
+COLUMNS: tuple[Column, ...] = _columns()
+"""The table of a study."""

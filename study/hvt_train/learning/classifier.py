@@ -13,9 +13,8 @@ from torch.nn import functional
 from torch.utils.data import DataLoader, IterableDataset
 
 from hvt_scene.drawing.vehicles import CLASS_NAMES
-from hvt_train.learning.export import export_onnx
+from hvt_train.learning.export import export_onnx, load_onnx
 from hvt_train.learning.loop import LoopSettings, Loss, train
-from hvt_train.learning.start import load_onnx
 from hvt_train.pictures.crops import CROP_SIDE, CropSource
 
 MEAN, SCALE = 115.0, 1 / 60

@@ -1,4 +1,4 @@
-"""From a trained network to an ONNX file that carries what is needed to use and to judge it."""
+"""ONNX files of networks: go on from one, its batch norms measured anew, and write one that can be judged."""
 
 from __future__ import annotations
 
@@ -8,12 +8,93 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import onnx
 import torch
-from onnx import helper
-from torch import nn
+from onnx import helper, numpy_helper
+from torch import Tensor, nn
 
-from hvt_train.learning.halve import halve
+from hvt_train.learning.detector import DetectorNet
+from hvt_train.learning.halve import halve, unfolded
+
+
+def load_onnx(net: nn.Module, path: Path, images: Tensor, *, rows: Sequence[int] | None = None) -> None:
+    """Put the weights of ``path`` into ``net``, which then computes the same and can be trained further.
+
+    ``rows`` names for each class of a `DetectorNet` the class of the file that it begins as, -1 for none; without it
+    the file has the same classes.
+
+    The file's convolutions have absorbed their batch norms, so that a norm's mean and variance are measured on
+    ``images`` ((N, 3, H, W) float32 BGR 0…255), and scale and shift are set to undo them.
+
+    Raises `ValueError` where the file is of another architecture.
+    """
+    weights = _weights(onnx.load(str(path)).graph)
+    hooks, order = [], iter(weights)
+
+    def take(layer: nn.Module, _inputs: object) -> None:
+        weight, bias = next(order, (np.zeros(0), np.zeros(0)))
+        assert isinstance(layer, (nn.Conv2d, nn.Linear))
+        if rows is not None and layer in named:
+            weight, bias = _chosen(layer, weight, bias, rows)
+        wanted = tuple(layer.weight.shape)
+        if weight.shape != wanted:
+            raise ValueError(f"{path} has weights {weight.shape} where {wanted} are expected")
+        layer.weight.data = torch.from_numpy(weight.copy())
+        pending.append(torch.from_numpy(bias.copy()))
+        if layer.bias is not None:
+            layer.bias.data = pending.pop()
+
+    def measure(norm: nn.Module, inputs: tuple[Tensor]) -> None:
+        assert isinstance(norm, nn.BatchNorm2d)
+        assert norm.running_mean is not None
+        assert norm.running_var is not None
+        mean, variance = inputs[0].mean((0, 2, 3)), inputs[0].var((0, 2, 3))
+        norm.running_mean.copy_(mean)
+        norm.running_var.copy_(variance)
+        norm.weight.data = (variance + norm.eps).sqrt()
+        norm.bias.data = pending.pop() + mean
+
+    pending: list[Tensor] = []
+    named = [head.classes for head in net.heads] if isinstance(net, DetectorNet) else []
+    for module in net.modules():
+        if isinstance(module, (nn.Conv2d, nn.Linear)):
+            hooks.append(module.register_forward_pre_hook(take))
+        elif isinstance(module, nn.BatchNorm2d):
+            hooks.append(module.register_forward_pre_hook(measure))
+    with torch.no_grad():
+        net.eval()(images)
+    for hook in hooks:
+        hook.remove()
+
+
+def _chosen(
+    layer: nn.Conv2d | nn.Linear, weight: np.ndarray, bias: np.ndarray, rows: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The file's rows in the order of ours; a class that the file has not keeps what it began with."""
+    assert layer.bias is not None
+    own_weight, own_bias = layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()
+    for row, theirs in enumerate(rows):
+        if theirs >= 0:
+            own_weight[row], own_bias[row] = weight[theirs], bias[theirs]
+    return own_weight, own_bias
+
+
+def _weights(graph: onnx.GraphProto) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Weight and bias of each layer that has some, as float32, in the order in which the file computes them."""
+    values = {item.name: numpy_helper.to_array(item).astype(np.float32) for item in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "Cast" and node.input[0] in values:
+            values[node.output[0]] = values[node.input[0]]
+    for name, value in values.items():
+        if value.shape[1:] == (12, 3, 3):
+            values[name] = unfolded(value)
+    return [
+        (values[node.input[1]], values[node.input[2]])
+        for node in graph.node
+        if node.op_type in {"Conv", "Gemm"}
+    ]
+
 
 _OPSET = 17
 

@@ -8,8 +8,8 @@ from importlib.metadata import entry_points
 
 import pytest
 
-from hvt_study.cache.code_digest import DETECTING, FLYING, code_digest, flight_code, tree_digest
-from hvt_study.runs.materials import software_versions
+from hvt_study.cache.results import DETECTING, FLYING, code_digest, flight_code, tree_digest
+from hvt_study.runs.run_context import software_versions
 
 
 def package(root, **files):

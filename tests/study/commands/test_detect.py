@@ -17,7 +17,7 @@ from hvt_scene import Scene
 from hvt_scene.truth import Truth
 from hvt_study.cli import main
 from hvt_study.commands.detect import print_score
-from hvt_study.metrics.operating_point import along_line, calibration_error, chance_error, fitted_line
+from hvt_study.metrics.picture_score import along_line, calibration_error, chance_error, fitted_line
 
 CLASSES = "car,van,truck,bus,motor,pedestrian,other"
 

@@ -14,14 +14,11 @@ from hvt_study.cli import main
 from hvt_study.commands import run as command
 from hvt_study.matrix.plan import StudyPlan, first_runs, parse_regimes
 from hvt_study.runs import execute
-from hvt_study.runs.columns import COLUMNS
-from hvt_study.runs.match_total import within
-from hvt_study.runs.materials import open_materials
 from hvt_study.runs.methods import chosen_methods
-from hvt_study.runs.run_context import open_run_context
+from hvt_study.runs.run_context import open_materials, open_run_context
 from hvt_study.runs.run_settings import flown
-from hvt_study.runs.spec import ModelChoice
-from hvt_study.runs.video_shape import VideoShape
+from hvt_study.runs.spec import COLUMNS, ModelChoice
+from hvt_study.runs.video_shape import VideoShape, within
 from media.onnx_models import colour_classifier, colour_detector
 from programs.processes import PATIENT_S
 from studies.layouts import write_images, write_visdrone

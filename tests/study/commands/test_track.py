@@ -10,7 +10,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_study.cli import main
-from hvt_study.datasets.mot_files import detections_by_frame, read_mot
+from hvt_study.commands.track import detections_by_frame, read_mot
 from studies.clear_mot import score
 
 LINE = "{frame},-1,{x},20,40,60,{score},-1,-1,-1\n"

@@ -19,10 +19,9 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
 from hvt_scene import Scene
 from hvt_study.datasets.annotation_rows import read_rows
-from hvt_study.datasets.clip import stage_clip
 from hvt_study.datasets.layouts.mot import mot_table, read_truth_rows
 from hvt_study.datasets.layouts.uri import open_dataset, open_datasets
-from hvt_study.datasets.sequence import content_hash
+from hvt_study.datasets.sequence import content_hash, stage_clip
 from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
 from media.clips import smooth_pictures

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_study.datasets.clip import stage_clip
 from hvt_study.datasets.layouts.uri import open_dataset
+from hvt_study.datasets.sequence import stage_clip
 from hvt_study.datasets.virtual_camera import VirtualCamera, open_camera, read_annotations
 
 BOX = (300, 200, 40, 24)  # x, y, w, h of a white block

@@ -13,7 +13,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
-from hvt_study.datasets.clip import Clip
+from hvt_study.datasets.sequence import Clip
 from hvt_study.flights.flight import Flight, FlightPlan, coded_frames, fly
 from hvt_study.flights.flight_ground import SharedModels
 from hvt_study.reading.flight import _ReadGround

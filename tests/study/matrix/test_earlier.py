@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_study.matrix.accounting import in_accounting
-from hvt_study.matrix.earlier import check_parameters, staying
-from hvt_study.matrix.plan import StudyPlan
+from hvt_study.matrix.plan import StudyPlan, check_parameters, staying
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.runs.methods import chosen_methods
 
 

@@ -12,9 +12,9 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_study.matrix.plan import Regime, StudyPlan, parse_regimes
 from hvt_study.matrix.schedule import run_all
-from hvt_study.runs.match_total import grid_target
 from hvt_study.runs.methods import METHODS, chosen_methods
 from hvt_study.runs.spec import ModelChoice
+from hvt_study.runs.video_shape import grid_target
 
 SPENT = {"M2": 700_000, "M5": 780_000, "M6": 783_000}
 

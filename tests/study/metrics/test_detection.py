@@ -11,7 +11,7 @@ import pytest
 from hvt_common.inference.class_names import kind_of
 from hvt_common.values import iou
 from hvt_study.metrics.detection import detection_score
-from hvt_study.metrics.frames import FrameView
+from hvt_study.metrics.judged import FrameView
 from studies.metric_frames import labels, square, view
 
 

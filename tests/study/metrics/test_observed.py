@@ -14,8 +14,8 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
-from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.labels import NO_ID
+from hvt_study.datasets.sequence import NOMINAL_FPS, Clip
 from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
 from hvt_study.metrics.bits import bit_split, still_counts
@@ -28,9 +28,9 @@ from hvt_study.metrics.observed import (
     refined_frames,
     refined_objects,
     shown_times_s,
+    still_delays_ms,
 )
 from hvt_study.metrics.proxy import proxies
-from hvt_study.metrics.stills import still_delays_ms
 from hvt_study.metrics.tracking import tracking_score
 from media.clips import smooth_pictures
 from rigs.flight import SIZE, RedSquares, square_box

@@ -13,7 +13,7 @@ from hvt_ground.sinks.event_tables import TrackTable
 from hvt_scene import Scene
 from hvt_study.cli import main
 from hvt_study.datasets.labels import FrameLabels
-from hvt_study.metrics.frames import FrameView
+from hvt_study.metrics.judged import FrameView
 from hvt_study.metrics.track_table_score import read_tracks, read_truth, score
 
 AREA_PX = 1280 * 720

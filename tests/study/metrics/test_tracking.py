@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from hvt_study.metrics.frames import FrameView
-from hvt_study.metrics.hota import ALPHAS
-from hvt_study.metrics.tracking import TrackingScore, compare_tracks, tracking_score
+from hvt_study.metrics.judged import FrameView
+from hvt_study.metrics.tracking import ALPHAS, TrackingScore, compare_tracks, tracking_score
 from studies.metric_frames import labels, square, view
 
 SEQUENCES = ("TUD-Campus", "TUD-Stadtmitte")

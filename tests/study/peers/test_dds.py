@@ -10,7 +10,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.values import Detections
-from hvt_study.datasets.clip import Clip
+from hvt_study.datasets.sequence import Clip
 from hvt_study.metrics.observed import detected_frames
 from hvt_study.peers.dds import DdsSettings, fly_dds
 from media.clips import hard_pictures, smooth_pictures

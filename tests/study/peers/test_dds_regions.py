@@ -10,6 +10,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_common.values import Detections
 from hvt_study.peers.dds_regions import (
+    DdsSettings,
     RegionRequest,
     combined,
     merged,
@@ -18,7 +19,6 @@ from hvt_study.peers.dds_regions import (
     requested_blocks,
     requested_boxes,
 )
-from hvt_study.peers.dds_settings import DdsSettings
 
 SIZE = (320, 192)
 RULES = DdsSettings(low=0.2, high=0.6, overlap_iou=0.3, max_area=0.1, merge_iou=0.3, enlarge=0.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hvt_scene import Scene
-from hvt_study.reading.reader import CodeReader, code_crop
+from hvt_study.reading.score import CodeReader, code_crop
 
 pytest.importorskip("rapidocr", reason="rapidocr is not installed: hvt[reading]")
 AT_S = 3.0

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from hvt_scene import CodeInView
-from hvt_study.reading.reader import Reading
-from hvt_study.reading.score import Code, Evidence, channel_score, codes_to_read
+from hvt_study.reading.score import Code, Evidence, Reading, channel_score, codes_to_read
 
 PICTURE = np.zeros((48, 160, 3), np.uint8)
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from hvt_study.report.data.intervals import ENOUGH, interval_of, mean_of
+from hvt_study.report.data.captions import ENOUGH, interval_of, mean_of
 
 
 def test_an_interval_worked_out_by_hand():

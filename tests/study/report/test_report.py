@@ -22,12 +22,11 @@ from hvt_ground.config import check as check_ground
 from hvt_study import cli
 from hvt_study.cli import main
 from hvt_study.datasets.class_map import map_classes
-from hvt_study.datasets.clip import Clip
 from hvt_study.datasets.labels import FrameLabels
-from hvt_study.datasets.sequence import Sequence
+from hvt_study.datasets.sequence import Clip, Sequence
 from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
-from hvt_study.matrix.accounting import in_accounting
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.arms import Arm, settings
 from hvt_study.report.data.document import Drawing, Pictures
 from hvt_study.report.data.pairs import equal_quality, needed_bps, pairs
@@ -39,18 +38,23 @@ from hvt_study.report.example.choice import (
     Timeline,
     Word,
     choose_run,
+    load_example,
     percentile_rows,
+    save_example,
 )
 from hvt_study.report.example.fly_again import example_of
-from hvt_study.report.example.store import load_example, save_example
 from hvt_study.report.make import make_report
-from hvt_study.report.pages.render import html_page
-from hvt_study.report.tables.appendix_tables import failed_table, sweep_table
-from hvt_study.report.tables.arm_tables import matrix_table, named_table, spent_table
-from hvt_study.report.tables.pair_tables import differences_table
-from hvt_study.report.write import write_report
-from hvt_study.runs.columns import COLUMNS
+from hvt_study.report.tables import (
+    differences_table,
+    failed_table,
+    matrix_table,
+    named_table,
+    spent_table,
+    sweep_table,
+)
+from hvt_study.report.write import html_page, write_report
 from hvt_study.runs.run_context import RunContext
+from hvt_study.runs.spec import COLUMNS
 from rigs.flight import SIZE, RedSquares, grainy_pictures, square_box
 from studies.study_rows import column, row, study
 

@@ -12,7 +12,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_study import cli
-from hvt_study.matrix.accounting import in_accounting
+from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.arms import Arm, settings
 from hvt_study.report.data.pairs import EqualQuality, pairs
 from hvt_study.report.data.table_file import write_results
@@ -22,11 +22,19 @@ from hvt_study.report.figures.drawing import PALETTE, style_of
 from hvt_study.report.figures.example_figures import crop_pictures
 from hvt_study.report.figures.pair_figures import difference_figures
 from hvt_study.report.make import make_report
-from hvt_study.report.pages.render import inline_svg
-from hvt_study.report.tables.appendix_tables import failed_table, metrics_table, sweep_table
-from hvt_study.report.tables.arm_tables import named_table, proxy_table, seen_table, size_table, spent_table
-from hvt_study.report.tables.pair_tables import differences_table, equal_table
-from hvt_study.report.write import write_report
+from hvt_study.report.tables import (
+    differences_table,
+    equal_table,
+    failed_table,
+    metrics_table,
+    named_table,
+    proxy_table,
+    seen_table,
+    size_table,
+    spent_table,
+    sweep_table,
+)
+from hvt_study.report.write import inline_svg, write_report
 from hvt_study.runs.methods import METHODS
 from studies.study_rows import column, row, study, to_m5
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_study.runs.match_total import grid_target, match, within
+from hvt_study.runs.video_shape import grid_target, match, within
 
 totals = st.floats(2e4, 1e7)
 

@@ -11,7 +11,7 @@ import pytest
 from hvt_common.values import View
 from hvt_scene import Appearance, Scene, write_truth
 from hvt_scene.drawing.vehicles import CLASS_NAMES, draw_vehicle
-from hvt_scene.view.project import turns
+from hvt_scene.view import turns
 
 CLASSES = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
 

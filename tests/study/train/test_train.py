@@ -199,7 +199,7 @@ def test_training_lowers_the_loss(torch, batch):
 
 def test_perfect_answers_cost_next_to_nothing(torch):
     """The loss would pull right answers away from where they belong."""
-    from hvt_train.learning.loss import Targets, detector_loss
+    from hvt_train.learning.train_detector import Targets, detector_loss
 
     maps = [torch.full((1, 12, side, side), -12.0) for side in (16, 8, 4)]
     for level in maps:

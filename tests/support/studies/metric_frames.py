@@ -6,7 +6,7 @@ import numpy as np
 
 from hvt_study.datasets.labels import NO_ID, FrameLabels
 from hvt_study.metrics.classes import class_score
-from hvt_study.metrics.frames import FrameView
+from hvt_study.metrics.judged import FrameView
 
 
 def square(x, y=0, side=10):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hvt_study.report.data.document import Table
-from hvt_study.runs.columns import COLUMNS
+from hvt_study.runs.spec import COLUMNS
 
 EMPTY = {"text": "", "int": None, "real": None, "yes": None}
 

@@ -14,10 +14,9 @@ from hvt_edge.source.demo import SCENE_WORDS, demo_scene
 from hvt_edge.source.resample import base_frame_count
 from hvt_scene import CodeInView, Scene
 from hvt_scene.drawing.vehicles import CLASS_NAMES
-from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.options import parse_numbers
-from hvt_study.datasets.sequence import Sequence
+from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, Sequence
 
 _SIZE = (1920, 1080)
 _LEAST_VISIBLE = 0.5

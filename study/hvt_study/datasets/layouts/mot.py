@@ -60,8 +60,7 @@ _MOT15_COLUMNS = 10
 def open_mot(root: Path, options: Options) -> Mapping[str, Callable[[], Sequence]]:
     """Every sequence by name, opened when called.
 
-    Raises:
-        UserError: ROOT is not laid out so, or annotations are missing.
+    Raises `UserError` where ROOT is not laid out so, or annotations are missing.
     """
     folders = [folder for folder in find_folders(root, depth=2) if _is_sequence(folder)]
     if not folders:

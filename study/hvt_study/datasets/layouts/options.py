@@ -38,8 +38,7 @@ class Options:
 def split_options(uri: str, place: str, *, accepted: Collection[str]) -> tuple[str, Options]:
     """The path and the options of what follows the scheme.
 
-    Raises:
-        UserError: names the option that is not one, or its value.
+    A `UserError` names the option that is not one, or its value.
     """
     path, mark, query = place.rpartition("?")
     if not mark or Path(place).exists():
@@ -63,11 +62,7 @@ def missing_labels(whose: str, file: Path | str) -> UserError:
 
 
 def parse_numbers(uri: str, text: str) -> tuple[int, ...]:
-    """``0-4`` or ``1,5`` or both, sorted, each once.
-
-    Raises:
-        UserError: for anything else, or more than can be meant.
-    """
+    """``0-4`` or ``1,5`` or both, sorted, each once; `UserError` for anything else, or more than can be meant."""
     numbers: set[int] = set()
     for part in text.split(","):
         match = re.fullmatch(r"\s*([0-9]{1,10})(?:-([0-9]{1,10}))?\s*", part)

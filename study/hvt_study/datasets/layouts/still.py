@@ -14,12 +14,11 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_edge.source.folder import sequence_files
-from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.label_table import file_stamp
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.image_sequence import find_folders
 from hvt_study.datasets.layouts.options import Options
-from hvt_study.datasets.sequence import Sequence
+from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, USUAL_VIEW, VirtualCamera, annotation_file
 
 
@@ -45,8 +44,7 @@ class StillLabels:
 def open_stills(place: Path, options: Options) -> Mapping[str, Callable[[], Sequence]]:
     """A sequence for each picture and seed by name, opened when called.
 
-    Raises:
-        UserError: there are no pictures, or annotations are missing.
+    Raises `UserError` where there are no pictures, or annotations are missing.
     """
     pictures = [place] if place.is_file() else _pictures(place)
     if options.annotated and place.is_dir():

@@ -46,8 +46,7 @@ _ATTRIBUTES = (
 def open_uavdt(root: Path, options: Options) -> Mapping[str, Callable[[], Sequence]]:
     """Every sequence by name, opened when called.
 
-    Raises:
-        UserError: ROOT is not laid out so, or annotations are missing.
+    Raises `UserError` where ROOT is not laid out so, or annotations are missing.
     """
     folders = [root] if _SEQUENCE.fullmatch(root.name) else _folders(root)
     sequences = {folder.name: folder for folder in reversed(folders) if _SEQUENCE.fullmatch(folder.name)}

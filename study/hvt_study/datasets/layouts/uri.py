@@ -13,8 +13,8 @@ from pathlib import Path
 
 from hvt_common.errors import UserError, named_path
 from hvt_study.datasets.class_map import of_kinds
-from hvt_study.datasets.layouts.clips import open_clips
 from hvt_study.datasets.layouts.demo import open_demo
+from hvt_study.datasets.layouts.image_sequence import open_clips
 from hvt_study.datasets.layouts.mot import open_mot
 from hvt_study.datasets.layouts.options import Options, split_options
 from hvt_study.datasets.layouts.still import open_stills
@@ -60,8 +60,7 @@ def open_datasets(
 ) -> Iterator[tuple[str, Sequence]]:
     """The same of several, each with its URI; ``limit`` is of each.
 
-    Raises:
-        UserError: as `open_dataset`; what ``only`` names has to be in one of them, not in all.
+    Raises `UserError` as `open_dataset`; what ``only`` names has to be in one of them, not in all.
     """
     uris = tuple(dict.fromkeys(uris))
     found = {uri: _layout(uri, limit) for uri in uris}

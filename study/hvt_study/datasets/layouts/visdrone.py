@@ -15,11 +15,10 @@ from functools import partial
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_study.datasets.label_table import TableLabels
+from hvt_study.datasets.label_table import TableLabels, video_table
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
 from hvt_study.datasets.layouts.options import Options, missing_labels
 from hvt_study.datasets.sequence import Sequence
-from hvt_study.datasets.visdrone_rows import video_table
 
 _FPS = 30.0
 """The dataset does not say; its drones filmed at 24 to 30."""
@@ -30,8 +29,7 @@ _LAYOUT = "sequences/NAME/0000001.jpg and annotations/NAME.txt"
 def open_visdrone(root: Path, options: Options) -> Mapping[str, Callable[[], Sequence]]:
     """Every sequence by name, opened when called.
 
-    Raises:
-        UserError: ROOT is not laid out so, or annotations are missing.
+    Raises `UserError` where ROOT is not laid out so, or annotations are missing.
     """
     splits = [folder for folder in find_folders(root, depth=1) if (folder / "sequences").is_dir()]
     if not splits:

@@ -17,7 +17,7 @@ from statistics import median_low
 import numpy as np
 
 from hvt_study.report.data.arms import Arm, BySequence, Setting, values
-from hvt_study.report.data.intervals import Interval, interval_of
+from hvt_study.report.data.captions import Interval, interval_of
 
 
 @dataclass(frozen=True, slots=True)

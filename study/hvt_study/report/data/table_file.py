@@ -1,4 +1,4 @@
-"""``results.parquet``: one row a run; types and order as `hvt_study.runs.columns.COLUMNS` has them."""
+"""``results.parquet``: one row a run; types and order as `hvt_study.runs.spec.COLUMNS` has them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hvt_common.errors import UserError
-from hvt_study.runs.columns import COLUMNS, Column
+from hvt_study.runs.spec import COLUMNS, Column
 
 RESULTS = "results.parquet"
 SWEEP = "sweep.csv"
@@ -41,10 +41,8 @@ SCHEMA = pa.schema(
 def write_results(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write the table, whole or not at all: what was there stays until the new one is complete.
 
-    NaN becomes null. A column that a row does not have is null, or the empty text.
-
-    Raises:
-        UserError: the file cannot be written.
+    NaN becomes null. A column that a row does not have is null, or the empty text. Raises `UserError` where the file
+    cannot be written.
     """
     table = pa.table(
         {column.name: [_value(row.get(column.name), column) for row in rows] for column in COLUMNS},
@@ -62,8 +60,7 @@ def write_results(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 def read_results(path: Path) -> list[dict[str, Any]]:
     """The rows in the order in which they were written; null is None. Columns that are not ours are passed over.
 
-    Raises:
-        UserError: the file is missing, damaged, or no table of a study.
+    Raises `UserError` where the file is missing, damaged, or no table of a study.
     """
     try:
         table = pq.read_table(path)

@@ -22,15 +22,22 @@ from hvt_common.values import Image, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.still_codecs import psnr_y_db
 from hvt_ground.events import Event, Refinement
-from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.labels import NO_ID
+from hvt_study.datasets.sequence import NOMINAL_FPS, Clip
 from hvt_study.flights.flight import Flight, FlightPlan, FlightReport
 from hvt_study.flights.flight_ground import GroundSide, SharedModels
 from hvt_study.matrix.plan import StudyPlan
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.observed import refined_frames, refined_objects
-from hvt_study.report.example.choice import CropExample, Example, Lane, Timeline, Word, percentile_rows
-from hvt_study.report.example.store import png_of
+from hvt_study.report.example.choice import (
+    CropExample,
+    Example,
+    Lane,
+    Timeline,
+    Word,
+    percentile_rows,
+    png_of,
+)
 from hvt_study.runs.run_context import RunContext, open_run_context
 from hvt_study.runs.run_settings import flight_plan
 from hvt_study.runs.spec import RunSpec
@@ -48,8 +55,7 @@ _BEST_DB = 99.0
 def fly_again(spec: RunSpec, plan: StudyPlan, *, rule: str) -> Example:
     """Fly the run of `choose_run` once more; ``rule`` says why this one.
 
-    Raises:
-        UserError: dataset or models cannot be used, or the edge refuses its settings.
+    Raises `UserError` where dataset or models cannot be used, or the edge refuses its settings.
     """
     context = open_run_context(spec, cache=plan.cache)
     flight = flight_plan(spec, context, budget_bps=spec.budget_bps, shape=VideoShape())
@@ -58,11 +64,7 @@ def fly_again(spec: RunSpec, plan: StudyPlan, *, rule: str) -> Example:
 
 
 def example_of(flight: FlightPlan, context: RunContext, *, key: str, rule: str, title: str) -> Example:
-    """Fly, and look at it.
-
-    Raises:
-        UserError: the edge refuses its settings.
-    """
+    """Fly, and look at it; `UserError` where the edge refuses its settings."""
     models = SharedModels(context.detector, context.classifier)
     again = Flight(
         flight,

@@ -9,10 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hvt_study.report.data.arms import Arm, BySequence, Setting, values
-from hvt_study.report.data.captions import INTERVALS, under
+from hvt_study.report.data.captions import INTERVALS, METRICS, interval_of, mean_of, under
 from hvt_study.report.data.document import Drawing
-from hvt_study.report.data.intervals import interval_of, mean_of
-from hvt_study.report.data.metric_names import METRICS
 from hvt_study.report.figures.drawing import drawn, fill_of, mark_of, plain_axes, rate_axis, style_of
 
 _UTILITY = ("named_f1", "top1_all", "map_50")

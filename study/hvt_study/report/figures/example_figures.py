@@ -9,8 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hvt_study.report.data.document import Drawing, Picture, PictureRow, Pictures
-from hvt_study.report.example.choice import CropExample, Example, Lane, Timeline
-from hvt_study.report.example.store import enlarged
+from hvt_study.report.example.choice import CropExample, Example, Lane, Timeline, enlarged
 from hvt_study.report.figures.drawing import GREY, INK, PALETTE, drawn, plain_axes
 
 _LANE_IN = 0.18

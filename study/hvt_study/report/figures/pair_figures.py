@@ -12,9 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hvt_study.report.data.arms import Setting
-from hvt_study.report.data.captions import INTERVALS, under
+from hvt_study.report.data.captions import INTERVALS, METRICS, under
 from hvt_study.report.data.document import Drawing
-from hvt_study.report.data.metric_names import METRICS
 from hvt_study.report.data.pairs import EqualQuality, Pair
 from hvt_study.report.figures.drawing import GREY, INK, drawn, mark_of, plain_axes, style_of
 

@@ -1,1 +1,0 @@
-"""From the world to pixels: the camera on its way, projection, and composition of ground and sprites."""

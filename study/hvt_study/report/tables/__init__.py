@@ -1,1 +1,0 @@
-"""Tables of the report, each a function of a `Setting` or of rows."""
