@@ -34,9 +34,7 @@ class Arrival(Generic[_T]):
 
     message: _T
     size_bytes: int
-    """Line bytes."""
     urgent: bool
-    """Of the base stream."""
     enter_ns: int
     """When it was handed to the link."""
     arrival_ns: int

@@ -26,10 +26,8 @@ from hvt_common.inference.labels import metadata_labels
 from hvt_train.learning.halve import halve, stripe_stem, unfold_stem
 
 PREFIX = "street_"
-"""Of all names of YOLOX-nano's part."""
 
 _OWN = "own_output"
-"""Of the aerial part."""
 _STRIDES = (12, 24, 48)
 """Of its cells, pixels of the whole picture: 8, 16 and 32 of what it is given."""
 _THEIR_CONFIDENCE = 0.3

@@ -194,7 +194,6 @@ class _Best:
         self._best = -1.0
 
     def check(self, net: nn.Module, step: int) -> dict[str, float]:
-        """Export, measure and perhaps keep the averaged network of this step."""
         trial = self._stem.with_suffix(".trial.onnx")
         self._export(
             copy.deepcopy(net), trial, properties={**self._properties, "hvt.training_step": str(step)}

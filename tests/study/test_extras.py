@@ -8,7 +8,10 @@ import sys
 
 import pytest
 
-STUDY = ("faster_coco_eval", "jinja2", "matplotlib", "motmetrics", "optuna", "pandas", "pyarrow", "sklearn")
+STUDY = (
+    *("faster_coco_eval", "jinja2", "matplotlib", "motmetrics", "optuna", "pandas", "pyarrow", "scipy"),
+    *("sklearn", "yaml"),
+)
 GROUND = ("cryptography", "rerun")
 BLOCK = """
 import sys

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import time
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import msgpack
@@ -21,7 +20,15 @@ from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.runtimes.model_file import files_of
 from hvt_common.inference.store import resolve_model
 from hvt_common.values import Detections, Image
-from hvt_study.cache.results import DETECTING, code_digest, file_digest, make_folder, read_whole, write_whole
+from hvt_study.cache.results import (
+    DETECTING,
+    code_digest,
+    file_digest,
+    installed,
+    make_folder,
+    read_whole,
+    write_whole,
+)
 
 _PACKAGES = ("numpy", "opencv-python-headless", "onnxruntime", "onnxruntime-gpu", "openvino")
 """Those that may have a say in an answer, as far as they are installed."""
@@ -44,7 +51,8 @@ class CachedDetector(OnnxDetector):
             *(_digest_of_file(file.resolve()) for file in files_of(path)),
             self.model.provider.provider,
             f"{confidence:g}",
-            *_versions(),
+            f"code {code_digest(*DETECTING)}",
+            *(f"{name} {number}" for name, number in installed(_PACKAGES).items()),
         )
         self._name = " ".join(said).encode()
         self._folder = make_folder(folder)
@@ -70,17 +78,6 @@ class CachedDetector(OnnxDetector):
         digest = hashlib.sha1(self._name + repr(image_bgr.shape).encode(), usedforsecurity=False)
         digest.update(image_bgr.tobytes())
         return digest.hexdigest()
-
-
-@cache
-def _versions() -> tuple[str, ...]:
-    found = [f"code {code_digest(*DETECTING)}"]
-    for name in _PACKAGES:
-        try:
-            found.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
-    return tuple(found)
 
 
 def _read(path: Path) -> tuple[Detections, float] | None:

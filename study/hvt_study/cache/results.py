@@ -11,7 +11,9 @@ import json
 import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -61,6 +63,15 @@ def tree_digest(folders: Iterable[Path], *, without: Collection[str] = ()) -> st
     return digest.hexdigest()[:_DIGITS]
 
 
+def installed(packages: Iterable[str]) -> dict[str, str]:
+    """The versions of those of these packages that are installed."""
+    found = {}
+    for name in packages:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
 def _folders(packages: Iterable[str]) -> Iterator[Path]:
     for name in packages:
         found = find_spec(name)
@@ -76,7 +87,6 @@ _log = logging.getLogger(__name__)
 
 _CHECKSUM_BYTES = 16
 FLIGHTS = "flights"
-"""Of the cache: results of flights."""
 
 
 class CacheError(UserError):

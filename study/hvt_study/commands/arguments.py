@@ -39,142 +39,119 @@ _ALL_AT_ONCE = 10_000
 
 
 _USUAL: Mapping[str, dict[str, Any]] = {
+    "--accounting": {
+        "choices": ACCOUNTINGS,
+        "help": "rates by the processed span, or by the length of the whole clip as in the pilot's notebooks, for "
+        "comparison with its tables",
+    },
+    "--cache": {"type": Path, "metavar": "DIR", "help": "finished flights (default: DIR/cache)"},
     "--classes": {"default": "", "metavar": "NAME,…", "help": "of YOLO labels without classes.txt"},
+    "--classifier": {
+        "action": "append",
+        "help": "reads the stills: detector, none, FILE.onnx or a model's name; may be given several times "
+        "(default: detector)",
+    },
+    "--dask": {
+        "metavar": "tcp://…",
+        "help": "run on the workers of this Dask cluster instead, which see the same files "
+        "(dask worker --nthreads 1)",
+    },
+    "--detect-every": {
+        "type": int,
+        "default": 5,
+        "metavar": "N",
+        "help": "frames from one detection to the next at edge and ground; DDS looks at every frame that it codes, "
+        "and with 1 so does the rest",
+    },
     "--detector": {"metavar": "FILE"},
     "--edge-detector": {"metavar": "FILE", "help": "of the edge (default: the ground's)"},
+    "--jobs": {
+        "type": int,
+        "metavar": "N",
+        "help": "processes, each with one thread and one sequence's pictures at a time (default: the cores)",
+    },
     "--labelled": {
         "default": "",
         "metavar": "KIND,…",
         "help": "kinds that the labels know, such as vehicle; others count neither way (default: all they name)",
     },
+    "--labels": {
+        "default": "annotations",
+        "choices": ("annotations", "reference"),
+        "help": "what is there: the dataset's word, or the ground's detector on untouched frames",
+    },
+    "--limit": {"type": int, "metavar": "N", "help": "sequences of a dataset"},
+    "--matched-to": {
+        "metavar": "NAME,…",
+        "help": "methods at whose totals video is coded again (default: each of --methods that is not video)",
+    },
     "--max-frames": {"type": int, "metavar": "N", "help": "frames of the clip, 15 a second"},
     "--methods": {"metavar": "NAME,…", "help": "which to fly"},
+    "--only": {
+        "action": "append",
+        "default": [],
+        "metavar": "NAME",
+        "help": "sequences, or patterns of them",
+    },
     "--out": {"type": Path, "required": True, "metavar": "DIR"},
     "--provider": {
         "default": "cpu",
         "help": "what runs the networks, as of hvt-edge; auto may choose another each time",
     },
     "--rates": {"metavar": "KBPS,…", "help": "budgets in kbps"},
+    "--refine": {"default": "fuse", "choices": ("replace", "fuse"), "help": "as of hvt-ground"},
+    "--regimes": {
+        "default": "low,moderate",
+        "metavar": "NAME,…",
+        "help": "low, moderate, or budgets such as 300kbps",
+    },
     "--size": {"default": "1280x720", "metavar": "WxH", "help": "size of the base stream"},
+    "--still-codecs": {"default": "jpeg", "metavar": "NAME,…", "help": "for the methods with stills"},
+    "--tune": {
+        "action": "append",
+        "default": [],
+        "metavar": "METHOD:KEY=VALUE,…|FILE",
+        "help": "parameters of a method other than its defaults, or the tune.json of a search",
+    },
 }
-"""Options that several commands have."""
 
 
 def option(parser: argparse.ArgumentParser, name: str, **own: Any) -> None:
-    """Add one of those that several commands have, with what is this command's ``own``; no default is not shown."""
-    parser.add_argument(name, **{"default": argparse.SUPPRESS, **_USUAL[name], **own})
+    """Add an option, of several commands or with all that is this command's ``own``; no default is not shown."""
+    parser.add_argument(name, **{"default": argparse.SUPPRESS, **_USUAL.get(name, {}), **own})
 
 
 def add_pool_arguments(parser: argparse.ArgumentParser) -> None:
     """Where it is done."""
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=argparse.SUPPRESS,
-        metavar="N",
-        help="processes, each with one thread and one sequence's pictures at a time (default: the cores)",
-    )
-    parser.add_argument(
-        "--dask",
-        default=argparse.SUPPRESS,
-        metavar="tcp://…",
-        help="run on the workers of this Dask cluster instead, which see the same files (dask worker --nthreads 1)",
-    )
-
-
-def add_accounting(parser: argparse.ArgumentParser, *, default: str) -> None:
-    """What rates are divided by; matching is not touched by it."""
-    parser.add_argument(
-        "--accounting",
-        choices=ACCOUNTINGS,
-        default=default,
-        help="rates by the processed span, or by the length of the whole clip as in the pilot's notebooks, for "
-        "comparison with its tables",
-    )
+    option(parser, "--jobs")
+    option(parser, "--dask")
 
 
 def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True, writes: bool = True) -> None:
     """All that decides which runs there are; ``methods`` where several may be named, ``writes`` with ``--out``."""
     parser.add_argument("datasets", nargs="+", metavar="DATASET", help=", ".join(DATASETS))
-    option(
-        parser,
-        "--detector",
-        action="append",
-        help="of the ground, and of reference labels: FILE.onnx or a model's name; may be given several times "
-        "(default: the embedded one)",
+    several = (
+        "of the ground, and of reference labels: FILE.onnx or a model's name; may be given several times "
+        "(default: the embedded one)"
     )
-    option(parser, "--edge-detector")
-    parser.add_argument(
-        "--classifier",
-        action="append",
-        default=argparse.SUPPRESS,
-        help="reads the stills: detector, none, FILE.onnx or a model's name; may be given several times "
-        "(default: detector)",
-    )
-    parser.add_argument("--refine", default="fuse", choices=("replace", "fuse"), help="as of hvt-ground")
+    option(parser, "--detector", action="append", help=several)
+    for name in ("--edge-detector", "--classifier", "--refine"):
+        option(parser, name)
     every = ",".join(METHODS)
     if methods:
         option(parser, "--methods", default=every)
-        parser.add_argument(
-            "--matched-to",
-            default=argparse.SUPPRESS,
-            metavar="NAME,…",
-            help="methods at whose totals video is coded again (default: each of --methods that is not video)",
-        )
-        parser.add_argument(
-            "--tune",
-            action="append",
-            default=[],
-            metavar="METHOD:KEY=VALUE,…|FILE",
-            help="parameters of a method other than its defaults, or the tune.json of a search",
-        )
+        option(parser, "--matched-to")
+        option(parser, "--tune")
     else:
         parser.set_defaults(methods=every, tune=[])
-    parser.add_argument(
-        "--regimes",
-        default="low,moderate",
-        metavar="NAME,…",
-        help="low, moderate, or budgets such as 300kbps",
-    )
-    parser.add_argument(
-        "--still-codecs", default="jpeg", metavar="NAME,…", help="for the methods with stills"
-    )
-    parser.add_argument(
-        "--labels",
-        default="annotations",
-        choices=("annotations", "reference"),
-        help="what is there: the dataset's word, or the ground's detector on untouched frames",
-    )
-    parser.add_argument(
-        "--detect-every",
-        type=int,
-        default=5,
-        metavar="N",
-        help="frames from one detection to the next at edge and ground; DDS looks at every frame that it codes, and "
-        "with 1 so does the rest",
-    )
-    option(parser, "--size")
+    for name in ("--regimes", "--still-codecs", "--labels", "--detect-every", "--size"):
+        option(parser, name)
     option(parser, "--max-frames", help="frames of a sequence")
-    parser.add_argument(
-        "--limit", type=int, default=argparse.SUPPRESS, metavar="N", help="sequences of a dataset"
-    )
-    parser.add_argument(
-        "--only", action="append", default=[], metavar="NAME", help="sequences, or patterns of them"
-    )
-    option(parser, "--provider")
-    option(
-        parser,
-        "--out",
-        required=writes,
-        help="results.parquet, report.html, …" if writes else "not needed: nothing is written",
-    )
-    parser.add_argument(
-        "--cache",
-        type=Path,
-        default=argparse.SUPPRESS,
-        metavar="DIR",
-        help="finished flights (default: DIR/cache)",
-    )
+    for name in ("--limit", "--only", "--provider"):
+        option(parser, name)
+    written = "results.parquet, report.html, …" if writes else "not needed: nothing is written"
+    option(parser, "--out", required=writes, help=written)
+    option(parser, "--cache")
 
 
 def parse_rates(text: str) -> tuple[int, ...]:

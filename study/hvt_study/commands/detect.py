@@ -112,26 +112,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     option(parser, "--out")
     option(parser, "--detector", default=EMBEDDED_DETECTOR, help="as of hvt-edge")
-    parser.add_argument(
-        "--head", metavar="NAME", help=f"what its outputs mean, as of hvt-edge: {', '.join(HEAD_NAMES)}"
-    )
-    parser.add_argument(
-        "--labels", type=Path, metavar="FILE", help="class names of the detector, as of hvt-edge"
-    )
+    add = parser.add_argument
+    add("--head", metavar="NAME", help=f"what its outputs mean, as of hvt-edge: {', '.join(HEAD_NAMES)}")
+    add("--labels", type=Path, metavar="FILE", help="class names of the detector, as of hvt-edge")
     option(parser, "--size", help="what the detector is given: pictures are fitted into it")
-    parser.add_argument("--tiles", default="off", help="as of hvt-edge: off, auto or CxR")
-    parser.add_argument(
-        "--confidence",
-        type=float,
-        help="least confidence of what is written and counted (default: the detector's own, else 0.25)",
-    )
+    add("--tiles", default="off", help="as of hvt-edge: off, auto or CxR")
+    least = "least confidence of what is written and counted (default: the detector's own, else 0.25)"
+    add("--confidence", type=float, help=least)
     option(parser, "--classes")
     option(parser, "--labelled")
-    parser.add_argument(
-        "--vehicles-as-one", action="store_true", help="car, van, truck and bus are one class"
-    )
+    add("--vehicles-as-one", action="store_true", help="car, van, truck and bus are one class")
     option(parser, "--provider", help="what runs the network, as of hvt-edge")
-    parser.add_argument("--threads", type=int, default=2, help="of the network")
+    add("--threads", type=int, default=2, help="of the network")
 
 
 def run(arguments: argparse.Namespace) -> int:

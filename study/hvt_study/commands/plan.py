@@ -7,11 +7,11 @@ import os
 
 from hvt_common.runtime.reporting import print_table
 from hvt_study.commands.arguments import (
-    add_accounting,
     add_plan_arguments,
     add_pool_arguments,
     jobs_of,
     open_sequences,
+    option,
     study_plan,
 )
 from hvt_study.matrix.estimate import Estimate, estimate, time_of_a_frame
@@ -22,7 +22,7 @@ _MANY_JOBS = 16
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Those of ``run``, so that one line can be both."""
     add_plan_arguments(parser, writes=False)
-    add_accounting(parser, default="span")
+    option(parser, "--accounting", default="span")
     add_pool_arguments(parser)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
-from hvt_study.commands.arguments import add_accounting
+from hvt_study.commands.arguments import option
 from hvt_study.report.write import join_studies, write_report
 
 
@@ -20,14 +20,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="with results.parquet; sweep.csv of hvt-study sweep is taken in where it is there",
     )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=argparse.SUPPRESS,
-        metavar="DIR",
-        help="write there, with one results.parquet of all; needed where there are several (default: DIR itself)",
+    there = (
+        "write there, with one results.parquet of all; needed where there are several (default: DIR itself)"
     )
-    add_accounting(parser, default=argparse.SUPPRESS)
+    option(parser, "--out", required=False, help=there)
+    option(parser, "--accounting")
 
 
 def run(arguments: argparse.Namespace) -> int:

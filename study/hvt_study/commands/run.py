@@ -11,11 +11,11 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
 from hvt_study.commands.arguments import (
-    add_accounting,
     add_plan_arguments,
     add_pool_arguments,
     open_pool,
     open_sequences,
+    option,
     study_plan,
 )
 from hvt_study.commands.output import RunProgress, make_out
@@ -32,7 +32,7 @@ from hvt_study.runs.execute import run_spec
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What to compare, and where it is done and written."""
     add_plan_arguments(parser)
-    add_accounting(parser, default="span")
+    option(parser, "--accounting", default="span")
     add_pool_arguments(parser)
 
 

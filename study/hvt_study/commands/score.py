@@ -30,15 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "tracks", nargs="+", metavar="[NAME=]TRACKS.csv", help="tables of tracks; NAME heads the column"
     )
-    parser.add_argument(
-        "--truth",
-        type=Path,
-        required=True,
-        default=argparse.SUPPRESS,
-        metavar="GT.txt",
-        help="MOTChallenge ground truth: frame,id,x,y,w,h,1,class,visibility",
-    )
-    parser.add_argument("--classes", default=",".join(Scene.class_names), help="names of the truth's classes")
+    truth = "MOTChallenge ground truth: frame,id,x,y,w,h,1,class,visibility"
+    option(parser, "--truth", type=Path, required=True, metavar="GT.txt", help=truth)
+    option(parser, "--classes", default=",".join(Scene.class_names), help="names of the truth's classes")
     option(parser, "--size")
 
 

@@ -15,14 +15,13 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.units import parse_size
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.video import VideoSource
-from hvt_study.commands.arguments import check_whole
+from hvt_study.commands.arguments import check_whole, option
 from hvt_study.commands.output import make_out, print_columns, writing
 from hvt_study.matrix.sweep import COLUMNS, RawDetections, SweepRow, detect_clip, read_csv, sweep
 
 _ANY_SIZE = (64, 64)  # of base frames, which the sweep does not look at
 
 _USUAL = {"detect_every": 5, "confidence": 0.25, "nms_iou": 0.45}
-"""Of a clip."""
 _OF_A_CLIP = ("detector", *_USUAL)
 _OF_A_TABLE = ("size",)
 
@@ -35,34 +34,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CLIP|DETECTIONS.csv",
         help="a video, or columns frame,x1,y1,x2,y2,conf,class",
     )
-    parser.add_argument(
-        "--detector", default=argparse.SUPPRESS, help="for a clip: FILE.onnx or a model's name"
-    )
-    parser.add_argument(
-        "--size", metavar="WxH", default=argparse.SUPPRESS, help="for a CSV file: size of the frames"
-    )
-    parser.add_argument(
-        "--detect-every",
-        type=int,
-        default=argparse.SUPPRESS,
-        metavar="N",
-        help=f"for a clip: one frame in so many (default: {_USUAL['detect_every']})",
-    )
-    parser.add_argument(
-        "--confidence",
-        type=float,
-        default=argparse.SUPPRESS,
-        help=f"for a clip: least confidence of a raw detection (default: {_USUAL['confidence']:g})",
-    )
-    parser.add_argument(
-        "--nms-iou",
-        type=float,
-        default=argparse.SUPPRESS,
-        help=f"for a clip: overlap above which two boxes are one (default: {_USUAL['nms_iou']:g})",
-    )
-    parser.add_argument(
-        "--out", type=Path, default=argparse.SUPPRESS, metavar="DIR", help="also write sweep.csv"
-    )
+    option(parser, "--detector", metavar="DETECTOR", help="for a clip: FILE.onnx or a model's name")
+    option(parser, "--size", default=argparse.SUPPRESS, help="for a CSV file: size of the frames")
+    every = f"for a clip: one frame in so many (default: {_USUAL['detect_every']})"
+    option(parser, "--detect-every", default=argparse.SUPPRESS, help=every)
+    least = f"for a clip: least confidence of a raw detection (default: {_USUAL['confidence']:g})"
+    option(parser, "--confidence", type=float, help=least)
+    overlap = f"for a clip: overlap above which two boxes are one (default: {_USUAL['nms_iou']:g})"
+    option(parser, "--nms-iou", type=float, help=overlap)
+    option(parser, "--out", required=False, help="also write sweep.csv")
 
 
 def run(arguments: argparse.Namespace) -> int:

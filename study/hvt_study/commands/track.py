@@ -122,40 +122,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Files, frame rate, and the options of the authors' program by their names there."""
     share = _number(0, 1)
     parser.add_argument("detections", type=Path, metavar="DETECTIONS", help="lines of frame,id,x,y,w,h,score")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        default=argparse.SUPPRESS,
-        metavar="TRACKS",
-        help="the file of tracks to write",
-    )
-    parser.add_argument("--fps", type=_number(0, 1000, open_below=True), default=30.0, help="frames a second")
-    parser.add_argument(
-        "--track-thresh", type=share, default=0.5, help="score above which tracks are matched first"
-    )
-    parser.add_argument(
-        "--low-thresh", type=share, default=0.1, help="score below which detections are ignored"
-    )
-    parser.add_argument(
-        "--new-thresh",
-        type=share,
-        default=argparse.SUPPRESS,
-        help="least score of a new track (default: track-thresh + 0.1)",
-    )
-    parser.add_argument(
-        "--track-buffer", type=_whole, default=30, help="memory for lost tracks, frames at 30 fps"
-    )
-    parser.add_argument(
-        "--match-thresh", type=share, default=0.8, help="greatest cost 1 - IoU * score of a match"
-    )
-    parser.add_argument("--no-fuse-scores", action="store_true", help="match by IoU alone (mot20)")
-    parser.add_argument(
-        "--min-box-area",
-        type=_number(0, math.inf),
-        default=10.0,
-        help="boxes up to this are not written, square px",
-    )
+    add, hidden = parser.add_argument, argparse.SUPPRESS
+    written = "the file of tracks to write"
+    add("--out", type=Path, required=True, default=hidden, metavar="TRACKS", help=written)
+    add("--fps", type=_number(0, 1000, open_below=True), default=30.0, help="frames a second")
+    add("--track-thresh", type=share, default=0.5, help="score above which tracks are matched first")
+    add("--low-thresh", type=share, default=0.1, help="score below which detections are ignored")
+    least = "least score of a new track (default: track-thresh + 0.1)"
+    add("--new-thresh", type=share, default=hidden, help=least)
+    add("--track-buffer", type=_whole, default=30, help="memory for lost tracks, frames at 30 fps")
+    add("--match-thresh", type=share, default=0.8, help="greatest cost 1 - IoU * score of a match")
+    add("--no-fuse-scores", action="store_true", help="match by IoU alone (mot20)")
+    small = "boxes up to this are not written, square px"
+    add("--min-box-area", type=_number(0, math.inf), default=10.0, help=small)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -210,7 +189,6 @@ def _number(low: float, high: float, *, open_below: bool = False) -> Callable[[s
 
 
 def _whole(text: str) -> int:
-    """An argparse type: a whole number from 0 to the last frame there can be."""
     if not (text.isascii() and text.isdigit() and int(text) <= LAST_FRAME):
         raise argparse.ArgumentTypeError(f"is {text}, must be a whole number from 0 to {LAST_FRAME}")
     return int(text)

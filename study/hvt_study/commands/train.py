@@ -50,7 +50,6 @@ class _Own:
     path: Path
     labels: FrameLabels
     labelled_size: tuple[int, int] | None = None
-    """As of `LabelledPicture`."""
 
     def base(self, size: _Size) -> tuple[Image, FrameLabels]:
         """As the edge fits it into the base stream, with the labels there."""
@@ -70,21 +69,11 @@ class _Own:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Labelled pictures, where to begin, and for how long."""
-    parser.add_argument(
-        "--data",
-        action="append",
-        required=True,
-        default=argparse.SUPPRESS,
-        metavar="yolo:FOLDER|coco:FILE.json",
-        help="labelled pictures: images/, labels/ and classes.txt, or COCO's JSON; may be given several times",
-    )
-    parser.add_argument(
-        "--held-out",
-        action="append",
-        default=[],
-        metavar="yolo:FOLDER|coco:FILE.json",
-        help="pictures to measure on in place of the last fifth of --data",
-    )
+    several = {"action": "append", "metavar": "yolo:FOLDER|coco:FILE.json"}
+    data = "labelled pictures: images/, labels/ and classes.txt, or COCO's JSON; may be given several times"
+    option(parser, "--data", **several, required=True, help=data)
+    apart = "pictures to measure on in place of the last fifth of --data"
+    option(parser, "--held-out", **several, default=[], help=apart)
     parser.add_argument("--start", default=EMBEDDED_DETECTOR, metavar="NAME|FILE", help="where to begin")
     option(parser, "--out", metavar="FILE.onnx")
     option(parser, "--classes")

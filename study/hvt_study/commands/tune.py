@@ -29,14 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plan_arguments(parser, methods=False)
     add_pool_arguments(parser)
     parser.add_argument("--method", required=True, help="the one to tune, such as M5")
-    parser.add_argument(
-        "--parameters", default="", metavar="NAME,…", help="which of its parameters (default: all)"
-    )
-    parser.add_argument("--trials", type=int, default=40, metavar="N", help="proposals that are flown")
-    parser.add_argument(
+    add = parser.add_argument
+    add("--parameters", default="", metavar="NAME,…", help="which of its parameters (default: all)")
+    add("--trials", type=int, default=40, metavar="N", help="proposals that are flown")
+    add(
         "--held-out", type=float, default=0.34, metavar="SHARE", help="of the sequences, for the report alone"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the search")
+    add("--seed", type=int, default=0, help="of the search")
 
 
 def run(arguments: argparse.Namespace) -> int:

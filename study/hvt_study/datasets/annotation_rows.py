@@ -34,11 +34,9 @@ class Rows:
     table: npt.NDArray[np.float64]
     """(N, C), finite."""
     columns: tuple[str, ...]
-    """C names."""
     lines: npt.NDArray[np.int64]
     """(N,) line in the file, from 1."""
     text: tuple[str, ...]
-    """N lines."""
     of_dataset: bool = False
     """A line that is wrong is left out."""
 

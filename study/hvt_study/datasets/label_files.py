@@ -22,8 +22,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-import yaml
-
 from hvt_common import files
 from hvt_common.errors import UserError
 from hvt_common.inference.labels import numbered_names, read_labels
@@ -33,9 +31,7 @@ from hvt_study.datasets.labels import FrameLabels, LabelDoubts
 LOOKED_IN = (
     "labels/, annotations/, Annotations/, beside the pictures, and COCO's JSON in annotations/ and beside"
 )
-"""For sentences."""
 YAML = (".yaml", ".yml")
-"""Endings."""
 _PICTURES = ("images", "JPEGImages", "data", "obj_train_data")
 _LABELS = (
     *(("labels", ".txt"), ("annotations", ".txt")),
@@ -176,6 +172,8 @@ def keypoint_columns(path: Path | None) -> int:
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     """A table whose words are all text; `UserError` where the file is no YAML. What is no table is an empty one."""
+    import yaml  # noqa: PLC0415 - of the study alone; hvt-study sweep runs where only the edge is installed
+
     try:
         found = yaml.load(read_text(path), yaml.BaseLoader)  # noqa: S506 - makes text, lists and tables alone
     except (yaml.YAMLError, RecursionError) as error:
@@ -283,7 +281,6 @@ def _number(text: str | None, *, missing: float = 0.0) -> float:
 
 
 YOLO_COLUMNS = 5
-"""Class and box."""
 _MOST_COLUMNS = 6
 """With a confidence, as trackers and annotators add it; more is a polygon."""
 _LEAST_POLYGON = 7

@@ -30,11 +30,16 @@ class Regions:
     """Boxes by frame that are not asked for: regions in which nothing counts, and single objects."""
 
     frames: npt.NDArray[np.int64]
-    """(M,)"""
     boxes: Boxes
-    """(M, 4)"""
     land: npt.NDArray[np.bool_]
     """(M,) True for regions whose objects nobody has labelled, False for a single object that does not count."""
+
+    @classmethod
+    def of(
+        cls, rows: Rows, chosen: npt.NDArray[np.bool_], land: npt.NDArray[np.bool_], *, origin: float = 0.0
+    ) -> Regions:
+        """These of some rows; ``origin`` is the first pixel's number."""
+        return cls(rows["frame"].astype(np.int64)[chosen], rows.boxes(origin=origin)[chosen], land[chosen])
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,27 +57,24 @@ class LabelTable:
     @classmethod
     def of(
         cls,
-        *,
-        frames: npt.NDArray[np.int64],
-        boxes: Boxes,
-        ids: npt.NDArray[np.int64],
+        rows: Rows,
+        judged: npt.NDArray[np.bool_],
         class_ids: npt.NDArray[np.int64],
         class_names: tuple[str, ...],
+        *,
         ignored: Regions,
         size: tuple[int, int],
+        origin: float = 0.0,
     ) -> LabelTable:
-        """From rows in any order: boxes are cut at the frame of this (width, height), empty ones left out."""
-        boxes, regions = inside_frame(boxes, size), inside_frame(ignored.boxes, size)
-        rows = _rows_with_area(frames, boxes)
+        """Those rows that are ``judged``, cut at the frame of this (width, height); empty ones are left out."""
+        frames, boxes = rows["frame"].astype(np.int64), inside_frame(rows.boxes(origin=origin), size)
+        regions = inside_frame(ignored.boxes, size)
         places = _rows_with_area(ignored.frames, regions)
-        return cls(
-            frames=frames[rows],
-            boxes=boxes[rows],
-            ids=ids[rows],
-            class_ids=class_ids[rows],
-            class_names=class_names,
-            ignored=Regions(ignored.frames[places], regions[places], ignored.land[places]),
-        )
+        kept = _rows_with_area(frames, boxes)
+        kept = kept[judged[kept]]
+        ids = rows["id"].astype(np.int64)[kept]
+        passed = Regions(ignored.frames[places], regions[places], ignored.land[places])
+        return cls(frames[kept], boxes[kept], ids, class_ids[kept], class_names, passed)
 
     @property
     def class_set(self) -> tuple[str, ...]:
@@ -176,14 +178,7 @@ def _table(rows: Rows, size: tuple[int, int]) -> LabelTable:
         np.isin(rows["category"], np.arange(_OTHERS + 1)),
         accepted=f"a category from 0 to {_OTHERS} in column {column}",
     )
-    category, frames, boxes = rows["category"].astype(np.int64), rows["frame"].astype(np.int64), rows.boxes()
+    category = rows["category"].astype(np.int64)
     judged = (category >= 1) & (category <= len(VISDRONE_NAMES)) & (rows["score"] != 0)
-    return LabelTable.of(
-        frames=frames[judged],
-        boxes=boxes[judged],
-        ids=rows["id"].astype(np.int64)[judged],
-        class_ids=category[judged] - 1,
-        class_names=VISDRONE_NAMES,
-        ignored=Regions(frames[~judged], boxes[~judged], category[~judged] == _REGION),
-        size=size,
-    )
+    ignored = Regions.of(rows, ~judged, category == _REGION)
+    return LabelTable.of(rows, judged, category - 1, VISDRONE_NAMES, ignored=ignored, size=size)

@@ -73,7 +73,6 @@ class LabelledPicture:
     keypoints: int = 0
     """Columns of keypoints behind the boxes of a YOLO file."""
     doubts: LabelDoubts = field(default_factory=LabelDoubts)
-    """Of the whole set."""
 
     @property
     def unreadable(self) -> str:

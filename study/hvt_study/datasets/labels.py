@@ -69,7 +69,6 @@ class LabelDoubts:
     """What was wrong with the labels of a set, counted; the worst, or the first, is named."""
 
     good: int = 0
-    """Rows that count."""
     _clipped: int = 0
     _worst: tuple[float, str] = (0.0, "")
     _left_out: int = 0

@@ -140,7 +140,6 @@ class Sequence:
     frame_count: int
     """Source frames of the whole sequence, of which `limited` takes nothing away."""
     fps: float
-    """Source frames a second."""
     source_size: tuple[int, int]
     """(width, height) in pixels."""
     labels: Callable[[int], FrameLabels] | None

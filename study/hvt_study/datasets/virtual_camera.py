@@ -50,7 +50,6 @@ _LEAST_VISIBLE = 0.6
 """An object of which the window shows less is not asked for."""
 _LEAST_SIDE_PX = 64
 _YOLO = "labels"
-"""Folder of YOLO's label files."""
 _ACROSS, _DOWN = range(-3, 4), range(-2, 3)
 """Mirror images on each axis: enough for the widest view on its whole way."""
 
@@ -130,7 +129,6 @@ class VirtualCamera:
     """Height of what it sees at its lowest, in heights of the picture; beyond about 0.9 mirrored land is in view."""
     fps: float = 15.0
     seed: int = 0
-    """Of the way that it takes."""
     annotated: bool = True
     """False: the annotations are not looked at."""
     classes: tuple[str, ...] = ()

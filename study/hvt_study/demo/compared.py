@@ -110,7 +110,6 @@ class Shown:
     object_id: int
     still: FlownStill
     box_base_px: tuple[float, float, float, float]
-    """Of the code at the still's frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +223,6 @@ class Compared:
     legible: tuple[Legible, ...] | None
     """None where no reader is installed."""
     codes: Mapping[int, Code]
-    """What there was to read."""
     truth: Mapping[int, FrameLabels]
     """By frame, from 1; base pixels."""
     views: Sequence[Sequence[CodeInView]]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from hvt_common.errors import UserError
 from hvt_common.values import Image
 from hvt_study.datasets.labels import FrameLabels
-from hvt_study.metrics.judged import LEAST_IOU, FrameView, matched_rows
+from hvt_study.metrics.judged import FrameView, matched_rows
 
 _Colour = tuple[int, int, int]
 
@@ -80,7 +80,7 @@ def _panel(one: Panel) -> Image:
     canvas = _coarse(np.asarray(cv2.resize(part, _PANEL_PX, interpolation=cv2.INTER_CUBIC), np.uint8))
     truth = (one.truth.boxes_xyxy_px - [x, y, x, y]) * scale
     shown = (one.shown.boxes_xyxy_px - [x, y, x, y]) * scale
-    partner = dict(matched_rows(shown, truth, least_iou=LEAST_IOU).tolist())
+    partner = dict(matched_rows(shown, truth).tolist())
     for row in set(range(len(truth))) - set(partner.values()):
         cv2.rectangle(canvas, *_corners(truth[row]), _MISSED, 1, cv2.LINE_8)
     for row, name in enumerate(one.shown.class_names):

@@ -65,12 +65,10 @@ class FlightReport:
     lists: tuple[ObservedFrame, ...]
     """The ground's list at every frame, source pixels."""
     account: LedgerSummary
-    """The edge's ledger over the whole clip."""
     line_bytes: Mapping[str, int]
     """By row of the key table: payload, attachment and transport."""
     messages: Mapping[str, int]
     max_frame_bytes: int
-    """The largest access unit."""
     link: LinkReport
     """Its delays are those of the base stream, from capture to arrival."""
     picture_age_p95_ms: float
@@ -275,7 +273,6 @@ class _NoGround:
         """Nothing is listed."""
 
     def advance(self, now_ns: int | None) -> None:
-        """Let go of what has arrived."""
         self._link.arrived(now_ns)
 
     def close(self) -> None:

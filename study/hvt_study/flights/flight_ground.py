@@ -123,7 +123,6 @@ class GroundSide:
         self._info = info
         self._captures = CaptureTimes()
         self.now_ns = info.started_ns
-        """Media time."""
         detector, classifier = models.take()
         shared = SharedModels(detector, classifier, config=config)
         self._session = GroundSession(
@@ -145,15 +144,12 @@ class GroundSide:
         """By how much the newest picture came after its capture."""
         self._uncoded: deque[tuple[int, int]] = deque()
         self.lists: dict[int, ObservedFrame] = {}
-        """By frame."""
         self.results: deque[tuple[int, StillResult]] = deque()
         """What the edge is to hear, with the time at which it does."""
         self.detected: deque[tuple[int, Detected]] = deque()
-        """The same of what the detector shows."""
         self.back_bytes = 0
         """Line bytes of the reports that say something of stills; the way back is not the budget's."""
         self.arrivals: list[Arrival[Received]] = []
-        """Everything, in order."""
         self.base_delays_ns: list[int] = []
         """Capture to arrival of every picture."""
         self.shown_ns: list[tuple[int, int]] = []

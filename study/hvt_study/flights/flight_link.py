@@ -91,7 +91,6 @@ class FlightOutlet:
         self.messages: Counter[str] = Counter()
         self.max_frame_bytes = 0
         self.last_frame = -1
-        """Index of the newest frame sent."""
 
     def has_ground(self) -> bool:
         """Always."""

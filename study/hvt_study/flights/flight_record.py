@@ -97,10 +97,8 @@ class _Pending:
 
     done: RefinedObject
     frame_index: int
-    """Of the still."""
     edge_track_id: int
     box_source_px: Boxes
-    """(1, 4)"""
 
 
 class FlightRecord:

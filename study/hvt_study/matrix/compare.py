@@ -58,7 +58,6 @@ class ComparePlan:
     rates_bps: tuple[int, ...]
     cache: Path
     methods: tuple[str, ...] = tuple(COMPARED)
-    """Names of `COMPARED`."""
     size: tuple[int, int] | None = None
     """(width, height) of the base stream in pixels; None: as of ``hvt-edge``, never larger than the source."""
     max_frames: int | None = None
@@ -70,7 +69,6 @@ class ComparePlan:
 
 
 _Run: TypeAlias = tuple[int, str]
-"""Rate and name of `COMPARED`."""
 CompareRow: TypeAlias = dict[str, Any]
 """One flight over the whole clip (``half`` 0) or one half of it (1, 2), by the names of `_FIGURES`; docs/compare.md
 says what they are. What is not of the list is of the whole clip, in all three alike."""

@@ -30,11 +30,9 @@ class Estimate:
 
     sequences: int
     frames: int
-    """Of all sequences."""
     runs: int
     """Rows of results.parquet; where methods spend the same, several rows share one flight, and it takes less."""
     source_bytes: int
-    """Pictures and annotations."""
     cache_bytes: int
     scratch_bytes: int
     """Pixels of one sequence in the folder for temporary files, for each process."""

@@ -47,7 +47,6 @@ class StudyPlan:
     max_frames: int | None = None
     detect_every: int = 5
     tune: Mapping[str, tuple[str, ...]] | None = None
-    """Parameters by method."""
     matched_to: tuple[str, ...] | None = None
     """Methods at whose totals video is coded again; None: each that is not video itself."""
 

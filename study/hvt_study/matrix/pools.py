@@ -21,7 +21,6 @@ R = TypeVar("R")
 
 _CONNECT_S = 10
 _TALKERS = ("distributed", "distributed.client", "tornado", "tornado.application", "asyncio")
-"""Loggers with a level of their own."""
 _GOES_ON = "finished runs are kept, and the same command goes on from there"
 
 

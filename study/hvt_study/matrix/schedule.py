@@ -103,7 +103,6 @@ class _Agenda:
                 yield spec
 
     def finished(self, spec: RunSpec, row: RunRow) -> None:
-        """Make room, and note what follows."""
         self._busy.discard(_flight(spec))
         matched = list(matched_runs(self._plan, spec, row))
         self._matched += matched
@@ -115,6 +114,5 @@ class _Agenda:
 
 
 def _flight(spec: RunSpec) -> tuple[object, ...]:
-    """What two runs of one flight have in common."""
     near = None if spec.target is None else grid_target(spec.target.total_bps)
     return (spec.dataset, spec.sequence, spec.method, spec.budget_bps, spec.still_codec, spec.models, near)

@@ -39,9 +39,7 @@ class SweepRow:
 
     policy: str
     selected: int
-    """ROIs kept, over all frames."""
     ratio: float
-    """Of the raw detections."""
     frame_coverage: float
     """Share of the frames with raw detections that keep at least one ROI."""
 

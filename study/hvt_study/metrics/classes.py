@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_study.metrics.judged import (
-    LEAST_IOU,
     LIMITS_PX2,
     SIZES,
     Judged,
@@ -47,7 +46,6 @@ class ClassCounts:
     found: int = 0
     """Matched with a box that is shown."""
     labels: int = 0
-    """As judged."""
 
     @property
     def top1_found(self) -> float:
@@ -114,12 +112,10 @@ class _Pairs:
     said: _Codes
     """(L,) class of its box, `_NOBODY` where it was missed."""
     areas_px2: npt.NDArray[np.float64]
-    """(L,)"""
     stray: _Codes
     """(S,) classes of the boxes without a label."""
 
     def counts(self, rows: npt.NDArray[np.bool_]) -> ClassCounts:
-        """Of some labels."""
         true, said = self.true[rows], self.said[rows]
         return ClassCounts(int((true == said).sum()), int((said != _NOBODY).sum()), len(true))
 
@@ -130,7 +126,6 @@ def class_score(
     refined: bool = True,
     word: Callable[[str], str] = str,
     classes: Collection[str] | None = None,
-    least_iou: float = LEAST_IOU,
     limits_px2: tuple[float, float] = LIMITS_PX2,
 ) -> ClassScore:
     """Count right classes over all frames.
@@ -140,11 +135,10 @@ def class_score(
         refined: names as shown; False takes those before refinement, of the very same boxes.
         word: see `judged.judged`.
         classes: likewise.
-        least_iou: from which on a box is on a label.
         limits_px2: areas in source pixels between small and medium, and between medium and large.
     """
     frames = judged(labelled, word=word, classes=classes)
-    pairs = _paired(frames, refined=refined, least_iou=least_iou)
+    pairs = _paired(frames, refined=refined)
     every = np.ones(len(pairs.true), np.bool_)
     return ClassScore(
         counts=pairs.counts(every),
@@ -156,14 +150,14 @@ def class_score(
     )
 
 
-def _paired(frames: Sequence[Judged], *, refined: bool, least_iou: float) -> _Pairs:
+def _paired(frames: Sequence[Judged], *, refined: bool) -> _Pairs:
     code_of: dict[str, int] = {}
     true: list[_Codes] = [np.empty(0, np.int64)]
     said, stray, areas = list(true), list(true), [np.empty(0)]
     for one in frames:
         labels = _codes(one.class_names, code_of)
         shown = _codes(one.view.class_names if refined else one.view.names_before, code_of)
-        rows, columns = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px, least_iou=least_iou).T
+        rows, columns = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px).T
         partners = np.full(len(labels), _NOBODY, np.int64)
         partners[rows] = shown[columns]
         true.append(labels)

@@ -32,7 +32,6 @@ class AveragePrecision:
     """0…1; NaN where there is no label of the kind."""
 
     at_50: float = math.nan
-    """At IoU 0.5."""
     at_50_95: float = math.nan
     """Mean over IoU 0.5, 0.55 … 0.95."""
 
@@ -44,7 +43,6 @@ class DetectionScore:
     mean: AveragePrecision
     """Over the classes that have labels."""
     by_class: Mapping[str, AveragePrecision]
-    """Of each class that has labels."""
     by_size: Mapping[Size, AveragePrecision]
     """Mean over classes, of labels of one size; boxes of other sizes that match nothing do not count."""
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.stats import CensoredData, ecdf
 
 from hvt_study.datasets.labels import NO_ID
-from hvt_study.metrics.judged import LEAST_IOU, Judged, LabelledFrames, judged, matched_rows
+from hvt_study.metrics.judged import Judged, LabelledFrames, judged, matched_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,6 @@ def first_correct(
     refined: bool = True,
     word: Callable[[str], str] = str,
     classes: Collection[str] | None = None,
-    least_iou: float = LEAST_IOU,
 ) -> FirstCorrect:
     """Watch every true track.
 
@@ -89,7 +88,7 @@ def first_correct(
         there = [track for track in one.ids.tolist() if track != NO_ID]
         first = dict.fromkeys(there, frame_index) | first
         last |= dict.fromkeys(there, frame_index)
-        right = dict.fromkeys(_right_ids(one, refined=refined, least_iou=least_iou), frame_index) | right
+        right = dict.fromkeys(_right_ids(one, refined=refined), frame_index) | right
     if shown_s is None:
         shown_s = [frame_index / fps for frame_index in range(len(labelled))]
     end_s = [shown_s[right.get(track, last[track])] for track in first]
@@ -97,9 +96,9 @@ def first_correct(
     return FirstCorrect(waits_s, np.array([track not in right for track in first], np.bool_))
 
 
-def _right_ids(one: Judged, *, refined: bool, least_iou: float) -> list[int]:
+def _right_ids(one: Judged, *, refined: bool) -> list[int]:
     """True tracks that this frame shows with their class."""
     shown = one.view.class_names if refined else one.view.names_before
-    pairs = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px, least_iou=least_iou).tolist()
+    pairs = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px).tolist()
     hits = [row for row, column in pairs if shown[column] == one.class_names[row]]
     return [track for track in one.ids[hits].tolist() if track != NO_ID]

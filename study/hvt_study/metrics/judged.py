@@ -20,7 +20,6 @@ from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 from hvt_common.inference.class_names import MOVING
 from hvt_common.values import Boxes, iou
@@ -84,7 +83,6 @@ def rows_of(names: Sequence[str], chosen: Rows) -> tuple[str, ...]:
 
 
 LabelledFrame: TypeAlias = tuple[FrameLabels, FrameView]
-"""What was there, and what was shown."""
 
 LabelledFrames: TypeAlias = Sequence[LabelledFrame]
 """Of one sequence, in order; it may be empty."""
@@ -192,6 +190,8 @@ def matched_rows(
     """
     if not len(labels_xyxy_px) or not len(shown_xyxy_px):
         return np.empty((0, 2), np.int64)
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - what needs no figures runs without it
+
     overlap = iou(labels_xyxy_px, shown_xyxy_px)
     enough = overlap >= least_iou
     # A pair that counts is worth more than any sum of overlaps.

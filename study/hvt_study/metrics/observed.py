@@ -25,11 +25,8 @@ class StillArrival:
     sent_s: float
     """When it was handed to the link."""
     arrived_s: float
-    """When its last bit was there."""
     size_bytes: int
-    """Payload."""
     line_bytes: int
-    """With header and transport."""
     reason: str
     """Why the edge's method sent it."""
 
@@ -40,9 +37,7 @@ class Opinion:
 
     class_name: str
     confidence: float
-    """Of ``class_name``, 0…1."""
     entropy_nats: float
-    """Of the whole posterior."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,15 +73,10 @@ class ObservedFrame:
     """The ground's list at one source frame, with all that metrics need of it; N tracks."""
 
     boxes_xyxy_px: Boxes = field(default_factory=no_boxes)
-    """(N, 4) float32, source pixels."""
     classes: tuple[str, ...] = ()
-    """N names as shown."""
     ids: npt.NDArray[np.int64] = field(default_factory=no_ids)
-    """(N,) of the ground."""
     confidences: npt.NDArray[np.float32] = field(default_factory=no_numbers)
-    """(N,) of the class that is shown."""
     classes_before: tuple[str, ...] = ()
-    """N names without refinement."""
     confidences_before: npt.NDArray[np.float32] = field(default_factory=no_numbers)
     """(N,) of the last detection that was matched."""
     origins: tuple[str, ...] = ()

@@ -113,7 +113,6 @@ def _logits(confidences: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 _VEHICLE = "vehicle"
 VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
-"""Kinds that `as_one` takes for one."""
 
 
 def as_one(name: str) -> str:

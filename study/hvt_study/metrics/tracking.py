@@ -198,11 +198,7 @@ class TrackingScore:
 
 
 def tracking_score(
-    labelled: LabelledFrames,
-    *,
-    word: Callable[[str], str] = str,
-    classes: Collection[str] | None = None,
-    least_iou: float = LEAST_IOU,
+    labelled: LabelledFrames, *, word: Callable[[str], str] = str, classes: Collection[str] | None = None
 ) -> TrackingScore:
     """Compare what is shown at every frame with the labelled tracks; ``word`` and ``classes`` as in `judged.judged`.
 
@@ -213,7 +209,7 @@ def tracking_score(
         known, tracked = one.ids != NO_ID, one.view.ids != NO_ID
         true = one.ids[known], one.boxes_xyxy_px[known]
         frames.append((true, (one.view.ids[tracked], one.view.boxes_xyxy_px[tracked])))
-    return compare_tracks(frames, least_iou=least_iou)
+    return compare_tracks(frames)
 
 
 def compare_tracks(
@@ -255,20 +251,15 @@ class Continuity:
     """Mean over objects of the share of their frames at which they are found, 0…1; NaN without objects."""
     gaps: int
     longest_gap: int
-    """Frames."""
 
 
 def continuity(
-    labelled: LabelledFrames,
-    *,
-    word: Callable[[str], str] = str,
-    classes: Collection[str] | None = None,
-    least_iou: float = LEAST_IOU,
+    labelled: LabelledFrames, *, word: Callable[[str], str] = str, classes: Collection[str] | None = None
 ) -> Continuity:
     """Follow every object with an id through its frames; ``word`` and ``classes`` as in `judged.judged`."""
     lives: dict[int, list[bool]] = {}
     for one in judged(labelled, word=word, classes=classes):
-        pairs = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px, least_iou=least_iou)
+        pairs = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px)
         found = set(pairs[:, 0].tolist())
         for row, number in enumerate(one.ids.tolist()):
             if number != NO_ID:

@@ -122,7 +122,6 @@ class DdsEdge:
         self._ready: list[AccessUnit] = []
         self._first_done = self._second_done = False
         self.cpu_s = 0.0
-        """Of both passes."""
 
     @property
     def idle(self) -> bool:
@@ -178,7 +177,6 @@ class DdsEdge:
         self.cpu_s += time.process_time() - began_s
 
     def _fill(self) -> None:
-        """Code what makes up the next message."""
         while self._requested and sum(len(unit.data) for unit in self._ready) < self._settings.bundle_bytes:
             self._ready.append(self._code_next())
 

@@ -38,12 +38,10 @@ class _Held:
     frame_index: int
     capture_ns: int
     picture_bgr: Image
-    """Base size."""
     found: Detections
     """Of the first pass; of both once the second has come."""
     blocks: Blocks
     whole: bool = False
-    """Nothing more is to come for it."""
 
 
 @dataclass(slots=True)
@@ -59,12 +57,9 @@ class DdsGround:
     settings: DdsSettings
     view: View
     segments: Sequence[tuple[int, ...]]
-    """The coded frames of each segment."""
     line: Line
     started_ns: int
-    """Capture of the first frame."""
     lists: dict[int, ObservedFrame] = field(default_factory=dict)
-    """By frame."""
     delays_ns: list[int] = field(default_factory=list)
     """Of every coded frame, in order: capture to the arrival that finished it."""
     shown_ns: list[tuple[int, int]] = field(default_factory=list)
@@ -147,7 +142,6 @@ class DdsGround:
         mine.whole = True
 
     def _finish(self) -> None:
-        """List the frames that are complete, in order."""
         while self._held:
             one = next(iter(self._held.values()))
             if not one.whole:

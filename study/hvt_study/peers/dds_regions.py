@@ -55,7 +55,6 @@ class DdsSettings:
     max_area: float = 0.04
     """A larger region is not asked for (``size_obj``)."""
     merge_iou: float = 0.3
-    """Regions that overlap more become one."""
     enlarge: float = 0.1
     """By so much of its own length a region grows on every side (``rpn_enlarge_ratio``)."""
     align_px: int = 16
@@ -69,7 +68,6 @@ class DdsSettings:
     camera_motion: Literal["off", "flow"] = "flow"
     """Of the tracker, as at the ground that flies."""
     preset: str = "veryfast"
-    """Of x265, both passes."""
     bundle_bytes: int = 4000
     """Access units of the second pass share a message up to about so much: DDS sends a segment's as one file."""
     request_bytes: int = 700
@@ -230,7 +228,6 @@ class RegionRequest:
     """One question of the ground."""
 
     first_frame: int
-    """Of the segment."""
     frames: tuple[Blocks, ...]
     """Of every coded frame of the segment in order, 1 to 255; empty masks where nothing is asked."""
 

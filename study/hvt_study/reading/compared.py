@@ -35,9 +35,7 @@ READ_METHODS: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
 _VIDEO = ("M0", "M0-best")
 _FPS_CHOICES = (15.0, 5.0, 2.0, 1.0, 0.5)
 _MOST_FPS_LARGE = 5.0
-"""Of video larger than the base stream."""
 _HEIGHT_EDGES_PX = (0.0, 8.0, 11.0, 1e6)
-"""Of the three groups of character heights."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +48,6 @@ class ReadPlan:
     rates_bps: tuple[int, ...]
     cache: Path
     methods: tuple[str, ...] = tuple(READ_METHODS)
-    """Names of `READ_METHODS`."""
     size: tuple[int, int] = (1280, 720)
     """(width, height) of the base stream."""
     max_frames: int | None = None
@@ -75,7 +72,6 @@ class ReadRow:
     """One method at one rate over all scenes."""
 
     rate_kbps: float
-    """0 for the source."""
     method: str
     scenes: tuple[SceneReading, ...]
 

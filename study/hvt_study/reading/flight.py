@@ -41,12 +41,10 @@ class ReadFlight:
     size: tuple[int, int]
     """(width, height) of the base stream; of the source where that was read itself."""
     fps: float
-    """Base pictures a second."""
     total_bps: int
     base_bps: int
     roi_bps: int
     evidence: Mapping[Channel, Mapping[int, Evidence]]
-    """By channel and object."""
 
 
 class Readings:
@@ -61,7 +59,6 @@ class Readings:
         assert sequence.codes is not None, "whoever calls has looked"
         self._views = [sequence.codes(sequence.source_frame(index)) for index in range(sequence.clip_frames)]
         self.codes = codes_to_read(self._views)
-        """What there is to read, by object."""
         if not self.codes:
             raise UserError(f"{spec.sequence} shows no code for a second: give more --max-frames")
         self._reader = reader

@@ -147,5 +147,4 @@ class CodeObserver:
 
 
 def _share(code: CodeInView, still: DecodedStill) -> float:
-    """How much of a code's box a still shows, 0…1."""
     return share_inside(code.box_source_px, np.array(still.crop_source_px, np.float32))

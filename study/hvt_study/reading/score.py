@@ -26,7 +26,6 @@ from hvt_study.datasets.sequence import NOMINAL_FPS
 _HEIGHT_PX = 48  # of a line of text, as the network takes it
 _WIDTH_PX = 192
 _MARGIN = 0.15
-"""Of the shorter side of a box, around it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +86,6 @@ def code_crop(image: Image, box_px: Sequence[float]) -> Image:
 
 
 def _lying(crop: Image) -> tuple[Image, Image]:
-    """The crop with its longer side across, and the same upside down."""
     flat = crop if crop.shape[1] >= crop.shape[0] else cv2.rotate(crop, cv2.ROTATE_90_CLOCKWISE)
     return np.asarray(flat, np.uint8), np.asarray(cv2.rotate(flat, cv2.ROTATE_180), np.uint8)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.arms import RunRow, Setting, counts, sequence_of, settings
@@ -96,12 +96,12 @@ def make_report(
         Section("End-to-end results", tuple(_each(found, spent_table, seen_table, named_table, size_table))),
         Section("Method matrix", tuple(_matrices(found))),
         Section("Against video at the same bits", tuple(_against(found))),
-        Section("Utility over bitrate", tuple(_utility(found))),
-        Section("Still codecs", tuple(_codecs(found))),
+        Section("Utility over bitrate", tuple(_curves(found, "utility", utility_figure))),
+        Section("Still codecs", tuple(_curves(found, "codecs", codec_figure))),
         Section("One flight", tuple(_flight(rows, example))),
         Section("The pilot's accounting and proxies", tuple(_pilot(rows, found))),
         Section("Metrics", (metrics_table(accounting),)),
-        Section("Runs that do not count", tuple(_failed(rows))),
+        Section("Runs that do not count", tuple(_there(failed_table(rows)))),
         Section("What it was run with", tuple(_provenance(rows))),
     )
     return Report(
@@ -151,13 +151,9 @@ def _many(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
-def _each(found: Iterable[Setting], *makers: object) -> Iterator[Part]:
-    for setting in found:
-        for make in makers:
-            assert callable(make)
-            table: Table = make(setting)
-            if table.rows:
-                yield table
+def _each(found: Iterable[Setting], *makers: Callable[[Setting], Table]) -> Iterator[Part]:
+    tables = (make(setting) for setting in found for make in makers)
+    yield from (table for table in tables if table.rows)
 
 
 def _pilot(rows: Sequence[RunRow], found: Sequence[Setting]) -> Iterator[Part]:
@@ -169,16 +165,12 @@ def _pilot(rows: Sequence[RunRow], found: Sequence[Setting]) -> Iterator[Part]:
 def _matrices(found: Iterable[Setting]) -> Iterator[Part]:
     for setting in found:
         for column in _MATRICES:
-            table = matrix_table(setting, column)
-            if table is not None:
-                yield table
+            yield from _there(matrix_table(setting, column))
 
 
 def _against(found: Sequence[Setting]) -> Iterator[Part]:
     for index, setting in enumerate(found):
-        table = differences_table(setting, list(pairs(setting)))
-        if table is not None:
-            yield table
+        yield from _there(differences_table(setting, list(pairs(setting))))
         if index:  # the first stands above all
             yield from forests(setting, name=f"differences-{index + 1}")
         equal = [
@@ -192,14 +184,9 @@ def _against(found: Sequence[Setting]) -> Iterator[Part]:
         yield from _there(equal_table(setting, equal, column=DECIDES))
 
 
-def _utility(found: Sequence[Setting]) -> Iterator[Part]:
-    for index, setting in enumerate(found):
-        yield from _there(utility_figure(setting, name=f"utility-{index + 1}"))
-
-
-def _codecs(found: Sequence[Setting]) -> Iterator[Part]:
-    for index, setting in enumerate(found):
-        yield from _there(codec_figure(setting, name=f"codecs-{index + 1}"))
+def _curves(found: Sequence[Setting], name: str, make: Callable[..., Drawing | None]) -> Iterator[Part]:
+    for index, setting in enumerate(found, start=1):
+        yield from _there(make(setting, name=f"{name}-{index}"))
 
 
 def _flight(rows: Sequence[RunRow], example: Example | None) -> Iterator[Part]:
@@ -214,10 +201,6 @@ def _flight(rows: Sequence[RunRow], example: Example | None) -> Iterator[Part]:
     yield timeline_figure(example, name="timeline")
     if example.crops:
         yield crop_pictures(example)
-
-
-def _failed(rows: Sequence[RunRow]) -> Iterator[Part]:
-    yield from _there(failed_table(rows))
 
 
 def _provenance(rows: Sequence[RunRow]) -> Iterator[Part]:

@@ -25,7 +25,7 @@ from hvt_study.report.data.captions import (
     same_sequences,
     under,
 )
-from hvt_study.report.data.document import Cell, Head, Table, breaks_between, words
+from hvt_study.report.data.document import Cell, Head, Table, breaks_between, cells, words
 from hvt_study.report.data.pairs import EqualQuality, Pair
 from hvt_study.runs.methods import METHODS
 
@@ -72,15 +72,15 @@ class _Kind:
 
     def __call__(self, setting: Setting) -> Table:
         """A row an arm, a line between regimes. Columns and arms that have no figure at all are left out."""
-        arms = [(arm, setting.runs(arm)) for regime in setting.regimes for arm in setting.arms(regime)]
+        arms = [(arm, setting.runs(arm)) for arm in setting.all_arms]
         if self.only_with:
             arms = [(arm, runs) for arm, runs in arms if _has_any(runs, self.only_with)]
         shown = [name for name in self.columns if any(_has_any(runs, name) for _, runs in arms)]
         rows: list[tuple[Cell, ...]] = []
         for arm, runs in arms:
             n = f"{len(runs)} of {setting.sequences}" if len(runs) < setting.sequences else str(len(runs))
-            cells = [Cell(arm.regime), Cell(arm.method), Cell(arm.still_codec or NOTHING), Cell(n)]
-            rows.append((*cells, *(_mean_cell(runs, name, interval=self.intervals) for name in shown)))
+            first = cells(arm.regime, arm.method, arm.still_codec or NOTHING, n)
+            rows.append((*first, *(_mean_cell(runs, name, interval=self.intervals) for name in shown)))
         heads = (*words("regime", "method", "codec"), Head("n", says="sequences whose run counts"))
         metrics = [METRICS[name] for name in shown]
         heads += tuple(Head(one.title, says=definition(one, setting.accounting)) for one in metrics)
@@ -131,9 +131,9 @@ def _mean_cell(runs: BySequence, column: str, *, interval: bool) -> Cell:
 def matrix_table(setting: Setting, column: str) -> Table | None:
     """A row a method and codec, a column a regime; None where no run has the figure."""
     metric = METRICS[column]
-    arms = [arm for regime in setting.regimes for arm in setting.arms(regime)]
-    names = list(dict.fromkeys((arm.method, arm.still_codec) for arm in arms))
-    names.sort(key=lambda one: list(METHODS).index(one[0]) if one[0] in METHODS else len(METHODS))
+    names = sorted(
+        setting.lines, key=lambda one: list(METHODS).index(one[0]) if one[0] in METHODS else len(METHODS)
+    )
     figures = pd.DataFrame(
         {
             (regime, *name): pd.Series(values(setting.runs(Arm(regime, *name)), column), dtype=float)
@@ -147,11 +147,11 @@ def matrix_table(setting: Setting, column: str) -> Table | None:
     rows: list[tuple[Cell, ...]] = []
     for method, codec in names:
         says = METHODS[method].says if method in METHODS else ""
-        cells = [Cell(method), Cell(codec or NOTHING), Cell(says)]
+        found = list(cells(method, codec or NOTHING, says))
         for one in ((regime, method, codec) for regime in setting.regimes):
             interval = interval_of(figures[one])
-            cells.append(figure_cell(interval, metric, of=setting.sequences, strong=one in best))
-        rows.append(tuple(cells))
+            found.append(figure_cell(interval, metric, of=setting.sequences, strong=one in best))
+        rows.append(tuple(found))
     heads = words("method", "codec", "what it does")
     heads += tuple(Head(_budget(setting, name)) for name in setting.regimes)
     caption = (
@@ -195,13 +195,14 @@ def differences_table(setting: Setting, found: Sequence[Pair]) -> Table | None:
     shown = [name for name in _COMPARED if any(pair.gaps(name) for pair in found)]
     rows = tuple((*_who(pair), *(_gap(pair, name) for name in shown), Cell(_ahead(pair))) for pair in found)
     breaks = breaks_between((pair.arm.regime, pair.arm.name) for pair in found)
-    heads = words("regime", "method", "against")
-    heads += (Head("n", says="sequences of which both runs count, of those of which the method's does"),)
-    heads += (Head("kbps", says="mean total of the method and of its match"),)
-    heads += tuple(
-        Head(f"Δ {METRICS[name].title}", says=definition(METRICS[name], setting.accounting)) for name in shown
+    metrics = [METRICS[name] for name in shown]
+    heads = (
+        *words("regime", "method", "against"),
+        Head("n", says="sequences of which both runs count, of those of which the method's does"),
+        Head("kbps", says="mean total of the method and of its match"),
+        *(Head(f"Δ {one.title}", says=definition(one, setting.accounting)) for one in metrics),
+        Head("ahead", says=f"sequences with more {METRICS[_DECIDES].title}, with less"),
     )
-    heads += (Head("ahead", says=f"sequences with more {METRICS[_DECIDES].title}, with less"),)
     off = max(pair.most_off_pct() for pair in found)
     caption = (
         f"Paired differences at matched totals, {setting.name}: method less video-only method on the same sequence, "
@@ -219,24 +220,19 @@ def equal_table(setting: Setting, found: Sequence[EqualQuality], *, column: str)
         return None
     rows = tuple(
         (
-            Cell(one.arm.regime),
-            Cell(one.arm.name),
-            Cell(one.reference),
+            *cells(one.arm.regime, one.arm.name, one.reference),
             Cell(ratio(one.median), strong=len(one.ratios) >= ENOUGH and one.median > 1),
-            Cell(str(len(one.ratios) - one.above - one.below)),
-            Cell(str(one.above)),
-            Cell(str(one.below)),
-            Cell(str(one.unread)),
+            *cells(len(one.ratios) - one.above - one.below, one.above, one.below, one.unread),
         )
         for one in found
     )
     breaks = breaks_between(one.arm.regime for one in found)
-    heads = words("regime", "method", "video")
-    heads += (Head("bits needed", says="of video, by those of the method; median over sequences"),)
-    heads += (Head("read", says="sequences in which the curve reaches the level"),)
-    heads += (Head("above", says="sequences in which no video that was flown shows as much"),)
-    heads += (Head("below", says="sequences in which the least video that was flown shows more"),)
-    heads += (
+    heads = (
+        *words("regime", "method", "video"),
+        Head("bits needed", says="of video, by those of the method; median over sequences"),
+        Head("read", says="sequences in which the curve reaches the level"),
+        Head("above", says="sequences in which no video that was flown shows as much"),
+        Head("below", says="sequences in which the least video that was flown shows more"),
         Head("unreadable", says="sequences with fewer than two totals of video, or without the figure"),
     )
     caption = (
@@ -263,7 +259,7 @@ def _who(pair: Pair) -> tuple[Cell, ...]:
     ours, theirs = values(pair.runs, "total_bps"), values(pair.matched, "total_bps")
     kbps = f"{_mean_kbps(ours, names)} / {_mean_kbps(theirs, names)}" if names else NOTHING
     n = f"{len(names)} of {len(pair.runs)}" if len(names) < len(pair.runs) else str(len(names))
-    return Cell(pair.arm.regime), Cell(pair.arm.name), Cell(pair.reference), Cell(n), Cell(kbps)
+    return cells(pair.arm.regime, pair.arm.name, pair.reference, n, kbps)
 
 
 def _mean_kbps(totals: dict[str, float], names: Sequence[str]) -> str:
@@ -287,13 +283,7 @@ def metrics_table(accounting: str) -> Table:
     """What each figure is, where rates are of this accounting."""
     better = {"more": "higher", "less": "lower", "": NOTHING}
     rows = tuple(
-        (
-            Cell(one.group),
-            Cell(one.title),
-            Cell(one.name),
-            Cell(definition(one, accounting)),
-            Cell(better[one.better]),
-        )
+        cells(one.group, one.title, one.name, definition(one, accounting), better[one.better])
         for one in METRICS.values()
     )
     titles = ("about", "metric", "column", "definition", "better")
@@ -306,14 +296,12 @@ def failed_table(rows: Iterable[RunRow]) -> Table | None:
     failed = [row for row in rows if not counts(row)]
     if not failed:
         return None
-    cells = tuple(
-        (
-            Cell(place(row["dataset"])),
-            Cell(row["sequence"]),
-            Cell(row["regime"]),
-            Cell(f"{row['method']} {row['still_codec']}".strip()),
-            Cell(f"{row['matched_to']} {row['matched_codec']}".strip() or NOTHING),
-            Cell(row["failed"] or "missed the total that it was to match by more than 1 %"),
+    said = tuple(
+        cells(
+            *(place(row["dataset"]), row["sequence"], row["regime"]),
+            f"{row['method']} {row['still_codec']}".strip(),
+            f"{row['matched_to']} {row['matched_codec']}".strip() or NOTHING,
+            row["failed"] or "missed the total that it was to match by more than 1 %",
         )
         for row in failed
     )
@@ -321,7 +309,7 @@ def failed_table(rows: Iterable[RunRow]) -> Table | None:
     other = any(row["accounting"] == "pilot" for row in failed)
     rates = " Rates in the reasons are over the processed span, not the whole clip." if other else ""
     caption = f"Runs that failed or missed their match ({len(failed)}): they are in no average.{rates}"
-    return Table(caption, words(*titles), cells)
+    return Table(caption, words(*titles), said)
 
 
 _TYPES = {"policy": str, "selected": int, "ratio": float, "frame_coverage": float}
@@ -349,12 +337,7 @@ def sweep_table(path: Path) -> Table | None:
         Head("frame coverage", says="share of frames with raw detections that keep at least one ROI"),
     )
     rows = tuple(
-        (
-            Cell(row.policy),
-            Cell(str(row.selected)),
-            Cell(f"{row.ratio:.4f}"),
-            Cell(f"{row.frame_coverage:.4f}"),
-        )
+        cells(row.policy, row.selected, f"{row.ratio:.4f}", f"{row.frame_coverage:.4f}")
         for row in found.itertuples()
     )
     caption = "Selector sweep: what each of the pilot's selectors keeps of raw detections in all. No labels."

@@ -27,7 +27,6 @@ from hvt_study.report.make import make_report
 from hvt_study.report.tables import sweep_table
 
 FIGURES = "figures"
-"""Folder of figures, beside the Markdown page."""
 _ID = re.compile(r'\bid="([^"]+)"')
 _REFERENCE = re.compile(r'(?:xlink:)?href="#([^"]+)"|url\(#([^)]+)\)')
 

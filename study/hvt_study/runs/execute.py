@@ -71,7 +71,6 @@ class _Flights:
         self._spec, self._folder, self._found, self._here = spec, cache, found, here
         self._cache = ResultCache(cache / FLIGHTS)
         self.wall_s = 0.0
-        """What all of them took, whenever that was."""
 
     def best(self) -> RunRow:
         """The flight that counts; of several frame rates and sizes the one that shows most.

@@ -102,7 +102,6 @@ _ALL = (
     ),
 )
 METHODS: Mapping[str, Method] = MappingProxyType({method.name: method for method in _ALL})
-"""By name, in the order of tables."""
 
 
 def chosen_methods(names: str) -> tuple[Method, ...]:

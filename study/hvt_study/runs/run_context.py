@@ -9,9 +9,8 @@ from __future__ import annotations
 import os
 import platform
 import weakref
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
@@ -30,7 +29,7 @@ from hvt_common.inference.tiles import tiled
 from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, NONE
 from hvt_study.cache.cached_detector import CachedDetector
-from hvt_study.cache.results import CacheError, ResultCache, content_key, file_digest, flight_code
+from hvt_study.cache.results import CacheError, ResultCache, content_key, file_digest, flight_code, installed
 from hvt_study.datasets.class_map import ClassMap, joint_classes
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.uri import open_dataset
@@ -54,14 +53,12 @@ class Materials:
     sequence: Sequence
     """As far as it is played, with the labels of its dataset."""
     classes: ClassMap
-    """Between the ground's models and the labels."""
-    detector: CachedDetector
+    detector: Detector
     """The ground's."""
-    edge_detector: CachedDetector
+    edge_detector: Detector
     classifier: Classifier | None
     """Reads the stills; None where the detector does, or nobody."""
     content: dict[str, str]
-    """Hashes of all that the runs are made from."""
     software: dict[str, str]
     """All that has a say beside that, by name; what runs the networks too."""
 
@@ -97,17 +94,8 @@ def open_materials(spec: RunSpec, *, cache: Path) -> Materials:
 def software_versions() -> dict[str, str]:
     """Of everything that may change a result; of HVT's own code what is in its files, edited or not."""
     versions = {"hvt": __version__, "code": flight_code(), "python": platform.python_version()}
-    versions |= {"machine": platform.machine()}
-    for name in _PACKAGES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return {**versions, "libav": _libav()}
-
-
-def _libav() -> str:
-    return " ".join(f"{name} {'.'.join(map(str, one))}" for name, one in sorted(av.library_versions.items()))
+    libav = (f"{name} {'.'.join(map(str, one))}" for name, one in sorted(av.library_versions.items()))
+    return {**versions, "machine": platform.machine(), **installed(_PACKAGES), "libav": " ".join(libav)}
 
 
 @lru_cache(maxsize=_SEQUENCES)
@@ -156,22 +144,13 @@ _OPEN_FILES = Path("/proc/self/fd")
 
 
 @dataclass(frozen=True, slots=True)
-class RunContext:
-    """Open for one process; flights take turns."""
+class RunContext(Materials):
+    """Open for one process; flights take turns. Its sequence has the labels of the runs, and its pixels at hand."""
 
-    sequence: Sequence
     labels: tuple[FrameLabels, ...]
     """Of every frame, source pixels."""
-    classes: ClassMap
-    """Between the ground's models and the labels."""
-    detector: Detector
-    """The ground's."""
-    edge_detector: Detector
-    classifier: Classifier | None
     pictures: object
     """Keeps the pixels; they go with it."""
-    content: dict[str, str]
-    """Hashes of all that the runs are made from."""
 
 
 def open_run_context(spec: RunSpec, *, cache: Path) -> RunContext:
@@ -192,16 +171,8 @@ def _open(spec: RunSpec, cache: Path) -> RunContext:
     if spec.labels == "reference":
         sequence = _with_reference(sequence, found, cache, base_size=spec.size)
     truth = (sequence.labels_at(frame_index) for frame_index in range(sequence.clip_frames))
-    return RunContext(
-        sequence=sequence,
-        labels=tuple(one for one in truth if one is not None),
-        classes=found.classes,
-        detector=found.detector,
-        edge_detector=found.edge_detector,
-        classifier=found.classifier,
-        pictures=pictures,
-        content=found.content,
-    )
+    own = {one.name: getattr(found, one.name) for one in fields(found)} | {"sequence": sequence}
+    return RunContext(**own, labels=tuple(one for one in truth if one is not None), pictures=pictures)
 
 
 def _staged(clip: Clip) -> tuple[Clip, object]:

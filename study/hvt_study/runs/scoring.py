@@ -42,7 +42,6 @@ _OPINIONS = {
     "change_rate": "change_rate",
     "entropy_gain_nats": "entropy_gain_nats",
 }
-"""Column to field of a `ProxyScore`."""
 
 
 def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:

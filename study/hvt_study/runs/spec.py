@@ -48,20 +48,17 @@ class RunSpec:
     dataset: str
     """URI, such as ``visdrone:/data/VisDrone2019-VID-val``."""
     sequence: str
-    """Its name within the dataset."""
     method: str
     """A name of `hvt_study.runs.methods.METHODS`."""
     regime: str
     """``low``, ``moderate``, or the budget in words, such as ``300kbps``."""
     budget_bps: int
-    """B_tot of the regime."""
     models: ModelChoice
     still_codec: str = "jpeg"
     labels: LabelKind = "reference"
     size: tuple[int, int] = (1280, 720)
     """(width, height) of the base stream in pixels."""
     max_frames: int | None = None
-    """At 15 a second."""
     detect_every: int = 5
     """Frames from one detection to the next, at the edge and at the ground. The peer looks at all that it codes."""
     target: Target | None = None
@@ -139,7 +136,6 @@ class Column:
     group: str
     """Of metrics; empty for what no table of the report shows."""
     title: str
-    """In the head of a table."""
     style: Literal["", "share", "kbps", "count", "seconds", "ms", "bytes", "rate", "nats"]
     better: Literal["", "more", "less"]
     over: Literal["", "mean", "median"]
@@ -155,4 +151,3 @@ def _columns() -> tuple[Column, ...]:
 
 
 COLUMNS: tuple[Column, ...] = _columns()
-"""The table of a study."""

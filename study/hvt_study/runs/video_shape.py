@@ -79,7 +79,6 @@ def match(spends: Callable[[int], float | None], *, target_bps: float) -> Matche
 
 
 def _next(seen: dict[int, float], target: float) -> int:
-    """The next budget to try."""
     low = max((one for one, total in seen.items() if total < target), default=None)
     high = min((one for one, total in seen.items() if total >= target), default=None)
     if low is None or high is None or low >= high:

@@ -68,7 +68,6 @@ def fit_temperature(classifier: Classifier, stills: Iterable[tuple[Image, str]])
     logits = np.log(np.array([said.probabilities for said in classifier.classify(list(images))]) + 1e-9)
 
     def surprise(temperature: float) -> float:
-        """Mean negative log likelihood."""
         return float(-log_softmax(logits / temperature, axis=1)[np.arange(len(truth)), truth].mean())
 
     return min((float(one) for one in np.geomspace(0.3, 6, 61)), key=surprise)

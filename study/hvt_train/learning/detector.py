@@ -8,7 +8,6 @@ from torch.nn import functional
 
 STRIDES = (8, 16, 32)
 _HEAD = 64
-"""Width of every head."""
 
 
 class Conv(nn.Sequential):

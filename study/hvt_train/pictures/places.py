@@ -94,7 +94,6 @@ class _View:
         return np.asarray(self.px_per_m * flatten @ turn, np.float64)
 
     def to_px(self, points_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(…, 2) world metres to pixels."""
         return np.asarray(points_m @ self.linear().T + self.size / 2, np.float64)
 
     def lean(self, foot_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -122,7 +121,6 @@ class _Stage:
         self._owner = np.full(image.shape[:2], -1, np.int16)
 
     def show(self, things: list[Thing], rng: _Rng) -> Picture:
-        """Draw shadows, then everything from far to near."""
         view = self._view
         feet = [view.to_px(np.array([thing.x, thing.y])) for thing in things]
         self._shade(things, feet, rng)

@@ -43,7 +43,6 @@ class HeldOut:
 
     image_bgr: Image
     boxes_px: npt.NDArray[np.float32]
-    """(N, 4) x1 y1 x2 y2."""
     ignored_px: npt.NDArray[np.float32]
     """(M, 4); boxes on them count neither way."""
     judged: frozenset[str]
@@ -178,7 +177,6 @@ def held_out_pictures(data: Path) -> Iterator[HeldOut]:
 
 
 SETS: dict[str, Callable[[Path], Iterator[_Labelled]]] = {"kit": _kit, "thermal": _thermal, "road": _road}
-"""Kinds of the pool and who reads them."""
 
 
 _NAMES = {

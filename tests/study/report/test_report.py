@@ -364,6 +364,7 @@ def run_context(clip):
         classifier=None,
         pictures=None,
         content={},
+        software={},
     )
 
 

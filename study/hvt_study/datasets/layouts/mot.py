@@ -91,16 +91,8 @@ def mot_table(
         used = np.unique(kinds[judged])  # only pedestrians count in the published sequences
         class_names = tuple(class_names[kind - 1] for kind in used.tolist())
         kinds = np.searchsorted(used, kinds) + 1
-    boxes, frames = rows.boxes(origin=1.0), rows["frame"].astype(np.int64)
-    return LabelTable.of(
-        frames=frames[judged],
-        boxes=boxes[judged],
-        ids=rows["id"].astype(np.int64)[judged],
-        class_ids=kinds[judged] - 1,
-        class_names=class_names,
-        ignored=Regions(frames[passed], boxes[passed], np.zeros(int(passed.sum()), np.bool_)),
-        size=size,
-    )
+    ignored = Regions.of(rows, passed, np.zeros(len(rows), np.bool_), origin=1.0)
+    return LabelTable.of(rows, judged, kinds - 1, class_names, ignored=ignored, size=size, origin=1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,11 +100,9 @@ class TruthRows:
     """Rows of a gt.txt whose classes are given apart, in its order."""
 
     frames: npt.NDArray[np.int64]
-    """(N,) as in the file."""
     boxes: Boxes
     """(N, 4) x1 y1 x2 y2 pixels that count from 0."""
     class_names: tuple[str, ...]
-    """N names."""
     judged: npt.NDArray[np.bool_]
     """(N,) False for what does not count, and for what is hidden by half."""
     classless: bool

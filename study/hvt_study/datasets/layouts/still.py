@@ -30,7 +30,6 @@ class StillLabels:
     view: float
     seed: int
     classes: tuple[str, ...] = ()
-    """Of YOLO's labels."""
 
     def __call__(self, index: int) -> FrameLabels:
         """Of frame ``index``, in the camera's pixels; each mirror image of an object is one of its own."""

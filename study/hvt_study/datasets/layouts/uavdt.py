@@ -25,6 +25,7 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_study.datasets.annotation_rows import read_rows
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
+from hvt_study.datasets.labels import no_boxes, no_ids
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
 from hvt_study.datasets.layouts.options import Options, missing_labels
 from hvt_study.datasets.sequence import Sequence
@@ -69,15 +70,9 @@ def uavdt_table(whole: Path, ignore: Path, size: tuple[int, int]) -> LabelTable:
         rows = rows.only(
             np.isin(rows["category"], (1, 2, 3)), accepted="a category of 1 car, 2 truck or 3 bus in column 9"
         )
-    return LabelTable.of(
-        frames=rows["frame"].astype(np.int64),
-        boxes=rows.boxes(),
-        ids=rows["id"].astype(np.int64),
-        class_ids=np.zeros(len(rows), np.int64) if plain else rows["category"].astype(np.int64) - 1,
-        class_names=(_VEHICLE,) if plain else _NAMES,
-        ignored=_regions(ignore),
-        size=size,
-    )
+    kinds = np.zeros(len(rows), np.int64) if plain else rows["category"].astype(np.int64) - 1
+    names, every = (_VEHICLE,) if plain else _NAMES, np.ones(len(rows), np.bool_)
+    return LabelTable.of(rows, every, kinds, names, ignored=_regions(ignore), size=size)
 
 
 def _folders(root: Path) -> list[Path]:
@@ -107,10 +102,10 @@ def _open(name: str, folder: Path, texts: Mapping[str, Path], options: Options) 
 
 def _regions(path: Path) -> Regions:
     if not path.is_file():  # some copies of the dataset come without
-        empty = np.empty(0, np.int64)
-        return Regions(empty, np.empty((0, 4), np.float32), empty.astype(np.bool_))
+        return Regions(no_ids(), no_boxes(), np.empty(0, np.bool_))
     rows = read_rows(path, columns="frame,region,x,y,w,h", least=6, of_dataset=True)
-    return Regions(rows["frame"].astype(np.int64), rows.boxes(), np.ones(len(rows), np.bool_))
+    every = np.ones(len(rows), np.bool_)
+    return Regions.of(rows, every, every)
 
 
 def _attributes(path: Path | None) -> dict[str, str]:

@@ -36,7 +36,6 @@ _LAYOUTS: Mapping[str, tuple[_Layout, frozenset[str]]] = {
 """What each scheme is, and the options that it takes. Only sequences that are asked for are opened."""
 
 DATASETS = ("visdrone:ROOT", "uavdt:ROOT", "mot:ROOT", "clips:FOLDER", "demo:SEEDS", "still:FOLDER")
-"""What is accepted."""
 _SHOWN_NAMES = 5
 
 

@@ -68,7 +68,6 @@ def how_they_differ(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
 
 @lru_cache(maxsize=100_000)
 def _said(config: str) -> tuple[Conditions, tuple[str, ...]]:
-    """Every caption asks for it."""
     run = said_run({"config": config})
     models = run.get("models")
     size = run.get("size") or USUAL.size
@@ -97,7 +96,6 @@ def _word(value: Any) -> str:
 
 
 RunRow: TypeAlias = Mapping[str, Any]
-"""Of ``results.parquet``."""
 BySequence: TypeAlias = Mapping[str, RunRow]
 """One run of each sequence; the key is dataset and name."""
 _WHOSE = ("regime", "method", "still_codec", "matched_to", "matched_codec")
@@ -139,7 +137,6 @@ class Setting:
     """
 
     datasets: tuple[str, ...]
-    """URIs."""
     labels: str
     models: Models
     rows: tuple[RunRow, ...]
@@ -202,6 +199,16 @@ class Setting:
             if row["regime"] == regime and not row["matched_to"]
         }
         return sorted(found, key=lambda arm: (_order(arm.method), arm.still_codec))
+
+    @property
+    def all_arms(self) -> list[Arm]:
+        """Those of every regime, in the order of tables."""
+        return [arm for regime in self.regimes for arm in self.arms(regime)]
+
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        """(method, still codec) of all arms, each once."""
+        return list(dict.fromkeys((arm.method, arm.still_codec) for arm in self.all_arms))
 
     def hybrids(self, regime: str) -> list[Arm]:
         """Those whose totals video is matched with."""

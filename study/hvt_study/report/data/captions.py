@@ -39,7 +39,6 @@ class Interval:
     """NaN with fewer than `ENOUGH` sequences, as is ``high``."""
     high: float
     sequences: int
-    """That have the figure."""
 
 
 def interval_of(values: Iterable[float]) -> Interval:
@@ -74,14 +73,12 @@ def _interval(values: tuple[float, ...]) -> Interval:
 
 
 INTERVALS = f"95 % bootstrap interval over sequences (from {ENOUGH} on)"
-"""How means are bracketed."""
 _LABELS = {
     "annotations": "annotations (people's, or exact)",
     "reference": "reference (the detector on source frames before they are coded, in tiles, "
     "none smaller than the base)",
 }
 _NAMED = 4
-"""Of several datasets; the rest is counted."""
 
 
 def under(setting: Setting) -> str:
@@ -98,8 +95,7 @@ def under(setting: Setting) -> str:
 
 def same_sequences(setting: Setting) -> str:
     """A sentence for tables of means of which not all are of all sequences; empty where they are."""
-    arms = [arm for regime in setting.regimes for arm in setting.arms(regime)]
-    if all(len(setting.runs(arm)) == setting.sequences for arm in arms):
+    if all(len(setting.runs(arm)) == setting.sequences for arm in setting.all_arms):
         return ""
     return "Means of fewer sequences (n) are not to be compared with the others. "
 
@@ -118,7 +114,6 @@ def _datasets(setting: Setting) -> str:
 
 
 NOTHING = "\N{EN DASH}"
-"""Stands where a run has no such figure."""
 _MINUS = "\N{MINUS SIGN}"
 
 _SCALE = {"kbps": 1e-3}

@@ -35,6 +35,11 @@ class Cell:
     strong: bool = False
 
 
+def cells(*contents: object) -> tuple[Cell, ...]:
+    """Plain cells of a row."""
+    return tuple(Cell(str(one)) for one in contents)
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """A table; its caption says which labels it is of and how many sequences."""
@@ -56,12 +61,9 @@ class Drawing:
     """A figure in lines."""
 
     name: str
-    """Of its files, unique in the report."""
     caption: str
     svg: str
-    """A standalone file."""
     pdf: bytes
-    """The same for print."""
     alternative: str
     """What it shows, for those who do not see it."""
 
@@ -71,7 +73,6 @@ class Picture:
     """Pixels."""
 
     name: str
-    """Of its file, unique in the report."""
     png: bytes
     alternative: str
 
@@ -94,7 +95,6 @@ class Pictures:
 
 
 Part: TypeAlias = str | Table | Drawing | Pictures
-"""A text is a paragraph."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,6 @@ class Report:
 
     title: str
     lead: tuple[str, ...]
-    """Paragraphs above the contents."""
     sections: tuple[Section, ...]
 
 

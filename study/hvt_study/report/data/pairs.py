@@ -27,9 +27,7 @@ class Pair:
     arm: Arm
     reference: str
     runs: BySequence
-    """Of the arm, that count."""
     matched: BySequence
-    """Of the reference, that count."""
 
     @property
     def names(self) -> list[str]:

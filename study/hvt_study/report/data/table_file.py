@@ -16,10 +16,8 @@ from hvt_study.runs.spec import COLUMNS, Column
 
 RESULTS = "results.parquet"
 SWEEP = "sweep.csv"
-"""In a study's folder."""
 _TYPES = {"text": pa.string(), "int": pa.int64(), "real": pa.float64(), "yes": pa.bool_()}
 _NAMED = 4
-"""Of missing columns, the rest is counted."""
 _NEEDED = ("budget_bps", "duration_s", "clip_s", "total_bps", "target_bps")
 """Figures that no table may be without."""
 

@@ -29,7 +29,6 @@ class Choice:
     """A run to be shown."""
 
     key: str
-    """Of its row."""
     rule: str
     """Why this one; the end of a sentence."""
 
@@ -45,7 +44,6 @@ class CropExample:
     at_s: float
     """Capture of its frame, from the first frame."""
     track_id: int
-    """Of the edge."""
     class_before: str
     class_after: str
     size_bytes: int
@@ -86,11 +84,9 @@ class Timeline:
     named_before: tuple[float, ...]
     """Found & named, without the stills' word."""
     named: tuple[float, ...]
-    """As shown."""
     lanes: tuple[Lane, ...]
     """Tracks whose class changed most often first, then those with the most words; not all of them."""
     tracks_named: int
-    """How many there are in all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,14 +94,12 @@ class Example:
     """A flight that was flown again to be looked at."""
 
     key: str
-    """Of its row in the table."""
     digest: str
     """Of all payloads, as in its row: it is the same flight."""
     rule: str
     title: str
     """Sequence, method, regime and labels, in words."""
     stills: int
-    """Of which percentiles are shown."""
     crops: tuple[CropExample, ...]
     timeline: Timeline
 
@@ -246,7 +240,6 @@ def _timeline(content: Mapping[str, Any]) -> Timeline:
 
 
 def _is_picture(png: bytes) -> bool:
-    """Whether it can be decoded."""
     return bool(png) and cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR) is not None
 
 

@@ -45,7 +45,6 @@ from hvt_study.runs.video_shape import VideoShape
 from hvt_study.serial_link import Arrival
 
 _MOST_STILLS = 2000
-"""Of which the pixels are kept."""
 _MOST_LANES = 14
 _SECOND_FRAMES = round(NOMINAL_FPS)
 _BEST_DB = 99.0
@@ -242,7 +241,6 @@ def _interest(lane: Lane) -> tuple[int, int, int]:
 
 
 def _spans(listed: Sequence[bool]) -> Iterator[tuple[float, float]]:
-    """Runs of True, in seconds."""
     edges = np.flatnonzero(np.diff([0, *map(int, listed), 0]))
     for first, last in edges.reshape(-1, 2).tolist():
         yield first / NOMINAL_FPS, last / NOMINAL_FPS

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hvt_study.matrix.compare import COMPARED, CompareResult, CompareRow
-from hvt_study.report.figures.drawing import mark_of, plain_axes, rate_axis, style_of
+from hvt_study.report.figures.drawing import plain_axes, rate_axis, style_of
 
 _MEASURES = (("named_f1", "named F1 of the list"), ("false_per_frame", "false objects a frame"))
 _ONE_TARGET = (("recall", "share of its time at which the target is found"), ("gaps", "gaps"))
@@ -47,13 +47,6 @@ def _draw(axes: Axes, rows: Sequence[CompareRow], *, measure: str) -> None:
         if not points:
             continue
         style = style_of(name)
-        axes.plot(
-            *zip(*points, strict=True),
-            color=style.colour,
-            marker=style.marker,
-            linestyle=style.dashes,
-            markersize=1.4 * mark_of(style),
-            label=name,
-        )
+        axes.plot(*zip(*points, strict=True), linestyle=style.dashes, label=name, **style.marks(1.4))
     rate_axis(axes, [row["rate_kbps"] for row in rows])
     plain_axes(axes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 from hvt_study.report.data.arms import Arm, BySequence, Setting, values
 from hvt_study.report.data.captions import INTERVALS, METRICS, interval_of, mean_of, under
 from hvt_study.report.data.document import Drawing
-from hvt_study.report.figures.drawing import drawn, fill_of, mark_of, plain_axes, rate_axis, style_of
+from hvt_study.report.figures.drawing import drawn, fill_of, plain_axes, rate_axis, style_of
 
 _UTILITY = ("named_f1", "top1_all", "map_50")
 _CODEC = ("named_f1", "confidence_gain", "stills_per_min")
@@ -24,7 +25,7 @@ def utility_figure(setting: Setting, *, name: str) -> Drawing | None:
     shown = [column for column in _UTILITY if _any_value(setting, column)]
     if not shown:
         return None
-    lines = [line for line in _lines(setting) if _line(setting, line, shown)[0]]
+    lines = [line for line in setting.lines if _line(setting, line, shown)[0]]
     codecs = _codecs(setting)
 
     def paint(figure: Figure) -> None:
@@ -136,12 +137,10 @@ def _draw_utility(
     axes.plot(
         [float(np.mean([row["total_bps"] for row in runs.values()])) / 1e3 for _, runs in points],
         means,
-        color=style.colour,
-        marker=style.marker,
         linestyle=style.dashes if count else "none",
         fillstyle=fill_of(arm, codecs),
-        markersize=1.1 * mark_of(style),
         label=f"{arm.name}{n}",
+        **style.marks(1.1),
     )
 
 
@@ -159,27 +158,14 @@ def _draw_codecs(
         places.append((float(np.mean(sizes)), interval.mean))
         if not math.isnan(interval.low):
             axes.vlines(places[-1][0], interval.low, interval.high, color=style.colour, linewidth=0.8)
-        axes.plot(
-            *places[-1],
-            color=style.colour,
-            marker=style.marker,
-            markersize=1.1 * mark_of(style),
-            fillstyle=fill_of(arm, codecs),
-            linestyle="none",
-            label=arm.name,
-        )
+        fill = fill_of(arm, codecs)
+        axes.plot(*places[-1], fillstyle=fill, linestyle="none", label=arm.name, **style.marks(1.1))
     if places:
-        axes.plot(
-            *zip(*sorted(places), strict=True),
-            color=style.colour,
-            linestyle=style.dashes,
-            linewidth=0.8,
-            zorder=1,
-        )
+        line: Any = {"color": style.colour, "linestyle": style.dashes, "linewidth": 0.8}
+        axes.plot(*zip(*sorted(places), strict=True), zorder=1, **line)
 
 
 def _sizes(setting: Setting, arm: Arm) -> list[float]:
-    """Bytes of a still, a sequence each."""
     found = values(setting.runs(arm), "mean_still_bytes").values()
     return [value for value in found if value > 0]
 
@@ -207,11 +193,6 @@ def _budget_kbps(setting: Setting, regime: str) -> float:
     return setting.budget_bps(regime) * factor / 1e3
 
 
-def _lines(setting: Setting) -> list[tuple[str, str]]:
-    arms = [arm for regime in setting.regimes for arm in setting.arms(regime)]
-    return list(dict.fromkeys((arm.method, arm.still_codec) for arm in arms))
-
-
 def _codecs(setting: Setting) -> tuple[str, ...]:
     return tuple(dict.fromkeys(row["still_codec"] for row in setting.rows if row["still_codec"]))
 
@@ -219,7 +200,6 @@ def _codecs(setting: Setting) -> tuple[str, ...]:
 def _any_value(setting: Setting, column: str) -> bool:
     return any(
         not math.isnan(value)
-        for regime in setting.regimes
-        for arm in setting.arms(regime)
+        for arm in setting.all_arms
         for value in values(setting.runs(arm), column).values()
     )

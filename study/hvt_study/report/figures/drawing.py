@@ -16,7 +16,6 @@ from hvt_study.report.data.arms import Arm
 from hvt_study.report.data.document import Drawing
 
 WIDTH_IN = 7.2
-"""Of a page of two columns."""
 INK = "#000000"
 """Becomes the page's own colour of text in HTML."""
 GREY = "#808080"
@@ -65,6 +64,11 @@ class Style:
     marker: str
     dashes: str
 
+    def marks(self, size: float = 1.0) -> dict[str, Any]:
+        """Colour and marker, as ``plot`` takes them; a star has little area."""
+        area = 6.5 if self.marker == "*" else 4.5
+        return {"color": self.colour, "marker": self.marker, "markersize": size * area}
+
 
 _STYLES: Mapping[str, Style] = MappingProxyType(
     {
@@ -102,11 +106,6 @@ def style_of(method: str) -> Style:
 def fill_of(arm: Arm, codecs: tuple[str, ...]) -> Any:
     """How a marker is filled: by its codec, full for the first."""
     return _FILLS[codecs.index(arm.still_codec) % len(_FILLS)] if arm.still_codec in codecs else _FILLS[0]
-
-
-def mark_of(style: Style) -> float:
-    """Size of a marker: a star has little area."""
-    return 6.5 if style.marker == "*" else 4.5
 
 
 def plain_axes(axes: Axes, *, grid: str = "both") -> None:

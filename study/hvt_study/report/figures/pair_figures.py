@@ -15,14 +15,13 @@ from hvt_study.report.data.arms import Setting
 from hvt_study.report.data.captions import INTERVALS, METRICS, under
 from hvt_study.report.data.document import Drawing
 from hvt_study.report.data.pairs import EqualQuality, Pair
-from hvt_study.report.figures.drawing import GREY, INK, drawn, mark_of, plain_axes, style_of
+from hvt_study.report.figures.drawing import GREY, INK, drawn, plain_axes, style_of
 
 _One = TypeVar("_One", Pair, EqualQuality)
 _ROW_IN = 0.19
 _DOT = 9.0
 _LEFT, _RIGHT = r"$\leftarrow$", r"$\rightarrow$"
 _THIN: Mapping[str, Any] = MappingProxyType({"markeredgewidth": 0.2, "linestyle": "none", "zorder": 4})
-"""Of arrows: an edge blurs their heads."""
 _RATIO_MARKS = (0.1, 0.2, 0.5, 0.8, 1.0, 1.25, 1.6, 2.0, 3.0, 5.0, 10.0, 20.0)
 
 
@@ -50,12 +49,10 @@ def equal_figures(
 
 
 def _of_regime(name: str, regime: str, regimes: Sequence[str]) -> str:
-    """Of a file."""
     return name if len(regimes) == 1 else f"{name}-{re.sub('[^A-Za-z0-9.]+', '-', regime)}"
 
 
 def _differences(setting: Setting, found: Sequence[Pair], *, name: str, column: str) -> Drawing:
-    """Of one regime."""
     title = METRICS[column].title
     return _forest(
         setting,
@@ -75,7 +72,6 @@ def _differences(setting: Setting, found: Sequence[Pair], *, name: str, column: 
 
 
 def _ratios(setting: Setting, found: Sequence[EqualQuality], *, name: str, column: str) -> Drawing:
-    """Of one regime."""
     read = [ratio for one in found for ratio in one.ratios if 0 < ratio < math.inf]
     low, high = min(0.8, *read) / 1.15, max(1.25, *read) * 1.15
 
@@ -153,9 +149,7 @@ def _draw_gap(axes: Axes, pair: Pair, column: str, *, row: int) -> None:
             capthick=1.2,
             zorder=3,
         )
-    axes.plot(
-        [interval.mean], [row], color=style.colour, marker=style.marker, markersize=mark_of(style), zorder=4
-    )
+    axes.plot([interval.mean], [row], zorder=4, **style.marks())
 
 
 def _draw_ratios(axes: Axes, one: EqualQuality, *, row: int, ends: tuple[float, float]) -> None:
@@ -167,9 +161,7 @@ def _draw_ratios(axes: Axes, one: EqualQuality, *, row: int, ends: tuple[float, 
         if count:
             axes.plot([place], [row], color=GREY, marker=marker, markersize=7, **_THIN)
     if 0 < middle < math.inf:
-        axes.plot(
-            [middle], [row], color=style.colour, marker=style.marker, markersize=mark_of(style), zorder=4
-        )
+        axes.plot([middle], [row], zorder=4, **style.marks())
     else:
         place, marker = (low, _LEFT) if middle == 0 else (high, _RIGHT)
         axes.plot([place], [row], color=style.colour, marker=marker, markersize=11, **_THIN)
