@@ -155,13 +155,10 @@ def bounds(pixels: Floats, *, size: tuple[int, int], margin_px: int) -> npt.NDAr
 def sprite_matrix(
     linear: Floats, spot: Floats, *, shape: tuple[int, ...], grain: tuple[float, float]
 ) -> Matrix:
-    """(2, 3) from OpenCV's sprite coordinates to its frame coordinates.
+    """(2, 3) from OpenCV's coordinates of a sprite of ``shape`` to its coordinates of the frame.
 
-    Args:
-        linear: (2, 2) metres in body axes to pixels.
-        spot: (2,) pixel of the body's centre.
-        shape: of the sprite's picture.
-        grain: metres a sprite pixel on x and on y.
+    ``linear`` (2, 2) takes metres in body axes to pixels, ``spot`` (2,) is the pixel of the body's centre, and
+    ``grain`` metres a sprite pixel on x and on y.
     """
     scaled = linear * np.array(grain)
     shift = spot - scaled @ np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2]) - 0.5

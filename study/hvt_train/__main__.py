@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,8 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     arguments = _parser().parse_args(argv)
-    run = {"eval": _evaluate, "curve": _curve, "join": _join}.get(arguments.command, _train)
-    return run(arguments)
+    return {"eval": _evaluate, "curve": _curve, "join": _join}.get(arguments.command, _train)(arguments)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -48,27 +48,14 @@ def _parser() -> argparse.ArgumentParser:
         own.add_argument("--batch", type=int, default=8, help="views in a step of the detector")
         own.add_argument("--classifier-steps", type=int, default=5000, help="of 64 crops each")
         own.add_argument("--minutes", type=float, default=None, help="end each network's schedule by then")
-        own.add_argument(
-            "--real",
-            type=Path,
-            default=None,
-            metavar="DATA",
-            help="folder of kit_ais, hit_uav, cats_madison and street",
-        )
-        own.add_argument(
-            "--start", default=None, metavar="embedded|FOLDER|FILE", help="ONNX files to go on from"
-        )
+        real = "folder of kit_ais, hit_uav, cats_madison and street"
+        own.add_argument("--real", type=Path, default=None, metavar="DATA", help=real)
+        own.add_argument("--start", metavar="embedded|FOLDER|FILE", help="ONNX files to go on from")
     own = commands.add_parser("eval", help="measure", formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     own.add_argument("--drawn", action="store_true", help="on held-out drawn scenes")
-    own.add_argument(
-        "--real", type=Path, metavar="CLIP", default=None, help="on a real clip, against --reference"
-    )
-    own.add_argument(
-        "--reference", type=Path, metavar="MODEL", default=None, help="detector whose boxes count as true"
-    )
-    own.add_argument(
-        "--speed", action="store_true", help="milliseconds of the detector at 640x384 on one thread"
-    )
+    own.add_argument("--real", type=Path, metavar="CLIP", help="on a real clip, against --reference")
+    own.add_argument("--reference", type=Path, metavar="MODEL", help="detector whose boxes count as true")
+    own.add_argument("--speed", action="store_true", help="milliseconds at 640x384 on one thread")
     own.add_argument("--detector", type=Path, default=embedded_models()[DETECTOR])
     own.add_argument("--classifier", type=Path, default=embedded_models()[CLASSIFIER])
     own.add_argument("--seeds", type=int, default=8, help="held-out scenes")
@@ -76,9 +63,8 @@ def _parser() -> argparse.ArgumentParser:
     own.add_argument("--threads", type=int, default=1)
     own = commands.add_parser("join", help=f"make the embedded {DETECTOR} of a trained one and YOLOX-nano")
     own.add_argument("aerial", type=Path, metavar="TRAINED.onnx")
-    own.add_argument(
-        "street", type=Path, metavar="YOLOX_NANO.onnx", help="`hvt-models fetch yolox-nano` has it"
-    )
+    street = "`hvt-models fetch yolox-nano` has it"
+    own.add_argument("street", type=Path, metavar="YOLOX_NANO.onnx", help=street)
     own.add_argument("--out", type=Path, required=True, metavar="FILE.onnx")
     own = commands.add_parser("curve", help="draw the training curve of a log")
     own.add_argument("log", type=Path)
@@ -99,12 +85,32 @@ def _join(arguments: argparse.Namespace) -> int:
 
 
 def _curve(arguments: argparse.Namespace) -> int:
+    """Loss (left axis) and what the checks measured (right axis, 0…1) over the steps of a training log, as SVG."""
     with needs_extra("'hvt[study]'"):
-        from hvt_train.curve import draw_curve  # noqa: PLC0415
+        import matplotlib as mpl  # noqa: PLC0415
+        from matplotlib.figure import Figure  # noqa: PLC0415
 
     if not arguments.log.is_file():
         raise UserError(f"{arguments.log} does not exist; the log of a training run is expected")
-    draw_curve(arguments.log, arguments.out, title=arguments.title, quality=arguments.quality)
+    rows = [json.loads(line) for line in arguments.log.read_text(encoding="utf-8").splitlines()]
+    figure = Figure(figsize=(7.2, 3), layout="constrained")
+    left = figure.subplots()
+    right = left.twinx()
+    for axes, name, label, style in (
+        (left, "loss", "loss", "-"),
+        (right, "validation", arguments.quality, ".-"),
+    ):
+        points = [(row["step"], row[name]) for row in rows if name in row]
+        colour = "#3060b0" if axes is left else "#c04020"
+        axes.plot(*zip(*points, strict=True), style, color=colour)
+        axes.set_ylabel(label, color=colour)
+        axes.set_ylim(0)
+    right.set_ylim(0, 1)
+    left.set_xlabel("steps")
+    left.set_title(arguments.title)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    with mpl.rc_context({"svg.hashsalt": arguments.title}):
+        figure.savefig(arguments.out, format="svg", metadata={"Date": None})
     return 0
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import av
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -16,7 +15,8 @@ from hvt_common.errors import UserError
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import Detector, open_detector
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
-from hvt_common.values import Boxes, Detections, Image, View, iou
+from hvt_common.values import Boxes, Detections, Image, iou
+from hvt_edge.source.resample import Resizer
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.crops import held_out_crops
 from hvt_train.pictures.places import Picture
@@ -139,17 +139,9 @@ def clip_frames(clip: Path, *, every: int) -> Iterator[Image]:
     with av.open(str(clip)) as container:
         for index, frame in enumerate(container.decode(video=0)):
             if index % every == 0:
-                yield _letterboxed(np.asarray(frame.to_ndarray(format="bgr24"), np.uint8))
-
-
-def _letterboxed(image: Image) -> Image:
-    size = (image.shape[1], image.shape[0])
-    view = View.fitted(size, BASE_SIZE, fit="letterbox")
-    canvas = np.zeros((BASE_SIZE[1], BASE_SIZE[0], 3), np.uint8)
-    x, y = (round(v) for v in view.offset_px)
-    wide, high = round(size[0] * view.scale), round(size[1] * view.scale)
-    canvas[y : y + high, x : x + wide] = cv2.resize(image, (wide, high), interpolation=cv2.INTER_AREA)
-    return canvas
+                image = np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+                fitted = Resizer((frame.width, frame.height), BASE_SIZE, fit="letterbox")
+                yield fitted.frame(image, index=index, capture_ns=0).base_bgr
 
 
 def reference_vehicles(reference: Path, frames: Sequence[Image], *, confidence: float = 0.4) -> list[Boxes]:

@@ -98,18 +98,10 @@ def fine_tune(
 ) -> FineTuned:
     """Train a network of ``classes`` into the ONNX file ``out``, with calibrated scores; a log lies beside it.
 
-    Args:
-        pool: of `fill_own`.
-        held_out: gives the pictures that are not trained on, anew at each call: the calibration is fitted on them.
-        classes: what class ids of the pool index.
-        start: an ONNX file of the same network; classes of the same kind begin as its.
-        out: the file; ``out`` with another suffix holds the log.
-        settings: how long and how fast.
-        measure: how good the network of a file is on the held-out pictures; the best one is kept.
-        on_step: called with the steps done, and what was measured where it was.
-
-    Raises:
-        UserError: ``start`` is of another network.
+    ``pool`` is of `fill_own`. ``held_out`` gives the pictures that are not trained on, anew at each call: the
+    calibration is fitted on them, and ``measure`` says how good the network of a file is on them; the best is kept.
+    ``start`` is an ONNX file of the same network (else `UserError`), as whose classes those of the same kind begin.
+    ``on_step`` is called with the steps done, and what was measured where it was.
     """
     cv2.setNumThreads(1)
     torch.set_num_threads(settings.threads)

@@ -122,15 +122,11 @@ colour (float[1, 3, height, width] images) => (bool[1] street_colour)
 
 
 def join(aerial: Path, street: Path, out: Path) -> None:
-    """Write the file.
+    """Write the file, whole or not at all; `UserError` where one is not of its kind.
 
-    Args:
-        aerial: of `hvt_train.recipe`: a raw YOLOX head, ``classes`` and ``hvt.confidence`` in its metadata, which the
-            new file takes over; of a file that was joined before it is the aerial part.
-        street: YOLOX-nano as its authors export it: input ``images``, output (1, cells, 85).
-        out: to write, whole or not at all.
-
-    Raises `UserError` where a file is not of that kind.
+    ``aerial`` is of `hvt_train.recipe`: a raw YOLOX head, ``classes`` and ``hvt.confidence`` in its metadata, which
+    the new file takes over; of a file that was joined before it is the aerial part. ``street`` is YOLOX-nano as its
+    authors export it: input ``images``, output (1, cells, 85).
     """
     ours = _aerial_part(onnx.load(str(aerial)))
     properties = {one.key: one.value for one in ours.metadata_props}

@@ -30,11 +30,9 @@ def shade(colour: Colour, gain: float) -> Colour:
 
 
 class Sprite:
-    """A thing seen from above, premultiplied BGRA, with its outline; averaged to coarser levels when asked.
+    """A thing ``height_m`` high seen from above, with its outline; averaged to coarser levels when asked.
 
-    Args:
-        bgra: (h, w, 4) uint8, premultiplied by alpha, `SPRITE_M_PER_PX` a pixel, centre at the middle, nose to +x.
-        height_m: how high it stands, for its shadow.
+    ``bgra`` is (h, w, 4) uint8, premultiplied by alpha, `SPRITE_M_PER_PX` a pixel, centre at the middle, nose to +x.
     """
 
     def __init__(self, bgra: npt.NDArray[np.uint8], *, height_m: float) -> None:

@@ -102,11 +102,8 @@ def draw_code(
 ) -> RoofCode | None:
     """Draw a code for a body; None where its class bears none, or not even the smallest characters fit.
 
-    Args:
-        class_name: of the body.
-        sprite: its picture, for the size of the roof.
-        rng: the only source of variety; as much is drawn from it whether a code fits or not.
-        m_per_px: of the source, to make characters of `HEIGHTS_PX`.
+    Characters are of `HEIGHTS_PX` at ``m_per_px`` of the source. As much is drawn from ``rng`` whether a code fits or
+    not.
     """
     text = "".join(ALPHABET[one] for one in rng.integers(len(ALPHABET), size=CODE_LENGTH))
     share, colours = float(rng.random()), _COLOURS[int(rng.integers(len(_COLOURS)))]

@@ -40,13 +40,7 @@ _Rng = np.random.Generator
 
 
 def draw_vehicle(class_name: str, rng: _Rng, *, small: bool = False) -> Sprite:
-    """Draw one object of a class in `CLASS_NAMES`.
-
-    Args:
-        class_name: what it is.
-        rng: the only source of variety; the same state draws the same sprite.
-        small: keep vans, trucks and others within a parking stall.
-    """
+    """Draw one of `CLASS_NAMES`, the same from the same state; ``small`` ones fit into a stall."""
     return _DRAW[class_name](rng) if class_name in _DRAW else _DRAW_SIZED[class_name](rng, small=small)
 
 

@@ -38,9 +38,7 @@ def flight_code() -> str:
 def code_digest(*packages: str, without: tuple[str, ...] = ()) -> str:
     """Of the Python files of these packages, as they are installed here; a process reads them once.
 
-    Args:
-        packages: names; a checkout and a wheel with the same files have the same digest.
-        without: folders, such as ``hvt_study/report``, that are passed over.
+    A checkout and a wheel with the same files have the same digest. ``without`` names folders that are passed over.
     """
     return tree_digest(_folders(packages), without=without)
 

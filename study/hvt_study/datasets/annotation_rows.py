@@ -74,17 +74,11 @@ class Rows:
 
 
 def read_rows(path: Path, *, columns: str, least: int, frames: bool = True, of_dataset: bool = False) -> Rows:
-    """Read a file of which the columns are called so; further ones, blank lines and a comma at the end are no matter.
+    """Read a file of which the columns between commas are called so; further ones and blank lines are no matter.
 
-    Args:
-        path: the file, which may be empty.
-        columns: names between commas.
-        least: how many of them every line must have; all lines have as many as the first.
-        frames: whether the first one is a frame number.
-        of_dataset: a line that is not so is left out, as long as there are others.
-
-    Raises:
-        UserError: names the file that cannot be read, or the first line that is not so.
+    Every line must have the ``least`` first ones and as many as the first line, of which ``frames`` are counted by
+    the first column. A line that is not so is left out ``of_dataset``, as long as there are others; else `UserError`
+    names it.
     """
     numbered = [
         (number, line.strip())

@@ -41,15 +41,7 @@ class ClassMap:
 
 
 def map_classes(model_names: Iterable[str], dataset_classes: Iterable[str]) -> ClassMap:
-    """Find the partners.
-
-    Args:
-        model_names: class names of a detector or classifier (VisDrone's ten, COCO's 80, ImageNet's 1000 …).
-        dataset_classes: `Sequence.class_set`.
-
-    Raises:
-        UserError: the two share no kind at all.
-    """
+    """Partners of a model's class names in `Sequence.class_set`; `UserError` where none share a kind."""
     models, classes = tuple(dict.fromkeys(model_names)), tuple(dict.fromkeys(dataset_classes))
     ours, theirs = _by_kind(models, classes), _by_kind(classes, classes)
     spoken: dict[str, tuple[str, ...]] = {}
@@ -108,18 +100,11 @@ def _some(names: Collection[str]) -> str:
 def joint_classes(
     detector_names: Collection[str], reader_names: Collection[str] | None, class_set: Collection[str]
 ) -> ClassMap:
-    """One vocabulary for a detector, a classifier and the labels of a dataset.
+    """One vocabulary for a detector, a classifier (None: the detector reads, or nobody) and the labels of a dataset.
 
     Within one kind names stay apart only where both models have the very names of the dataset: what one of them
     cannot tell apart is not asked of the other. A ``minivan`` of ImageNet is right on a ``car``, and on a ``van``.
-
-    Args:
-        detector_names: of the ground's detector.
-        reader_names: of the classifier that reads stills; None where the detector does it, or nobody.
-        class_set: `Sequence.class_set`.
-
-    Raises:
-        UserError: detector and dataset have no kind in common, or the classifier has none with what they share.
+    Raises `UserError` where one of them has no kind in common with the dataset.
     """
     found = map_classes(detector_names, class_set)
     if reader_names is None:

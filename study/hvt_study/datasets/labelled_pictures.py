@@ -126,14 +126,10 @@ class LabelledPicture:
 
 
 def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[LabelledPicture]:
-    """All pictures of one argument, in natural order.
+    """All pictures of a picture, a folder, COCO's JSON, or the YAML of a YOLO set, in natural order.
 
-    Args:
-        place: a picture, a folder, COCO's JSON, or the YAML of a YOLO set.
-        classes: names of a YOLO folder's classes; None: those of its ``classes.txt``, ``obj.names`` or ``data.yaml``.
-
-    Raises:
-        UserError: nothing is there, or YOLO labels have no names.
+    ``classes`` are names of a YOLO folder's classes; None: those of its ``classes.txt``, ``obj.names`` or
+    ``data.yaml``. Raises `UserError` where nothing is there, or YOLO labels have no names.
     """
     doubts = LabelDoubts()
     if place.suffix == ".json" and place.is_file():

@@ -72,14 +72,10 @@ def reference_labels(
     size: tuple[int, int] | None = None,
     frames: range | None = None,
 ) -> ReferenceLabels:
-    """Label the source frames that the clip shows, one at a time.
+    """Label the source frames that the clip shows (all, or the range ``frames``), one at a time, brought to ``size``.
 
-    Args:
-        sequence: its own labels are not looked at.
-        detector: speaks of boxes and classes; its answers below `CONFIDENCE` are passed over.
-        classifier: names each box anew, by its crop with the margin of stills.
-        size: (width, height) to which frames are brought for the detector; None: as they are.
-        frames: which of them, with step 1; None: all that the sequence plays.
+    Answers of the detector below `CONFIDENCE` are passed over. A classifier names each box anew, by its crop with the
+    margin of stills.
     """
     chosen = range(sequence.clip_frames) if frames is None else frames
     resizer = None if size is None else Resizer(sequence.source_size, size, fit="letterbox")

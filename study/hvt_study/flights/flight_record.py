@@ -104,12 +104,9 @@ class _Pending:
 class FlightRecord:
     """Gathers between two lists; `complete` makes of a list what the metrics are given.
 
-    Args:
-        view: between source and base pixels.
-        started_ns: capture of the first frame.
-        classes: how many the detector knows.
-        classifier: the ground's, which is asked of each still and of the base crop at its place; None takes what
-            re-detection said of the still, and what the list said of the object at the still's frame.
+    ``classes`` is how many the detector knows. The ground's ``classifier`` is asked of each still and of the base
+    crop at its place; None takes what re-detection said of the still, and what the list said of the object at the
+    still's frame.
     """
 
     def __init__(self, view: View, *, started_ns: int, classes: int, classifier: Classifier | None) -> None:

@@ -161,9 +161,7 @@ class _Desk:
             for models in plan.models
             for regime in plan.regimes
         ]
-        run = partial(
-            run_spec, cache=plan.cache, folder=Path.cwd()
-        )  # workers may have been started elsewhere
+        run = partial(run_spec, cache=plan.cache, folder=Path.cwd())  # as of workers started elsewhere
         rows = [future.result() for future in [self._pool.submit(run, spec) for spec in specs]]
         for row in rows:
             if row["failed"] and not texts:

@@ -49,15 +49,9 @@ class StillCounts:
 
 
 def bit_split(row_bytes: Mapping[str, int], *, seconds: float) -> BitSplit:
-    """Line bits a second by row of the key table.
+    """Line bits a second by row of the key table, of ``FlightReport.line_bytes``.
 
-    Args:
-        row_bytes: line bytes of each row that sent anything (``FlightReport.line_bytes``).
-        seconds: what to divide by: the media time from the first processed frame to the end of the last, or, as the
-            pilot did, the length of the whole clip.
-
-    Raises:
-        ValueError: the time is not above 0.
+    ``seconds`` go from the first processed frame to the end of the last, or, as the pilot's, over the whole clip.
     """
     _check(seconds)
     known = {row: 8 * row_bytes.get(row, 0) / seconds for row in (Channel.BASE, Channel.ROI, Channel.TRACKS)}

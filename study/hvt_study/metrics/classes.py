@@ -128,14 +128,10 @@ def class_score(
     classes: Collection[str] | None = None,
     limits_px2: tuple[float, float] = LIMITS_PX2,
 ) -> ClassScore:
-    """Count right classes over all frames.
+    """Count right classes over every frame of a sequence; ``word`` and ``classes`` as in `judged.judged`.
 
-    Args:
-        labelled: every frame of the sequence, also those without a picture.
-        refined: names as shown; False takes those before refinement, of the very same boxes.
-        word: see `judged.judged`.
-        classes: likewise.
-        limits_px2: areas in source pixels between small and medium, and between medium and large.
+    ``refined`` takes names as shown; False those before refinement, of the very same boxes. ``limits_px2`` are areas
+    in source pixels between small and medium, and between medium and large.
     """
     frames = judged(labelled, word=word, classes=classes)
     pairs = _paired(frames, refined=refined)

@@ -25,6 +25,8 @@ from hvt_study.metrics.judged import LARGEST_PX2, LIMITS_PX2, SIZES, Judged, Lab
 
 _MOST_BOXES: Final = 500
 _Precision = npt.NDArray[np.float64]
+_Frame = tuple[npt.NDArray[Any], Sequence[str], npt.NDArray[Any]]
+"""Boxes, names and confidences."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +55,9 @@ def detection_score(
     word: Callable[[str], str] = str,
     classes: Collection[str] | None = None,
 ) -> DetectionScore:
-    """Average precision of the boxes and class names that are shown, ranked by confidence.
+    """Average precision of boxes and names as shown, by confidence, over frames that were detected on.
 
-    Refined names count as shown.
-
-    Args:
-        labelled: the frames that were detected on.
-        word: see `judged.judged`.
-        classes: likewise.
+    ``word`` and ``classes`` are as in `judged.judged`.
     """
     frames = judged(labelled, word=word, classes=classes)
     names = sorted({name for one in frames for name in one.class_names})
@@ -78,17 +75,9 @@ def detection_score(
 def _precision(frames: Sequence[Judged], names: Sequence[str]) -> _Precision:
     """(10 IoUs, 101 recalls, classes, 4 sizes with all of them first); -1 where there is no label."""
     category = {name: number for number, name in enumerate(names, start=1)}
-    truth = _dataset(category, len(frames))
-    truth["annotations"] = [
-        _annotation(number, frame, box, category[name])
-        for number, (frame, box, name) in enumerate(_labels(frames), start=1)
-    ]
-    found = _dataset(category, len(frames))
-    found["annotations"] = [
-        _annotation(number, frame, box, category[name]) | {"score": confidence}
-        for number, (frame, box, name, confidence) in enumerate(_boxes(frames), start=1)
-        if name in category
-    ]
+    labels = [(frame.boxes_xyxy_px, frame.class_names, np.ones(len(frame.ids))) for frame in frames]
+    boxes = [(one.view.boxes_xyxy_px, one.view.class_names, one.view.confidences) for one in frames]
+    truth, found = _dataset(category, labels), _dataset(category, boxes)
     small, large = LIMITS_PX2
     ranges = {"small": [0.0, small], "medium": [small, large], "large": [large, LARGEST_PX2]}
     run = COCOeval_faster(COCO(truth), COCO(found), "bbox", ranges=ranges)
@@ -98,47 +87,31 @@ def _precision(frames: Sequence[Judged], names: Sequence[str]) -> _Precision:
     return np.asarray(run.eval["precision"], np.float64)[..., 0]
 
 
-def _dataset(category: Mapping[str, int], frames: int) -> dict[str, Any]:
-    images = [{"id": frame, "width": 1, "height": 1} for frame in range(1, frames + 1)]
+def _dataset(category: Mapping[str, int], frames: Sequence[_Frame]) -> dict[str, Any]:
+    """COCO's, of boxes whose names are categories."""
+    found = [
+        (number, box, category[name], score)
+        for number, (boxes, names, scores) in enumerate(frames, start=1)
+        for box, name, score in zip(boxes.tolist(), names, scores.tolist(), strict=True)
+        if name in category
+    ]
     return {
         "info": {},
-        "images": images,
+        "images": [{"id": number, "width": 1, "height": 1} for number in range(1, len(frames) + 1)],
         "categories": [{"id": number, "name": name} for name, number in category.items()],
+        "annotations": [
+            {
+                "id": number,
+                "image_id": frame,
+                "category_id": kind,
+                "score": score,
+                "iscrowd": 0,
+                "bbox": [x1, y1, x2 - x1, y2 - y1],
+                "area": (x2 - x1) * (y2 - y1),
+            }
+            for number, (frame, (x1, y1, x2, y2), kind, score) in enumerate(found, start=1)
+        ],
     }
-
-
-def _annotation(number: int, frame: int, box: Sequence[float], category: int) -> dict[str, Any]:
-    x1, y1, x2, y2 = box
-    sides = [x1, y1, x2 - x1, y2 - y1]
-    return {
-        "id": number,
-        "image_id": frame,
-        "category_id": category,
-        "bbox": sides,
-        "area": sides[2] * sides[3],
-        "iscrowd": 0,
-    }
-
-
-def _labels(frames: Sequence[Judged]) -> list[tuple[int, list[float], str]]:
-    return [
-        (frame, box, name)
-        for frame, one in enumerate(frames, start=1)
-        for box, name in zip(one.boxes_xyxy_px.tolist(), one.class_names, strict=True)
-    ]
-
-
-def _boxes(frames: Sequence[Judged]) -> list[tuple[int, list[float], str, float]]:
-    return [
-        (frame, box, name, confidence)
-        for frame, one in enumerate(frames, start=1)
-        for box, name, confidence in zip(
-            one.view.boxes_xyxy_px.tolist(),
-            one.view.class_names,
-            one.view.confidences.tolist(),
-            strict=True,
-        )
-    ]
 
 
 def _mean(precision: _Precision) -> AveragePrecision:

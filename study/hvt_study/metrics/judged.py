@@ -113,21 +113,19 @@ class Judged:
     @property
     def areas_px2(self) -> npt.NDArray[np.float64]:
         """(N,) source pixels squared."""
-        return _areas(self.boxes_xyxy_px)
+        boxes = self.boxes_xyxy_px
+        return np.asarray(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None).prod(axis=1))
 
 
 def judged(
     labelled: LabelledFrames, *, word: Callable[[str], str] = str, classes: Collection[str] | None = None
 ) -> list[Judged]:
-    """Take out of every frame what is not to be judged.
+    """Take out of every frame of a sequence what is not to be judged.
 
-    Args:
-        labelled: of one sequence.
-        word: brings the names of labels and boxes into one vocabulary, such as
-            `hvt_common.inference.class_names.kind_of`; by default they are compared as they are.
-        classes: names in that vocabulary; labels and boxes of others are left out. None keeps all.
-            A box stays where its name before *or* after refinement is one of them, so that no still can take a false
-            box out of the account. What merely moves (`MOVING`) may be of any class and stays.
+    ``word`` brings the names of labels and boxes into one vocabulary, such as
+    `hvt_common.inference.class_names.kind_of`. Labels and boxes of other ``classes`` (names in it) are left out; None
+    keeps all. A box stays where its name before *or* after refinement is one of them, so that no still can take a
+    false box out of the account. What merely moves (`MOVING`) may be of any class and stays.
     """
     return [_judged(labels, view, word, classes) for labels, view in labelled]
 
@@ -157,26 +155,16 @@ def _judgeable(boxes: Boxes, labels: FrameLabels, *, there: Boxes) -> npt.NDArra
     if not len(labels.beside_xyxy_px):
         return outside
     free = _outside(boxes, np.concatenate((labels.ignored_xyxy_px, labels.beside_xyxy_px)))
-    return outside & (free | _on(boxes, there))
+    on = iou(boxes, there).max(axis=1, initial=0) >= LEAST_IOU
+    return np.asarray(outside & (free | on))
 
 
 def _outside(boxes: Boxes, regions: Boxes) -> npt.NDArray[np.bool_]:
     return np.asarray(covered_share(boxes, regions) < _IGNORED_SHARE)
 
 
-def _on(boxes: Boxes, there: Boxes) -> npt.NDArray[np.bool_]:
-    """(N,) whether each box is on one of the labels."""
-    if not len(there):
-        return np.zeros(len(boxes), np.bool_)
-    return np.asarray(iou(boxes, there).max(axis=1) >= LEAST_IOU)
-
-
 def _known(names: Sequence[str], classes: Collection[str] | None) -> npt.NDArray[np.bool_]:
     return np.array([classes is None or name == MOVING or name in classes for name in names], np.bool_)
-
-
-def _areas(boxes: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    return np.asarray(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None).prod(axis=1))
 
 
 def matched_rows(

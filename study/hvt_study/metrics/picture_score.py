@@ -129,12 +129,9 @@ def above(frames: Sequence[LabelledFrame], confidence: float) -> list[LabelledFr
 def picture_score(
     used: Sequence[Judged], curve: DetectionScore, *, recall_only: bool = False
 ) -> dict[str, Any]:
-    """What ``score.json`` holds; None stands for what cannot be said.
+    """What ``score.json`` holds of pictures with boxes from the confidence of use on, and of the whole ``curve``.
 
-    Args:
-        used: pictures that hold only boxes at or above the confidence of use.
-        curve: average precision, of boxes of all confidences.
-        recall_only: not all objects are labelled, so that no box is known to be wrong.
+    None stands for what cannot be said: with ``recall_only`` no box is known to be wrong.
     """
     seen = sorted({name for one in used for name in (*one.class_names, *one.view.class_names)})
     points = {name: operating_point(used, name=name) for name in seen}

@@ -229,12 +229,9 @@ def compare_tracks(
         distance = 1 - iou(true_boxes, boxes)  # motmetrics' own needs NumPy 1
         distance[distance > 1 - least_iou] = np.nan
         events.update(true_ids.tolist(), ids.tolist(), distance, frameid=number)
-    return TrackingScore(**_counts(events), higher_order=hota(sequence))
-
-
-def _counts(events: Any) -> dict[str, int]:
     summary = _judge().compute(events, metrics=list(_COUNTS), return_dataframe=False)
-    return {name: round(float(summary[key])) for key, name in _COUNTS.items()}
+    counts = {name: round(float(summary[key])) for key, name in _COUNTS.items()}
+    return TrackingScore(**counts, higher_order=hota(sequence))
 
 
 @cache

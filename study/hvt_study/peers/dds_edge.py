@@ -86,14 +86,10 @@ def most_stored(settings: DdsSettings) -> int:
 
 
 class DdsEdge:
-    """Two encoders over one budget. A frame stays in memory until the ground's answer about it has come and gone.
+    """Two encoders over one budget, opened with `pass_rates` as ``line.budget`` was.
 
-    Args:
-        rates: of `pass_rates`.
-        size: (width, height) of the base frames.
-        segments: the coded frames of each segment.
-        line: takes the messages; ``line.budget`` was opened with ``rates.budget``.
-        most_bytes: line bytes that the whole flight may take; a second pass beyond it is not sent.
+    A frame stays in memory until the ground's answer about it has come and gone. A second pass that would take the
+    flight beyond ``most_bytes`` on the line is not sent.
     """
 
     def __init__(

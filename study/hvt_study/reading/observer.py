@@ -36,12 +36,7 @@ INSIDE_SHARE = 0.98
 class CodeObserver:
     """Is shown what a flight's ground has received, at the media time ``at_ns``; changes nothing.
 
-    Args:
-        codes: what there is to read, by object.
-        views: the codes in view, by frame of the clip.
-        view: between source and base pixels.
-        started_ns: media time 0.
-        reader: reads.
+    ``codes`` are what there is to read, by object, and ``views`` the codes in view, by frame of the clip.
     """
 
     def __init__(

@@ -30,13 +30,8 @@ _in_flight = threading.Lock()
 def run_spec(spec: RunSpec, *, cache: Path, folder: Path = Path()) -> RunRow:
     """Do one run; what the edge refuses, or no one has foreseen, is a row that says so.
 
-    Args:
-        spec: what to do.
-        cache: folder of what was computed before.
-        folder: what paths that are not absolute begin at, such as the folder in which the study was started.
-
-    Raises:
-        UserError: dataset or models cannot be used, or the cache not be written: that ends the study.
+    Paths that are not absolute begin at ``folder``, such as the one in which the study was started. A `UserError`
+    ends the study: dataset or models cannot be used, or the cache not be written.
     """
     with _in_flight:
         here = located(spec, folder=folder)

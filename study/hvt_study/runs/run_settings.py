@@ -29,11 +29,8 @@ def edge_flags(
 ) -> tuple[str, ...]:
     """The command line of ``hvt-edge`` without its source; a peer's settings in words of its own.
 
-    Args:
-        spec: its paths can be opened from here: the detector's file says its default confidence.
-        budget_bps: the edge's budget, bit/s.
-        shape: frame rate and size of the video.
-        named: how the user named the models, to be used in the result; None: as ``spec`` does.
+    The paths of ``spec`` can be opened from here: the detector's file says its default confidence. ``named`` is how
+    the user named the models, to be used in the result; None: as ``spec`` does.
     """
     method = METHODS[spec.method]
     if method.kind is Kind.PEER:

@@ -137,13 +137,9 @@ def search_shape(
     sizes: Sequence[tuple[int, int]],
     nominal: tuple[int, int],
 ) -> None:
-    """Fly from coarse to fine; ``fly`` says what a flight was worth, None where it cannot be flown.
+    """Fly each shape once, from coarse to fine; ``sizes`` go from the smallest, the run's own (``nominal``) is one.
 
-    Args:
-        fly: called once for each shape.
-        rates: frames a second, in order.
-        sizes: smallest first, ``nominal`` among them.
-        nominal: the run's own size.
+    ``fly`` says what a flight was worth, None where it cannot be flown.
     """
     worth: dict[float, Any] = {fps: fly(VideoShape(fps)) for fps in rates}
     flown = [fps for fps in rates if worth[fps] is not None]

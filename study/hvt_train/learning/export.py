@@ -124,14 +124,9 @@ def export_onnx(
     free: Mapping[str, Mapping[int, str]],
     properties: Mapping[str, str],
 ) -> None:
-    """Write the network; weights are stored as float16 and widened when the file is opened.
+    """Write the network, whole or not at all; weights are stored as float16 and widened when the file is opened.
 
-    Args:
-        net: in evaluation mode; its input is called ``images`` and its output ``output``.
-        path: to write, whole or not at all.
-        example: an input.
-        free: names of the free axes of input and output.
-        properties: the file's metadata.
+    Its input is called ``images`` and its output ``output``; ``free`` names the free axes of both.
     """
     buffer = io.BytesIO()
     with warnings.catch_warnings():

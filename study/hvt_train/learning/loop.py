@@ -63,15 +63,10 @@ def train(
     log: Path,
     check: Callable[[nn.Module, int], dict[str, float]] | None = None,
 ) -> nn.Module:
-    """Train and return the averaged network.
+    """Train the network in place on batches without end, and return the averaged one.
 
-    Args:
-        net: to train, in place.
-        batches: without end.
-        loss_of: (network, batch) to a loss and its parts.
-        settings: of the schedule.
-        log: one JSON object a line: step, seconds, rate and parts every 50 steps, and what ``check`` returns.
-        check: measures the averaged network at a step.
+    ``loss_of`` makes of (network, batch) a loss and its parts, ``check`` measures the averaged network at a step. The
+    log has one JSON object a line: step, seconds, rate and parts every 50 steps, and what ``check`` returns.
     """
     optimizer = torch.optim.AdamW(_groups(net, settings.decay), lr=settings.rate, betas=(0.9, 0.99))
     average = Average(net, settings.average)

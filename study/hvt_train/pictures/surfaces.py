@@ -24,14 +24,7 @@ _MATERIALS: dict[str, tuple[float, float, float]] = {
 
 
 class Surface:
-    """What lies where, in world metres, to be painted later.
-
-    Args:
-        to_px: world metres to pixels.
-        size: of the square picture in pixels.
-        px_per_m: scale across the tilt.
-        half_m: half the side of the world's square.
-    """
+    """What lies where in a square picture of ``size`` pixels, in world metres, to be painted later."""
 
     def __init__(
         self, to_px: Callable[[_Floats], _Floats], *, size: int, px_per_m: float, half_m: float

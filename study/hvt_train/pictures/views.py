@@ -57,13 +57,7 @@ class ViewSettings:
 
 
 class ViewSource:
-    """Draws views from a pool, without end.
-
-    Args:
-        pool: The files of `hvt_train.pictures.pool.fill_pool`.
-        seed: of everything that is random here.
-        settings: how to cut.
-    """
+    """Draws views from a pool (`hvt_train.pictures.pool.fill_pool`), without end."""
 
     def __init__(self, pool: list[Path], *, seed: int, settings: ViewSettings) -> None:
         self._kinds = [name for name, _ in settings.shares]

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
@@ -76,14 +77,6 @@ def parse_numbers(uri: str, text: str) -> tuple[int, ...]:
     return tuple(sorted(numbers))
 
 
-def _fps(uri: str, text: str) -> float:
-    return _number(uri, "fps", text, 0.1, 1000)
-
-
-def _view(uri: str, text: str) -> float:
-    return _number(uri, "view", text, 0.1, 3)
-
-
 def _words(uri: str, text: str) -> tuple[str, ...]:
     words = tuple(word.strip() for word in text.split(","))
     if not all(words):
@@ -97,7 +90,7 @@ def _annotated(uri: str, text: str) -> bool:
     return text == "annotations"
 
 
-def _number(uri: str, name: str, text: str, least: float, most: float) -> float:
+def _number(uri: str, text: str, *, name: str, least: float, most: float) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -110,9 +103,9 @@ def _number(uri: str, name: str, text: str, least: float, most: float) -> float:
 
 
 _OPTIONS: Mapping[str, tuple[str, Callable[[str, str], Any]]] = {
-    "fps": ("fps", _fps),
+    "fps": ("fps", partial(_number, name="fps", least=0.1, most=1000)),
     "labels": ("annotated", _annotated),
-    "view": ("view", _view),
+    "view": ("view", partial(_number, name="view", least=0.1, most=3)),
     "seeds": ("seeds", parse_numbers),
     "classes": ("classes", _words),
     "labelled": ("labelled", _words),

@@ -40,16 +40,11 @@ _SHOWN_NAMES = 5
 
 
 def open_dataset(uri: str, *, limit: int | None = None, only: Words[str] = ()) -> tuple[Sequence, ...]:
-    """The sequences of a dataset, in natural order.
+    """The sequences of a dataset, in natural order: at most ``limit``, and ``only`` those of these names or patterns.
 
-    Args:
-        uri: one of `DATASETS`; options follow a question mark: ``visdrone:ROOT?fps=24``.
-        limit: at most so many sequences.
-        only: names of sequences, or patterns such as ``uav00000*``; none: all.
-
-    Raises:
-        UserError: unknown scheme or option, nothing there, the layout lacks something, an annotation line is wrong,
-            or ``only`` names what is not there.
+    ``uri`` is one of `DATASETS`; options follow a question mark: ``visdrone:ROOT?fps=24``. Raises `UserError` for an
+    unknown scheme or option, where the layout lacks something or an annotation is wrong, or ``only`` names what is
+    not there.
     """
     return tuple(one for _, one in open_datasets((uri,), limit=limit, only=only))
 
@@ -62,10 +57,16 @@ def open_datasets(
     Raises `UserError` as `open_dataset`; what ``only`` names has to be in one of them, not in all.
     """
     uris = tuple(dict.fromkeys(uris))
-    found = {uri: _layout(uri, limit) for uri in uris}
+    if limit is not None and limit < 1:
+        raise UserError(f"dataset {uris[0]!r} is limited to {limit} sequences: accepted is 1 or more")
+    found = {}
+    for uri in uris:
+        with _readable(uri):
+            found[uri] = _laid_out(uri)
     _check_there(found, only)
     for uri, sequences in found.items():
-        for name in islice(_chosen(sequences, only), limit):
+        chosen = (name for name in sequences if not only or any(fnmatchcase(name, one) for one in only))
+        for name in islice(chosen, limit):
             with _readable(uri):
                 sequence = sequences[name]()
             yield uri, sequence
@@ -77,13 +78,6 @@ def _readable(uri: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(f"dataset {uri!r} cannot be read: {error}") from None
-
-
-def _layout(uri: str, limit: int | None) -> _Found:
-    if limit is not None and limit < 1:
-        raise UserError(f"dataset {uri!r} is limited to {limit} sequences: accepted is 1 or more")
-    with _readable(uri):
-        return _laid_out(uri)
 
 
 def _laid_out(uri: str) -> _Found:
@@ -124,7 +118,3 @@ def _check_there(found: Mapping[str, _Found], only: Words[str]) -> None:
             which = f"dataset {where} has" if len(found) == 1 else f"datasets {where} have"
             there = ", ".join(names[:_SHOWN_NAMES]) + (", …" if len(names) > _SHOWN_NAMES else "")
             raise UserError(f"{which} no sequence {wanted!r}: there are {there}")
-
-
-def _chosen(found: _Found, only: Words[str]) -> Iterator[str]:
-    return (name for name in found if not only or any(fnmatchcase(name, wanted) for wanted in only))
