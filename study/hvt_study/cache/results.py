@@ -50,7 +50,10 @@ def tree_digest(folders: Iterable[Path], *, without: Collection[str] = ()) -> st
     """
     digest = hashlib.sha256()
     files = {
-        file.relative_to(folder.parent).as_posix(): file for folder in folders for file in _python(folder)
+        file.relative_to(folder.parent).as_posix(): file
+        for folder in folders
+        for file in folder.rglob("*.py")
+        if file.is_file()
     }
     for name, file in sorted(files.items()):
         if any(name.startswith(f"{folder}/") for folder in without):
@@ -75,10 +78,6 @@ def _folders(packages: Iterable[str]) -> Iterator[Path]:
         found = find_spec(name)
         assert found is not None, f"{name} is a part of HVT"
         yield from map(Path, found.submodule_search_locations or ())
-
-
-def _python(folder: Path) -> Iterator[Path]:
-    return (path for path in folder.rglob("*.py") if path.is_file())
 
 
 _log = logging.getLogger(__name__)

@@ -212,6 +212,7 @@ def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequenc
     """What the arguments ask for, with these of `open_sequences`; `UserError` for what cannot be."""
     size = base_size(arguments.size)
     frames = flown_frames(getattr(arguments, "max_frames", None))
+    cache: Path = getattr(arguments, "out", Path()) / "cache"  # who plans writes nothing
     check_whole("--detect-every", arguments.detect_every, 1)
     codecs = tuple(dict.fromkeys(names_of(arguments.still_codecs) or ("",)))
     for codec in codecs:
@@ -223,7 +224,7 @@ def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequenc
         still_codecs=codecs,
         models=_models(arguments),
         labels=arguments.labels,
-        cache=_cache(arguments).absolute(),
+        cache=Path(getattr(arguments, "cache", cache)).absolute(),
         size=size,
         max_frames=frames,
         detect_every=arguments.detect_every,
@@ -237,11 +238,8 @@ def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequenc
 def _matched_to(arguments: argparse.Namespace) -> tuple[str, ...] | None:
     if not hasattr(arguments, "matched_to"):
         return None
-    return chosen_names(
-        arguments.matched_to,
-        [one.name for one in chosen_methods(arguments.methods) if one.kind is not Kind.VIDEO],
-        flag="--matched-to",
-    )
+    known = [one.name for one in chosen_methods(arguments.methods) if one.kind is not Kind.VIDEO]
+    return chosen_names(arguments.matched_to, known, flag="--matched-to")
 
 
 def open_pool(arguments: argparse.Namespace) -> tuple[AbstractContextManager[Any], int]:
@@ -258,11 +256,6 @@ def jobs_of(arguments: argparse.Namespace) -> int:
     if hasattr(arguments, "dask"):
         raise UserError(f"--jobs {jobs} has no say with --dask: give one of them")
     return check_whole("--jobs", jobs, 1, _MOST_JOBS)
-
-
-def _cache(arguments: argparse.Namespace) -> Path:
-    out: Path = getattr(arguments, "out", Path())  # who plans writes nothing
-    return getattr(arguments, "cache", out / "cache")
 
 
 def _models(arguments: argparse.Namespace) -> tuple[ModelChoice, ...]:

@@ -22,6 +22,10 @@ from hvt_study.reading.sheet import write_sheet
 from hvt_study.runs.methods import chosen_names
 from hvt_study.runs.spec import ModelChoice
 
+_HEADS = (
+    *("kbps", "method", "video", "total", "stills", "base", "still", "all", "<8", "8-11", ">11"),
+    *("s", "wrong"),
+)
 _CAPTION = (
     "total, stills: kbps; then shares of the codes that were read right at least once:\n"
     "base, still, all: in base pictures, in stills, in both together\n"
@@ -65,21 +69,7 @@ def print_result(result: ReadResult) -> None:
     """One line a method and rate."""
     print_columns(
         f"{len(result.rows[0].codes())} codes, read by {result.reader}",
-        (
-            "kbps",
-            "method",
-            "video",
-            "total",
-            "stills",
-            "base",
-            "still",
-            "all",
-            "<8",
-            "8-11",
-            ">11",
-            "s",
-            "wrong",
-        ),
+        _HEADS,
         map(_cells, result.rows),
         words=("method", "video"),
         gap=1,
@@ -93,10 +83,12 @@ def _cells(row: ReadRow) -> tuple[str, ...]:
     linked = row.method != "source"
     every = row.score("composite" if linked else "base")
     heights = row.by_height("composite" if linked else "base")
+    flights = (one.flight for one in row.scenes)
+    streams = (f"{one.size[0]}x{one.size[1]}@{one.fps:.3g}" for one in flights)
     return (
         f"{row.rate_kbps:g}" if linked else "",
         row.method,
-        "; ".join(dict.fromkeys(_stream(one.flight.size, one.flight.fps) for one in row.scenes)),
+        "; ".join(dict.fromkeys(streams)),
         f"{row.mean('total_bps') / 1e3:.0f}" if linked else "",
         f"{row.mean('roi_bps') / 1e3:.0f}" if linked else "",
         share(row.score("base").read, 2),
@@ -106,10 +98,6 @@ def _cells(row: ReadRow) -> tuple[str, ...]:
         decimals(every.median_s, 1),
         share(every.misread, 2),
     )
-
-
-def _stream(size: tuple[int, int], fps: float) -> str:
-    return f"{size[0]}x{size[1]}@{fps:.3g}"
 
 
 def _plan(arguments: argparse.Namespace) -> ReadPlan:

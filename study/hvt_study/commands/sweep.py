@@ -53,7 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
         frames, area = _from_clip(arguments)
     raw = sum(len(found.confidences) for found in frames.values())
     rows = sweep(frames, frame_area_px=area)
-    _print(rows, raw=raw, frames=len(frames))
+    cells = ((row.policy, str(row.selected), f"{row.ratio:.4f}", f"{row.frame_coverage:.4f}") for row in rows)
+    print_columns(f"{raw} raw detections on {len(frames)} frames", COLUMNS, cells, words=("policy",))
     if hasattr(arguments, "out"):
         _write(rows, arguments.out)
     return 0
@@ -101,11 +102,6 @@ def _own_rate(path: Path) -> float:
         if source.live:
             raise UserError(f"{path} is live: give a clip or a folder of images")
         return min(240.0, source.source_fps) if isinstance(source, VideoSource) else source.fps
-
-
-def _print(rows: Sequence[SweepRow], *, raw: int, frames: int) -> None:
-    cells = ((row.policy, str(row.selected), f"{row.ratio:.4f}", f"{row.frame_coverage:.4f}") for row in rows)
-    print_columns(f"{raw} raw detections on {frames} frames", COLUMNS, cells, words=("policy",))
 
 
 def _write(rows: Sequence[SweepRow], folder: Path) -> None:

@@ -127,6 +127,6 @@ def joint_classes(
 
 def _common_word(name: str, *maps: ClassMap) -> str:
     """Of a class of the dataset: the word of its kind where one of the models knows no finer."""
-    own = first_synonym(name).casefold()
+    own = _plain(name)
     said = (one.words.get(name, own) for one in maps)
     return next((word for word in said if word != own), own)

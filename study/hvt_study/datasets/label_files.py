@@ -61,16 +61,14 @@ class Folders:
         """The file or folder of this path, each of its names in any case; None where there is none."""
         if path.exists():
             return path
-        folder = path.parent if path.parent.is_dir() else self._above(path)
+        above = None if path.parent == path else path.parent
+        folder = above if above is None or above.is_dir() else self.find(above)
         if folder is None or not folder.is_dir():
             return None
         if folder not in self._names:
             self._names[folder] = {one.name.lower(): one.name for one in folder.iterdir()}
         name = self._names[folder].get(path.name.lower())
         return None if name is None else folder / name
-
-    def _above(self, path: Path) -> Path | None:
-        return None if path.parent == path else self.find(path.parent)
 
 
 def pictures_below(place: Path) -> list[Path]:

@@ -143,7 +143,8 @@ def read_codes_of(
     read: dict[int, Shown] = {}
     for shown in stills_with_codes(flown, codes, views, base_per_source=base_per_source):
         if shown.object_id not in read:
-            (reading,) = reader.read([_still_crop(shown)])
+            crop = code_crop(shown.still.image_bgr, _in_still(shown.still, shown.box_base_px))
+            (reading,) = reader.read([crop])
             if reading.text == codes[shown.object_id].text:
                 read[shown.object_id] = shown
     return Legible(frozenset(video), read)
@@ -159,9 +160,9 @@ def stills_with_codes(
     """Every still with each code that lies whole in it."""
     for still in flown.stills:
         place = np.array(still.place_base_px)
-        for one in _whole(codes, views, still.frame):
-            box = one.box_source_px * base_per_source
-            if share_inside(box, place) >= INSIDE_SHARE:
+        for one in views[still.frame - 1]:
+            box, whole = one.box_source_px * base_per_source, one.visible >= LEAST_VISIBLE
+            if whole and one.object_id in codes and share_inside(box, place) >= INSIDE_SHARE:
                 x1, y1, x2, y2 = box.tolist()
                 yield Shown(one.object_id, still, (x1, y1, x2, y2))
 
@@ -195,14 +196,6 @@ def _in_video(
         if reader.read([crop])[0].text == code.text:
             return True
     return False
-
-
-def _whole(codes: Mapping[int, Code], views: Sequence[Sequence[CodeInView]], frame: int) -> list[CodeInView]:
-    return [one for one in views[frame - 1] if one.visible >= LEAST_VISIBLE and one.object_id in codes]
-
-
-def _still_crop(shown: Shown) -> Image:
-    return code_crop(shown.still.image_bgr, _in_still(shown.still, shown.box_base_px))
 
 
 def _in_still(still: FlownStill, box_base_px: Sequence[float]) -> list[float]:

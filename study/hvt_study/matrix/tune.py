@@ -140,21 +140,23 @@ def tune(
     )
 
 
+@dataclass(frozen=True, slots=True)
 class _Desk:
     """Flies one method with some parameters over some sequences."""
 
-    def __init__(self, plan: StudyPlan, method: str, pool: Pool) -> None:
-        self._plan, self._method, self._pool = plan, method, pool
+    plan: StudyPlan
+    method: str
+    pool: Pool
 
     def mean_worth(self, sequences: Sequence[tuple[str, str]], texts: tuple[str, ...]) -> float:
         rows = self.rows(sequences, texts)
         return sum(_worth(row) for row in rows) / len(rows)
 
     def rows(self, sequences: Sequence[tuple[str, str]], texts: tuple[str, ...]) -> list[dict[str, Any]]:
-        plan = self._plan
+        plan = self.plan
         specs = [
             replace(
-                spec_of(plan, dataset, sequence, FLOWN[self._method], regime, models, plan.still_codecs[0]),
+                spec_of(plan, dataset, sequence, FLOWN[self.method], regime, models, plan.still_codecs[0]),
                 tune=texts,
             )
             for dataset, sequence in sequences
@@ -162,10 +164,10 @@ class _Desk:
             for regime in plan.regimes
         ]
         run = partial(run_spec, cache=plan.cache, folder=Path.cwd())  # as of workers started elsewhere
-        rows = [future.result() for future in [self._pool.submit(run, spec) for spec in specs]]
+        rows = [future.result() for future in [self.pool.submit(run, spec) for spec in specs]]
         for row in rows:
             if row["failed"] and not texts:
-                raise UserError(f"{self._method} cannot be flown over {row['sequence']}: {row['failed']}")
+                raise UserError(f"{self.method} cannot be flown over {row['sequence']}: {row['failed']}")
         return rows
 
 

@@ -32,18 +32,16 @@ def tuned_methods(words: Iterable[str]) -> dict[str, tuple[str, ...]]:
             raise UserError(f"--tune {word!r} is of {name!r}: choose one of {', '.join(known.values())}")
         method(own, **parameters)
         found[own] = found.get(own, {}) | parameters
-    return {name: texts for name, one in found.items() if (texts := tuning_texts(_changed(name, one)))}
+    changed = {  # a method with its defaults is that method
+        name: {key: value for key, value in one.items() if value != METHODS[name].parameters[key]}
+        for name, one in found.items()
+    }
+    return {name: texts for name, one in changed.items() if (texts := tuning_texts(one))}
 
 
 def tuning_texts(parameters: Mapping[str, float]) -> tuple[str, ...]:
     """``KEY=VALUE`` as the edge takes them, by name: equal parameters are equal texts."""
     return tuple(f"{name}={value:g}" for name, value in sorted(parameters.items()))
-
-
-def _changed(name: str, parameters: Mapping[str, float]) -> dict[str, float]:
-    """Without what is as it would be anyway: a method with its defaults is that method."""
-    defaults = METHODS[name].parameters
-    return {key: value for key, value in parameters.items() if value != defaults[key]}
 
 
 def _from_words(word: str) -> tuple[str, dict[str, float]]:

@@ -171,12 +171,12 @@ class DdsGround:
             confidences_before=confidences,
             origins=("base",) * len(names),
             shown_s=(self._at_ns - self.started_ns) / 1e9,
-            detections=None if found is None else self._detections(found),
+            detections=None
+            if found is None
+            else FrameView.plain(
+                self._inside(found.boxes_xyxy_px), self._names(found.class_ids), found.confidences
+            ),
         )
-
-    def _detections(self, found: Detections) -> FrameView:
-        names = self._names(found.class_ids)
-        return FrameView.plain(self._inside(found.boxes_xyxy_px), names, found.confidences)
 
     def _names(self, class_ids: np.ndarray[tuple[int], np.dtype[np.int32]]) -> tuple[str, ...]:
         return tuple(self.detector.class_names[kind] for kind in class_ids.tolist())

@@ -32,16 +32,13 @@ def write_sheet(path: Path, result: ReadResult) -> None:
         return
     lowest = min(row.rate_kbps for row in flown)
     rows = [row for row in result.rows if row.rate_kbps in (0, lowest)]
-    columns = [(row, channel) for row in rows for channel in _channels(row)]
+    both: tuple[Channel, ...] = "base", "stills"
+    columns = [(row, channel) for row in rows for channel in (both if row.mean("roi_bps") else both[:1])]
     picture = np.vstack(
         [_line([f"at {lowest:g} kbps", *(_title(*one) for one in columns)], high_px=_HEAD_PX)]
         + [_row(object_id, columns) for object_id in _chosen(columns)]
     )
     path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
-
-
-def _channels(row: ReadRow) -> tuple[Channel, ...]:
-    return ("base", "stills") if row.mean("roi_bps") else ("base",)
 
 
 def _title(row: ReadRow, channel: Channel) -> str:

@@ -47,7 +47,12 @@ def inline_svg(drawing: Drawing) -> str:
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg)
     svg = _ID.sub(lambda found: f'id="{drawing.name}-{found[1]}"', svg)
-    svg = _REFERENCE.sub(lambda found: _renamed(drawing.name, found), svg)
+    svg = _REFERENCE.sub(
+        lambda found: (
+            f'href="#{drawing.name}-{found[1]}"' if found[1] else f"url(#{drawing.name}-{found[2]})"
+        ),
+        svg,
+    )
     svg = svg.replace("#000000", "currentColor").replace(
         "'DejaVu Sans'", "system-ui, 'DejaVu Sans', sans-serif"
     )
@@ -57,10 +62,6 @@ def inline_svg(drawing: Drawing) -> str:
     head, rest = svg.split(">", 1)
     head = re.sub(r'\s(width|height)="[^"]*"', "", head).replace("<svg", label, 1)
     return f"{head}>{rest}".strip()
-
-
-def _renamed(name: str, found: re.Match[str]) -> str:
-    return f'href="#{name}-{found[1]}"' if found[1] else f"url(#{name}-{found[2]})"
 
 
 def _rendered(template: str, report: Report) -> str:

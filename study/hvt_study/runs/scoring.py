@@ -26,6 +26,7 @@ from hvt_study.metrics.tracking import continuity, tracking_score
 from hvt_study.runs.run_context import RunContext
 
 _DIGITS = 6
+_RATES = ("total_bps", "base_bps", "roi_bps")
 _SAYS_OF_ONE = {
     *("recall", "recall_half_1", "recall_half_2", "top1_before", "top1", "top1_half_1", "top1_half_2"),
     *("top1_all_before", "top1_all", "found_share", "gaps", "longest_gap_s", "id_switches"),
@@ -34,6 +35,7 @@ _SAYS_OF_ONE = {
 """What labels of one target can say: of the rest of the list nobody knows whether it is right."""
 
 
+_OF_A_LIST = ("named_f1", "false_per_frame", "recall", "precision", "f1")
 _OPINIONS = {
     "confidence_base": "confidence_base",
     "confidence_refined": "confidence_still",
@@ -62,26 +64,18 @@ def _bits(report: FlightReport, context: RunContext) -> dict[str, Any]:
     return {
         "duration_s": report.duration_s,
         "clip_s": context.sequence.duration_s,
-        "total_bps": round(span.total_bps),
-        "base_bps": round(span.base_bps),
-        "roi_bps": round(span.roi_bps),
-        "track_bps": round(span.track_bps),
-        "other_bps": round(span.other_bps),
-        "back_bps": round(8 * _back_bytes(report) / report.duration_s),
-        "total_bps_pilot": round(pilot.total_bps),
-        "base_bps_pilot": round(pilot.base_bps),
-        "roi_bps_pilot": round(pilot.roi_bps),
+        **{name: round(getattr(span, name)) for name in (*_RATES, "track_bps", "other_bps")},
+        # Of a server its questions, which are a row of what crossed the line.
+        "back_bps": round(
+            8 * (report.back_bytes + report.line_bytes.get(Channel.CONTROL, 0)) / report.duration_s
+        ),
+        **{f"{name}_pilot": round(getattr(pilot, name)) for name in _RATES},
         "fps": report.messages.get("base", 0) / report.duration_s,
         "stills": counts.stills,
         "stills_per_min": counts.stills_per_min,
         "mean_still_bytes": counts.mean_bytes,
         "tracks_refined": counts.tracks_refined,
     }
-
-
-def _back_bytes(report: FlightReport) -> int:
-    """Of a server its questions, which are a row of what crossed the line."""
-    return report.back_bytes + report.line_bytes.get(Channel.CONTROL, 0)
 
 
 def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
@@ -100,11 +94,7 @@ def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
         "map_50_95": detection.mean.at_50_95,
         **{f"map_50_{size}": one.at_50 for size, one in detection.by_size.items()},
         "named_f1_before": before.named_f1,
-        "named_f1": after.named_f1,
-        "false_per_frame": after.false_per_frame,
-        "recall": after.recall,
-        "precision": after.precision,
-        "f1": after.f1,
+        **{name: getattr(after, name) for name in _OF_A_LIST},
         "top1_before": before.counts.top1_found,
         "top1": after.counts.top1_found,
         "top1_all_before": before.counts.top1_all,
@@ -135,15 +125,8 @@ def _halves(labelled: LabelledFrames, words: dict[str, Any]) -> dict[str, float]
     found: dict[str, float] = {}
     for half, part in enumerate((labelled[:middle], labelled[middle:]), start=1):
         one = class_score(part, **words)
-        figures = {
-            "named_f1": one.named_f1,
-            "false_per_frame": one.false_per_frame,
-            "recall": one.recall,
-            "precision": one.precision,
-            "f1": one.f1,
-            "top1": one.counts.top1_found,
-        }
-        found |= {f"{name}_half_{half}": value for name, value in figures.items()}
+        found |= {f"{name}_half_{half}": getattr(one, name) for name in _OF_A_LIST}
+        found[f"top1_half_{half}"] = one.counts.top1_found
     return found
 
 

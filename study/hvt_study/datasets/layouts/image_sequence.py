@@ -116,15 +116,15 @@ def find_folders(root: Path, *, depth: int) -> list[Path]:
         level = [
             folder
             for parent in level
-            for folder in sorted(parent.iterdir(), key=lambda path: _natural(path.name))
+            for folder in sorted(parent.iterdir(), key=_natural)
             if not folder.name.startswith(".") and folder.is_dir()
         ]
         found += level
     return found
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def _number(file: Path) -> int:

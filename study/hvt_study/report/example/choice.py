@@ -16,7 +16,7 @@ from hvt_common.errors import FlightError, UserError
 from hvt_common.runtime.reporting import write_json
 from hvt_common.values import Image
 from hvt_study.report.data.arms import Arm, BySequence, RunRow, Setting, is_video, settings, values
-from hvt_study.report.data.pairs import Pair, pairs
+from hvt_study.report.data.pairs import pairs
 
 PERCENTILES = (10, 50, 90)
 """Of the gain in PSNR: the stills that are shown."""
@@ -163,17 +163,13 @@ def _median(setting: Setting, arm: Arm, runs: BySequence) -> Choice:
 
 def _gains(setting: Setting, arm: Arm, runs: BySequence) -> tuple[Mapping[str, float], str]:
     """In named F1 by sequence, and over what."""
-    for pair in _plain(setting, arm):
+    for pair in (one for one in pairs(setting, references=("M0",)) if one.arm == arm):
         against = {name: gap for name, gap in pair.gaps(_GAIN).items() if name in runs}
         if against:
             return against, "M0 at the same total"
     after, before = values(runs, _GAIN), values(runs, f"{_GAIN}_before")
     own = {name: after[name] - before[name] for name in runs}
     return {name: gap for name, gap in own.items() if not math.isnan(gap)}, "itself without stills"
-
-
-def _plain(setting: Setting, arm: Arm) -> list[Pair]:
-    return [pair for pair in pairs(setting, references=("M0",)) if pair.arm == arm]
 
 
 _FOLDER = "example"
@@ -201,7 +197,8 @@ def load_example(folder: Path) -> Example | None:
     place = folder / _FOLDER
     try:
         content = json.loads((place / _FILE).read_text(encoding="utf-8"))
-        return _example(content, place)
+        crops = tuple(_crop(crop, place) for crop in content["crops"])
+        return Example(**{**content, "crops": crops, "timeline": _timeline(content["timeline"])})
     except FileNotFoundError:
         if not (place / _FILE).exists():
             return None
@@ -210,11 +207,6 @@ def load_example(folder: Path) -> Example | None:
         raise UserError(
             f"{place / _FILE} is damaged: remove the folder, and the report does without"
         ) from None
-
-
-def _example(content: Mapping[str, Any], place: Path) -> Example:
-    crops = tuple(_crop(crop, place) for crop in content["crops"])
-    return Example(**{**content, "crops": crops, "timeline": _timeline(content["timeline"])})
 
 
 def _crop(content: Mapping[str, Any], place: Path) -> CropExample:

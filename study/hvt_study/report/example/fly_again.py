@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from typing import Any
 
@@ -86,12 +86,8 @@ def example_of(flight: FlightPlan, context: RunContext, *, key: str, rule: str, 
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Shown:
-    """A still as the ground had it."""
-
-    event: Refinement
-    header: RoiHeader
+_Shown = tuple[Refinement, RoiHeader]
+"""A still as the ground had it."""
 
 
 class _WatchedGround(GroundSide):
@@ -112,28 +108,25 @@ class _WatchedGround(GroundSide):
             if _row_of(arrival) is Channel.ROI
             for header in [RoiHeader.parse(arrival.message.attachment, arrival.message.payload)]
         }
-        return [_Shown(event, headers[number]) for number, event in sorted(self._events.items())]
+        return [(event, headers[number]) for number, event in sorted(self._events.items())]
 
     def _observed_by(self, emit: Callable[[Event], None]) -> Callable[[Event], None]:
         tell = super()._observed_by(emit)
 
         def watch(event: Event) -> None:
             if isinstance(event, Refinement) and len(self._events) < _MOST_STILLS:
-                self._note_still(event)
+                whole = event.still_bgr is not None and event.base_crop_bgr is not None
+                self._events = ({event.still_sequence: event} if whole else {}) | self._events
             tell(event)
 
         return watch
-
-    def _note_still(self, event: Refinement) -> None:
-        if event.still_bgr is not None and event.base_crop_bgr is not None:
-            self._events.setdefault(event.still_sequence, event)
 
 
 def _compared(stills: Sequence[_Shown], clip: Clip, *, view: View) -> Iterator[CropExample]:
     """Each still against the source frame that it was cut from; frames are read once, one at a time."""
     by_frame: dict[int, list[_Shown]] = {}
-    for one in stills:
-        by_frame.setdefault(one.header.frame_index, []).append(one)
+    for event, header in stills:
+        by_frame.setdefault(header.frame_index, []).append((event, header))
     with closing(clip.images()) as images:
         for frame_index, image in enumerate(islice(images, max(by_frame, default=-1) + 1)):
             for one in by_frame.get(frame_index, ()):
@@ -141,7 +134,7 @@ def _compared(stills: Sequence[_Shown], clip: Clip, *, view: View) -> Iterator[C
 
 
 def _crop(one: _Shown, source_bgr: Image, *, view: View) -> CropExample:
-    event, header = one.event, one.header
+    event, header = one
     still, patch = event.still_bgr, event.base_crop_bgr
     assert still is not None, "only those with pixels are kept"
     assert patch is not None, "only those with pixels are kept"
