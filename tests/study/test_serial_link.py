@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_study.serial_link import LinkReport, SerialLink
+from hvt_study.flights.flight_link import LinkReport, SerialLink
 
 MS = 1_000_000
 

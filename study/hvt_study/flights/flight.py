@@ -40,9 +40,16 @@ from hvt_ground.wiring import Models
 from hvt_study.cache.cached_detector import CachedDetector
 from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, FrameSource
 from hvt_study.flights.flight_ground import GroundSide, InlineExecutor
-from hvt_study.flights.flight_link import START_NS, FlightInbox, FlightOutlet, MediaClock, frame_ns
+from hvt_study.flights.flight_link import (
+    START_NS,
+    FlightInbox,
+    FlightOutlet,
+    LinkReport,
+    MediaClock,
+    SerialLink,
+    frame_ns,
+)
 from hvt_study.metrics.observed import ObservedFrame
-from hvt_study.serial_link import LinkReport, SerialLink
 
 _SESSION = 1 << 40  # as many bytes on the wire as a random one
 

@@ -35,10 +35,10 @@ from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
 from hvt_ground.session.session import GroundSession
 from hvt_ground.wiring import Models, make_pipeline
+from hvt_study.flights.flight_link import Arrival, SerialLink
 from hvt_study.flights.flight_record import FlightRecord, Watch
 from hvt_study.metrics.judged import FrameView
 from hvt_study.metrics.observed import ObservedFrame
-from hvt_study.serial_link import Arrival, SerialLink
 
 _MOST_RESULTS = 1024
 _RECEIVER = 1 << 40  # as many bytes on the wire as a random one

@@ -23,10 +23,9 @@ from hvt_ground.perception.stills.classify import object_crops
 from hvt_ground.perception.stills.decode import DecodedStill
 from hvt_ground.perception.stills.refine import Refiner, ShownClasses
 from hvt_study.datasets.labels import NO_ID, inside_frame
+from hvt_study.flights.flight_link import Arrival
 from hvt_study.metrics.judged import FrameView
-from hvt_study.metrics.observed import ObservedFrame, Opinion, RefinedObject, StillArrival
-from hvt_study.metrics.proxy import score_entropy_nats
-from hvt_study.serial_link import Arrival
+from hvt_study.metrics.observed import ObservedFrame, Opinion, RefinedObject, StillArrival, score_entropy_nats
 
 _SAME_OBJECT_IOU = 0.4
 """As re-detection asks of a detection at an object's place."""

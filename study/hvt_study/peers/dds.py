@@ -13,22 +13,207 @@ clip's end, is cut short where it would go beyond.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections import deque
+from collections.abc import Generator, Sequence
 from contextlib import closing
+from dataclasses import dataclass, field
 from itertools import groupby
 
+import cv2
+import numpy as np
+
 from hvt_common.inference.detect import Detector
-from hvt_common.values import Frame
+from hvt_common.protocol.channels import Channel
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
+from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import RollingBudget
 from hvt_edge.source.resample import Resizer
+from hvt_study.datasets.labels import inside_frame
 from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, FrameSource
 from hvt_study.flights.flight import FlightReport, coded_frames, picture_age_p95_ms
-from hvt_study.flights.flight_link import START_NS, frame_ns
-from hvt_study.peers.dds_edge import DdsEdge, pass_rates
-from hvt_study.peers.dds_ground import DdsGround
+from hvt_study.flights.flight_link import START_NS, LinkReport, frame_ns
+from hvt_study.metrics.judged import FrameView
+from hvt_study.metrics.observed import ObservedFrame
+from hvt_study.peers.dds_edge import DdsEdge, most_stored, pass_rates
 from hvt_study.peers.dds_line import Line
-from hvt_study.peers.dds_regions import DdsSettings
-from hvt_study.serial_link import LinkReport
+from hvt_study.peers.dds_regions import (
+    Blocks,
+    DdsSettings,
+    RegionRequest,
+    combined,
+    pasted,
+    requested_blocks,
+    requested_boxes,
+)
+
+
+@dataclass(slots=True)
+class _Held:
+    """A frame that is not finished."""
+
+    frame_index: int
+    capture_ns: int
+    picture_bgr: Image
+    found: Detections
+    """Of the first pass; of both once the second has come."""
+    blocks: Blocks
+    whole: bool = False
+
+
+@dataclass(slots=True)
+class DdsGround:
+    """Takes what the line delivers; frames are finished in order, each when the pass that completes it is there.
+
+    A frame about which nothing is asked is complete with its segment's question, that is when the last frame of the
+    segment is there; one that the edge had to leave out, when a later one comes. Between two coded frames the list is
+    foretold by the tracker.
+    """
+
+    detector: Detector
+    settings: DdsSettings
+    view: View
+    segments: Sequence[tuple[int, ...]]
+    line: Line
+    started_ns: int
+    lists: dict[int, ObservedFrame] = field(default_factory=dict)
+    delays_ns: list[int] = field(default_factory=list)
+    """Of every coded frame, in order: capture to the arrival that finished it."""
+    shown_ns: list[tuple[int, int]] = field(default_factory=list)
+    """(arrival, capture) of every picture of the first pass."""
+    requests: deque[tuple[int, bytes]] = field(default_factory=deque)
+    """What the edge is to hear, with the time at which it does."""
+    _held: dict[int, _Held] = field(default_factory=dict)
+    _last_frames: dict[int, tuple[int, ...]] = field(init=False)
+    _first: BaseDecoder = field(init=False)
+    _second: BaseDecoder = field(init=False)
+    _tracker: ByteTracker = field(init=False)
+    _listed_to: int = 0
+    _at_ns: int = 0
+
+    def __post_init__(self) -> None:
+        size = self.view.base_size
+        self._last_frames = {frames[-1]: frames for frames in self.segments}
+        self._first, self._second = BaseDecoder(size=size), BaseDecoder(size=size)
+        tracking = TrackerSettings.starting_at(
+            self.settings.confidence, camera_motion=self.settings.camera_motion
+        )
+        self._tracker = ByteTracker(tracking, fps=NOMINAL_FPS)
+
+    def advance(self, now_ns: int) -> None:
+        """Take in what has arrived by now."""
+        for arrival in self.line.arrived(now_ns):
+            self._at_ns = arrival.arrival_ns
+            for unit in arrival.message.units:
+                if arrival.message.row is Channel.BASE:
+                    self._first_pass(unit)
+                else:
+                    self._second_pass(unit)
+            self._finish()
+
+    def close(self, *, frames: int) -> None:
+        """Nothing more comes: finish what is left, and list every frame up to the last."""
+        for held in self._held.values():
+            held.whole = True
+        self._finish()
+        self._list_between(frames)
+
+    def _first_pass(self, unit: AccessUnit) -> None:
+        self.shown_ns.append((self._at_ns, unit.capture_ns))
+        picture = self._full(_decoded(self._first, unit))
+        found = self.detector.detect(picture)
+        size = self.view.base_size
+        regions = requested_boxes(found, size=size, settings=self.settings)
+        blocks = requested_blocks(regions, size=size, align_px=self.settings.align_px)
+        frame_index = unit.frame_index
+        self._held[frame_index] = _Held(frame_index, unit.capture_ns, picture, found, blocks)
+        if frame_index in self._last_frames:
+            self._request(self._last_frames[frame_index])
+        if len(self._held) > most_stored(self.settings) + self.settings.segment_frames:
+            next(iter(self._held.values())).whole = True
+
+    def _request(self, frames: tuple[int, ...]) -> None:
+        """Of a whole segment at once, as DDS does."""
+        segment = [self._held[frame_index] for frame_index in frames]
+        if self.settings.steady:
+            every = np.logical_or.reduce([one.blocks for one in segment])
+            for one in segment:
+                one.blocks = every
+        for one in segment:
+            one.whole = not one.blocks.any()
+        if not all(one.whole for one in segment):
+            payload = RegionRequest(frames[0], tuple(one.blocks for one in segment)).pack()
+            self.requests.append((self.line.send_request(payload, now_ns=self._at_ns), payload))
+
+    def _second_pass(self, unit: AccessUnit) -> None:
+        over = _decoded(self._second, unit)
+        for held in self._held.values():
+            if held.frame_index < unit.frame_index and not held.whole:
+                held.whole = True  # the edge had to leave it out
+        mine = self._held.get(unit.frame_index)
+        if mine is None or mine.whole:
+            return
+        mine.picture_bgr = pasted(mine.picture_bgr, over, mine.blocks, align_px=self.settings.align_px)
+        again = self.detector.detect(mine.picture_bgr)
+        mine.found = combined(mine.found, again, settings=self.settings)
+        mine.whole = True
+
+    def _finish(self) -> None:
+        while self._held:
+            one = next(iter(self._held.values()))
+            if not one.whole:
+                return
+            del self._held[one.frame_index]
+            self._list_between(one.frame_index)
+            tracks = self._tracker.update(one.found, frame_index=one.frame_index, image_bgr=one.picture_bgr)
+            self.lists[one.frame_index] = self._seen(tracks, found=one.found)
+            self.delays_ns.append(self._at_ns - one.capture_ns)
+            self._listed_to = one.frame_index + 1
+
+    def _list_between(self, frame_index: int) -> None:
+        """Those before ``frame`` that were not coded."""
+        for between in range(self._listed_to, frame_index):
+            self.lists[between] = self._seen(self._tracker.extrapolated(frame_index=between))
+        self._listed_to = max(self._listed_to, frame_index)
+
+    def _seen(self, tracks: Tracks, *, found: Detections | None = None) -> ObservedFrame:
+        names = self._names(tracks.class_ids)
+        confidences = tracks.confidences.astype(np.float32)
+        return ObservedFrame(
+            self._inside(tracks.boxes_xyxy_px),
+            names,
+            ids=tracks.ids,
+            confidences=confidences,
+            classes_before=names,
+            confidences_before=confidences,
+            origins=("base",) * len(names),
+            shown_s=(self._at_ns - self.started_ns) / 1e9,
+            detections=None
+            if found is None
+            else FrameView.plain(
+                self._inside(found.boxes_xyxy_px), self._names(found.class_ids), found.confidences
+            ),
+        )
+
+    def _names(self, class_ids: np.ndarray[tuple[int], np.dtype[np.int32]]) -> tuple[str, ...]:
+        return tuple(self.detector.class_names[kind] for kind in class_ids.tolist())
+
+    def _inside(self, boxes_base_px: np.ndarray) -> np.ndarray:
+        return inside_frame(self.view.to_source(boxes_base_px), self.view.source_size)
+
+    def _full(self, picture: Image) -> Image:
+        """Base size, whatever the scale of the first pass."""
+        size = self.view.base_size
+        if (picture.shape[1], picture.shape[0]) == size:
+            return picture
+        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def _decoded(decoder: BaseDecoder, unit: AccessUnit) -> Image:
+    picture = decoder.decode(unit.data)
+    assert picture is not None, f"frame {unit.frame_index} cannot be decoded"
+    return picture
+
 
 _LONGEST_TAIL_S = 30
 """How long after the clip the last second pass may take."""

@@ -14,7 +14,7 @@ from hvt_common.protocol.messages import BaseHeader, Flags
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import RollingBudget
-from hvt_study.serial_link import Arrival, SerialLink
+from hvt_study.flights.flight_link import Arrival, SerialLink
 
 HEADER_BYTES = 48
 """What a `BaseHeader` takes at most."""

@@ -23,13 +23,13 @@ from hvt_study.cache.results import ResultCache, content_key
 from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.flights.flight import Flight
 from hvt_study.flights.flight_ground import GroundSide, SharedModels
+from hvt_study.flights.flight_link import SerialLink
 from hvt_study.reading.observer import CHANNELS, Channel, CodeObserver
 from hvt_study.reading.score import LEAST_VISIBLE, CodeReader, Evidence, Reading, code_crop, codes_to_read
 from hvt_study.runs.run_context import open_run_context, software_versions
 from hvt_study.runs.run_settings import dry_run_bps, edge_flags, flight_plan
 from hvt_study.runs.spec import RunSpec
 from hvt_study.runs.video_shape import VideoShape, match, within
-from hvt_study.serial_link import SerialLink
 
 _EVERY_FRAMES = 5  # of the source, as of the base
 

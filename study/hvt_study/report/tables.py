@@ -10,7 +10,6 @@ from pathlib import Path
 import pandas as pd
 
 from hvt_common.errors import UserError
-from hvt_study.matrix.sweep import COLUMNS as SWEEP_COLUMNS
 from hvt_study.report.data.arms import Arm, BySequence, RunRow, Setting, counts, place, values
 from hvt_study.report.data.captions import (
     ENOUGH,
@@ -328,7 +327,7 @@ def sweep_table(path: Path) -> Table | None:
             raise ValueError("no rows, or cells without a value")  # noqa: TRY301
     except (OSError, ValueError):
         raise UserError(
-            f"{path} is not a table of {','.join(SWEEP_COLUMNS)}: write it with hvt-study sweep --out {path.parent}"
+            f"{path} is not a table of {','.join(_TYPES)}: write it with hvt-study sweep --out {path.parent}"
         ) from None
     heads = (
         Head("selector", number=False),

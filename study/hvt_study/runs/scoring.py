@@ -16,12 +16,12 @@ from hvt_study.metrics.judged import LabelledFrames
 from hvt_study.metrics.observed import (
     arrivals,
     detected_frames,
+    proxies,
     refined_frames,
     refined_objects,
     shown_times_s,
     still_delays_ms,
 )
-from hvt_study.metrics.proxy import proxies
 from hvt_study.metrics.tracking import continuity, tracking_score
 from hvt_study.runs.run_context import RunContext
 

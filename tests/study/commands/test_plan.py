@@ -11,8 +11,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_edge.stills.policy.registry import METHODS
 from hvt_study.cli import main
-from hvt_study.commands.plan import hours_in_words
-from hvt_study.matrix.estimate import estimate
+from hvt_study.commands.plan import estimate, hours_in_words
 from hvt_study.matrix.plan import StudyPlan, first_runs, matched_runs, parse_regimes
 from hvt_study.matrix.tuning import tuned_methods
 from hvt_study.runs.methods import chosen_methods

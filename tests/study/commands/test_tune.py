@@ -9,7 +9,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_study.cache.results import ResultCache
 from hvt_study.cli import main
-from hvt_study.matrix.tune import split, tunable
+from hvt_study.commands.tune import split, tunable
 from hvt_study.matrix.tuning import tuned_methods
 from studies.small_study import arguments, write_scene
 

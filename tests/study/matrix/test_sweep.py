@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hvt_study.cli import main
-from hvt_study.matrix.sweep import read_csv
+from hvt_study.commands.sweep import read_csv
 
 # 640x480 frames: 0.015 of the area is 4608 px², 0.020 is 6144.
 DETECTIONS = """frame,x1,y1,x2,y2,conf,class

@@ -13,8 +13,8 @@ from hvt_common.inference.detect import detect_every
 from hvt_edge.config import EdgeConfig, with_profile
 from hvt_edge.config import check as check_edge
 from hvt_edge.stills.policy.registry import METHODS as REGISTRY
+from hvt_study.commands.compare import SIMPLEST_FIRST, command_of, verdicts
 from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult
-from hvt_study.matrix.verdict import SIMPLEST_FIRST, command_of, verdicts
 from hvt_study.runs.methods import METHODS
 from hvt_study.runs.run_settings import edge_flags
 from hvt_study.runs.spec import ModelChoice, RunSpec

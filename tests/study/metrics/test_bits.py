@@ -8,8 +8,14 @@ import pytest
 
 from hvt_study.datasets.labels import NO_ID
 from hvt_study.metrics.bits import StillCounts, bit_split, still_counts
-from hvt_study.metrics.observed import Opinion, RefinedObject, StillArrival, still_delays_ms
-from hvt_study.metrics.proxy import proxies, score_entropy_nats
+from hvt_study.metrics.observed import (
+    Opinion,
+    RefinedObject,
+    StillArrival,
+    proxies,
+    score_entropy_nats,
+    still_delays_ms,
+)
 
 SECOND = 1_000_000_000
 

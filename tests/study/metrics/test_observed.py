@@ -25,12 +25,12 @@ from hvt_study.metrics.first_correct import first_correct
 from hvt_study.metrics.observed import (
     arrivals,
     detected_frames,
+    proxies,
     refined_frames,
     refined_objects,
     shown_times_s,
     still_delays_ms,
 )
-from hvt_study.metrics.proxy import proxies
 from hvt_study.metrics.tracking import tracking_score
 from media.clips import smooth_pictures
 from rigs.flight import SIZE, RedSquares, square_box

@@ -18,8 +18,7 @@ from hvt_study.datasets.layouts.image_sequence import open_clips
 from hvt_study.datasets.layouts.mot import open_mot
 from hvt_study.datasets.layouts.options import Options, split_options
 from hvt_study.datasets.layouts.still import open_stills
-from hvt_study.datasets.layouts.uavdt import open_uavdt
-from hvt_study.datasets.layouts.visdrone import open_visdrone
+from hvt_study.datasets.layouts.visdrone import open_uavdt, open_visdrone
 from hvt_study.datasets.sequence import Sequence
 
 _Found = Mapping[str, Callable[[], Sequence]]

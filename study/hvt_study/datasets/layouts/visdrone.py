@@ -1,21 +1,37 @@
-"""VisDrone's video layouts (VID and MOT, https://github.com/VisDrone/VisDrone-Dataset).
+"""VisDrone's video layouts (VID and MOT, https://github.com/VisDrone/VisDrone-Dataset), and UAVDT's for tracking.
 
 ::
 
     ROOT/sequences/uav0000086_00000_v/0000001.jpg …
     ROOT/annotations/uav0000086_00000_v.txt        frame,id,x,y,w,h,score,category,truncation,occlusion
 
-ROOT may also hold several such folders, as the downloads unpack (VisDrone2019-VID-train, …-val).
+ROOT may also hold several such folders, as the downloads unpack (VisDrone2019-VID-train, …-val). UAVDT is of Du et
+al., The Unmanned Aerial Vehicle Benchmark, ECCV 2018::
+
+    ROOT/UAV-benchmark-M/M0203/img000001.jpg …
+    ROOT/UAV-benchmark-MOTD_v1.0/GT/M0203_gt_whole.txt    frame,id,x,y,w,h,out-of-view,occlusion,category
+    ROOT/UAV-benchmark-MOTD_v1.0/GT/M0203_gt_ignore.txt   frame,id,x,y,w,h,…: regions that nobody has labelled
+    ROOT/UAV-benchmark-MOTD_v1.0/GT/M0203_gt.txt          frame,id,x,y,w,h,1,1,-1: without classes, for tracking
+    ROOT/M_attr/test/M0203_attr.txt                       ten times 0 or 1
+
+Only the names of folders M0203 and files matter, not where below ROOT they lie. Categories are 1 car, 2 truck, 3 bus.
+Pixels count from 0. Where only ``_gt.txt`` is there, all objects are of class ``vehicle``: it is ``_gt_whole``
+without what leaves the frame.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from hvt_common.errors import UserError
-from hvt_study.datasets.label_table import TableLabels, video_table
+from hvt_study.datasets.annotation_rows import read_rows
+from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels, video_table
+from hvt_study.datasets.labels import no_boxes, no_ids
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
 from hvt_study.datasets.layouts.options import Options, missing_labels
 from hvt_study.datasets.sequence import Sequence
@@ -63,3 +79,95 @@ def _check_frames(labels: TableLabels, annotations: Path) -> None:
         raise UserError(f"annotations {annotations} are empty: expected are lines of {_COLUMNS}")
     if last_frame < labels.first_frame:
         raise UserError(f"annotations {annotations} speak of no frame from {labels.first_frame} on")
+
+
+_UAVDT_FPS = 30.0
+_NAMES = ("car", "truck", "bus")
+_VEHICLE = "vehicle"
+_SEQUENCE = re.compile(r"M[0-9]{4}")
+_DEPTH = 3
+_ATTRIBUTES = (
+    *(("weather", word) for word in ("daylight", "night", "fog")),
+    *(("altitude", word) for word in ("low", "medium", "high")),
+    *(("view", word) for word in ("front", "side", "bird")),
+    ("duration", "long-term"),
+)
+"""What the columns of an attribute file mean, in their order."""
+
+
+def open_uavdt(root: Path, options: Options) -> Mapping[str, Callable[[], Sequence]]:
+    """Every sequence by name, opened when called.
+
+    Raises `UserError` where ROOT is not laid out so, or annotations are missing.
+    """
+    folders = [root] if _SEQUENCE.fullmatch(root.name) else _folders(root)
+    sequences = {folder.name: folder for folder in reversed(folders) if _SEQUENCE.fullmatch(folder.name)}
+    if not sequences:
+        raise UserError(
+            f"UAVDT folder {root} has no sequences: expected are folders M0203 with img000001.jpg …"
+        )
+    texts = {file.name: file for folder in [*folders, root.parent] for file in sorted(folder.glob("*_*.txt"))}
+    ordered = sorted(sequences.items())
+    return {name: partial(_open_uavdt, name, folder, texts, options) for name, folder in ordered}
+
+
+def uavdt_table(whole: Path, ignore: Path, size: tuple[int, int]) -> LabelTable:
+    """All labels of a sequence; ``whole`` may be a ``_gt.txt``, and ``ignore`` may be missing."""
+    rows = read_rows(
+        whole, columns="frame,id,x,y,w,h,out-of-view,occlusion,category", least=9, of_dataset=True
+    )
+    plain = not whole.name.endswith("_gt_whole.txt")
+    if not plain:
+        rows = rows.only(
+            np.isin(rows["category"], (1, 2, 3)), accepted="a category of 1 car, 2 truck or 3 bus in column 9"
+        )
+    kinds = np.zeros(len(rows), np.int64) if plain else rows["category"].astype(np.int64) - 1
+    names, every = (_VEHICLE,) if plain else _NAMES, np.ones(len(rows), np.bool_)
+    return LabelTable.of(rows, every, kinds, names, ignored=_regions(ignore), size=size)
+
+
+def _folders(root: Path) -> list[Path]:
+    """Those in which something may lie; sequences are not looked into."""
+    found, level = [root], [root]
+    for _ in range(_DEPTH):
+        inner = [folder for parent in level for folder in find_folders(parent, depth=1)[1:]]
+        found += inner
+        level = [folder for folder in inner if not _SEQUENCE.fullmatch(folder.name)]
+    return found
+
+
+def _open_uavdt(name: str, folder: Path, texts: Mapping[str, Path], options: Options) -> Sequence:
+    inside = next((folder / inner for inner in ("img1", "images") if (folder / inner).is_dir()), folder)
+    images = ImageSequence(inside)
+    labels = None
+    if options.annotated:
+        whole = texts.get(f"{name}_gt_whole.txt") or texts.get(f"{name}_gt.txt")
+        if whole is None:
+            raise missing_labels(f"UAVDT sequence {folder}", f"{name}_gt_whole.txt")
+        ignore = texts.get(f"{name}_gt_ignore.txt", whole.with_name(f"{name}_gt_ignore.txt"))
+        labels = TableLabels(uavdt_table, (whole, ignore, images.size), images.first_number)
+    attributes = _attributes(texts.get(f"{name}_attr.txt"))
+    fps = options.fps or _UAVDT_FPS
+    return images.sequence(name=name, dataset="uavdt", fps=fps, labels=labels, attributes=attributes)
+
+
+def _regions(path: Path) -> Regions:
+    if not path.is_file():  # some copies of the dataset come without
+        return Regions(no_ids(), no_boxes(), np.empty(0, np.bool_))
+    rows = read_rows(path, columns="frame,region,x,y,w,h", least=6, of_dataset=True)
+    every = np.ones(len(rows), np.bool_)
+    return Regions.of(rows, every, every)
+
+
+def _attributes(path: Path | None) -> dict[str, str]:
+    """``{"weather": "daylight", "altitude": "low", …}``; empty without a file."""
+    if path is None:
+        return {}
+    rows = read_rows(
+        path, columns=",".join(word for _, word in _ATTRIBUTES), least=len(_ATTRIBUTES), frames=False
+    )
+    found: dict[str, str] = {}
+    for (kind, word), value in zip(_ATTRIBUTES, rows.table[:1].ravel().tolist(), strict=False):
+        if value:
+            found[kind] = f"{found[kind]}, {word}" if kind in found else word
+    return found

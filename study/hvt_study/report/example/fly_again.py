@@ -26,6 +26,7 @@ from hvt_study.datasets.labels import NO_ID
 from hvt_study.datasets.sequence import NOMINAL_FPS, Clip
 from hvt_study.flights.flight import Flight, FlightPlan, FlightReport
 from hvt_study.flights.flight_ground import GroundSide, SharedModels
+from hvt_study.flights.flight_link import Arrival
 from hvt_study.matrix.plan import StudyPlan
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.observed import refined_frames, refined_objects
@@ -42,7 +43,6 @@ from hvt_study.runs.run_context import RunContext, open_run_context
 from hvt_study.runs.run_settings import flight_plan
 from hvt_study.runs.spec import RunSpec
 from hvt_study.runs.video_shape import VideoShape
-from hvt_study.serial_link import Arrival
 
 _MOST_STILLS = 2000
 _MOST_LANES = 14
@@ -114,9 +114,13 @@ class _WatchedGround(GroundSide):
         tell = super()._observed_by(emit)
 
         def watch(event: Event) -> None:
-            if isinstance(event, Refinement) and len(self._events) < _MOST_STILLS:
-                whole = event.still_bgr is not None and event.base_crop_bgr is not None
-                self._events = ({event.still_sequence: event} if whole else {}) | self._events
+            if (
+                isinstance(event, Refinement)
+                and len(self._events) < _MOST_STILLS
+                and event.still_bgr is not None
+                and event.base_crop_bgr is not None
+            ):
+                self._events.setdefault(event.still_sequence, event)
             tell(event)
 
         return watch
