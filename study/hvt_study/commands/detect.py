@@ -24,7 +24,7 @@ from hvt_common.inference.tiles import tiled
 from hvt_common.units import parse_size
 from hvt_common.values import Detections, Image, View
 from hvt_edge.source.resample import Resizer
-from hvt_study.commands.arguments import names_of, option
+from hvt_study.commands.arguments import check_whole, names_of, option
 from hvt_study.commands.output import RunProgress, decimals, make_out, print_columns, writing
 from hvt_study.datasets.labelled_pictures import LabelledPicture, doubts_of, find_pictures, read_image
 from hvt_study.datasets.labels import FrameLabels, inside_frame
@@ -139,6 +139,7 @@ def _detect(arguments: argparse.Namespace) -> int:
         confidence = default_confidence(arguments.detector)
     if not _LEAST_CONFIDENCE <= confidence <= 1:
         raise UserError(f"--confidence is {confidence}, must be from {_LEAST_CONFIDENCE} to 1")
+    check_whole("--threads", arguments.threads, 1)
     names = names_of(arguments.classes)
     sets = {place: find_pictures(place, classes=names or None) for place in arguments.pictures}
     pictures = [one for of_set in sets.values() for one in of_set]
@@ -237,10 +238,14 @@ def _rows(path: Path, view: FrameView, confidence: float) -> list[tuple[Any, ...
 
 def _counted(pictures: Sequence[LabelledPicture], labelled: Sequence[str], word: _Word) -> tuple[str, ...]:
     """The words that count: what ``--labelled`` names, else every class that the labels may use."""
-    names = labelled or sorted({name for picture in pictures for name in picture.class_names})
+    known = sorted({name for picture in pictures for name in picture.class_names})
+    names = labelled or known
     if labelled and _VEHICLE in labelled:
         names = [*names, *VEHICLES]
-    return tuple(sorted({word(name) for name in names}))
+    counted = {word(name) for name in names}
+    if known and counted.isdisjoint(map(word, known)):
+        raise UserError(f"--labelled {','.join(labelled)} is none of the labels' classes: {', '.join(known)}")
+    return tuple(sorted(counted))
 
 
 def _write_sheets(

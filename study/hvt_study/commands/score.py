@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from hvt_common.errors import UserError
 from hvt_common.units import parse_size
 from hvt_scene import Scene
 from hvt_study.commands.arguments import option
@@ -39,7 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print one column a table of tracks."""
     width, height = parse_size(arguments.size, name="--size")
-    truth = read_truth(arguments.truth, class_names=arguments.classes.split(","))
+    names = [name.strip() for name in arguments.classes.split(",")]
+    if not all(names):
+        raise UserError(
+            f"--classes {arguments.classes!r} has an empty name: give names between commas, from class 1 on"
+        )
+    truth = read_truth(arguments.truth, class_names=names)
     columns: list[tuple[str, ClassScore]] = []
     for spec in arguments.tracks:
         name, separator, path = spec.rpartition("=")

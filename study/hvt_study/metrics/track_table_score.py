@@ -40,7 +40,11 @@ def read_tracks(path: Path, *, column: str = "class") -> dict[int, FrameView]:
             for frame, box, name in _lines(csv.DictReader(file), column):
                 rows[frame][0].append(box)
                 rows[frame][1].append(name)
-    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
+    except OSError as error:
+        raise UserError(
+            f"{path} cannot be read ({error.strerror}): give a table of hvt-ground --tracks"
+        ) from None
+    except (KeyError, ValueError, TypeError, csv.Error) as error:
         raise UserError(
             f"{path} is not a table of tracks as hvt-ground --tracks writes it ({error})"
         ) from None

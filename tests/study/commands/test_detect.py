@@ -281,3 +281,20 @@ def test_of_several_sets_each_is_measured_with_the_line_of_the_others(
     rows = {one[1]: one[3::2] for one in cells if len(one) > 1 and one[1] in "ab"}
     assert rows["a"] == rows["b"], "both hold the same picture"
     assert len(rows["a"]) == 4, "boxes, error, error with the line of the other, error by chance"
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--threads", "0", "--threads 0 is not accepted: give a whole number from 1"),
+        ("--labelled", "dog", "--labelled dog is none of the labels' classes: car, van"),
+    ],
+)
+def test_what_would_count_nothing_is_refused(tmp_path, capsys, option, value, said):
+    """A table of dashes would be taken for the detector's."""
+    for folder in ("images", "labels"):
+        (tmp_path / folder).mkdir()
+    cv2.imwrite(str(tmp_path / "images/a.png"), np.zeros((64, 64, 3), np.uint8))
+    (tmp_path / "labels/a.txt").write_text("0 .5 .5 .2 .2\n")
+    (tmp_path / "classes.txt").write_text("car\nvan\n")
+    assert said in sentence(capsys, tmp_path, "--out", tmp_path / "out", option, value)

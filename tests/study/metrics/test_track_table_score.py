@@ -203,3 +203,13 @@ def test_truth_with_any_byte_order_mark_is_read(tmp_path: Path, capsys: pytest.C
     text = "1,1,10,10,50,30,1,1,1\r\n"
     for encoding in ("utf-8-sig", "utf-16"):
         assert scored(tmp_path, capsys, text.encode(encoding))[0] == 0
+
+
+def test_a_table_that_is_missing_and_a_class_without_a_name_are_said(tmp_path, capsys):
+    """Every object would be of no class, and a missing file of another format."""
+    tracks, truth = tmp_path / "t.csv", tmp_path / "gt.txt"
+    truth.write_text("1,1,0,0,9,9,1,1,1\n")
+    assert main(["score", str(tracks), "--truth", str(truth)]) == 2
+    assert f"{tracks} cannot be read (No such file or directory)" in capsys.readouterr().err
+    assert main(["score", str(tracks), "--truth", str(truth), "--classes", "car,,van"]) == 2
+    assert "--classes 'car,,van' has an empty name" in capsys.readouterr().err
