@@ -13,7 +13,6 @@ from typing import Any, cast
 import numpy as np
 
 from hvt_common.inference.classify import Classifier
-from hvt_common.inference.detect import FailingDetector
 from hvt_common.protocol.messages import RoiHeader, StillResult
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Boxes, Detections, Image, Posterior, Tracks, View, iou
@@ -32,57 +31,34 @@ _SAME_OBJECT_IOU = 0.4
 
 
 class Watch:
-    """Between a ground's pipeline and two of its parts."""
+    """Stands for a pipeline's detector on the base stream and its refiner; stills go to the detector itself."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         parts = pipeline._parts  # noqa: SLF001 - events say neither raw detections nor confidences without refinement
-        self._detector = _WatchedDetector(parts.detector)
-        self._refiner = _WatchedRefiner(parts.refiner)
-        refiner = cast("Refiner", self._refiner)
-        pipeline._parts = replace(parts, detector=self._detector, refiner=refiner)  # noqa: SLF001
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        """Of the detections."""
-        return self._detector.class_names
-
-    @property
-    def listed(self) -> Tracks | None:
+        self._detector, self._refiner = parts.detector, parts.refiner
+        self._found: Detections | None = None
+        self.class_names = parts.detector.class_names
+        self.listed: Tracks | None = None
         """The tracks of the last list, before refinement."""
-        return self._refiner.listed
+        pipeline._parts = replace(parts, detector=self, refiner=cast("Refiner", self))  # noqa: SLF001
+
+    def detect(self, image_bgr: Image) -> Detections | None:
+        """As the detector does."""
+        self._found = self._detector.detect(image_bgr)
+        return self._found
 
     def take_found(self) -> Detections | None:
         """What was detected on the base stream since the last time; None where nothing was looked for."""
-        found, self._detector.found = self._detector.found, None
+        found, self._found = self._found, None
         return found
 
-
-class _WatchedDetector:
-    """The ground's detector on the base stream; re-detection of stills has its own way to it."""
-
-    def __init__(self, detector: FailingDetector) -> None:
-        self._detector = detector
-        self.found: Detections | None = None
-
-    @property
-    def class_names(self) -> tuple[str, ...]:
-        return self._detector.class_names
-
-    def detect(self, image_bgr: Image) -> Detections | None:
-        self.found = self._detector.detect(image_bgr)
-        return self.found
-
-
-class _WatchedRefiner:
-    def __init__(self, refiner: Refiner) -> None:
-        self._refiner = refiner
-        self.listed: Tracks | None = None
-
     def shown(self, tracks: Tracks) -> ShownClasses:
+        """As the refiner does."""
         self.listed = tracks
         return self._refiner.shown(tracks)
 
     def preview(self, tracks: Tracks) -> ShownClasses:
+        """As the refiner does."""
         self.listed = tracks
         return self._refiner.preview(tracks)
 
