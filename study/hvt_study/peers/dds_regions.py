@@ -120,21 +120,15 @@ class DdsSettings:
 
 
 _RANGES: tuple[tuple[str, float, float], ...] = (
-    ("share", 0.05, 0.95),
-    ("segment_s", 1 / NOMINAL_FPS, 10),
-    ("fps", 0.5, NOMINAL_FPS),
-    ("scale", 0.1, 1),
-    ("low", 0, 1),
-    ("high", 0, 1),
-    ("overlap_iou", 0, 1),
-    ("max_area", 0, 1),
-    ("merge_iou", 0, 1),
-    ("enlarge", 0, 2),
-    ("align_px", 2, 128),
-    ("confidence", 0.01, 1),
-    ("nms_iou", 0, 1),
-    ("bundle_bytes", 1, 100_000),
-    ("request_bytes", 0, 100_000),
+    *((name, 0, 1) for name in ("low", "high", "overlap_iou", "max_area", "merge_iou", "nms_iou")),
+    *(
+        ("share", 0.05, 0.95),
+        ("segment_s", 1 / NOMINAL_FPS, 10),
+        ("fps", 0.5, NOMINAL_FPS),
+        ("scale", 0.1, 1),
+    ),
+    *(("enlarge", 0, 2), ("align_px", 2, 128), ("confidence", 0.01, 1)),
+    *(("bundle_bytes", 1, 100_000), ("request_bytes", 0, 100_000)),
 )
 
 

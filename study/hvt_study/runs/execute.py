@@ -209,19 +209,11 @@ def _missed(spec: RunSpec, row: RunRow) -> str:
 
 def _identity(spec: RunSpec) -> RunRow:
     target = spec.target
+    own = ("key", "dataset", "sequence", "labels", "method", "regime", "budget_bps", "still_codec")
     return {
-        "key": spec.key,
+        **{name: getattr(spec, name) for name in own},
+        **{name: getattr(spec.models, name) for name in ("detector", "edge_detector", "classifier")},
         "accounting": "span",
-        "dataset": spec.dataset,
-        "sequence": spec.sequence,
-        "labels": spec.labels,
-        "method": spec.method,
-        "regime": spec.regime,
-        "budget_bps": spec.budget_bps,
-        "still_codec": spec.still_codec,
-        "detector": spec.models.detector,
-        "edge_detector": spec.models.edge_detector,
-        "classifier": spec.models.classifier,
         "matched_to": "" if target is None else target.method,
         "matched_codec": "" if target is None else target.still_codec,
         "target_bps": None if target is None else target.total_bps,

@@ -15,16 +15,17 @@ from hvt_train.pictures.places import Picture
 
 _Rng = np.random.Generator
 _FILL = 114
-_DAMAGE = {
-    "demo": (0.6, 0.3),
-    "base": (0.4, 0.1),
-    "place": (1.0, 0.6),
-    "kit": (0.6, 0.15),
-    "road": (0.7, 0.2),
-    "thermal": (0.5, 0.15),
-    "street": (0.5, 0.2),
+_KINDS = {
+    "demo": (0.6, 0.3, 0.3, 2.6),
+    "base": (0.4, 0.1, 0.35, 1.3),
+    "place": (1.0, 0.6, 0.26, 2.2),
+    "kit": (0.6, 0.15, 0.6, 2.6),
+    "road": (0.7, 0.2, 0.25, 3.8),
+    "thermal": (0.5, 0.15, 0.6, 1.9),
+    "street": (0.5, 0.2, 0.3, 3.0),
 }
-"""Strength and how often the codec is bad. Base pictures have been through x265 already."""
+"""Strength of the damage and how often the codec is bad (base pictures have been through x265 already); least and
+greatest scale."""
 _STRAIGHT_DOWN = frozenset({"kit", "road"})
 """Have no up; the others are aslant, at least in part, and mostly left upright."""
 _SPECKLED = 0.4
@@ -82,7 +83,7 @@ class ViewSource:
             view = View(255 - view.image_bgr, view.boxes_px, view.class_ids)
         if kind not in {"thermal", "street"} and rng.random() < _SPECKLED:
             view = View(_speckled(view.image_bgr, rng), view.boxes_px, view.class_ids)
-        strength, compress = _DAMAGE[kind]
+        strength, compress, *_ = _KINDS[kind]
         image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
         if kind == "thermal":  # alone without colour: a white blob is a person there, a stone elsewhere
             image = np.repeat(image[..., 1:2], 3, axis=2)
@@ -141,15 +142,7 @@ def _scale(kind: str, rng: _Rng) -> float:
         return 1.0 if draw < 0.4 else 0.5
     if kind == "demo" and draw < 0.45:
         return float(rng.uniform(0.8, 1.25))
-    low, high = {
-        "demo": (0.3, 2.6),
-        "base": (0.35, 1.3),
-        "place": (0.26, 2.2),
-        "kit": (0.6, 2.6),
-        "road": (0.25, 3.8),
-        "thermal": (0.6, 1.9),
-        "street": (0.3, 3.0),
-    }[kind]
+    *_, low, high = _KINDS[kind]
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
