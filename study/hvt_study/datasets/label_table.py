@@ -70,11 +70,11 @@ class LabelTable:
         frames, boxes = rows["frame"].astype(np.int64), inside_frame(rows.boxes(origin=origin), size)
         regions = inside_frame(ignored.boxes, size)
         places = _rows_with_area(ignored.frames, regions)
-        kept = _rows_with_area(frames, boxes)
-        kept = kept[judged[kept]]
-        ids = rows["id"].astype(np.int64)[kept]
+        chosen = _rows_with_area(frames, boxes)
+        chosen = chosen[judged[chosen]]
+        ids = rows["id"].astype(np.int64)[chosen]
         passed = Regions(ignored.frames[places], regions[places], ignored.land[places])
-        return cls(frames[kept], boxes[kept], ids, class_ids[kept], class_names, passed)
+        return cls(frames[chosen], boxes[chosen], ids, class_ids[chosen], class_names, passed)
 
     @property
     def class_set(self) -> tuple[str, ...]:

@@ -1,1 +1,1 @@
-"""Which runs a study takes, and where they are done: `StudyPlan`, `run_all`, `compare`, `estimate`, `tune`."""
+"""Which runs a study takes, and where they are done: `StudyPlan`, `run_all`, `compare`."""
