@@ -40,7 +40,7 @@ from hvt_ground.wiring import (
     OpenSink,
     SessionFactory,
     check_outputs,
-    make_record_folder,
+    make_folders,
 )
 
 _POLL_S = 0.1
@@ -118,7 +118,7 @@ class Ground:
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)
             session = stack.enter_context(open_session(settings, failures=models.failures))
-            make_record_folder(config)
+            make_folders(config)
             client = EdgeClient.of_session(session, settings)
             for one in services:
                 one.begin(client)

@@ -196,6 +196,11 @@ def _check_files(config: GroundConfig, more: Iterable[tuple[str, Path]]) -> None
     if config.stills is not None and not config.stills.is_dir():
         kind = UserError if config.stills.exists() else NotYetError
         raise kind(f"--stills {config.stills} is no folder: create it, or name one that is there")
-    in_folders = (("--record", config.record, ".rrd"), ("--tracks", config.tracks, ".csv"))
-    files = [(name, path) for name, path, suffix in in_folders if path is not None and path.suffix == suffix]
+    files = [(name, path) for name, path, suffix in in_folders(config) if path.suffix == suffix]
     check_apart([*files, ("--timing", config.timing), ("--summary", config.summary), *more])
+
+
+def in_folders(config: GroundConfig) -> list[tuple[str, Path, str]]:
+    """Option, path and suffix of what is one file, or a folder with a file for each session."""
+    both = (("--record", config.record, ".rrd"), ("--tracks", config.tracks, ".csv"))
+    return [(name, path, suffix) for name, path, suffix in both if path is not None]

@@ -15,7 +15,7 @@ from hvt_common.errors import UserError
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import checked, config_class
 from hvt_ground.sinks.line_file import has_nothing
-from hvt_ground.wiring import output_path
+from hvt_ground.wiring import check_outputs, make_folders, output_path
 from hvt_ground.wiring.files import backlog_path, free_path
 
 
@@ -70,6 +70,22 @@ def test_every_flag_explains_itself(capsys):
         assert len(one.metadata["help"]) > 8
     assert "[aerial-nano]" in out.replace("- ", "-"), "argparse breaks lines at hyphens"
     assert "[hvt-<edge>-<time>.rrd here]" in out
+
+
+@pytest.mark.parametrize(("option", "file"), [("record", "a.rrd"), ("tracks", "a.csv")])
+def test_a_folder_that_is_not_there_is_made_and_a_file_of_another_kind_refused(tmp_path, option, file):
+    """All tracks of a flight would be lost."""
+    folder = tmp_path / "flights" / "today"
+    config = read(f"--{option}", str(folder))
+    check_outputs(config)
+    assert not folder.exists(), "a start that is refused leaves nothing behind"
+    make_folders(config)
+    assert folder.is_dir()
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(UserError, match=f"--{option} .*notes.txt is neither a folder nor named {file[1:]}"):
+        check_outputs(read(f"--{option}", str(tmp_path / "notes.txt")))
+    with pytest.raises(UserError, match=f"--{option} .* cannot be made"):
+        make_folders(read(f"--{option}", str(tmp_path / "notes.txt" / "in")))
 
 
 @given(

@@ -39,7 +39,7 @@ from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.live_view import LiveView
-from hvt_ground.wiring import SessionFactory, check_outputs, make_record_folder
+from hvt_ground.wiring import SessionFactory, check_outputs, make_folders
 
 _Messages = Callable[[], Iterator[Received]]
 """All that was received, from the beginning."""
@@ -150,7 +150,7 @@ class _Replay:
         """Play all of it; a summary a session."""
         check_edge_pattern(self._config.edges)
         infos = _infos(self._messages())
-        make_record_folder(self._config)
+        make_folders(self._config)
         models = Models(self._config)
         models.wait()  # the log waits for them
         ended: list[tuple[dict[str, Any], GroundSession]] = []

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.reporting import check_writable
-from hvt_ground.config import GroundConfig
+from hvt_ground.config import GroundConfig, in_folders
 from hvt_ground.extras import extras_of
 from hvt_ground.sinks.line_file import claim_name
 
@@ -27,29 +27,27 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
         extra.check_outputs(config, reads=reads)
     check_writable(config.summary, name="--summary", reads=reads)
     check_writable(config.timing, name="--timing", reads=reads)
-    for path, suffix, name in (
-        (config.tracks, ".csv", "--tracks"),
-        (config.record, ".rrd", "--record"),
-    ):
-        if path is not None and path.suffix == suffix and not path.is_dir():
+    for name, path, suffix in in_folders(config):
+        if path.suffix == suffix and not path.is_dir():
             check_writable(path, name=name, reads=reads)
-    record = config.record
-    if record is not None and record.suffix != ".rrd" and record.exists() and not record.is_dir():
-        raise UserError(f"--record {record} is neither a folder nor named .rrd: give FILE.rrd or a folder")
+        elif path.exists() and not path.is_dir():
+            raise UserError(
+                f"{name} {path} is neither a folder nor named {suffix}: give FILE{suffix} or a folder"
+            )
 
 
-def make_record_folder(config: GroundConfig) -> None:
+def make_folders(config: GroundConfig) -> None:
     """Comes after all that may be refused at once: a start that is refused leaves nothing behind."""
-    record = config.record
-    if record is None or record.suffix == ".rrd":
-        return
-    try:
-        record.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        kind = UserError if isinstance(error, NotADirectoryError) else NotYetError
-        raise kind(
-            f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
-        ) from None
+    for name, path, suffix in in_folders(config):
+        if path.suffix == suffix:
+            continue
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            kind = UserError if isinstance(error, NotADirectoryError) else NotYetError
+            raise kind(
+                f"{name} {path} cannot be made ({error.strerror}): give FILE{suffix} or a folder"
+            ) from None
 
 
 def output_path(
