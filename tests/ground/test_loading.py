@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ from hvt_common.protocol.messages import RoiHeader
 from hvt_common.runtime.failures import Failures
 from hvt_ground import app
 from hvt_ground.app import Ground
-from hvt_ground.backlog.jobs import Destination, StillJob
+from hvt_ground.backlog.jobs import read_still
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception import models as ground_models
 from hvt_ground.perception.models import NotOpenError
@@ -134,11 +135,10 @@ def test_a_stored_still_that_nobody_read_before_the_run_ended_comes_again(compil
     item = flight.still(0, 0)
     still = ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
     backlog = sessions.session.backlog
-    job = StillJob(still, Destination(lambda: backlog, lambda _: None), done=done.append)
+    job = read_still(still, lambda: nullcontext(backlog), done=done.append)
     models.give_up()
-    with pytest.raises(NotOpenError) as gone:
-        job.step()
-    job.fail(gone.value)
+    with pytest.raises(NotOpenError):
+        next(job)
     assert done == [None]
     assert backlog.is_new_still(still.header.sequence)
     sessions.close()

@@ -115,28 +115,24 @@ class BacklogAssembly:
             del self._open[key]
         return None
 
-    def settle(self, key: ObjectKey, *, usable: bool) -> None:
-        """Report the outcome of an object that was handed out: it is in its place, or unusable."""
+    def settle(self, key: ObjectKey, *, usable: bool | None) -> None:
+        """Report the outcome of an object that was handed out: it is in its place, or unusable.
+
+        None forgets one that cannot be taken: another ground may, or this one later.
+        """
         entry = self._open.get(key)
         if entry is None or not entry.handed:
             return
         del self._open[key]
-        if usable:
-            self._finish(key, entry.total_bytes)
+        if usable is None:
+            self._unreported.pop(key, None)
             return
-        times = self._refusals.pop(key, 0) + 1
-        if times >= _PATIENCE:
+        times = 0 if usable else self._refusals.pop(key, 0) + 1
+        if usable or times >= _PATIENCE:
             self._finish(key, entry.total_bytes)
             return
         self._refusals[key] = times
         self._report(key, 0)
-
-    def drop(self, key: ObjectKey) -> None:
-        """Forget an object that was handed out and cannot be taken: another ground may, or this one later."""
-        entry = self._open.get(key)
-        if entry is not None and entry.handed:
-            del self._open[key]
-            self._unreported.pop(key, None)
 
     def drop_handed(self) -> int:
         """Forget objects that were handed out to somebody who is gone: the edge sends them again. How many."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -22,11 +23,11 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.runtime.statistics import Newest
 from hvt_ground.backlog.assembly import BacklogAssembly, backlog_content
-from hvt_ground.backlog.jobs import Destination, StillJob, VideoJob
+from hvt_ground.backlog.jobs import Take, read_still, show_video
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.perception.worker import Job, PerceptionWorker
+from hvt_ground.perception.worker import PerceptionWorker
 
 _log = logging.getLogger(__name__)
 
@@ -117,20 +118,17 @@ class EdgeBacklog:
                 self._assembly.settle(key, usable=True)
             return
         if is_own:  # it stays open as long as its worker
-            destination = Destination(lambda: own if own.able() else None, lambda _own: None)
+            take: Take = lambda: nullcontext(own if own.able() else None)  # noqa: E731
         else:
             assert self._recordings is not None, "without, no chunk of another session is taken"
-            acquire = partial(self._recordings.acquire, self._infos[key[0]])
-            destination = Destination(acquire, self._recordings.release)
+            take = partial(self._recordings.using, self._infos[key[0]])
         with self._lock:
             self.working += 1
             done = partial(self._done, key, self._sessions)
-        job: Job
         if isinstance(content, ReceivedStill):
-            job = StillJob(content, destination, done=done)
+            worker.submit(read_still(content, take, done=done))
         else:
-            job = VideoJob(content, destination, worker=worker, done=done)
-        worker.submit(job)
+            worker.submit(show_video(content, take, worker=worker, done=done))
 
     def _done(self, key: ObjectKey, session: int, usable: bool | None) -> None:  # noqa: FBT001 - partial
         # A job has ended; None: its object was not taken.
@@ -138,7 +136,4 @@ class EdgeBacklog:
             if session != self._sessions:
                 return
             self.working -= 1
-            if usable is None:
-                self._assembly.drop(key)
-            else:
-                self._assembly.settle(key, usable=usable)
+            self._assembly.settle(key, usable=usable)

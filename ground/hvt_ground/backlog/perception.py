@@ -5,8 +5,7 @@ Neither the tracks of the open session nor a detector's memory are touched.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import numpy as np
 
@@ -32,66 +31,6 @@ FIRST_TRACK_ID = 1_000_001
 """Id of the first track in stored video: these tracks are others than those of the live stream."""
 
 Emit = Callable[[Event], None]
-
-
-class StretchTracker:
-    """Detects and tracks along one stretch of video. What is doubted live is doubted here."""
-
-    def __init__(
-        self,
-        detector: FailingDetector,
-        tracker: ByteTracker,
-        *,
-        first_id: int,
-        detect_every: int,
-        emit: Emit,
-        trust: ViewTrust,
-        tilt: ViewTilt,
-        guesses: Guesses | None,
-    ) -> None:
-        self._detector = detector
-        self._tracker = tracker
-        self._first_id = first_id
-        self._detect_every = detect_every
-        self._emit = emit
-        self._trust = trust
-        self._tilt = tilt
-        self._guesses = guesses
-        self._detected: int | None = None
-        self.next_id = first_id
-
-    def analyze(self, frame_index: int, capture_ns: int, image_bgr: Image) -> None:
-        """Take the next frame; frames rise."""
-        if self._detected is None or frame_index - self._detected >= self._detect_every:
-            self._detected = frame_index
-            found = self._detector.detect(image_bgr) or Detections.none()
-            self._trust.take(found)
-            tracks = self._tracker.update(found, frame_index=frame_index, image_bgr=image_bgr)
-            self._tilt.take(tracks, self._detector.class_names, height_px=image_bgr.shape[0])
-        else:
-            tracks = self._tracker.predict(frame_index=frame_index, image_bgr=image_bgr)
-        ids = tracks.ids + (self._first_id - 1)
-        self.next_id = max(self.next_id, int(ids.max(initial=0)) + 1)
-        names = tuple(self._detector.class_names[class_id] for class_id in tracks.class_ids)
-        doubted = np.full(len(tracks), self._trust.unlike)
-        if self._guesses is not None:
-            self._guesses.update(tracks, names, self._tracker.camera_step)
-            doubted |= self._guesses.among(tracks.ids)
-        self._emit(
-            Overlay(
-                frame_index=frame_index,
-                capture_ns=capture_ns,
-                track_ids=ids,
-                boxes_base_px=tracks.boxes_xyxy_px,
-                base_classes=names,
-                classes=names,
-                confidences=tracks.confidences,
-                refined=np.zeros(len(tracks), np.bool_),
-                stored=True,
-                doubted=doubted,
-                vague=np.array([self._tilt.is_vague(name) for name in names], np.bool_),
-            )
-        )
 
 
 class BacklogPerception:
@@ -124,23 +63,49 @@ class BacklogPerception:
         self._guesses_of = guesses_of
         self._next_id = FIRST_TRACK_ID
 
-    @contextmanager
-    def track(self, emit: Emit) -> Iterator[StretchTracker]:
-        """Give a tracker for one stretch of video."""
-        tracker = StretchTracker(
-            self._take_models()[0],
-            self._tracker_of(),
-            first_id=self._next_id,
-            detect_every=self._detect_every,
-            emit=emit,
-            trust=self._trust,
-            tilt=self.tilt,
-            guesses=self._guesses_of(),
-        )
-        try:
-            yield tracker
-        finally:
-            self._next_id = tracker.next_id
+    def track(self, emit: Emit) -> Callable[[int, int, Image], None]:
+        """What detects and tracks along one stretch of video, given frame index, capture time and picture in order.
+
+        What is doubted live is doubted there.
+        """
+        detector, tracker, guesses = self._take_models()[0], self._tracker_of(), self._guesses_of()
+        before = self._next_id - 1
+        detected: int | None = None
+
+        def analyze(frame_index: int, capture_ns: int, image_bgr: Image) -> None:
+            nonlocal detected
+            if detected is None or frame_index - detected >= self._detect_every:
+                detected = frame_index
+                found = detector.detect(image_bgr) or Detections.none()
+                self._trust.take(found)
+                tracks = tracker.update(found, frame_index=frame_index, image_bgr=image_bgr)
+                self.tilt.take(tracks, detector.class_names, height_px=image_bgr.shape[0])
+            else:
+                tracks = tracker.predict(frame_index=frame_index, image_bgr=image_bgr)
+            ids = tracks.ids + before
+            self._next_id = max(self._next_id, int(ids.max(initial=0)) + 1)
+            names = tuple(detector.class_names[class_id] for class_id in tracks.class_ids)
+            doubted = np.full(len(tracks), self._trust.unlike)
+            if guesses is not None:
+                guesses.update(tracks, names, tracker.camera_step)
+                doubted |= guesses.among(tracks.ids)
+            emit(
+                Overlay(
+                    frame_index=frame_index,
+                    capture_ns=capture_ns,
+                    track_ids=ids,
+                    boxes_base_px=tracks.boxes_xyxy_px,
+                    base_classes=names,
+                    classes=names,
+                    confidences=tracks.confidences,
+                    refined=np.zeros(len(tracks), np.bool_),
+                    stored=True,
+                    doubted=doubted,
+                    vague=np.array([self.tilt.is_vague(name) for name in names], np.bool_),
+                )
+            )
+
+        return analyze
 
     def read(self, still: ReceivedStill, *, emit: Emit) -> None:
         """Decode, name and give out a still of a session that is over: no track of it is here to be matched."""

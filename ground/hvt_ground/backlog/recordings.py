@@ -9,7 +9,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from hvt_common.protocol.messages import Info
@@ -101,17 +102,28 @@ class BacklogRecordings:
         with self._lock:
             return not self._closed and (session_id in self._open or self._may_make())
 
-    def acquire(self, info: Info) -> SessionBacklog | None:
-        """The backlog of that session's recording, which stays open until `release`.
+    @contextmanager
+    def using(self, info: Info) -> Iterator[SessionBacklog | None]:
+        """The backlog of that session's recording, which stays open meanwhile.
 
         None where `takes` says no, or the recording cannot be written now.
         """
-        wait_s = 0.0
+        recording, wait_s = self._taken(info)
+        try:  # not while the lock is held: the receiving thread asks `takes`
+            able = recording is not None and recording.sink.is_open(within_s=wait_s)
+            yield recording.backlog if recording is not None and able else None
+        finally:
+            if recording is not None:
+                with self._lock:
+                    recording.users -= 1
+
+    def _taken(self, info: Info) -> tuple[BacklogRecording | None, float]:
+        # With one more user, and how long to wait for its file.
         with self._lock:
-            recording = self._open.get(info.session_id)
+            recording, wait_s = self._open.get(info.session_id), 0.0
             if recording is None:
                 if self._closed or not self._may_make():
-                    return None
+                    return None, wait_s
                 self._close_surplus()
                 self._made_s.append(self._clock())
                 recording = self._open[info.session_id] = self._open_one(info)
@@ -119,18 +131,7 @@ class BacklogRecordings:
                 wait_s = self._open_s
             self._open.move_to_end(info.session_id)
             recording.users += 1
-        # Not while the lock is held: the receiving thread asks `takes`.
-        if recording.sink.is_open(within_s=wait_s):
-            return recording.backlog
-        self.release(recording.backlog)
-        return None
-
-    def release(self, backlog: SessionBacklog) -> None:
-        """The user is done with it."""
-        with self._lock:
-            for recording in self._open.values():
-                if recording.backlog is backlog:
-                    recording.users -= 1
+            return recording, wait_s
 
     def close(self) -> None:
         """Close all that are open."""

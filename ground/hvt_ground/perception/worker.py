@@ -11,8 +11,9 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 
 from hvt_common.runtime.failures import reason_of
 from hvt_common.runtime.process import lower_priority
@@ -53,18 +54,9 @@ Step = Callable[[Tracks, int], None]
 Read = Callable[[Sequence[ReceivedStill]], None]
 
 
-class Job(ABC):
-    """Work that can wait, done step by step while nothing newer is there. For the worker's thread."""
-
-    @abstractmethod
-    def step(self) -> bool:
-        """Do one step; True once there is none left. Whatever it raises ends this job alone."""
-
-    def fail(self, error: Exception) -> None:  # noqa: B027 - most have nobody to tell
-        """A step has raised: there is no other."""
-
-    def close(self) -> None:  # noqa: B027 - many hold nothing
-        """Release its resources, done or not; called once."""
+Job = Generator[None, None, None]
+"""Work that can wait, done step by step while nothing newer is there. What a step raises ends this job alone; it is
+closed at its end, done or not."""
 
 
 class PerceptionWorker(ABC):
@@ -131,15 +123,17 @@ class PerceptionWorker(ABC):
     def _is_done(self, job: Job) -> bool:
         # Do one step of a job; whether it was the last.
         try:
-            return job.step()
+            next(job)
+        except StopIteration:
+            return True
         except Exception as error:  # noqa: BLE001 - the picture of now goes on
             self.jobs_failed += 1
             if self.jobs_failed.bit_count() == 1:
                 _log.warning(
                     "what was stored cannot be worked off (%d so far): %s", self.jobs_failed, reason_of(error)
                 )
-            job.fail(error)
             return True
+        return False
 
     def raise_error(self) -> None:  # noqa: B027 - errors may come out of the other methods instead
         """Raise the error that ended the thread."""
@@ -426,11 +420,9 @@ class LockstepWorker(PerceptionWorker):
             self._pending.popleft().result()
 
     def _do(self, job: Job) -> None:
-        try:
+        with closing(job):
             while not self._is_done(job):
                 pass
-        finally:
-            job.close()
 
 
 def _fits(still: ReceivedStill, queued: Collection[ReceivedStill]) -> bool:

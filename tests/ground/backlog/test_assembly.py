@@ -82,9 +82,9 @@ def test_what_is_in_progress_is_not_settled_by_a_word_too_late():
     assert assembly.drop_handed() == 1
     assembly.chunk(header(), TEN[:6])
     assembly.settle(KEY, usable=True)
-    assembly.drop(KEY)
+    assembly.settle(KEY, usable=None)
     assert assembly.chunk(header(6), TEN[6:]) == TEN
-    assembly.drop(KEY)
+    assembly.settle(KEY, usable=None)
     assert (assembly.in_progress, assembly.take_acknowledged_ranges(16)) == (0, ()), (
         "nobody can take it: nothing is said of it"
     )
@@ -236,7 +236,7 @@ def test_whatever_comes_it_stays_within_bounds(reported):
             continue
         assert len(whole) == total * QUARTER
         if then == "drop":
-            assembly.drop((7, "still", number))
+            assembly.settle((7, "still", number), usable=None)
         elif then != "keep":
             assembly.settle((7, "still", number), usable=then == "settle")
     event("full" if fullest > MAX_BACKLOG_BYTES else "not full")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import contextmanager, nullcontext
 
 import pytest
 
@@ -11,7 +12,7 @@ from hvt_common.inference.few_found import ViewTrust
 from hvt_common.protocol.messages import BacklogUnit, RoiHeader, parse_backlog_units
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
-from hvt_ground.backlog.jobs import Destination, StillJob, VideoJob
+from hvt_ground.backlog.jobs import read_still, show_video
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Notice, VideoSample
@@ -46,12 +47,20 @@ def test_work_that_was_never_begun_lets_its_recording_go():
         trust=ViewTrust("motion", hence=""),
     )
     former = SessionBacklog(info, log=log, perception=perception, read=lambda _still: None)
-    destination = Destination(lambda: users.append(former) or former, users.remove)
+
+    @contextmanager
+    def take():
+        users.append(former)
+        try:
+            yield former
+        finally:
+            users.remove(former)
+
     worker = patient_worker(lambda *_: None, lambda *_: None, lambda _stills: None, finish_s=0.1, leave_s=0.1)
     outcomes: list[bool | None] = []
-    worker.submit(VideoJob(units, destination, worker=worker, done=outcomes.append))
+    worker.submit(show_video(units, take, worker=worker, done=outcomes.append))
     assert last_shown.wait(timeout=60)
-    never = VideoJob(units, destination, worker=worker, done=outcomes.append)
+    never = show_video(units, take, worker=worker, done=outcomes.append)
     worker.submit(never)
     assert users == [former], "one that waits has nothing in hand"
     assert not worker.close(), "it is in the middle of a frame when the session ends"
@@ -113,19 +122,19 @@ class Outage:
             for i, u in enumerate(self.flight.units)
         ]
         self.said: list[bool | None] = []
-        self._to = Destination(lambda: self.backlog if self.backlog.able() else None, lambda _backlog: None)
+        self._to = lambda: nullcontext(self.backlog if self.backlog.able() else None)
 
-    def video(self) -> VideoJob:
+    def video(self) -> Job:
         """The edge sends its video, perhaps again."""
         worker = patient_worker(lambda *_: None, lambda *_: None, lambda _stills: None)
         worker.close()
-        return VideoJob(self.units, self._to, worker=worker, done=self.said.append)
+        return show_video(self.units, self._to, worker=worker, done=self.said.append)
 
-    def still(self) -> StillJob:
+    def still(self) -> Job:
         """The edge sends a still, perhaps again."""
         item = self.flight.still(3, 7)
         header = RoiHeader.parse(item.attachment, item.payload)
-        return StillJob(ReceivedStill(header, item.payload), self._to, done=self.said.append)
+        return read_still(ReceivedStill(header, item.payload), self._to, done=self.said.append)
 
     def hold(self) -> None:
         """The disk stops in the middle of an event."""
@@ -152,9 +161,8 @@ class Outage:
 
 def finish(job: Job) -> None:
     """Do all steps, as a worker does them."""
-    while not job.step():
+    for _ in job:
         pass
-    job.close()
 
 
 @pytest.mark.parametrize("kind", ["video", "still"])
@@ -191,7 +199,7 @@ def test_a_stretch_that_meets_a_full_queue_halfway_goes_on_where_it_was():
     outage.hold()
     job = outage.video()
     for _ in range(10):
-        assert not job.step()
+        next(job)
     outage.fill(4200)
     finish(job)
     assert outage.said == []

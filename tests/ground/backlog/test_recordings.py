@@ -43,12 +43,15 @@ def test_a_ground_that_runs_for_months_takes_former_sessions_every_day(tmp_path)
 
     recordings = BacklogRecordings(open_one, most_files=2, open_s=20.0, clock=lambda: now_s)
     first, second, third = (replace(Flight(1).info(), session_id=number) for number in (1, 2, 3))
-    assert None not in (recordings.acquire(first), recordings.acquire(second))
+    with recordings.using(first) as one, recordings.using(second) as other:
+        assert None not in (one, other)
     assert not recordings.takes(3), "whoever invents sessions does not fill the disk"
-    assert recordings.acquire(third) is None
+    with recordings.using(third) as one:
+        assert one is None
     now_s = 86_400.0
     assert recordings.takes(3)
-    assert recordings.acquire(third) is not None
+    with recordings.using(third) as one:
+        assert one is not None
     recordings.close()
     for one in made:
         one.join(time.monotonic() + 60)
@@ -69,17 +72,24 @@ def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):
 
     recordings = BacklogRecordings(open_one, open_s=60.0)
     acquired: list[SessionBacklog | None] = []
-    worker = threading.Thread(target=lambda: acquired.append(recordings.acquire(info)))
+
+    def acquire() -> None:
+        with recordings.using(info) as backlog:
+            acquired.append(backlog)
+
+    worker = threading.Thread(target=acquire)
     worker.start()
     assert opened.wait(timeout=60)
     assert recordings.takes(info.session_id), "what the receiving thread asks of each chunk"
-    assert recordings.acquire(info) is None, "nobody else waits for it: it is to come again"
+    with recordings.using(info) as other:
+        assert other is None, "nobody else waits for it: it is to come again"
     assert recordings.open_sessions == [info.session_id]
     assert not acquired, "it is still being opened"
     with pipe.open():
         worker.join(timeout=60)
         (backlog,) = acquired
         assert backlog is not None
-        assert recordings.acquire(info) is backlog
+        with recordings.using(info) as other:
+            assert other is backlog
         recordings.close()
         eventually(lambda: sinks[0].ended, what="its thread ends")

@@ -36,7 +36,6 @@ from hvt_ground.backlog.session_backlog import LateStills
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import ViewTilt
-from hvt_ground.perception.worker import Job
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
@@ -304,10 +303,10 @@ def test_stored_video_of_an_unknown_view_is_doubted_as_it_is_live(flight):
     """Boxes that were dashed and unnamed before an outage were certain in the middle of it."""
     trust, found = ViewTrust("motion", hence=""), []
     perception, decoder = look_of(flight.info(), trust=trust), BaseDecoder()
-    with perception.track(found.append) as tracker:
-        for unit in flight.units[:6]:
-            trust.unlike = unit.frame_index >= 3
-            tracker.analyze(unit.frame_index, unit.capture_ns, decoder.decode(unit.data))
+    analyze = perception.track(found.append)
+    for unit in flight.units[:6]:
+        trust.unlike = unit.frame_index >= 3
+        analyze(unit.frame_index, unit.capture_ns, decoder.decode(unit.data))
     assert [one.doubted.tolist() for one in found[1:]] == [[False]] * 2 + [[True]] * 3
 
 
@@ -315,10 +314,10 @@ def test_a_bus_of_stored_video_is_called_as_it_is_live(flight):
     """Seen aslant it was a vehicle before the outage and after it, and a bus in the middle."""
     found, decoder, tilt = [], BaseDecoder(), ViewTilt(vague_kinds=True)
     perception = look_of(flight.info(), models=Models(("bus",)), tilt=tilt)
-    with perception.track(found.append) as tracker:
-        for unit in flight.units[:6]:
-            tilt.aslant = unit.frame_index >= 3
-            tracker.analyze(unit.frame_index, unit.capture_ns, decoder.decode(unit.data))
+    analyze = perception.track(found.append)
+    for unit in flight.units[:6]:
+        tilt.aslant = unit.frame_index >= 3
+        analyze(unit.frame_index, unit.capture_ns, decoder.decode(unit.data))
     assert [one.words for one in found[1:]] == [("bus",)] * 2 + [("vehicle",)] * 3
 
 
@@ -326,9 +325,9 @@ def test_stored_video_tells_the_tilt_of_its_view(flight):
     """Of a session that is over nothing else does."""
     perception, decoder, taken = look_of(flight.info()), BaseDecoder(), []
     perception.tilt.take = lambda tracks, _names, *, height_px: taken.append((len(tracks), height_px))
-    with perception.track(lambda _: None) as tracker:
-        for unit in flight.units[:6]:
-            tracker.analyze(unit.frame_index, unit.capture_ns, decoder.decode(unit.data))
+    analyze = perception.track(lambda _: None)
+    for unit in flight.units[:6]:
+        analyze(unit.frame_index, unit.capture_ns, decoder.decode(unit.data))
     assert taken == [(1, 192)] * 2
 
 
@@ -602,23 +601,22 @@ def test_a_recording_in_use_stays_open(flight, tmp_path):
         return made[-1]
 
     recordings = BacklogRecordings(open_one, most=2, open_s=20)
-    first = recordings.acquire(formers[0].info())
-    for former in formers[1:]:
-        other = recordings.acquire(former.info())
-        assert other is made[-1].backlog
-        recordings.release(other)
-    assert recordings.open_sessions == [formers[0].session_id, formers[3].session_id]
-    first.read_still(received(formers[0].still(1, 1)))
-    recordings.release(first)
-    assert recordings.acquire(flight.info()) is made[4].backlog
+    with recordings.using(formers[0].info()) as first:
+        for former in formers[1:]:
+            with recordings.using(former.info()) as other:
+                assert other is made[-1].backlog
+        assert recordings.open_sessions == [formers[0].session_id, formers[3].session_id]
+        first.read_still(received(formers[0].still(1, 1)))
+    with recordings.using(flight.info()) as other:
+        assert other is made[4].backlog
     assert recordings.open_sessions == [formers[3].session_id, flight.session_id], "done with, it may go"
     recordings.close()
-    assert recordings.acquire(flight.info()) is None
+    with recordings.using(flight.info()) as other:
+        assert other is None
     few = BacklogRecordings(open_one, most_files=1, open_s=20)
-    assert few.acquire(formers[0].info()) is made[5].backlog
-    assert few.acquire(formers[1].info()) is None, (
-        "so many came at once that the last could not be refused before"
-    )
+    with few.using(formers[0].info()) as first, few.using(formers[1].info()) as other:
+        assert first is made[5].backlog
+        assert other is None, "so many came at once that the last could not be refused before"
     few.close()
     outputs.close(within_s=60)
     assert "1 still of this session arrived after it had ended" in [
@@ -811,36 +809,23 @@ def test_a_still_is_read_in_the_middle_of_a_stretch(flight, tmp_path):
         assert order.count("boxes") == 7
 
 
-class Steps(Job):
-    """Runs a generator, a step each; tells when it is closed."""
-
-    def __init__(self, steps, *, on_close=lambda: None) -> None:
-        self._steps = steps
-        self._on_close = on_close
-
-    def step(self) -> bool:
-        """One."""
-        return next(self._steps, "end") == "end"
-
-    def close(self) -> None:
-        """Tell."""
-        self._on_close()
-
-
 def test_stills_do_not_wait_for_boxes_in_stored_video():
     """Boxes of a stretch take a slow ground half a minute: for so long no still of the outage would be read."""
     order, closed, read = [], [], threading.Event()
 
     def boxes():
-        for _ in range(400):
-            if read.is_set():
-                break
-            order.append("boxes")
-            time.sleep(0.01)
-            yield
-        order.append("boxes ended")
-        while True:
-            yield
+        try:
+            for _ in range(400):
+                if read.is_set():
+                    break
+                order.append("boxes")
+                time.sleep(0.01)
+                yield
+            order.append("boxes ended")
+            while True:
+                yield
+        finally:
+            closed.append(1)
 
     def still():
         order.append("still")
@@ -849,13 +834,13 @@ def test_stills_do_not_wait_for_boxes_in_stored_video():
 
     worker = patient_worker(lambda *_: None, lambda *_: None, lambda _stills: None, finish_s=0.1)
     try:
-        assert worker.submit(Steps(boxes(), on_close=lambda: closed.append(1)), last=True)
+        assert worker.submit(boxes(), last=True)
         eventually(lambda: order)
-        assert worker.submit(Steps(still()))
+        assert worker.submit(still())
         eventually(lambda: "boxes ended" in order)
         assert order.index("still") < order.index("boxes ended")
         assert order[0] == "boxes", "it was in the middle of one"
-        taken = [worker.submit(Steps(boxes()), last=True) for _ in range(9)]
+        taken = [worker.submit(boxes(), last=True) for _ in range(9)]
         assert (taken.count(True), taken[-1]) == (7, False), "each holds a stretch of video"
         assert not closed
     finally:
@@ -906,7 +891,7 @@ def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():
     try:
         pending.append(1)
         worker.picture(PICTURE)
-        assert worker.submit(Steps(work()))
+        assert worker.submit(work())
         eventually(lambda: len(done) == 3)
     finally:
         worker.close()

@@ -131,5 +131,4 @@ def test_a_session_begins_though_the_files_of_the_models_are_gone(tmp_path: Path
     detector.unlink()
     classifier.unlink()
     make_pipeline(config, models, info=info, emit=lambda _: None).end()
-    with make_backlog_perception(config, models, info=info, trust=make_trust(config)).track(lambda _: None):
-        pass
+    make_backlog_perception(config, models, info=info, trust=make_trust(config)).track(lambda _: None)
