@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.messages import BacklogHeader, BacklogKind, WireError
 from hvt_common.values import View
 from hvt_common.video.still_codecs import StillError
 from hvt_ground.backlog.assembly import BacklogAssembly
-from hvt_ground.link.statistics import ReceptionStatistics
+from hvt_ground.link.reception import Reception
 from hvt_ground.perception.stills.decode import coded_size
-from rigs.messages import BASE, ROI
+from rigs.messages import BASE, INFO, ROI
 
 _SESSION = 2**63 + 9
 _SOURCE = (4000, 3000)
@@ -121,17 +122,20 @@ _TRACES: tuple[tuple[str, tuple[tuple[str, int, int, float | None], ...]], ...] 
     ),
 )
 """What came, its number, when in ms, its delay."""
+_OTHERS: Any = dict.fromkeys(("receiver_id", "sequence", "clock_offset_ns"), 0)
+_OTHERS |= dict.fromkeys(("clock_error_ns", "last_frame_index"), -1) | {"stills": (), "backlog": ()}
+"""Fields of a report that others fill."""
 
 
 def report_traces() -> Iterator[dict[str, Any]]:
     """What came and when, and the fields of the reports between."""
     for name, events in _TRACES:
-        counted = ReceptionStatistics()
+        counted = Reception(INFO, clock=int, edge_clock=ClockOffset(), emit=lambda _event: None)
         steps: list[dict[str, Any]] = []
         for kind, number, at_ms, delay_ms in events:
             at_ns = at_ms * 1_000_000
             if kind == _REPORT:
-                said = counted.take(at_ns)
+                said = counted.feedback(at_ns, **_OTHERS)
                 steps.append(
                     {
                         "report_at_ms": at_ms,
@@ -139,7 +143,7 @@ def report_traces() -> Iterator[dict[str, Any]]:
                         "base_held_us": said.base_held_us,
                         "still_sequence": said.still_sequence,
                         "missing_stills": said.missing_stills,
-                        "delay_p50_ms": -10 if said.delay_p50_ms is None else round(10 * said.delay_p50_ms),
+                        "delay_p50_ms": round(10 * said.delay_p50_ms),
                     }
                 )
                 continue

@@ -17,7 +17,7 @@ from hvt_common.values import Image, iou
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
-from hvt_ground.link.statistics import StillSequenceWindow
+from hvt_ground.link.reception import StillSequenceWindow
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.sinks import QueuedSink, Receipt

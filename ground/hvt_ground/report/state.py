@@ -74,11 +74,15 @@ def _counted(read: Callable[[Status], Any]) -> Any:
 
 
 def _delay_ms(percent: int) -> Any:
-    return _live(lambda one, _: one.overlay_latency.percentile(percent) if one.knows_delay else None)
+    def read(session: GroundSession, _: Traffic) -> float | None:
+        came = session.reception
+        return came.overlay_latency.percentile(percent) if came.knows_delay else None
+
+    return _live(read)
 
 
 def _picture_age_s(at: _Moment) -> float | None:
-    captured_ns = None if at.session.lockstep else at.session.newest_captured_ns
+    captured_ns = None if at.session.lockstep else at.session.reception.newest_captured_ns
     return None if captured_ns is None else max(0.0, (at.now_ns - captured_ns) / SECOND_NS)
 
 
@@ -86,9 +90,9 @@ def _pose(at: _Moment) -> PoseState | None:
     session, newest = at.session, at.session.poses.newest
     if newest is None:
         return None
-    age_ns = session.newest_capture_ns - newest.capture_ns
+    age_ns = session.reception.newest_capture_ns - newest.capture_ns
     if not session.lockstep:  # the camera may be gone, and flies on
-        age_ns = at.now_ns - session.pose_clock.to_local_ns(newest.capture_ns)
+        age_ns = at.now_ns - session.reception.pose_clock.to_local_ns(newest.capture_ns)
     age_s = max(0.0, age_ns / SECOND_NS)
     return PoseState(newest.latitude_deg, newest.longitude_deg, newest.height_m, age_s)
 
@@ -114,21 +118,21 @@ class SessionState:
     levers: str = _of(lambda at: at.session.levers)
     """What ``--profile auto`` sends beside the video and why; empty without."""
     lockstep: bool = _of(lambda at: at.session.lockstep)
-    duration_s: float = _of(lambda at: at.session.duration_s)
+    duration_s: float = _of(lambda at: at.session.reception.duration_s)
     source_size: tuple[int, int] = _of(lambda at: at.session.info.source_size)
     base_size: tuple[int, int] = _of(lambda at: at.session.info.base_size)
     fps: float = _of(lambda at: at.session.info.fps)
-    budget_bps: int = _of(lambda at: at.session.budget_bps)
+    budget_bps: int = _of(lambda at: at.session.reception.budget_bps)
     """As it is now, like the method; what was commanded shows within half a minute."""
     mean_bps: int = _of(
-        lambda at: at.session.ledger.mean_bps(
-            max(at.session.duration_s, at.session.info.window_ns / SECOND_NS)
+        lambda at: at.session.reception.ledger.mean_bps(
+            max(at.session.reception.duration_s, at.session.info.window_ns / SECOND_NS)
         )
     )
     """Over the session and at least the budget's window, all that crossed the line."""
     total_bps: float | None = _live(lambda _, now: now.total_bps)
     """Over the budget's window, like the two below; None while no picture comes, like all that is of now."""
-    budget_share: float | None = _live(lambda one, now: now.total_bps / one.budget_bps)
+    budget_share: float | None = _live(lambda one, now: now.total_bps / one.reception.budget_bps)
     """What that is of the budget."""
     base_bps: float | None = _live(lambda _, now: now.base_bps)
     roi_bps: float | None = _live(lambda _, now: now.roi_bps)
@@ -140,16 +144,16 @@ class SessionState:
     """Since the newest picture was captured, or came where the camera's clock cannot be right; None in lockstep."""
     pose: PoseState | None = _of(_pose)  # noqa: RUF009 - a dataclass field, not a default
     """None where none ever came."""
-    frames_received: int = _of(lambda at: at.session.frames_received)
+    frames_received: int = _of(lambda at: at.session.reception.frames)
     frames_decoded: int = _of(lambda at: at.session.frames_decoded)
     frames_untracked: int = _of(lambda at: at.session.worker.untracked)
     """Decoded, and passed over by detection and tracking for want of time."""
-    gaps: int = _of(lambda at: at.session.counters.gaps)
-    lost: int = _of(lambda at: at.session.counters.lost)
+    gaps: int = _of(lambda at: at.session.reception.counters.gaps)
+    lost: int = _of(lambda at: at.session.reception.counters.lost)
     """Messages."""
-    corrupt: int = _of(lambda at: at.session.counters.corrupt)
-    keyframe_requests: int = _of(lambda at: at.session.counters.keyframe_requests)
-    stills_received: int = _of(lambda at: at.session.stills_received)
+    corrupt: int = _of(lambda at: at.session.reception.counters.corrupt)
+    keyframe_requests: int = _of(lambda at: at.session.reception.counters.keyframe_requests)
+    stills_received: int = _of(lambda at: at.session.reception.stills)
     stills_pending: int = _of(
         lambda at: at.session.worker.stills_queued + at.session.perceived.stills_pending
     )

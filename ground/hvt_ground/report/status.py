@@ -47,8 +47,8 @@ def _edge_text(one: EdgeState) -> str:
 
 def summary(session: GroundSession) -> dict[str, Any]:
     """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do."""
-    info, pipeline, counters = session.info, session.perceived, session.counters
-    account = session.ledger.summary(session.duration_s)
+    info, pipeline, reception = session.info, session.perceived, session.reception
+    counters, account = reception.counters, reception.ledger.summary(reception.duration_s)
     status = session.last_status
     unread = pipeline.outcomes.get("unread", 0)
     backlog = session.backlog.totals
@@ -57,16 +57,16 @@ def summary(session: GroundSession) -> dict[str, Any]:
         "session": f"{info.session_id:016x}",
         "method": info.method,
         "pace": info.pace,
-        "frames": session.frames_received,
+        "frames": reception.frames,
         "frames_decoded": session.frames_decoded,
         "frames_untracked": session.worker.untracked,
         "edge_frames": None if status is None or not status.frames else status.frame_account.as_dict(),
-        "duration_s": round(session.duration_s, 3),
+        "duration_s": round(reception.duration_s, 3),
         **account.as_dict(),
         "budget_bps": info.budget_bps,
         "budget_base_bps": info.base_bps,
         "stills": {
-            "received": session.stills_received,
+            "received": reception.stills,
             "dropped": sum(session.stills_dropped.values()),
             "unread": unread,
             "reasons": {
@@ -75,9 +75,7 @@ def summary(session: GroundSession) -> dict[str, Any]:
                 "outcomes": dict(pipeline.outcomes),
                 "not_sent": dict(session.not_sent),
             },
-            "mean_bytes": round(account.roi_bytes / session.stills_received)
-            if session.stills_received
-            else 0,
+            "mean_bytes": round(account.roi_bytes / reception.stills) if reception.stills else 0,
         },
         "backlog": {
             "stills": backlog.stills,
@@ -96,8 +94,8 @@ def summary(session: GroundSession) -> dict[str, Any]:
         "corrupt": counters.corrupt,
         "duplicates": counters.duplicates + counters.replayed,
         "keyframe_requests": counters.keyframe_requests,
-        "latency_ms": session.overlay_latency.as_dict(),
-        "receive_latency_ms": session.receive_latency.as_dict(),
+        "latency_ms": reception.overlay_latency.as_dict(),
+        "receive_latency_ms": reception.receive_latency.as_dict(),
         "failure": session.failure,
         # Of these `completed` tells.
         "recording": None,

@@ -154,7 +154,7 @@ class EdgeSessions:
         if session.take_resumed():
             self.port.request_keyframe()
         session.worker.raise_error()
-        session.counters = self.receiver.stream.counters.since(self._counted)
+        session.reception.counters = self.receiver.stream.counters.since(self._counted)
         paused = self._backlog_ns is not None and now_ns - self._backlog_ns > _BACKLOG_PAUSE_NS
         if paused and not self.backlog.working:
             self._backlog_ns = None
@@ -264,7 +264,7 @@ class EdgeSessions:
         session, header = self.session, packet.arrival.header
         if session is None or header.session_id != session.info.session_id:
             return False
-        return header.frame_index > session.newest_index
+        return header.frame_index > session.reception.newest_index
 
     def _backlog(self, header: BacklogHeader, item: Received) -> None:
         session = self.session
@@ -312,7 +312,7 @@ class EdgeSessions:
             self._ended_id = session.info.session_id
         self._ended_ns = None
         counters = self.receiver.stream.counters
-        session.counters, self._counted = counters.since(self._counted), replace(counters)
+        session.reception.counters, self._counted = counters.since(self._counted), replace(counters)
         self.ended += 1
         for step in (session.close, partial(self._report_end, session), partial(self._on_ended, session)):
             try:

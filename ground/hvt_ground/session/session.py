@@ -36,9 +36,8 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
-from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.receiver import BasePacket
-from hvt_ground.link.statistics import CaptureClock, ReceptionStatistics, SessionAccount, StillSequenceWindow
+from hvt_ground.link.reception import Reception
 from hvt_ground.perception.models import NotOpenError
 from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
@@ -51,7 +50,7 @@ _ANEW_NS = 5 * SECOND_NS
 """What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""
 _LATELY_NS, _FRAMES_LATELY = 3 * SECOND_NS, 4
 """What came longer ago, and so many frames, says nothing of now."""
-_MOST_DELAY_MS, _MOST_OBJECTS = 3_600_000.0, 65_535
+_MOST_OBJECTS = 65_535
 _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""
 
@@ -79,7 +78,7 @@ class GroundSession:
     (Unix nanoseconds without steps).
     """
 
-    def __init__(  # noqa: PLR0915
+    def __init__(
         self,
         info: Info,
         *,
@@ -95,30 +94,22 @@ class GroundSession:
         self._queued = [one for one in sinks if isinstance(one, QueuedSink)]
         self.info = info
         """As the session began."""
-        self.budget_bps, self.method = info.budget_bps, info.method
-        """As they are now, some seconds late."""
+        self.method = info.method
+        """As it is now, some seconds late."""
         self.lockstep = info.pace == "lockstep"
         self.clock_offset = ClockOffset() if reports is None else reports.clock_offset
-        """Of the edge's clock, as `pose_clock` is of the source of poses."""
-        self._capture_clock, self.pose_clock = (CaptureClock(self.clock_offset) for _ in range(2))
-        self._account = SessionAccount(info, clock=clock, clock_offset=self._capture_clock, emit=self._emit)
-        self.ledger = self._account.ledger
-        self.receive_latency = self._account.receive_latency
-        self.overlay_latency = self._account.overlay_latency
+        """Of the edge's clock."""
+        self.reception = Reception(info, clock=clock, edge_clock=self.clock_offset, emit=self._emit)
+        """What came."""
         self._make_pipeline = partial(pipeline_of, self._emit)
         self._pipeline: Pipeline | None = None
-        self.frames_decoded = self.frames_received = self.stills_received = 0
-        self.steps_received = 0
-        """Reports of the edge's tracks."""
+        self.frames_decoded = 0
         self._analyzed = (-1, -1)
         """The last frame that was analyzed, and what was detected by then: reports want both of one moment."""
         self.failure = ""
         """What ended it, where that was no regular end."""
-        self.counters = StreamCounters()
-        """What the reassembly counted in this session."""
         self._clock = clock
         self._reports = reports
-        self._statistics = ReceptionStatistics(lockstep=self.lockstep)
         self._decoder = BaseDecoder(size=info.base_size)
         self._step_decoder = TrackStepDecoder()
         self.poses = SessionPoses(info.view, locator=locator)
@@ -130,15 +121,10 @@ class GroundSession:
         """Since when each part of the edge fails, by its clock: a report has the newest try."""
         self._log = SessionLog(self._emit, clock=clock)
         self._last_step = -1
-        self.newest_index = -1
-        """Frame index of the newest access unit; -1 before the first."""
         self._stepped_ns = self._status_ns = self._base_ns = 0
         """When the newest report of tracks came, the newest status, and the newest access unit."""
-        self._first_capture_ns: int | None = None
-        self.newest_capture_ns = 0
-        """Its capture time, the edge's clock; 0 before the first."""
         self._results: tuple[StillResult, ...] = ()
-        self._still_window, self._results_lock = StillSequenceWindow(), threading.Lock()
+        self._results_lock = threading.Lock()
         if worker_of is None:
             worker_of = (
                 partial(LockstepWorker, name=info.edge)
@@ -154,7 +140,7 @@ class GroundSession:
             log=self._emit,
             perception=backlog_perception,
             read=lambda still: self._read_stills([still]),
-            stills=self._still_window,
+            stills=self.reception.sequences,
             able=lambda: all(one.is_open() for one in outputs),
             outputs=outputs,
         )
@@ -168,24 +154,17 @@ class GroundSession:
         decode = packet.arrival.verdict == "decode"
         self._note_capture(header.capture_ns, item.received_ns)
         if packet.on_time:  # of one that waited behind a hole the time says nothing
-            delay_ms = None
-            if self.knows_delay:
-                captured_ns = self._capture_clock.to_local_ns(header.capture_ns)
-                delay_ms = max(0.0, (item.received_ns - captured_ns) / _MILLION)
-            self._statistics.base(
-                header, size_bytes=item.size_bytes, arrived_ns=item.received_ns, delay_ms=delay_ms
-            )
+            at_ns = item.received_ns
+            delay_ms = self.reception.delay_ms(header.capture_ns, at_ns)
+            self.reception.base(header, size_bytes=item.size_bytes, arrived_ns=at_ns, delay_ms=delay_ms)
         good = self._access_unit(header, item, decode=decode, starts_run=packet.arrival.starts_run)
-        self._account.time(Channel.BASE, item, header, handled=good and decode)
+        self.reception.time(Channel.BASE, item, header, handled=good and decode)
         return good
 
     def _access_unit(self, header: BaseHeader, item: Received, *, decode: bool, starts_run: bool) -> bool:
-        at_ns = header.send_ns
-        self._account.count(Channel.BASE, Account.BASE, item, at_ns=at_ns)
-        self.frames_received += 1
-        if self._first_capture_ns is None:
-            self._first_capture_ns = header.capture_ns
-        self.newest_index, self.newest_capture_ns = header.frame_index, header.capture_ns
+        reception = self.reception
+        reception.count(Channel.BASE, item, at_ns=header.send_ns)
+        reception.frame(header)
         self._base_ns = self._clock()
         if not decode:
             return True
@@ -199,26 +178,26 @@ class GroundSession:
         self.backlog.live(header.frame_index, item.payload, keyframe=header.keyframe, after_gap=starts_run)
         # In lockstep capture and sending are media time and say nothing of delay: count from here.
         reference_ns = item.received_ns if self.lockstep else None
-        if self.knows_delay:
-            reference_ns = self._capture_clock.to_local_ns(header.capture_ns)
+        if reception.knows_delay:
+            reference_ns = reception.capture_clock.to_local_ns(header.capture_ns)
         if reference_ns is not None:
-            self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
+            reception.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
         self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, picture))
-        if self._account.traffic_due(header):
-            self._account.traffic(header, tracks=self.perceived.tracks, tracks_refined=self.perceived.refined)
+        reception.traffic(header, tracks=self.perceived.tracks, tracks_refined=self.perceived.refined)
         return True
 
     def still(self, header: RoiHeader, item: Received) -> None:
         """Take one still; a second one of the same number is counted and not shown, a third ignored."""
-        self._statistics.still(header.sequence, size_bytes=item.size_bytes, arrived_ns=item.received_ns)
-        if not self._still_window.is_new(header.sequence, send_ns=header.send_ns):
-            if self._still_window.is_copy(header.sequence, send_ns=header.send_ns):
-                self._account.count(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
+        reception, sequence, at_ns = self.reception, header.sequence, header.send_ns
+        reception.still(sequence, size_bytes=item.size_bytes, arrived_ns=item.received_ns)
+        if not reception.sequences.is_new(sequence, send_ns=at_ns):
+            if reception.sequences.is_copy(sequence, send_ns=at_ns):
+                reception.count(Channel.ROI, item, at_ns=at_ns)
             return
-        self._account.count(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
-        self._account.time(Channel.ROI, item, header, handled=None)
-        self.stills_received += 1
-        self.ledger.record_outcome("received", header.reason)
+        reception.count(Channel.ROI, item, at_ns=at_ns)
+        reception.time(Channel.ROI, item, header, handled=None)
+        reception.stills += 1
+        reception.ledger.record_outcome("received", header.reason)
         self.worker.still(ReceivedStill(header, item.payload))
 
     def tracks(self, step: TrackStep, item: Received) -> None:
@@ -229,22 +208,22 @@ class GroundSession:
                 return
             self._step_decoder = TrackStepDecoder()
         self._last_step, self._stepped_ns = step.sequence, now_ns
-        self._account.count(Channel.TRACKS, Account.META, item, at_ns=step.send_ns)
-        self.steps_received += 1
+        self.reception.count(Channel.TRACKS, item, at_ns=step.send_ns)
+        self.reception.steps += 1
         tracks = self._step_decoder.decode(step)
-        self._account.time(Channel.TRACKS, item, step, handled=tracks is not None)
+        self.reception.time(Channel.TRACKS, item, step, handled=tracks is not None)
         if tracks is not None:
             self.worker.step(tracks, step.capture_ns)
 
     def pose(self, report: PoseReport, item: Received) -> None:
         """Take a report of where the camera is. Raises `WireError` where its bits make no sense."""
-        self._account.count(Channel.POSE, Account.META, item, at_ns=report.send_ns)
+        self.reception.count(Channel.POSE, item, at_ns=report.send_ns)
         pose = self.poses.report(report)
-        self._account.time(Channel.POSE, item, report, handled=pose is not None)
+        self.reception.time(Channel.POSE, item, report, handled=pose is not None)
         if pose is not None:
-            self.pose_clock.note(pose.capture_ns, received_ns=item.received_ns)
+            self.reception.pose_clock.note(pose.capture_ns, received_ns=item.received_ns)
             self.worker.pose(partial(self.poses.use, pose), pose.capture_ns)
-            self._emit(PoseUpdate(max(0, self.newest_index), pose.capture_ns, pose, self.info.view))
+            self._emit(PoseUpdate(max(0, self.reception.newest_index), pose.capture_ns, pose, self.info.view))
             self._note_stale(pose.capture_ns)
 
     def status(self, status: Status, item: Received) -> None:
@@ -254,15 +233,15 @@ class GroundSession:
         if old and now_ns - self._status_ns < _ANEW_NS:
             return
         self._status_ns = now_ns
-        self._account.count(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
-        self._account.time(Channel.STATUS, item, status, handled=True)
+        self.reception.count(Channel.STATUS, item, at_ns=status.send_ns)
+        self.reception.time(Channel.STATUS, item, status, handled=True)
         self.edge_failing = {
             one.part: self.edge_failing.get(one.part, one.failed_ns)
             for one in status.failed
             if not one.working
         }
         self.last_status = status
-        self._note_stale(self.newest_capture_ns)
+        self._note_stale(self.reception.newest_capture_ns)
         before, now = ([one for one, _ in lever_decisions(says)] for says in (self.levers, status.levers))
         self.levers = status.levers or self.levers
         if status.levers and now != before:  # numbers alone change each second: they are in the state
@@ -270,22 +249,21 @@ class GroundSession:
 
     def backlog_chunk(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
         """Count a chunk, of whichever session; ``delivered``: with it an object was whole, and is of use."""
-        self._statistics.backlog(size_bytes=item.size_bytes, arrived_ns=item.received_ns)
-        self._account.count(Channel.BACKLOG, Account.BACKLOG, item, at_ns=header.send_ns)
+        self.reception.backlog(size_bytes=item.size_bytes, arrived_ns=item.received_ns)
+        self.reception.count(Channel.BACKLOG, item, at_ns=header.send_ns)
         kind = f"{Channel.BACKLOG}-{header.kind}"
-        self._account.time(kind, item, header, handled=delivered)
+        self.reception.time(kind, item, header, handled=delivered)
         if delivered and header.kind == BacklogKind.STILL and header.session_id == self.info.session_id:
-            self._statistics.stored_still(header.number)
+            self.reception.stored_still(header.number)
 
     def learn(self, info: Info) -> None:
         """Take the session's present `Info`: budget and method may have changed."""
-        if (info.budget_bps, info.method) != (self.budget_bps, self.method):
+        if (info.budget_bps, info.method) != (self.reception.budget_bps, self.method):
             self.note(
                 "info",
                 f"from now on the budget is {bitrate_text(info.budget_bps)}, and the method {info.method}",
             )
-        self.budget_bps, self.method = info.budget_bps, info.method
-        self._account.budget_bps = info.budget_bps
+        self.reception.budget_bps, self.method = info.budget_bps, info.method
 
     def report_backlog(self) -> None:
         """Say in the recording how much of the backlog has come since the last time."""
@@ -296,7 +274,9 @@ class GroundSession:
 
     def note(self, level: Level, text: str, *, last: bool = False) -> None:
         """Put a line into the recording's log, unless there is a flood of them (`SessionLog`)."""
-        self._log.note(level, text, at=(max(0, self.newest_index), self.newest_capture_ns), last=last)
+        self._log.note(
+            level, text, at=(max(0, self.reception.newest_index), self.reception.newest_capture_ns), last=last
+        )
 
     def close(self) -> None:
         """Finish what is queued (for a second or two) and close the sinks, each whatever the others do.
@@ -339,23 +319,11 @@ class GroundSession:
         """The counts of perception, also before it is made."""
         return self._pipeline or NothingPerceived()
 
-    @property
-    def newest_captured_ns(self) -> int | None:
-        """The capture time of the newest picture, this ground's clock; None before the first."""
-        if self._first_capture_ns is None:
-            return None
-        return self._capture_clock.to_local_ns(self.newest_capture_ns)
-
-    @property
-    def knows_delay(self) -> bool:
-        """Whether the times of pictures say how long they were on their way."""
-        return self._capture_clock.is_sound and not self.lockstep
-
     def traffic(self, now_ns: int) -> Traffic | None:
         """The link's load; None before the first access unit, and where none has come lately."""
         fps = self.info.fps if self.last_status is None else self.last_status.coded_fps or self.info.fps
         lately_ns = max(_LATELY_NS, round(_FRAMES_LATELY * SECOND_NS / fps))
-        return None if now_ns - self._base_ns > lately_ns else self._account.last_traffic
+        return None if now_ns - self._base_ns > lately_ns else self.reception.last_traffic
 
     def health(self, now_ns: int) -> Health | None:
         """The edge's health; None before its first report, and where none has come lately."""
@@ -374,21 +342,13 @@ class GroundSession:
         return {} if self.last_status is None else self.last_status.outcomes
 
     @property
-    def duration_s(self) -> float:
-        """From the first frame received to the last by their capture, with one frame's length."""
-        if self._first_capture_ns is None:
-            return 0.0
-        span_ns = max(0, self.newest_capture_ns - self._first_capture_ns)
-        return span_ns / SECOND_NS + 1 / self.info.fps
-
-    @property
     def is_whole(self) -> bool:
         """Whether all has come that the edge counted in its newest report."""
-        last, messages = self.last_status, self.ledger.messages
+        last, messages = self.last_status, self.reception.ledger.messages
         if last is None:
             return False
         counted = (
-            (self.frames_received, last.base_messages),
+            (self.reception.frames, last.base_messages),
             (messages(Account.ROI), last.roi_messages),
             (messages(Account.BACKLOG), last.backlog_messages),
             # A report does not count itself.
@@ -415,7 +375,7 @@ class GroundSession:
 
     def report_if_due(self) -> None:
         """Report to the edge, as often as what has arrived is worth it."""
-        if self._statistics.due(now_ns=self._clock()):
+        if self.reception.due(now_ns=self._clock()):
             self.report()
 
     def report(self) -> None:
@@ -424,23 +384,10 @@ class GroundSession:
             self._reports.send(self._feedback)
 
     def _feedback(self, *, send_ns: int, **of_receiver: Any) -> Feedback:
-        measured, (last_frame_index, objects_detected) = self._statistics.take(send_ns), self._analyzed
-        delay_ms = measured.delay_p50_ms
-        return Feedback(
-            session_id=self.info.session_id,
-            send_ns=send_ns,
+        last_frame_index, objects_detected = self._analyzed
+        return self.reception.feedback(
+            send_ns,
             last_frame_index=last_frame_index,
-            base_messages=self.frames_received,
-            base_bytes=self.ledger.base_bytes,
-            roi_messages=self.stills_received,
-            roi_bytes=self.ledger.roi_bytes,
-            lost=self.counters.lost,
-            corrupt=self.counters.corrupt,
-            base_sequence=measured.base_sequence,
-            base_held_us=measured.base_held_us,
-            still_sequence=measured.still_sequence,
-            missing_stills=measured.missing_stills,
-            delay_p50_ms=-1.0 if delay_ms is None else min(delay_ms, _MOST_DELAY_MS),
             stills=self.take_results(MAX_STILL_RESULTS),
             objects_detected=min(objects_detected, _MOST_OBJECTS),
             **of_receiver,
@@ -459,9 +406,10 @@ class GroundSession:
     def _note_capture(self, capture_ns: int, received_ns: int) -> None:
         if self.lockstep:
             return
-        was_sound = self._capture_clock.is_sound
-        self._capture_clock.note(capture_ns, received_ns=received_ns)
-        if was_sound and not self._capture_clock.is_sound:
+        clock = self.reception.capture_clock
+        was_sound = clock.is_sound
+        clock.note(capture_ns, received_ns=received_ns)
+        if was_sound and not clock.is_sound:
             off_s = abs(received_ns - self.clock_offset.to_local_ns(capture_ns)) // SECOND_NS
             self.note(
                 "warning",
@@ -490,7 +438,7 @@ class GroundSession:
         self.pipeline.analyze(picture, hurry=hurry, news=news)
         self._analyzed = (picture.frame_index, self.pipeline.objects_detected)
         if picture.reference_ns is not None:
-            self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
+            self.reception.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
         self._collect_results()
         if self.lockstep:
             self.report()

@@ -216,7 +216,7 @@ class GroundSide:
 
     def _weight(self, results: tuple[StillResult, ...]) -> int:
         """Line bytes of a report with these, as `hvt_ground.session.edge_port` would send it."""
-        frames, stills = self._session.frames_received, self._session.stills_received
+        frames, stills = self._session.reception.frames, self._session.reception.stills
         payload = Feedback(
             session_id=self._info.session_id,
             receiver_id=_RECEIVER,

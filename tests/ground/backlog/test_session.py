@@ -381,8 +381,8 @@ def test_a_still_on_both_ways_is_shown_once(flight, tmp_path):
         rig.put(*backlog(flight, "still", 1, still_object(flight, 11, 1)))
         rig.put(*backlog(flight, "still", 0, still_object(flight, 10, 0)))
         rig.put(flight.still(11, 1))
-        assert (rig.session.stills_received, rig.session.backlog.totals.stills) == (2, 1)
-        assert rig.session.ledger.messages(Account.ROI) == 3
+        assert (rig.session.reception.stills, rig.session.backlog.totals.stills) == (2, 1)
+        assert rig.session.reception.ledger.messages(Account.ROI) == 3
         assert rig.reported().missing_stills == ()
     texts = [text for _, _, text in Recording(tmp_path / "0.rrd").events() if text.startswith("still #")]
     assert sorted(text[:8] for text in texts) == ["still #0", "still #1", "still #2"]
@@ -464,14 +464,14 @@ def test_pieces_are_in_the_account_to_the_byte(flight, tmp_path):
         rig.base(*range(10))
         kept = backlog(flight, "still", 3, still_object(flight, 4, 3), chunk_bytes=200)
         rig.put(*kept, *kept[:2], *chunks(other.session_id, "still", 0, still_object(other, 1, 0)))
-        assert rig.session.ledger.messages(Account.BACKLOG) == len(kept) + 3
-        assert rig.session.ledger.line_bytes == sum(
+        assert rig.session.reception.ledger.messages(Account.BACKLOG) == len(kept) + 3
+        assert rig.session.reception.ledger.line_bytes == sum(
             len(one.payload)
             + len(one.attachment)
             + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
             for one in rig.live
         )
-        pressed = rig.session.ledger.summary(1.0).backlog_bytes
+        pressed = rig.session.reception.ledger.summary(1.0).backlog_bytes
         assert pressed == sum(len(one.payload) for one in rig.live if one.key.endswith("/backlog"))
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.units import SECOND_NS
-from hvt_ground.link.statistics import CaptureClock
+from hvt_ground.link.reception import CaptureClock
 
 YEAR_NS = 365 * 86_400 * SECOND_NS
 

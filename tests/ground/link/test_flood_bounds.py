@@ -52,7 +52,7 @@ class Rig:
     def step(self, item, **lies) -> int:
         """Take a report of tracks; how many there have been."""
         self.session.tracks(replace(TrackStep.parse(item.payload), **lies), item)
-        return self.session.steps_received
+        return self.session.reception.steps
 
 
 @pytest.fixture

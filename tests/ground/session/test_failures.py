@@ -218,7 +218,7 @@ def test_what_waits_behind_a_hole_is_received_though_nothing_more_comes(flight, 
     rig = Rig(flight, Consumer(tmp_path))
     rig.put(0, 1, 3)
     session = rig.sessions.session
-    eventually(lambda: session.frames_received == 3, what="the one behind the hole is received")
+    eventually(lambda: session.reception.frames == 3, what="the one behind the hole is received")
     assert rig.thread.close(timeout_s=60)
 
 

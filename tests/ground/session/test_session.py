@@ -105,8 +105,8 @@ def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
         rig.put(*items)
         rig.settle()
         session = rig.receiver.session
-        assert (session.frames_received, session.frames_decoded) == (30, 30)
-        assert session.stills_received == 2
+        assert (session.reception.frames, session.frames_decoded) == (30, 30)
+        assert session.reception.stills == 2
         assert session.duration_s == pytest.approx(2.0)
         expected = sum(
             len(one.payload)
@@ -114,7 +114,7 @@ def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
             + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
             for one in items
         )
-        assert session.ledger.line_bytes == expected
+        assert session.reception.ledger.line_bytes == expected
         assert session.perceived.tracks >= 1
         eventually(lambda: rig.port.reports and rig.port.reports[-1].last_frame_index == 29)
         last = rig.port.reports[-1]
@@ -142,8 +142,8 @@ def test_the_edges_tracks_are_counted_and_shown(pace):
             rig.put(item)
             rig.settle()
         session = rig.receiver.session
-        assert (session.steps_received, session.ledger.messages(Account.META)) == (3, 3)
-        assert session.ledger.line_bytes == sum(
+        assert (session.reception.steps, session.reception.ledger.messages(Account.META)) == (3, 3)
+        assert session.reception.ledger.line_bytes == sum(
             len(one.payload)
             + len(one.attachment)
             + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
@@ -165,7 +165,7 @@ def test_tracks_that_make_no_sense_are_counted_and_skipped():
         rig.put(stranger.step(0, {1: square_box(0)}), Received(good[1].key, b"\x93\x02", b"", "", 1))
         rig.settle()
         session = rig.receiver.session
-        assert (session.steps_received, session.pipeline.steps_used) == (2, 1)
+        assert (session.reception.steps, session.pipeline.steps_used) == (2, 1)
         assert rig.receiver.receiver.unusable == 3
         rig.put(*bases(flight, *range(4, 10)), flight.status(base=10))
         rig.settle()
@@ -184,7 +184,7 @@ def test_the_end_waits_for_the_last_tracks():
         eventually(lambda: rig.ended)
         rig.settle()
         (session,) = rig.ended
-        assert (session.steps_received, session.pipeline.steps_used) == (1, 1)
+        assert (session.reception.steps, session.pipeline.steps_used) == (1, 1)
 
 
 def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
@@ -199,7 +199,7 @@ def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
         rig.put(*bases(flight, *range(14, 30)))
         rig.settle()
         assert session.frames_decoded == 3 + 10
-        assert session.frames_received == 28
+        assert session.reception.frames == 28
         assert session.last_frame_index == 29
         requested = rig.port.keyframe_requests
         time.sleep(0.4)
@@ -223,8 +223,8 @@ def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
         rig.put(status := flight.status(base=3, roi=1), status)
         rig.settle()
         session = rig.receiver.session
-        assert (session.frames_received, session.frames_decoded, session.stills_received) == (3, 3, 1)
-        assert session.ledger.messages(Account.META) == 1
+        assert (session.reception.frames, session.frames_decoded, session.reception.stills) == (3, 3, 1)
+        assert session.reception.ledger.messages(Account.META) == 1
         assert rig.receiver.receiver.unusable == 3
         rig.put(broken)
         rig.settle()
@@ -246,7 +246,7 @@ def test_a_still_that_came_twice_is_shown_once_and_counted_twice(flight):
         rig.put(*bases(flight, 0, 1, 2))
         rig.settle()
         session = rig.receiver.session
-        before = session.ledger.line_bytes
+        before = session.reception.ledger.line_bytes
         later = flight.still(1, 0, send_delay_ns=1_030_000_000)
         for one, copies in (
             (item, 1),
@@ -256,10 +256,10 @@ def test_a_still_that_came_twice_is_shown_once_and_counted_twice(flight):
         ):  # repeated, somebody else's, not the edge's
             rig.put(one)
             rig.settle()
-            assert session.ledger.messages(Account.ROI) == copies
-            assert session.ledger.line_bytes - before == pytest.approx(copies * once, abs=8)
-        assert session.stills_received == 1
-        assert session.ledger.outcomes("received") == {"utility": 1}
+            assert session.reception.ledger.messages(Account.ROI) == copies
+            assert session.reception.ledger.line_bytes - before == pytest.approx(copies * once, abs=8)
+        assert session.reception.stills == 1
+        assert session.reception.ledger.outcomes("received") == {"utility": 1}
         results = [one for report in rig.port.reports for one in report.stills]
         assert [one.still_sequence for one in results] == [0]
 
@@ -293,7 +293,7 @@ def test_a_second_edge_of_one_id_is_told_of_and_not_shown(flight, caplog):
             now_ns += 66_000_000
         assert rig.opened == [session := rig.receiver.session]
         assert session.info.session_id == flight.session_id
-        assert (session.frames_decoded, session.stills_received, session.last_status) == (30, 0, None)
+        assert (session.frames_decoded, session.reception.stills, session.last_status) == (30, 0, None)
         assert rig.port.keyframe_requests == 0
     said = [one.getMessage() for one in caplog.records if text in one.getMessage()]
     assert len(said) == 1
@@ -319,7 +319,7 @@ def test_a_session_that_the_edge_does_not_know_ends_nothing():
         rig.settle()
         assert rig.opened == [session := rig.receiver.session]
         # Shown again from the keyframe that was asked for.
-        assert (session.frames_received, session.frames_decoded) == (30, 15)
+        assert (session.reception.frames, session.frames_decoded) == (30, 15)
 
 
 def test_an_edge_that_restarts_gets_a_session_of_its_own(flight):
@@ -375,7 +375,7 @@ def test_a_session_ends_when_all_of_it_has_arrived(flight):
         rig.put(flight.still(3, 0))
         eventually(lambda: rig.ended)
         (session,) = rig.ended
-        assert (session.frames_received, session.stills_received) == (6, 1)
+        assert (session.reception.frames, session.reception.stills) == (6, 1)
         requested = rig.port.requested
         rig.put(flight.base(20), flight.still(3, 1))  # a keyframe after the end does not begin it again
         rig.settle()
@@ -404,8 +404,8 @@ def test_a_still_that_comes_before_its_session_is_open_is_taken(flight):
         rig.put(*bases(flight, *range(6)))
         rig.settle()
         session = rig.receiver.session
-        assert (session.stills_received, session.frames_received) == (1, 6)
-        assert session.ledger.messages(Account.ROI) == 1
+        assert (session.reception.stills, session.reception.frames) == (1, 6)
+        assert session.reception.ledger.messages(Account.ROI) == 1
         assert rig.receiver.receiver.unusable == 1, "the other one's"
 
 
@@ -425,7 +425,7 @@ def test_poses_that_come_before_their_session_is_open_are_taken(flight):
         rig.put(*bases(flight, *range(6)), pose(2, encoder))
         rig.settle()
         session = rig.receiver.session
-        assert session.ledger.messages(Account.META) == 3
+        assert session.reception.ledger.messages(Account.META) == 3
         assert session.poses.has_pose
         assert rig.receiver.receiver.unusable == 0
 

@@ -1,4 +1,4 @@
-"""Figures of the receiver report: the newest message of each stream, when it came, how old; stills missing.
+"""What came of a session, and the figures of the receiver report: the newest message of each stream, stills missing.
 
 Reports cost the way back: they come so often that together they take `_SHARE` of what arrives, within bounds, and
 only when something new has arrived; in a pause the usual ones, twice a second, go on.
@@ -10,7 +10,7 @@ import statistics
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.clock_offset import ClockOffset
@@ -19,6 +19,7 @@ from hvt_common.protocol.messages import (
     MAX_MISSING_STILLS,
     BacklogHeader,
     BaseHeader,
+    Feedback,
     Info,
     PoseReport,
     RoiHeader,
@@ -29,6 +30,7 @@ from hvt_common.runtime.statistics import LatencyStats, Newest, SequenceWindow
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, MessageTiming, Traffic
+from hvt_ground.link.reassemble import StreamCounters
 
 _MS = 1_000_000
 _LONGEST_TRIP_NS = 60 * SECOND_NS
@@ -39,7 +41,8 @@ REPORT_LINE_BYTES = 180
 _SHARE = 0.03
 _LEAST_NS, _MOST_NS = 100 * _MS, 500 * _MS
 _RATE_OVER_NS = 2 * SECOND_NS
-_MOST_DELAYS = 256
+_MOST_DELAYS, _MOST_DELAY_MS = 256, 3_600_000.0
+_ACCOUNTS = {Channel.BASE: Account.BASE, Channel.ROI: Account.ROI, Channel.BACKLOG: Account.BACKLOG}
 _HELD_US = 2**32 - 1
 _MOST_SENT = 512
 """Stills whose second copy is still known for one: those of the last seconds."""
@@ -51,28 +54,41 @@ _MISSED_NS = 6 * SECOND_NS
 """A still that has not come for so long does not come any more: reports need not name it for ever."""
 
 
-@dataclass(frozen=True, slots=True)
-class LinkMeasurement:
-    """A report's view of the link."""
+class Reception:
+    """What came of one session: bytes, order, gaps and ages, and the figures of the receiver report.
 
-    base_sequence: int
-    base_held_us: int
-    still_sequence: int
-    missing_stills: tuple[int, ...]
-    """Below it, in their order."""
-    delay_p50_ms: float | None
-    """The median over the base messages since the last report."""
-
-
-class ReceptionStatistics:
-    """Of one session. ``now_ns`` is one clock without steps in all calls.
-
-    Safe for threads: messages come in one, and a still that was read in another is reported at once.
+    ``clock`` is Unix nanoseconds without steps, the ``now_ns`` and ``arrived_ns`` of all calls; ``emit`` takes the
+    events. Safe for threads: messages come in one, and a still that was read in another is reported at once.
     """
 
-    def __init__(self, *, lockstep: bool = False) -> None:
+    def __init__(
+        self, info: Info, *, clock: Callable[[], int], edge_clock: ClockOffset, emit: Callable[[Event], None]
+    ) -> None:
+        self.lockstep = info.pace == "lockstep"
+        self.budget_bps = info.budget_bps
+        """As it is now, some seconds late."""
+        self.ledger = Ledger(window_ns=info.window_ns)
+        self.receive_latency, self.overlay_latency = LatencyStats(), LatencyStats()
+        self.capture_clock, self.pose_clock = CaptureClock(edge_clock), CaptureClock(edge_clock)
+        """Of the camera and of the source of poses."""
+        self.counters = StreamCounters()
+        """What the reassembly counted in this session."""
+        self.sequences = StillSequenceWindow()
+        self.frames = self.stills = self.steps = 0
+        """Received; the last are reports of the edge's tracks."""
+        self.newest_index = -1
+        """Frame index of the newest access unit; -1 before the first."""
+        self.newest_capture_ns = 0
+        """Its capture time, the edge's clock; 0 before the first."""
+        self._first_capture_ns: int | None = None
+        self._info = info
+        self._keys = EdgeKeys(info.edge)
+        self._clock = clock
+        self._emit = emit
+        self._next_traffic_ns = 0
+        self.last_traffic: Traffic | None = None
+        """The present measurement."""
         self._lock = threading.Lock()
-        self._lockstep = lockstep
         self._base_sequence = self._still_sequence = self._last_still = -1
         self._from_start = False
         self._missing: Newest[int, int] = Newest(MAX_MISSING_STILLS)
@@ -83,6 +99,98 @@ class ReceptionStatistics:
         self._delays_ms: deque[float] = deque(maxlen=_MOST_DELAYS)
         self._news = False
         self._reported_ns: int | None = None
+
+    @property
+    def knows_delay(self) -> bool:
+        """Whether the times of pictures say how long they were on their way."""
+        return self.capture_clock.is_sound and not self.lockstep
+
+    @property
+    def newest_captured_ns(self) -> int | None:
+        """The capture time of the newest picture, this ground's clock; None before the first."""
+        if self._first_capture_ns is None:
+            return None
+        return self.capture_clock.to_local_ns(self.newest_capture_ns)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first frame received to the last by their capture, with one frame's length."""
+        if self._first_capture_ns is None:
+            return 0.0
+        span_ns = max(0, self.newest_capture_ns - self._first_capture_ns)
+        return span_ns / SECOND_NS + 1 / self._info.fps
+
+    def frame(self, header: BaseHeader) -> None:
+        """An access unit has its turn."""
+        self.frames += 1
+        if self._first_capture_ns is None:
+            self._first_capture_ns = header.capture_ns
+        self.newest_index, self.newest_capture_ns = header.frame_index, header.capture_ns
+
+    def delay_ms(self, capture_ns: int, at_ns: int) -> float | None:
+        """From capture until then; None where clocks do not tell."""
+        if not self.knows_delay:
+            return None
+        return max(0.0, (at_ns - self.capture_clock.to_local_ns(capture_ns)) / _MS)
+
+    def count(self, row: Channel, item: Received, *, at_ns: int) -> None:
+        """Take the bytes of a message on the line."""
+        size, extra = len(item.payload), len(item.attachment)
+        self.ledger.count(
+            _ACCOUNTS.get(row, Account.META),
+            payload_bytes=size,
+            attachment_bytes=extra,
+            overhead_bytes=overhead_bytes(size, extra, key=self._keys.key(row), encoding=item.encoding),
+            at_ns=at_ns,
+        )
+
+    def time(
+        self,
+        kind: str,
+        item: Received,
+        header: BaseHeader | RoiHeader | TrackStep | PoseReport | Status | BacklogHeader,
+        *,
+        handled: bool | None,
+    ) -> None:
+        """Give out when a message came; ``handled``: something was made of it, None is said later."""
+        size, extra = len(item.payload), len(item.attachment)
+        frame_index, capture_ns = -1, 0
+        if isinstance(header, BaseHeader | RoiHeader | TrackStep):
+            frame_index, capture_ns = header.frame_index, header.capture_ns
+        self._emit(
+            MessageTiming(
+                kind=kind,
+                sequence=header.number if isinstance(header, BacklogHeader | PoseReport) else header.sequence,
+                frame_index=frame_index,
+                capture_ns=capture_ns,
+                send_ns=header.send_ns,
+                received_ns=item.received_ns,
+                handled_ns=None if handled is None else self._clock() if handled else 0,
+                line_bytes=size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding),
+                clock_offset_ns=self.capture_clock.offset_ns,
+            )
+        )
+
+    def traffic(self, header: BaseHeader, *, tracks: int, tracks_refined: int) -> None:
+        """Give out how full the link was and how old the picture is, twice a second of the stream."""
+        at_ns, ledger = header.send_ns, self.ledger
+        if 0 < self._next_traffic_ns - at_ns <= SECOND_NS // 2:  # more: its time was set back
+            return
+        self._next_traffic_ns = at_ns + SECOND_NS // 2
+        to_bps = 8 * SECOND_NS / self._info.window_ns
+        self.last_traffic = Traffic(
+            frame_index=header.frame_index,
+            capture_ns=header.capture_ns,
+            base_bps=ledger.window_bytes(Account.BASE, at_ns) * to_bps,
+            roi_bps=ledger.window_bytes(Account.ROI, at_ns) * to_bps,
+            total_bps=ledger.window_bytes(None, at_ns) * to_bps,
+            budget_bps=self.budget_bps,
+            receive_latency_ms=self.receive_latency.percentile(50) if self.knows_delay else None,
+            overlay_latency_ms=self.overlay_latency.percentile(50) if self.knows_delay else None,
+            tracks=tracks,
+            tracks_refined=tracks_refined,
+        )
+        self._emit(self.last_traffic)
 
     def base(
         self, header: BaseHeader, *, size_bytes: int, arrived_ns: int, delay_ms: float | None = None
@@ -129,7 +237,7 @@ class ReceptionStatistics:
             return since_ns >= _MOST_NS or (self._news and since_ns >= self._interval_ns(now_ns))
 
     def _interval_ns(self, now_ns: int) -> int:
-        if self._lockstep:
+        if self.lockstep:
             return _MOST_NS
         self._forget(now_ns)
         arriving = self._size_bytes / _RATE_OVER_NS
@@ -137,22 +245,31 @@ class ReceptionStatistics:
             return _MOST_NS
         return min(_MOST_NS, max(_LEAST_NS, round(REPORT_LINE_BYTES / (_SHARE * arriving))))
 
-    def take(self, now_ns: int) -> LinkMeasurement:
-        """The report of now; delays begin anew."""
+    def feedback(self, send_ns: int, **of_others: Any) -> Feedback:
+        """The report of now, with what others know; delays begin anew."""
         with self._lock:
             delays = list(self._delays_ms)
             self._delays_ms.clear()
             self._news = False
-            self._reported_ns = now_ns
-            for one in [one for one, at_ns in self._missing.items() if now_ns - at_ns > _MISSED_NS]:
+            self._reported_ns = send_ns
+            for one in [one for one, at_ns in self._missing.items() if send_ns - at_ns > _MISSED_NS]:
                 del self._missing[one]
-            held_us = max(0, now_ns - self._arrived_ns) // 1000 if self._base_sequence >= 0 else 0
-            return LinkMeasurement(
+            held_us = max(0, send_ns - self._arrived_ns) // 1000 if self._base_sequence >= 0 else 0
+            return Feedback(
+                session_id=self._info.session_id,
+                send_ns=send_ns,
+                base_messages=self.frames,
+                base_bytes=self.ledger.base_bytes,
+                roi_messages=self.stills,
+                roi_bytes=self.ledger.roi_bytes,
+                lost=self.counters.lost,
+                corrupt=self.counters.corrupt,
                 base_sequence=self._base_sequence,
                 base_held_us=min(held_us, _HELD_US),
                 still_sequence=self._still_sequence,
                 missing_stills=tuple(self._missing),
-                delay_p50_ms=statistics.median(delays) if delays else None,
+                delay_p50_ms=min(statistics.median(delays), _MOST_DELAY_MS) if delays else -1.0,
+                **of_others,
             )
 
     def _miss(self, first: int, end: int, *, at_ns: int) -> None:
@@ -244,90 +361,3 @@ class CaptureClock:
     def to_local_ns(self, capture_ns: int) -> int:
         """A time of the camera as our clock would have shown it."""
         return capture_ns - self.offset_ns
-
-
-class SessionAccount:
-    """The traffic of one session and its times. For the receiving thread; ``emit`` takes the events."""
-
-    def __init__(
-        self,
-        info: Info,
-        *,
-        clock: Callable[[], int],
-        clock_offset: CaptureClock,
-        emit: Callable[[Event], None],
-    ) -> None:
-        self.ledger = Ledger(window_ns=info.window_ns)
-        self.receive_latency = LatencyStats()
-        self.overlay_latency = LatencyStats()
-        self._info = info
-        self._keys = EdgeKeys(info.edge)
-        self._clock = clock
-        self._clock_offset = clock_offset
-        self._emit = emit
-        self._next_traffic_ns = 0
-        self.last_traffic: Traffic | None = None
-        """The present measurement."""
-        self.budget_bps = info.budget_bps
-
-    def count(self, row: Channel, account: Account, item: Received, *, at_ns: int) -> None:
-        """Take the bytes of a message on the line."""
-        size, extra = len(item.payload), len(item.attachment)
-        self.ledger.count(
-            account,
-            payload_bytes=size,
-            attachment_bytes=extra,
-            overhead_bytes=overhead_bytes(size, extra, key=self._keys.key(row), encoding=item.encoding),
-            at_ns=at_ns,
-        )
-
-    def time(
-        self,
-        kind: str,
-        item: Received,
-        header: BaseHeader | RoiHeader | TrackStep | PoseReport | Status | BacklogHeader,
-        *,
-        handled: bool | None,
-    ) -> None:
-        """Give out when a message came; ``handled``: something was made of it, None is said later."""
-        size, extra = len(item.payload), len(item.attachment)
-        frame_index, capture_ns = -1, 0
-        if isinstance(header, BaseHeader | RoiHeader | TrackStep):
-            frame_index, capture_ns = header.frame_index, header.capture_ns
-        self._emit(
-            MessageTiming(
-                kind=kind,
-                sequence=header.number if isinstance(header, BacklogHeader | PoseReport) else header.sequence,
-                frame_index=frame_index,
-                capture_ns=capture_ns,
-                send_ns=header.send_ns,
-                received_ns=item.received_ns,
-                handled_ns=None if handled is None else self._clock() if handled else 0,
-                line_bytes=size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding),
-                clock_offset_ns=self._clock_offset.offset_ns,
-            )
-        )
-
-    def traffic_due(self, header: BaseHeader) -> bool:
-        """Whether to call `traffic`: twice a second of the stream, and where its time was set back."""
-        return not 0 < self._next_traffic_ns - header.send_ns <= SECOND_NS // 2
-
-    def traffic(self, header: BaseHeader, *, tracks: int, tracks_refined: int) -> None:
-        """Give out how full the link was and how old the picture is."""
-        at_ns, ledger = header.send_ns, self.ledger
-        self._next_traffic_ns = at_ns + SECOND_NS // 2
-        to_bps = 8 * SECOND_NS / self._info.window_ns
-        sound = self._info.pace != "lockstep" and self._clock_offset.is_sound
-        self.last_traffic = Traffic(
-            frame_index=header.frame_index,
-            capture_ns=header.capture_ns,
-            base_bps=ledger.window_bytes(Account.BASE, at_ns) * to_bps,
-            roi_bps=ledger.window_bytes(Account.ROI, at_ns) * to_bps,
-            total_bps=ledger.window_bytes(None, at_ns) * to_bps,
-            budget_bps=self.budget_bps,
-            receive_latency_ms=self.receive_latency.percentile(50) if sound else None,
-            overlay_latency_ms=self.overlay_latency.percentile(50) if sound else None,
-            tracks=tracks,
-            tracks_refined=tracks_refined,
-        )
-        self._emit(self.last_traffic)
