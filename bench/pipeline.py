@@ -31,7 +31,7 @@ from hvt_ground.link.receiver import BasePacket
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.wiring import Models, make_pipeline
+from hvt_ground.wiring import Models, SessionPerception
 
 _FRAMES = 200
 _EVERY = 5
@@ -119,7 +119,7 @@ def _ground(units: list[AccessUnit]) -> float:
         session = GroundSession(
             info,
             sinks=[sink],
-            pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit),
+            pipeline_of=SessionPerception(config, models, info).pipeline,
             clock=time.time_ns,
         )
         began = time.perf_counter()

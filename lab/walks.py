@@ -41,7 +41,7 @@ _WALKS = {
         38,
     ),
     ("EdgeSessions.handle",): ("a message at the ground, received", 41),
-    ("perception.make_pipeline",): ("a session's perception at the ground, made", 27),
+    ("SessionPerception.pipeline",): ("a session's perception at the ground, made", 27),
     ("Pipeline.analyze",): ("a frame at the ground, analyzed", 34),
     ("Recorder.log",): ("an event at the ground, recorded", 13),
 }

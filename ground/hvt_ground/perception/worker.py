@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -59,7 +58,7 @@ Job = Generator[None, None, None]
 closed at its end, done or not."""
 
 
-class PerceptionWorker(ABC):
+class _Worker:
     """Takes pictures and stills from the receiving thread, and runs their jobs.
 
     Args:
@@ -77,48 +76,13 @@ class PerceptionWorker(ABC):
         self.dropped: Counter[str] = Counter()
         """Stills that were passed over, by reason."""
         self.jobs_failed = 0
+        self._error: BaseException | None = None
 
-    @property
-    @abstractmethod
-    def idle(self) -> bool:
-        """Nothing is queued, and nothing is in hand."""
-
-    @property
-    def stills_queued(self) -> int:
-        """Stills that are not read yet."""
-        return 0
-
-    @property
-    def accepts_jobs(self) -> bool:
-        """Whether `submit` takes another."""
-        return True
-
-    @abstractmethod
-    def picture(self, picture: DecodedFrame) -> None:
-        """Hand over a decoded frame."""
-
-    @abstractmethod
-    def step(self, tracks: Tracks, capture_ns: int) -> None:
-        """Hand over the edge's tracks at one frame."""
-
-    def pose(self, use: Callable[[], None], capture_ns: int) -> None:  # noqa: ARG002 - for lockstep
-        """Hand over where the camera was at that time; ``use()`` makes it count, here at once."""
-        use()
-
-    @abstractmethod
-    def still(self, still: ReceivedStill) -> None:
-        """Hand over a still."""
-
-    @abstractmethod
-    def submit(self, job: Job, *, last: bool = False) -> bool:
-        """Hand over a job; one that comes ``last`` lets all others go before it, between any two steps.
-
-        False where too many are queued: it is not taken.
-        """
-
-    @abstractmethod
-    def close(self) -> bool:
-        """Finish the queue, for a second or two; False if the thread did not come back."""
+    def raise_error(self) -> None:
+        """Raise the error that ended the thread."""
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
 
     def _is_done(self, job: Job) -> bool:
         # Do one step of a job; whether it was the last.
@@ -135,11 +99,8 @@ class PerceptionWorker(ABC):
             return True
         return False
 
-    def raise_error(self) -> None:  # noqa: B027 - errors may come out of the other methods instead
-        """Raise the error that ended the thread."""
 
-
-class RealtimeWorker(PerceptionWorker):
+class RealtimeWorker(_Worker):
     """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still.
 
     ``pass_over`` takes frame and capture time of a picture for which there is no time, ``take_late()`` what was found
@@ -182,7 +143,6 @@ class RealtimeWorker(PerceptionWorker):
         self._ending = threading.Event()
         self._given_up = threading.Event()
         self._in_hand = self._searching = False
-        self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=f"hvt-perception-{name}", daemon=True)
         self._thread.start()
 
@@ -227,6 +187,10 @@ class RealtimeWorker(PerceptionWorker):
         self._steps.append((tracks, capture_ns))
         self._wake.set()
 
+    def pose(self, use: Callable[[], None], capture_ns: int) -> None:  # noqa: ARG002 - for lockstep
+        """Where the camera was at that time counts at once, by ``use()``."""
+        use()
+
     def still(self, still: ReceivedStill) -> None:
         """Queue a still; where the queue is full it is dropped."""
         with self._lock:
@@ -237,7 +201,10 @@ class RealtimeWorker(PerceptionWorker):
         self._wake.set()
 
     def submit(self, job: Job, *, last: bool = False) -> bool:
-        """Queue a job."""
+        """Queue a job; one that comes ``last`` lets all others go before it, between any two steps.
+
+        False where too many are queued: it is not taken.
+        """
         queued, most = (self._last_jobs, _MOST_LAST_JOBS) if last else (self._jobs, _MOST_JOBS)
         if len(queued) >= most:
             return False
@@ -246,7 +213,7 @@ class RealtimeWorker(PerceptionWorker):
         return True
 
     def close(self) -> bool:
-        """Finish the queue, for a second or two."""
+        """Finish the queue, for a second or two; False if the thread did not come back."""
         self._ending.set()
         self._wake.set()
         self._thread.join(self._finish_s)
@@ -256,12 +223,6 @@ class RealtimeWorker(PerceptionWorker):
         self.dropped["ended"] += len(self._stills)
         self.untracked += len(self._pictures)
         return not self._thread.is_alive()
-
-    def raise_error(self) -> None:
-        """Raise the error that ended the thread."""
-        if self._error is not None:
-            error, self._error = self._error, None
-            raise error
 
     def _run(self) -> None:
         lower_priority(little=True)  # boxes follow the picture, detection follows them
@@ -340,8 +301,10 @@ class RealtimeWorker(PerceptionWorker):
             self._job_step_s = self._clock()
 
 
-class LockstepWorker(PerceptionWorker):
+class LockstepWorker(_Worker):
     """Analyzes one frame while the next is decoded, in order, waiting for it rather than passing anything over."""
+
+    stills_queued, accepts_jobs = 0, True
 
     def __init__(self, analyze: Analyze, step: Step, read: Read, *, name: str) -> None:
         super().__init__(analyze, step, read)
@@ -423,6 +386,9 @@ class LockstepWorker(PerceptionWorker):
         with closing(job):
             while not self._is_done(job):
                 pass
+
+
+PerceptionWorker = RealtimeWorker | LockstepWorker
 
 
 def _fits(still: ReceivedStill, queued: Collection[ReceivedStill]) -> bool:

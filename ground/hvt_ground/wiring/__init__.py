@@ -2,5 +2,5 @@
 
 from hvt_ground.perception.models import Models
 from hvt_ground.wiring.files import check_outputs, make_folders, output_path
-from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline
+from hvt_ground.wiring.perception import SessionPerception
 from hvt_ground.wiring.sessions import OpenSink, SessionFactory

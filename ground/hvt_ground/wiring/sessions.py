@@ -29,7 +29,7 @@ from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.wiring.files import backlog_path, free_path, output_path
-from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline, make_tilt, make_trust
+from hvt_ground.wiring.perception import SessionPerception
 
 S = TypeVar("S", bound=SinkWriter[Any])
 
@@ -124,16 +124,14 @@ class SessionFactory:
             sinks.append(self._outputs.open(one.part, one.open, wait_s=held_s, longest_pause_s=pause_s))
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
-        trust, tilt = make_trust(config), make_tilt(config)
+        perception = SessionPerception(config, models, info)
         return GroundSession(
             info,
             sinks=sinks,
-            pipeline_of=lambda emit: make_pipeline(
-                config, models, info=info, emit=emit, trust=trust, tilt=tilt
-            ),
+            pipeline_of=perception.pipeline,
             clock=self._clock,
             reports=reports,
-            backlog_perception=make_backlog_perception(config, models, info=info, trust=trust, tilt=tilt),
+            backlog_perception=perception.stored(),
             locator=locator,
         )
 
@@ -144,9 +142,7 @@ class SessionFactory:
         names = partial(backlog_path, self._config.record, edge=info.edge, stamp=stamp)
         part = f"backlog recording of {info.edge}"
         sink = self._outputs.open(part, partial(self._opened, self._files(settings, backlog=True), names))
-        perception = make_backlog_perception(
-            self._config, self._models, info=info, trust=make_trust(self._config)
-        )
+        perception = SessionPerception(self._config, self._models, info).stored()
         return BacklogRecording(info, sink=sink, perception=perception)
 
     def _new_file(

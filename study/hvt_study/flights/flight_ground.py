@@ -34,7 +34,7 @@ from hvt_ground.perception.models import ModelFacts
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
 from hvt_ground.session.session import GroundSession
-from hvt_ground.wiring import Models, make_pipeline
+from hvt_ground.wiring import Models, SessionPerception
 from hvt_study.flights.flight_link import Arrival, SerialLink
 from hvt_study.flights.flight_record import FlightRecord, Watch
 from hvt_study.metrics.judged import FrameView
@@ -124,10 +124,10 @@ class GroundSide:
         self._captures = CaptureTimes()
         self.now_ns = info.started_ns
         detector, classifier = models.take()
-        shared = SharedModels(detector, classifier, config=config)
+        perception = SessionPerception(config, SharedModels(detector, classifier, config=config), info)
         self._session = GroundSession(
             info,
-            pipeline_of=lambda emit: make_pipeline(config, shared, info=info, emit=self._observed_by(emit)),
+            pipeline_of=lambda emit: perception.pipeline(self._observed_by(emit)),
             clock=lambda: self.now_ns,
             worker_of=self._make_worker,
         )

@@ -43,15 +43,15 @@ def test_a_ground_that_runs_for_months_takes_former_sessions_every_day(tmp_path)
 
     recordings = BacklogRecordings(open_one, most_files=2, open_s=20.0, clock=lambda: now_s)
     first, second, third = (replace(Flight(1).info(), session_id=number) for number in (1, 2, 3))
-    with recordings.using(first) as one, recordings.using(second) as other:
-        assert None not in (one, other)
+    with recordings.using(first) as backlog, recordings.using(second) as other:
+        assert None not in (backlog, other)
     assert not recordings.takes(3), "whoever invents sessions does not fill the disk"
-    with recordings.using(third) as one:
-        assert one is None
+    with recordings.using(third) as backlog:
+        assert backlog is None
     now_s = 86_400.0
     assert recordings.takes(3)
-    with recordings.using(third) as one:
-        assert one is not None
+    with recordings.using(third) as backlog:
+        assert backlog is not None
     recordings.close()
     for one in made:
         one.join(time.monotonic() + 60)

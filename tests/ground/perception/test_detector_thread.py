@@ -16,7 +16,7 @@ from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.detector_thread import DetectorThread
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.wiring import Models
-from hvt_ground.wiring.perception import make_pipeline
+from hvt_ground.wiring.perception import SessionPerception
 from programs.processes import eventually
 from rigs.flight import Flight, NothingSeen, patient_worker
 
@@ -107,7 +107,7 @@ def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, run
     models, network = Models(check(GroundConfig(classifier="none"))), NothingSeen()
     models.take = lambda: (network, None)
     config, info = check(GroundConfig(classifier="none", tiles=tiles)), replace(Flight(1).info(), pace=pace)
-    pipeline = make_pipeline(config, models, info=info, emit=lambda _: None)
+    pipeline = SessionPerception(config, models, info).pipeline(lambda _: None)
     pipeline.analyze(DecodedFrame(0, 0, 0, PICTURE), hurry=False)
     assert network.runs == runs
     eventually(lambda: not models.loading, what="the models are loaded: no process ends meanwhile")

@@ -17,7 +17,7 @@ from hvt_ground.config import GroundConfig, check
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.models import Models
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
-from hvt_ground.wiring.perception import make_backlog_perception, make_pipeline, make_trust
+from hvt_ground.wiring.perception import SessionPerception
 from media.onnx_models import colour_classifier, colour_detector
 from rigs.flight import Flight
 
@@ -67,7 +67,7 @@ def test_the_picture_goes_on_without_boxes_and_they_come_back(tmp_path: Path, ca
         )
     )
     models, events, flight = Models(config), list[Event](), Flight(1)
-    pipeline = make_pipeline(config, models, info=flight.info(), emit=events.append)
+    pipeline = SessionPerception(config, models, flight.info()).pipeline(events.append)
 
     def boxes(index: int, value: int) -> int:
         pipeline.analyze(picture(index, value=value), hurry=False)
@@ -105,7 +105,7 @@ def test_a_still_is_shown_though_nobody_can_name_it(tmp_path: Path, classifier: 
         fragile(detector, bright=180)  # tried with grey
     config = check(GroundConfig(detector=str(detector), classifier=named, provider="cpu"))
     models, events, flight = Models(config), list[Event](), Flight(1)
-    pipeline = make_pipeline(config, models, info=flight.info(), emit=events.append)
+    pipeline = SessionPerception(config, models, flight.info()).pipeline(events.append)
     pipeline.analyze(picture(0, value=200), hurry=False)
     item = flight.still(0, 0)
     header = replace(RoiHeader.parse(item.attachment, item.payload), frame_index=0)
@@ -130,5 +130,5 @@ def test_a_session_begins_though_the_files_of_the_models_are_gone(tmp_path: Path
     models.take()
     detector.unlink()
     classifier.unlink()
-    make_pipeline(config, models, info=info, emit=lambda _: None).end()
-    make_backlog_perception(config, models, info=info, trust=make_trust(config)).track(lambda _: None)
+    SessionPerception(config, models, info).pipeline(lambda _: None).end()
+    SessionPerception(config, models, info).stored().track(lambda _: None)

@@ -107,7 +107,7 @@ def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
         session = rig.receiver.session
         assert (session.reception.frames, session.frames_decoded) == (30, 30)
         assert session.reception.stills == 2
-        assert session.duration_s == pytest.approx(2.0)
+        assert session.reception.duration_s == pytest.approx(2.0)
         expected = sum(
             len(one.payload)
             + len(one.attachment)
