@@ -27,7 +27,6 @@ from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.config import GroundConfig
 from hvt_ground.link.reassemble import Arrival
-from hvt_ground.link.receiver import BasePacket
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -124,8 +123,8 @@ def _ground(units: list[AccessUnit]) -> float:
         )
         began = time.perf_counter()
         for number, (header, item) in enumerate(items):
-            unit = Arrival("decode", header, item.payload, item.received_ns, starts_run=number == 0)
-            session.base(BasePacket(unit, item, on_time=True))
+            unit = Arrival("decode", header, item, item.received_ns, starts_run=number == 0)
+            session.base(unit)
         took = time.perf_counter() - began
         session.close()
         sink.join(time.monotonic() + 10.0)

@@ -27,11 +27,12 @@ where nothing comes but old numbers that have not been here: somebody else has c
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.statistics import Newest
 
+T = TypeVar("T")
 Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
 """What to do with an access unit. skip: fresh, but a unit before it is lost, or no keyframe has come yet;
 stale: older than what was given up or shown; foreign: of a session that is not the present one; implausible:
@@ -53,12 +54,12 @@ _REQUEST_INTERVALS_NS = (300_000_000, 300_000_000, 600_000_000, 1_000_000_000)
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class Arrival(Generic[T]):
     """One access unit and its verdict. A unit that waited comes out later, in a later call's list."""
 
     verdict: Verdict
     header: BaseHeader
-    payload: bytes
+    message: T
     received_ns: int
     """``now_ns`` of the call that brought it."""
     starts_run: bool = False
@@ -67,6 +68,8 @@ class Arrival:
     """The first unit of another session, or of one whose count was lost: reset whatever counts frames."""
     lost_before: int = 0
     """How many units were given up just before this one; above 0 it is the end of a gap."""
+    on_time: bool = True
+    """It did not wait behind a hole."""
     duplicate: bool = False
     """Foreign, and the present session goes on beside it: two edges of one name."""
 
@@ -96,7 +99,7 @@ class StreamCounters:
         )
 
 
-class Reassembler:
+class Reassembler(Generic[T]):
     """Order, gaps, duplicates and sessions of the base stream of one edge.
 
     ``now_ns`` is any clock that does not go back (monotonic); the same one in all calls.
@@ -117,7 +120,7 @@ class Reassembler:
         self._next = 0
         self._last_frame = -1
         self._recent = 0  # bit i: the sequence _next - 1 - i has been here
-        self._held: dict[int, Arrival] = {}
+        self._held: dict[int, Arrival[T]] = {}
         self._synced = False
         self._progress_ns = 0
         self._interval_ns = 0  # about the time between two units of the present session
@@ -125,9 +128,9 @@ class Reassembler:
         self._requested_ns: int | None = None
         self._requests_in_gap = 0
 
-    def accept(self, header: BaseHeader, payload: bytes, *, now_ns: int) -> list[Arrival]:
-        """Take one access unit whose CRC is right; return all that is now settled, in order."""
-        unit = Arrival("decode", header, payload, now_ns)
+    def accept(self, header: BaseHeader, message: T, *, now_ns: int) -> list[Arrival[T]]:
+        """Take the message of an access unit whose CRC is right; return all that is now settled, in order."""
+        unit = Arrival("decode", header, message, now_ns)
         if header.session_id in self._disowned:
             return [self._judged(unit, "foreign")]
         if self._adopted_ns is None or header.session_id != self._session:
@@ -188,12 +191,12 @@ class Reassembler:
 
     # Within the session: a hole waits, then is given up.
 
-    def overdue(self, *, now_ns: int) -> list[Arrival]:
+    def overdue(self, *, now_ns: int) -> list[Arrival[T]]:
         """What need not wait any longer behind a hole, where at most ``REORDER_UNITS`` units do.
 
         Until it counts as received the edge holds its next frames, and with them what would end the wait.
         """
-        released: list[Arrival] = []
+        released: list[Arrival[T]] = []
         keyframe = max(
             (sequence for sequence, unit in self._held.items() if unit.header.keyframe), default=-1
         )
@@ -210,7 +213,8 @@ class Reassembler:
             if lost:
                 self._give_up(lost)
             verdict = self._take(unit := self._held.pop(first), now_ns)
-            released.append(self._judged(unit, verdict, lost_before=lost))
+            on_time = unit.received_ns == now_ns
+            released.append(self._judged(unit, verdict, lost_before=lost, on_time=on_time))
         return released
 
     def _give_up(self, lost: int) -> None:
@@ -220,7 +224,7 @@ class Reassembler:
         self._next += lost
         self._synced = False
 
-    def _take(self, unit: Arrival, now_ns: int) -> Verdict:
+    def _take(self, unit: Arrival[T], now_ns: int) -> Verdict:
         header = unit.header
         self._recent = (self._recent << 1 | 1) & _WINDOW_MASK
         self._next = header.sequence + 1
@@ -258,8 +262,8 @@ class Reassembler:
         return self._progress_ns - since_ns > DUPLICATE_AFTER_NS
 
     def _accept_outsider(
-        self, unit: Arrival, refusal: Verdict, *, patience_ns: int, duplicate: bool = False
-    ) -> list[Arrival]:
+        self, unit: Arrival[T], refusal: Verdict, *, patience_ns: int, duplicate: bool = False
+    ) -> list[Arrival[T]]:
         # A unit that does not continue the session: adopted with a keyframe when the session is silent.
         header, now_ns = unit.header, unit.received_ns
         if header.sequence < self._left.get(header.session_id, 0):
@@ -278,7 +282,7 @@ class Reassembler:
         verdict = self._take(unit, now_ns)
         return [*resolved, self._judged(unit, verdict, starts_session=True)]
 
-    def _leave(self) -> list[Arrival]:
+    def _leave(self) -> list[Arrival[T]]:
         # End the present session, if any; units that waited behind a hole are skipped.
         resolved = [self._judged(unit, "skip") for _, unit in sorted(self._held.items())]
         self._held.clear()
@@ -298,13 +302,14 @@ class Reassembler:
 
     def _judged(
         self,
-        unit: Arrival,
+        unit: Arrival[T],
         verdict: Verdict,
         *,
         lost_before: int = 0,
         starts_session: bool = False,
         duplicate: bool = False,
-    ) -> Arrival:
+        on_time: bool = True,
+    ) -> Arrival[T]:
         self.counters.duplicates += verdict == "duplicate"
         self.counters.replayed += verdict == "stale"
         starts_run = verdict == "decode" and not self._synced
@@ -318,4 +323,5 @@ class Reassembler:
             starts_session=starts_session,
             lost_before=lost_before,
             duplicate=duplicate,
+            on_time=on_time,
         )

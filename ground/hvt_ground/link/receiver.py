@@ -6,7 +6,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (
@@ -45,18 +45,8 @@ _AGAIN_NS = 60 * SECOND_NS
 
 
 @dataclass(frozen=True, slots=True)
-class BasePacket:
-    """An access unit that the reassembly has judged, with its own bytes even if it waited behind a hole."""
-
-    arrival: Arrival
-    item: Received
-    on_time: bool
-    """It did not wait: the time of ``item`` is its own."""
-
-
-@dataclass(frozen=True, slots=True)
 class Packet:
-    """Any other message."""
+    """Any message but an access unit, which is an `Arrival`."""
 
     header: RoiHeader | TrackStep | PoseReport | BacklogHeader | Status
     item: Received
@@ -102,10 +92,8 @@ class Receiver:
         self._edge = edge
         self._versions = versions
         self._clock = clock
-        self.stream = Reassembler()
+        self.stream = Reassembler[Received]()
         """The base stream, over all sessions."""
-        self._base_item: Received | None = None
-        """The newest message of the base stream."""
         self._other: int | None = None
         """The session of a second edge of this id that was noted last."""
         self._other_said_ns: int | None = None
@@ -129,7 +117,7 @@ class Receiver:
         """For how long nothing has come."""
         return time.monotonic_ns() - self._last_message_ns
 
-    def receive(self, item: Received) -> Sequence[BasePacket | Packet]:
+    def receive(self, item: Received) -> Sequence[Arrival[Received] | Packet]:
         """The packets of one message: none if it is unusable or waits, several if it fills a hole."""
         self._last_message_ns = time.monotonic_ns()
         at_ns = self._uptime.handle(arrived_ns=item.received_ns, now_ns=self._clock())
@@ -140,9 +128,7 @@ class Receiver:
             match message:
                 case BaseHeader():
                     self._captures.note(message)
-                    self._base_item = item
-                    arrivals = self.stream.accept(message, item.payload, now_ns=at_ns)
-                    return [_base_packet(arrival, item) for arrival in arrivals]
+                    return self.stream.accept(message, item, now_ns=at_ns)
                 case RoiHeader():
                     otherwise_ns = item.received_ns - message.send_delay_ns
                     message = self._captures.filled(message, otherwise_ns=otherwise_ns)
@@ -153,13 +139,9 @@ class Receiver:
             self.skip(str(row), error)
         return []
 
-    def take_overdue(self, *, pending: bool) -> list[BasePacket]:
+    def take_overdue(self, *, pending: bool) -> list[Arrival[Received]]:
         """Access units that have waited long enough behind a hole; ``pending``: messages wait to be received."""
-        item = self._base_item
-        if item is None:
-            return []
-        at_ns = self._uptime.at(self._clock(), pending=pending)
-        return [_base_packet(arrival, item) for arrival in self.stream.overdue(now_ns=at_ns)]
+        return self.stream.overdue(now_ns=self._uptime.at(self._clock(), pending=pending))
 
     def take_keyframe_request(self, *, pending: bool) -> bool:
         """Whether to request a keyframe now, which is noted; ``pending``: messages wait to be received."""
@@ -215,13 +197,6 @@ class Receiver:
             self._damaged += 1
         else:
             self.skip(row, WireError(f"it belongs to the session {session_id:016x}, which is not shown"))
-
-
-def _base_packet(arrival: Arrival, item: Received) -> BasePacket:
-    if arrival.payload is item.payload:
-        return BasePacket(arrival, item, on_time=True)
-    attachment = arrival.header.pack(arrival.payload)
-    return BasePacket(arrival, replace(item, payload=arrival.payload, attachment=attachment), on_time=False)
 
 
 def _parsed(row: Channel | None, item: Received, versions: Sequence[int]) -> _Message | None:

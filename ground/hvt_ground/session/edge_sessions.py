@@ -15,6 +15,7 @@ from hvt_common.protocol.messages import (
     BASE_CODEC,
     SPOKEN_VERSIONS,
     BacklogHeader,
+    BaseHeader,
     Info,
     PoseReport,
     RoiHeader,
@@ -29,8 +30,8 @@ from hvt_common.transport.inbox import Received, TokenBucket
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.backlog.recordings import BacklogRecordings
-from hvt_ground.link.reassemble import StreamCounters
-from hvt_ground.link.receiver import BasePacket, Packet, Receiver
+from hvt_ground.link.reassemble import Arrival, StreamCounters
+from hvt_ground.link.receiver import Packet, Receiver
 from hvt_ground.session.edge_port import EdgePort, InfoAnswer, ReceiverReports
 from hvt_ground.session.session import GroundSession
 
@@ -199,8 +200,8 @@ class EdgeSessions:
 
     # Routing
 
-    def _route(self, packet: BasePacket | Packet) -> None:
-        if isinstance(packet, BasePacket):
+    def _route(self, packet: Arrival[Received] | Packet) -> None:
+        if isinstance(packet, Arrival):
             self._base(packet)
             return
         session, header, item = self.session, packet.header, packet.item
@@ -235,14 +236,13 @@ class EdgeSessions:
                 if header.state == "ended":
                     self._ended_ns = time.monotonic_ns()
 
-    def _base(self, packet: BasePacket) -> None:
-        arrival = packet.arrival
+    def _base(self, arrival: Arrival[Received]) -> None:
         session_id = arrival.header.session_id
         if arrival.duplicate and self.session is not None:
             text = self.receiver.duplicate_notice(session_id, shown=self.session.info.session_id)
             if text is not None:
                 self.session.note("warning", text)
-        begins = arrival.starts_session and not self._goes_on(packet)
+        begins = arrival.starts_session and not self._goes_on(arrival.header)
         if begins or (arrival.starts_run and self.session is None and session_id != self._ended_id):
             if self._pause.due(time.monotonic_ns()):
                 self._begin_session(session_id)
@@ -256,12 +256,12 @@ class EdgeSessions:
         if arrival.lost_before:
             lost = "1 picture was" if arrival.lost_before == 1 else f"{arrival.lost_before} pictures were"
             session.note("warning", f"{lost} lost: the ground waits for a keyframe")
-        if not session.base(packet):
+        if not session.base(arrival):
             self.receiver.stream.decoder_failed()
 
-    def _goes_on(self, packet: BasePacket) -> bool:
+    def _goes_on(self, header: BaseHeader) -> bool:
         # Whether the open session comes back from an interruption that was none of its own.
-        session, header = self.session, packet.arrival.header
+        session = self.session
         if session is None or header.session_id != session.info.session_id:
             return False
         return header.frame_index > session.reception.newest_index

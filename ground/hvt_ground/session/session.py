@@ -36,7 +36,7 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
-from hvt_ground.link.receiver import BasePacket
+from hvt_ground.link.reassemble import Arrival
 from hvt_ground.link.reception import Reception
 from hvt_ground.perception.models import NotOpenError
 from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
@@ -148,16 +148,16 @@ class GroundSession:
 
     # What the receiving thread brings
 
-    def base(self, packet: BasePacket) -> bool:
+    def base(self, arrival: Arrival[Received]) -> bool:
         """Take one access unit; False where the decoder could make nothing of it."""
-        header, item = packet.arrival.header, packet.item
-        decode = packet.arrival.verdict == "decode"
+        header, item = arrival.header, arrival.message
+        decode = arrival.verdict == "decode"
         self._note_capture(header.capture_ns, item.received_ns)
-        if packet.on_time:  # of one that waited behind a hole the time says nothing
+        if arrival.on_time:  # of one that waited behind a hole the time says nothing
             at_ns = item.received_ns
             delay_ms = self.reception.delay_ms(header.capture_ns, at_ns)
             self.reception.base(header, size_bytes=item.size_bytes, arrived_ns=at_ns, delay_ms=delay_ms)
-        good = self._access_unit(header, item, decode=decode, starts_run=packet.arrival.starts_run)
+        good = self._access_unit(header, item, decode=decode, starts_run=arrival.starts_run)
         self.reception.time(Channel.BASE, item, header, handled=good and decode)
         return good
 

@@ -28,7 +28,6 @@ from hvt_edge.perception.shadow import Detected
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.link.reassemble import Arrival as AccessUnitArrival
-from hvt_ground.link.receiver import BasePacket
 from hvt_ground.perception.detector_thread import DetectorThread
 from hvt_ground.perception.models import ModelFacts
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
@@ -252,8 +251,8 @@ class GroundSide:
         starts = not self._decoded
         self._decoded = True
         item = arrival.message
-        unit = AccessUnitArrival("decode", header, item.payload, arrival.arrival_ns, starts_run=starts)
-        whole = self._session.base(BasePacket(unit, item, on_time=True))
+        unit = AccessUnitArrival("decode", header, item, arrival.arrival_ns, starts_run=starts)
+        whole = self._session.base(unit)
         assert whole, f"the base frame {header.frame_index} cannot be decoded"
         self._answer(arrival)
         found = self._watch.take_found()

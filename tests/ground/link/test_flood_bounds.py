@@ -10,7 +10,6 @@ import pytest
 from hvt_common.protocol.messages import BaseHeader, RoiHeader, Status, TrackStep
 from hvt_ground.events import MessageTiming, Notice
 from hvt_ground.link.reassemble import Arrival
-from hvt_ground.link.receiver import BasePacket
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.session.session import GroundSession
 from rigs.flight import Flight, patient_worker, pipeline_of
@@ -46,8 +45,8 @@ class Rig:
         for index in range(3):
             item = flight.base(index)
             header = BaseHeader.parse(item.attachment, item.payload)
-            unit = Arrival("decode", header, item.payload, item.received_ns, starts_run=index == 0)
-            assert self.session.base(BasePacket(unit, item, on_time=True))
+            unit = Arrival("decode", header, item, item.received_ns, starts_run=index == 0)
+            assert self.session.base(unit)
 
     def step(self, item, **lies) -> int:
         """Take a report of tracks; how many there have been."""

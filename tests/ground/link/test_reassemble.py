@@ -105,7 +105,7 @@ def assert_decodable(out):
 def test_a_whole_stream_is_decoded_whole(running):
     """A clean link would lose frames, or the payload would not reach the decoder as it was."""
     assert running.decoded() == [0, 1, 2, 3]
-    assert [unit.payload for unit in running.out] == [b"1/0", b"1/1", b"1/2", b"1/3"]
+    assert [unit.message for unit in running.out] == [b"1/0", b"1/1", b"1/2", b"1/3"]
     assert [unit.starts_run for unit in running.out] == [True, False, False, False]
     assert running.out[0].starts_session
     assert not running.wants()

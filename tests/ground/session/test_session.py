@@ -232,7 +232,7 @@ def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
         rig.put(flight.base(3))  # the very unit, whole this time
         rig.settle()
         assert session.frames_decoded == 4
-    counters = rig.ended[0].counters
+    counters = rig.ended[0].reception.counters
     assert (counters.corrupt, counters.duplicates + counters.replayed) == (1, 2)
 
 

@@ -58,15 +58,14 @@ sys.path[:0] = sys.argv[1:]
 from dataclasses import replace
 from rigs.flight import Flight, pipeline_of
 from hvt_common.protocol.messages import BaseHeader
-from hvt_ground.link.receiver import BasePacket
 from hvt_ground.link.reassemble import Arrival
 from hvt_ground.session.session import GroundSession
 (bomb,) = pickle.load(sys.stdin.buffer)
 flight = Flight(2)
 session = GroundSession(flight.info(), pipeline_of=pipeline_of, clock=time.time_ns)
 def take(header, item):
-    unit = Arrival("decode", header, item.payload, item.received_ns, starts_run=True)
-    return session.base(BasePacket(unit, item, on_time=True))
+    unit = Arrival("decode", header, item, item.received_ns, starts_run=True)
+    return session.base(unit)
 first = flight.base(0)
 header = BaseHeader.parse(first.attachment, first.payload)
 assert take(header, first)
