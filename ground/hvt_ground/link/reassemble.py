@@ -26,7 +26,7 @@ where nothing comes but old numbers that have not been here: somebody else has c
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
 
 from hvt_common.protocol.messages import BaseHeader
@@ -76,7 +76,7 @@ class Arrival(Generic[T]):
 
 @dataclass(slots=True)
 class StreamCounters:
-    """Totals since the start, over all sessions."""
+    """Totals since whoever reads them has set new ones."""
 
     gaps: int = 0
     """Holes in the sequence that were given up."""
@@ -88,15 +88,6 @@ class StreamCounters:
     corrupt: int = 0
     """Reported by the caller: the header could not be read, or the CRC was wrong."""
     keyframe_requests: int = 0
-
-    def since(self, before: StreamCounters) -> StreamCounters:
-        """The counts since ``before`` was copied."""
-        return StreamCounters(
-            **{
-                one.name: getattr(self, one.name) - getattr(before, one.name)
-                for one in fields(StreamCounters)
-            }
-        )
 
 
 class Reassembler(Generic[T]):

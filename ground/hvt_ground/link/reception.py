@@ -72,7 +72,7 @@ class Reception:
         self.capture_clock, self.pose_clock = CaptureClock(edge_clock), CaptureClock(edge_clock)
         """Of the camera and of the source of poses."""
         self.counters = StreamCounters()
-        """What the reassembly counted in this session."""
+        """What the reassembly counted since the session before."""
         self.sequences = StillSequenceWindow()
         self.frames = self.stills = self.steps = 0
         """Received; the last are reports of the edge's tracks."""

@@ -6,7 +6,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 
 from hvt_common import __version__
@@ -97,8 +96,6 @@ class EdgeSessions:
             port.report, clock=self._clock, clock_offset=self._clock_offset, backlog=self.backlog
         )
         self.receiver = Receiver(port.edge, clock=self._clock, versions=versions)
-        self._counted = StreamCounters()
-        """When the session before ended."""
         self._ended_ns: int | None = None
         """When the edge said that the open session has ended."""
         self._ended_id: int | None = None
@@ -155,7 +152,6 @@ class EdgeSessions:
         if session.take_resumed():
             self.port.request_keyframe()
         session.worker.raise_error()
-        session.reception.counters = self.receiver.stream.counters.since(self._counted)
         paused = self._backlog_ns is not None and now_ns - self._backlog_ns > _BACKLOG_PAUSE_NS
         if paused and not self.backlog.working:
             self._backlog_ns = None
@@ -300,6 +296,7 @@ class EdgeSessions:
         self._next_clock_ns = time.monotonic_ns() + _CLOCK_EVERY_NS
         log_fields(session=f"{info.session_id:016x}")
         self.session = self._open_session(info, self._reports)
+        self.session.reception.counters = self.receiver.stream.counters
         self.failures.works(self._part)
         for packet in self.receiver.take_held():
             self._route(packet)
@@ -311,8 +308,7 @@ class EdgeSessions:
         if self._ended_ns is not None:
             self._ended_id = session.info.session_id
         self._ended_ns = None
-        counters = self.receiver.stream.counters
-        session.reception.counters, self._counted = counters.since(self._counted), replace(counters)
+        self.receiver.stream.counters = StreamCounters()
         self.ended += 1
         for step in (session.close, partial(self._report_end, session), partial(self._on_ended, session)):
             try:
