@@ -275,7 +275,7 @@ class Reassembler(Generic[T]):
 
     def _leave(self) -> list[Arrival[T]]:
         # End the present session, if any; units that waited behind a hole are skipped.
-        resolved = [self._judged(unit, "skip") for _, unit in sorted(self._held.items())]
+        resolved = [self._judged(unit, "skip", on_time=False) for _, unit in sorted(self._held.items())]
         self._held.clear()
         self._synced = False
         return resolved

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (
@@ -97,9 +98,11 @@ class Receiver:
         self._other: int | None = None
         """The session of a second edge of this id that was noted last."""
         self._other_said_ns: int | None = None
-        self._status: list[Packet] = []
-        self._stills: deque[Packet] = deque(maxlen=_MOST_HELD)
-        self._poses: deque[Packet] = deque(maxlen=_MOST_HELD)
+        self._held: Mapping[type[_Message], deque[Packet]] = {
+            Status: deque(maxlen=1),
+            PoseReport: deque(maxlen=_MOST_HELD),
+            RoiHeader: deque(maxlen=_MOST_HELD),
+        }
         self._uptime = Uptime()
         self._captures = CaptureTimes()
         self._last_message_ns = time.monotonic_ns()
@@ -153,17 +156,14 @@ class Receiver:
 
     def hold(self, packet: Packet) -> None:
         """Hold a still, a pose, or the first report of a session: it may overtake the keyframe that begins it."""
-        if isinstance(packet.header, RoiHeader):
-            self._stills.append(packet)
-        elif isinstance(packet.header, PoseReport):
-            self._poses.append(packet)
-        elif isinstance(packet.header, Status) and packet.header.sequence == 0:
-            self._status = [packet]
+        header = packet.header
+        if not (isinstance(header, Status) and header.sequence > 0):
+            self._held[type(header)].append(packet)
 
     def take_held(self) -> list[Packet]:
         """Hand them out, once: the report, then poses and stills, each in the order in which they came."""
-        packets = [*self._status, *self._poses, *self._stills]
-        for held in (self._status, self._poses, self._stills):
+        packets = [*chain.from_iterable(self._held.values())]
+        for held in self._held.values():
             held.clear()
         return packets
 
