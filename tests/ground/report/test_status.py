@@ -250,7 +250,8 @@ def test_the_state_says_what_is_known_and_nothing_else(ground):
     (edge,) = maker.make([("uav-1", ground.sessions)]).edges
     assert (edge.link, edge.session.frames_received, edge.session.tracks_refined) == ("up", 5, 0)
     assert edge.session.stills_not_sent == {"base_good": 49, "cooldown": 3, "too_large": 1}
-    crossed, window_s = ground.opened[0].reception.ledger.line_bytes, ground.opened[0].info.window_ns / SECOND_NS
+    session = ground.opened[0]
+    crossed, window_s = session.reception.ledger.line_bytes, session.info.window_ns / SECOND_NS
     assert edge.session.duration_s < window_s
     assert edge.session.mean_bps == pytest.approx(8 * crossed / window_s, abs=1), (
         "986 kbps of a budget of 800"
