@@ -11,7 +11,7 @@ from hvt_common.protocol.messages import BacklogHeader, BacklogKind, WireError
 from hvt_common.values import View
 from hvt_common.video.still_codecs import StillError
 from hvt_ground.backlog.assembly import BacklogAssembly
-from hvt_ground.link.reception import Reception
+from hvt_ground.link.reception import ReceptionStatistics
 from hvt_ground.perception.stills.decode import coded_size
 from rigs.messages import BASE, INFO, ROI
 
@@ -130,7 +130,7 @@ _OTHERS |= dict.fromkeys(("clock_error_ns", "last_frame_index"), -1) | {"stills"
 def report_traces() -> Iterator[dict[str, Any]]:
     """What came and when, and the fields of the reports between."""
     for name, events in _TRACES:
-        counted = Reception(INFO, clock=int, edge_clock=ClockOffset(), emit=lambda _event: None)
+        counted = ReceptionStatistics(INFO, clock=int, edge_clock=ClockOffset(), emit=lambda _event: None)
         steps: list[dict[str, Any]] = []
         for kind, number, at_ms, delay_ms in events:
             at_ns = at_ms * 1_000_000

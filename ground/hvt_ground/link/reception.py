@@ -54,7 +54,7 @@ _MISSED_NS = 6 * SECOND_NS
 """A still that has not come for so long does not come any more: reports need not name it for ever."""
 
 
-class Reception:
+class ReceptionStatistics:
     """What came of one session: bytes, order, gaps and ages, and the figures of the receiver report.
 
     ``clock`` is Unix nanoseconds without steps, the ``now_ns`` and ``arrived_ns`` of all calls; ``emit`` takes the

@@ -37,7 +37,7 @@ from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
 from hvt_ground.link.reassemble import Arrival
-from hvt_ground.link.reception import Reception
+from hvt_ground.link.reception import ReceptionStatistics
 from hvt_ground.perception.models import NotOpenError
 from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
@@ -99,7 +99,7 @@ class GroundSession:
         self.lockstep = info.pace == "lockstep"
         self.clock_offset = ClockOffset() if reports is None else reports.clock_offset
         """Of the edge's clock."""
-        self.reception = Reception(info, clock=clock, edge_clock=self.clock_offset, emit=self._emit)
+        self.reception = ReceptionStatistics(info, clock=clock, edge_clock=self.clock_offset, emit=self._emit)
         """What came."""
         self._make_pipeline = partial(pipeline_of, self._emit)
         self._pipeline: Pipeline | None = None

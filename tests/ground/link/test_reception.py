@@ -9,7 +9,7 @@ import pytest
 
 from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader, Feedback
-from hvt_ground.link.reception import REPORT_LINE_BYTES, Reception
+from hvt_ground.link.reception import REPORT_LINE_BYTES, ReceptionStatistics
 from rigs.footprint import footprint_bytes
 from rigs.messages import INFO
 
@@ -17,13 +17,13 @@ MS = 1_000_000
 S = 1_000_000_000
 
 
-def begun(**changes) -> Reception:
+def begun(**changes) -> ReceptionStatistics:
     """A session of which nothing has come."""
     info = replace(INFO, **changes)
-    return Reception(info, clock=lambda: 0, edge_clock=ClockOffset(), emit=lambda _event: None)
+    return ReceptionStatistics(info, clock=lambda: 0, edge_clock=ClockOffset(), emit=lambda _event: None)
 
 
-def report(reception: Reception, now_ns: int) -> Feedback:
+def report(reception: ReceptionStatistics, now_ns: int) -> Feedback:
     """What the edge is told."""
     others = {"receiver_id": 1, "sequence": 0, "clock_offset_ns": 0, "clock_error_ns": -1, "backlog": ()}
     return reception.feedback(now_ns, last_frame_index=-1, stills=(), **others)
@@ -107,7 +107,7 @@ def test_memory_is_bounded():
     assert sizes[-1] < 1.1 * sizes[0]
 
 
-def missing(reception: Reception, *, now_s: float = 1.0) -> tuple[int, ...]:
+def missing(reception: ReceptionStatistics, *, now_s: float = 1.0) -> tuple[int, ...]:
     """What a report would name."""
     return report(reception, round(now_s * S)).missing_stills
 
@@ -187,7 +187,7 @@ def test_a_forged_number_of_a_still_hides_no_true_one():
 class Progress(int):
     """A time that somebody reckons with just when a still comes in another thread."""
 
-    reception: Reception
+    reception: ReceptionStatistics
     threads: list[threading.Thread]
 
     def __sub__(self, other):
@@ -220,7 +220,7 @@ def test_a_still_may_come_while_a_report_is_made():
 def test_a_time_of_the_future_does_not_stop_the_measurement():
     """One forged frame would leave the numbers of the link as they were for the rest of the flight."""
     given, due = [], []
-    reception = Reception(INFO, clock=lambda: 0, edge_clock=ClockOffset(), emit=given.append)
+    reception = ReceptionStatistics(INFO, clock=lambda: 0, edge_clock=ClockOffset(), emit=given.append)
     for at_ns in (0, 100 * MS, 500 * MS, 10**6 * S, 600 * MS, 900 * MS, 1100 * MS):
         one = replace(header(0), capture_ns=at_ns)
         before = len(given)
