@@ -52,8 +52,6 @@ from hvt_edge.world import World
 _GOODBYE_S = 1.5
 _STUCK_S = 5.0
 """A loop that has not turned for so long, and two frames longer, hangs."""
-_SILENT_S = 3.0
-"""A source that has given no frame for so long, likewise, has failed."""
 
 
 class Edge:
@@ -190,7 +188,7 @@ class Edge:
                     break
                 stages.status.send_pending()
                 if source.restarts != restarts:  # another picture than the last
-                    restarts = source.restarts
+                    restarts, self._counts.resumed_ns = source.restarts, self._world.clock()
                     stages.link.keyframes.require(self._loop_clock())
                 if frame is not None:
                     self._counts.newest_came_ns = self._world.clock()
@@ -264,15 +262,14 @@ class Edge:
         return source
 
     def _health_server(self, address: str) -> AbstractContextManager[object]:
-        frame_s = 1 / self._config.nominal_fps
         return health_server(
             "edge",
             address,
             lambda: None if self._heartbeat is None else self._heartbeat.state,
             clock=self._world.clock,
-            stuck_s=_STUCK_S + 2 * frame_s,
+            stuck_s=_STUCK_S + 2 / self._config.nominal_fps,
             failures=self._failures,
-            lacks=lambda state: lacks(state, patience_s=_SILENT_S + 2 * frame_s),
+            lacks=lacks,
         )
 
     def _say_goodbye(self, stages: Stages, link: EdgeLink) -> None:

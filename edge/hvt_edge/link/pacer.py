@@ -82,9 +82,15 @@ class Pacer:
         return self._round_trip_ns
 
     @property
-    def measured_round_trip_ns(self) -> int | None:
-        """The same; None until one was measured."""
-        return None if self._round_trip.empty else self._round_trip_ns
+    def measures(self) -> bool:
+        """Whether a round trip was measured, of the present receiver."""
+        return not self._round_trip.empty
+
+    def measured_now(self, now_ns: int) -> bool:
+        """Whether that, and the rate, are of now: no report, or no frame that one could name, measures nothing."""
+        with self._lock:
+            reports = self._reported_ns is not None and now_ns - self._reported_ns <= _SILENCE_NS
+            return self.measures and reports and now_ns - self._progress_ns <= _MEMORY_NS
 
     @property
     def at_ceiling(self) -> bool:

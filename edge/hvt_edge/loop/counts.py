@@ -148,6 +148,8 @@ class FrameCounts:
     """How long the clock of a clip stood still, because the machine was too slow to play it in real time."""
     newest_came_ns: int | None = None
     """When the source gave the newest frame; None before the first."""
+    resumed_ns: int = 0
+    """When it was opened again."""
     last_index: int = -1
     first_capture_ns: int | None = None
     last_capture_ns: int = 0

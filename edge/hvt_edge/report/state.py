@@ -32,6 +32,8 @@ from hvt_edge.stills.stage import StillStage
 
 _LEAST_OLD_S = 1.5
 """Boxes that are younger are not called old."""
+_SILENT_S = 3.0
+"""A source that has given no frame for so long, and two frames longer, has failed."""
 _ZONES = "sys/class/thermal/thermal_zone*/temp"
 _WIRELESS = "proc/net/wireless"
 _HEAD_LINES = 2
@@ -196,7 +198,8 @@ class EdgeState:
     """Mean of one frame, since the start; like the next."""
     perception_ms: float | None
     boxes_age_s: float | None
-    """From the picture in which objects were last searched for to the newest one; None before the first search."""
+    """From the picture in which objects were last searched for to the newest one; None before the first search, and
+    while no picture comes."""
     detection_slow: bool
     """Boxes are older than they would be if detection had its time."""
     cores_needed: float | None
@@ -215,15 +218,32 @@ class EdgeState:
         return found
 
 
-def lacks(state: EdgeState, *, patience_s: float) -> str:
+def lacks(state: EdgeState) -> str:
     """Why an edge whose loop turns sends no pictures; empty for no reason."""
     if state.state == "waiting":
         return "it waits for a ground"
-    silent_s = state.source_silent_s
-    if silent_s is not None and silent_s < patience_s:
+    silent_s, operating = state.source_silent_s, state.operating
+    if silent_s is not None and silent_s < _patience_s(operating.fps * operating.decimation):
         return ""
     said = "no picture yet" if silent_s is None else f"no picture for {silent_s:.0f} s"
     return "; ".join([said, *(f"{one.part}: {one.reason}" for one in state.failed if one.part == "source")])
+
+
+def _patience_s(fps: float) -> float:
+    return _SILENT_S + 2 / fps
+
+
+def boxes_age_s(
+    detected_ns: int | None, *, newest_ns: int | None, resumed_ns: int, silent: bool, usual_s: float
+) -> tuple[float | None, bool]:
+    """See `EdgeState.boxes_age_s`, and whether detection is slow; ``usual_s`` is their age where it has its time.
+
+    ``resumed_ns``: when the source last gave pictures again; before, there was nothing to search.
+    """
+    if newest_ns is None or detected_ns is None or silent:
+        return None, False
+    age_s = max(0, newest_ns - detected_ns) / SECOND_NS
+    return age_s, min(age_s, (newest_ns - resumed_ns) / SECOND_NS) > usual_s
 
 
 @dataclass(eq=False)
@@ -277,7 +297,15 @@ class Heartbeat:
         total_bps = self._bps(None)
         outcomes = Counter(ledger.outcomes("deferred")) + Counter(ledger.outcomes("dropped"))
         came_ns = counts.newest_came_ns
-        boxes_age_s = self._boxes_age_s()
+        silent_s = None if came_ns is None else max(0.0, (now_ns - came_ns) / SECOND_NS)
+        lockstep = config.pace == "lockstep"
+        age_s, slow = boxes_age_s(
+            analyzer.detected_ns,
+            newest_ns=self.loop_clock() if lockstep else came_ns,
+            resumed_ns=counts.resumed_ns,
+            silent=not lockstep and (silent_s or 0.0) > _patience_s(config.nominal_fps),
+            usual_s=self._usual_age_s(),
+        )
         return EdgeState(
             at_ns=now_ns,
             version=__version__,
@@ -285,7 +313,7 @@ class Heartbeat:
             edge=config.edge_id,
             session=f"{self.session_id:016x}",
             state=phase,
-            lockstep=config.pace == "lockstep",
+            lockstep=lockstep,
             duration_s=counts.duration_s(config.nominal_fps),
             method=now.method,
             levers=now.levers,
@@ -312,7 +340,7 @@ class Heartbeat:
                 encoded=counts.encoded,
                 unanalyzed=counts.unanalyzed,
             ),
-            source_silent_s=None if came_ns is None else max(0.0, (now_ns - came_ns) / SECOND_NS),
+            source_silent_s=silent_s,
             keyframes=self.stills.keyframes.sent,
             keyframe_requests=self.stills.keyframes.served,
             stills_sent=sum(ledger.outcomes("sent").values()),
@@ -322,8 +350,8 @@ class Heartbeat:
             tracks=analyzer.tracks,
             encode_ms=counts.encode_ms if counts.encoded else None,
             perception_ms=analyzer.mean_ms if analyzer.frames else None,
-            boxes_age_s=boxes_age_s,
-            detection_slow=boxes_age_s is not None and boxes_age_s > self._usual_age_s(),
+            boxes_age_s=age_s,
+            detection_slow=slow,
             cores_needed=None if cores == Cores() else cores.needed,
             cores_free=None if cores == Cores() else cores.free,
             system=read_system(),
@@ -331,14 +359,6 @@ class Heartbeat:
             backlog=None if self.backlog is None else _backlog(self.backlog),
             failed=self.failures.now,
         )
-
-    def _boxes_age_s(self) -> float | None:
-        # A source that gives no pictures makes no box older than its picture.
-        newest_ns = self.loop_clock() if self.config.pace == "lockstep" else self.counts.newest_came_ns
-        detected_ns = self.stills.analyzer.detected_ns
-        if newest_ns is None or detected_ns is None:
-            return None
-        return max(0.0, (newest_ns - detected_ns) / SECOND_NS)
 
     def _usual_age_s(self) -> float:
         # Twice the time between two detections, which wait for frames that are coded.
@@ -355,15 +375,15 @@ class Heartbeat:
         ground = link.has_ground()
         if ground != self._ground:
             self._ground, self._since_ns = ground, now_ns
-        round_trip_ns = None if pacer is None else pacer.measured_round_trip_ns
+        measured = pacer if pacer is not None and pacer.measured_now(now_ns) else None
         return LinkState(
             ground=ground,
             since_ns=self._since_ns,
             watched=link.has_subscriber(Channel.BASE),
             trouble=link.trouble or None,
             reported_s=None if reported_ns is None else max(0, now_ns - reported_ns) / SECOND_NS,
-            round_trip_ms=None if round_trip_ns is None else round_trip_ns / 1e6,
-            rate_bps=None if pacer is None or round_trip_ns is None else pacer.rate_bps,
+            round_trip_ms=None if measured is None else measured.round_trip_ns / 1e6,
+            rate_bps=None if measured is None else measured.rate_bps,
             unusable_messages=link.unusable,
         )
 

@@ -201,7 +201,7 @@ def status_text(state: EdgeState, *, paused_s: float = 0.0) -> str:
     if state.levers.says:
         parts.append(state.levers.says)
     if state.detection_slow:
-        parts.append(f"boxes {state.boxes_age_s:.1f} s old: detection is too slow")
+        parts.append(f"boxes {state.boxes_age_s:.1f} s behind: detection is too slow")
     if paused_s:
         parts.append(f"clip {paused_s:.0f} s longer: slow machine")
     parts += [f"{one.part.upper()} FAILED" for one in state.failed]

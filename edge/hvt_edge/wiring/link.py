@@ -130,7 +130,7 @@ def make_least_link(config: EdgeConfig, line: Transmitter) -> LeastLink | None:
         return None
 
     def unreported_bytes() -> int:
-        return 0 if pacer.measured_round_trip_ns is None else line.in_flight.size_bytes
+        return line.in_flight.size_bytes if pacer.measures else 0
 
     return LeastLink(config.floor_bps, unreported_bytes=unreported_bytes)
 

@@ -23,7 +23,7 @@ _GAUGES: Table[EdgeState] = {
     "hvt_edge_source_silent_seconds": ("Since its last frame.", lambda one: one.source_silent_s),
     "hvt_edge_encode_seconds": ("A picture at the edge.", lambda one: seconds(one.encode_ms)),
     "hvt_edge_detect_seconds": ("A detection at the edge.", lambda one: seconds(one.perception_ms)),
-    "hvt_edge_boxes_age_seconds": ("Since the last detection.", lambda one: one.boxes_age_s),
+    "hvt_edge_boxes_age_seconds": ("Behind the newest picture.", lambda one: one.boxes_age_s),
     "hvt_edge_stills_pending": ("Stills in the edge's queue.", lambda one: one.stills_pending),
     "hvt_edge_stills_in_flight": ("Sent, not reported.", lambda one: one.stills_in_flight),
     "hvt_edge_tracks": ("Distinct tracks of the session.", lambda one: one.tracks),

@@ -75,7 +75,7 @@ def _takes(state: dict[str, Any]) -> str:
     return _listed(
         _known(state["encode_ms"], "{:.1f} ms to code a frame"),
         _known(state["perception_ms"], "{:.1f} ms to analyze one"),
-        _known(state["boxes_age_s"], "boxes {:.1f} s old"),
+        _known(state["boxes_age_s"], "boxes {:.1f} s behind"),
         _known(state["cores_needed"], "{:.1f} cores"),
         _known(state["cores_free"], "{:.1f} free"),
     )

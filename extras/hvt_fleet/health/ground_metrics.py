@@ -40,7 +40,7 @@ _GAUGES: Table[SessionState] = {
         lambda one: one.pose.longitude_deg if one.pose else None,
     ),
     "hvt_pose_age_seconds": (
-        "Of that place at the newest picture.",
+        "Of that place.",
         lambda one: one.pose.age_s if one.pose else None,
     ),
     "hvt_tracks": ("Distinct tracks of the session.", lambda one: one.tracks),

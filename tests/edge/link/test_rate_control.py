@@ -574,6 +574,25 @@ def test_a_receiver_that_has_left_is_forgotten_and_the_rate_stays_at_its_least()
     assert world.pacer.rate_bps == 100_000
 
 
+def test_a_round_trip_and_a_rate_are_of_now_or_not_known():
+    """Status, metrics and ``hvt-edge status`` showed those of minutes ago while the camera or the ground was away."""
+    pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
+    pacer.link(True, now_ns=0)
+    assert not pacer.measured_now(0)
+    known = []
+    for second in range(30):
+        if second in (0, 25):  # between, the camera is away
+            pacer.sent_base(second, 2_000, now_ns=second * S, keyframe=True)
+        if second != 28:  # a report is lost
+            named = 25 * (second >= 25)
+            pacer.on_report(
+                counted(report(second, base=named), now_ns=second * S + 20 * MS, first=not second)
+            )
+        known.append(pacer.measured_now(second * S + 30 * MS))
+    assert known == [True] * 15 + [False] * 10 + [True] * 5
+    assert not pacer.measured_now(32 * S), "the ground is silent"
+
+
 def test_a_link_that_comes_back_is_noticed_once():
     """No keyframe would come, and the ground would wait for one."""
     world = World(steps((0, 1e6))).run(5)

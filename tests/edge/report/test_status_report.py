@@ -5,13 +5,34 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from hvt_common.protocol.edge_words import FrameAccount
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import Status
 from hvt_common.runtime.failures import Failures
+from hvt_edge.report.state import boxes_age_s
 from hvt_edge.report.status import StatusReporter
 
 DAY_S = 86_400
+S = 1_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("newest_ns", "resumed_ns", "silent", "found"),
+    [
+        (11 * S, 0, False, (1.0, False)),
+        (13 * S, 0, False, (3.0, True)),
+        (13 * S, 0, True, (None, False)),
+        (50 * S, 49 * S, False, (40.0, False)),
+        (52 * S, 49 * S, False, (42.0, True)),
+        (None, 0, False, (None, False)),
+    ],
+)
+def test_a_camera_that_was_away_makes_no_boxes_new_and_no_detector_slow(newest_ns, resumed_ns, silent, found):
+    """Half a minute without a picture read "boxes 0.0 s old", and the first one after it "detection is too slow"."""
+    times = {"newest_ns": newest_ns, "resumed_ns": resumed_ns, "silent": silent, "usual_s": 2.0}
+    assert boxes_age_s(10 * S, **times) == found
 
 
 def test_numbers_that_a_report_cannot_say_end_no_flight():

@@ -199,14 +199,14 @@ def test_a_machine_too_slow_to_detect_says_how_old_its_boxes_are(address, free_p
         assert state(address)["tracks"] >= 1
         assert series(asked(address, "/metrics")[1])["hvt_edge_boxes_age_seconds"] > 1
         eventually(
-            lambda: "s old" in " ".join(status("--at", address)[1].replace("│", " ").split()),
+            lambda: "s behind" in " ".join(status("--at", address)[1].replace("│", " ").split()),
             what="`hvt-edge status` says it",
         )
         said: list[str] = []
 
         def told() -> bool:
             said.append(capsys.readouterr().err)
-            return " s old: detection is too slow" in "".join(said)
+            return " s behind: detection is too slow" in "".join(said)
 
         eventually(told, what="the status line says it, too")
     finally:
