@@ -100,14 +100,14 @@ class _Tries:
     _: KW_ONLY
     pixels: Image | None = None
     """The crop made smaller; None at its own size."""
-    done: dict[int, _Tried] = field(default_factory=dict)
+    done: dict[int, CodedCrop] = field(default_factory=dict)
     _gains: dict[int, float] = field(default_factory=dict)
 
     def at(self, quality_pct: int) -> _Tried:
+        pixels = self._coded_bgr
         if quality_pct not in self.done:
-            coded = self.codec.encode(self._coded_bgr, quality_pct=quality_pct, base_bgr=None)
-            self.done[quality_pct] = self._tried(coded, quality_pct)
-        return self.done[quality_pct]
+            self.done[quality_pct] = self.codec.encode(pixels, quality_pct=quality_pct, base_bgr=None)
+        return _Tried(self.done[quality_pct], quality_pct, (pixels.shape[1], pixels.shape[0]))
 
     def gain_db(self, one: _Tried) -> float:
         """The gain in closeness to the source over the base, at the crop's own size."""
@@ -129,20 +129,18 @@ class _Tries:
     def fitting(self, limit_bytes: int, *, most_pct: int) -> _Tried | None:
         """The best quality up to ``most_pct`` that fits."""
         found = best_fitting(
-            self.codec, self._coded_bgr, limit_bytes=limit_bytes, low_pct=_FLOOR_PCT, high_pct=most_pct
+            self.codec,
+            self._coded_bgr,
+            limit_bytes=limit_bytes,
+            low_pct=_FLOOR_PCT,
+            high_pct=most_pct,
+            tried=self.done,
         )
-        if found is None:
-            return None
-        self.done[found[1]] = one = self._tried(*found)
-        return one
+        return None if found is None else self.at(found[1])
 
     @property
     def _coded_bgr(self) -> Image:
         return self.job.crop_bgr if self.pixels is None else self.pixels
-
-    def _tried(self, coded: CodedCrop, quality_pct: int) -> _Tried:
-        height, width = self._coded_bgr.shape[:2]
-        return _Tried(coded, quality_pct, (width, height))
 
 
 def _as_good(tries: _Tries, wanted: _Tried, limit_bytes: int) -> _Tried | None:
@@ -162,7 +160,7 @@ def _lower(tries: _Tries, wanted: _Tried, limit_bytes: int) -> _Tried | None:
     # Below the requested quality, if that still beats the base.
     if wanted.size_bytes <= limit_bytes:
         return None
-    found = tries.fitting(limit_bytes, most_pct=wanted.quality_pct - 1)
+    found = tries.fitting(limit_bytes, most_pct=wanted.quality_pct)
     return found if tries.beats_base(found) else None
 
 
@@ -204,12 +202,12 @@ def _note(best: _Tried, wanted: _Tried, capacity: Capacity) -> str:
 
 
 def _refusal(tries: _Tries, wanted: _Tried, capacity: Capacity) -> str:
-    better = list(filter(tries.beats_base, tries.done.values()))
-    if not better and wanted.size_bytes > capacity.most_bytes:
-        better = list(filter(tries.beats_base, [tries.at(_BEST_PCT)]))
-    if not better:
+    smallest_first = sorted(map(tries.at, tries.done), key=lambda one: one.size_bytes)
+    least = next(filter(tries.beats_base, smallest_first), None)
+    if least is None and wanted.size_bytes > capacity.most_bytes and tries.beats_base(tries.at(_BEST_PCT)):
+        least = tries.at(_BEST_PCT)
+    if least is None:
         return "the video already shows it as well as the source does"
-    least = min(better, key=lambda one: one.size_bytes)
     (width, height), shrink = wanted.size, 0.9 * math.sqrt(capacity.most_bytes / least.size_bytes)
     smaller = int(width * shrink), int(height * shrink)
     advice = f"ask for a smaller region, {smaller[0]}x{smaller[1]} or so"

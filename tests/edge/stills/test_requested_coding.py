@@ -108,6 +108,21 @@ def test_what_the_video_shows_as_well_is_refused_and_what_is_too_large_says_what
         code_requested(job(as_base(70)), codec=JPEG, capacity=Capacity(0, 0, 150_000))
 
 
+def test_a_refusal_names_the_least_that_shows_more_and_no_coding_is_made_twice():
+    """Who is told of the bytes at the usual quality asks for a smaller region than need be; AVIF takes .5 s each."""
+    made: list[tuple[int, int]] = []
+
+    class Counting(JpegCodec):
+        def encode(self, crop_bgr, *, quality_pct, base_bgr=None):
+            made.append((crop_bgr.shape[1], quality_pct))
+            return super().encode(crop_bgr, quality_pct=quality_pct, base_bgr=base_bgr)
+
+    least_kb = len(JPEG.encode(CROP, quality_pct=20).data) / 1000
+    with pytest.raises(RefusedError, match=f"^240x160 pixels take {least_kb:.1f} kB to show more"):
+        code_requested(job(as_base(5)), codec=Counting(), capacity=Capacity(300, 500, 5_000))
+    assert len(made) == len(set(made))
+
+
 @settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),

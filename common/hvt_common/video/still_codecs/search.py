@@ -33,22 +33,26 @@ def best_fitting(
     low_pct: int,
     high_pct: int,
     base_bgr: Image | None = None,
+    tried: dict[int, CodedCrop] | None = None,
 ) -> tuple[CodedCrop, int] | None:
     """The best quality from ``low_pct`` to ``high_pct`` (both included) whose data is at most ``limit_bytes``.
 
-    With that quality in percent; None where nothing fits. ``base_bgr``: see `StillCodec.encode`.
+    With that quality in percent; None where nothing fits. ``base_bgr``: see `StillCodec.encode`. ``tried`` are
+    codings of this crop by quality: none is made again, and those that are made come in.
     """
     best = [steps[-1] for steps in _steps(codec, low_pct, high_pct)]
-    tried: dict[int, CodedCrop] = {}
+    tried = {} if tried is None else tried
 
     def excess(place: int) -> float:
         """Of the logarithm of the size; above 0 where it does not fit."""
-        tried[place] = coded = codec.encode(crop_bgr, quality_pct=best[place], base_bgr=base_bgr)
-        return math.log((len(coded.data) + 0.5) / (limit_bytes + 1))
+        quality_pct = best[place]
+        if quality_pct not in tried:
+            tried[quality_pct] = codec.encode(crop_bgr, quality_pct=quality_pct, base_bgr=base_bgr)
+        return math.log((len(tried[quality_pct].data) + 0.5) / (limit_bytes + 1))
 
     # Most often the best fits at once.
     found = _first_above(excess, len(best), first=len(best) - 1, rise=_WHOLE_SIZE / max(1, len(best))) - 1
-    return (tried[found], best[found]) if found in tried else None
+    return (tried[best[found]], best[found]) if found >= 0 else None
 
 
 def smallest_reaching(
