@@ -326,6 +326,7 @@ class BaseStage:
                     f"{self.encoder_name} failed {_MOST_FAILURES} times within {_FAILURES_NS // SECOND_NS} s "
                     f"({error}): there is no video without it, and another start may help"
                 ) from error
+            error.__traceback__ = None  # its frames hold the encoder, and with it its device
             try:
                 self.encoder = self.open_again()
             except Exception as again:  # noqa: BLE001 - another failure of the same kind

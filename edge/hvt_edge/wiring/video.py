@@ -200,8 +200,9 @@ def encoder_opener(
 
     def open_for(rates: Rates) -> Encoder:
         nonlocal last
-        if isinstance(last, BaseEncoder | CheckedEncoder):
-            last.close()
+        before, last = last, None  # it may be that no other opens now
+        if isinstance(before, BaseEncoder | CheckedEncoder):
+            before.close()
         last = encoder = make_encoder(
             config, rates, size=size, preset=operating.now.preset, headroom=headroom
         )

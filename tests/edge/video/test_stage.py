@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import weakref
 from dataclasses import replace
 
 import av
@@ -16,15 +17,19 @@ from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit, Frame
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.config import EdgeConfig, least_budget_bps
+from hvt_edge.config import EdgeConfig, check, least_budget_bps
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.operating import Rates
 from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings
+from hvt_edge.video.encoders.hardware import HardwareEncoder
+from hvt_edge.video.encoders.registry import CheckedEncoder, Encoder
 from hvt_edge.video.rate_model import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.x265 import BaseEncoder, TrackRegions, encoder_context
+from hvt_edge.wiring import video
 from media.clips import START_NS, framed, hard_pictures, smooth_pictures
 from rigs.flight import tracks_at
-from rigs.world import Puts, make_base_stage, make_transmitter
+from rigs.world import Puts, make_base_stage, make_operating, make_transmitter
 
 SIZE = (320, 192)
 SECOND_NS = 1_000_000_000
@@ -201,6 +206,34 @@ def test_three_failures_in_ten_seconds_end_the_process_with_a_sentence():
     rig = Rig()
     slow = [replace(frame, capture_ns=START_NS + frame.index * 4 * SECOND_NS) for frame in frames]
     assert stepped(rig, slow) == [0, 1, 2, 4, 6, 8, 9, 10, 11], "three in a minute do not"
+
+
+def test_the_device_of_an_encoder_that_failed_is_free_before_each_try_to_open_another(monkeypatch):
+    """A board whose encoder stumbled once, and takes one at a time, would end the flight."""
+    there: weakref.WeakSet[Encoder] = weakref.WeakSet()
+    busy: list[int] = []
+
+    class Broken(HardwareEncoder):
+        def __init__(self) -> None:
+            there.add(self)
+
+        def encode(self, frame, *, keyframe=False, regions=()):
+            raise ValueError("the device hangs")
+
+    def make(*_given, **_settings) -> Encoder:
+        busy.append(len(there))
+        if len(busy) == 2:
+            raise UserError("not at this moment")
+        return CheckedEncoder(Broken()) if len(busy) == 1 else BaseEncoder(SETTINGS)
+
+    monkeypatch.setattr(video, "make_encoder", make)
+    config = check(EdgeConfig(source="demo"))
+    operating, rates = make_operating(config), Rates(800_000, 400_000, 1)
+    opened = video.encoder_opener(config, operating, size=SIZE, headroom=1.0, presets=None)
+    rig = Rig()
+    rig.stage.encoder, rig.stage.open_again = opened(rates), lambda: opened(rates)
+    assert stepped(rig, framed(smooth_pictures(3, size=SIZE))) == [1, 2]
+    assert busy == [0, 0, 0]
 
 
 def test_in_lockstep_a_failing_encoder_is_an_error():
