@@ -181,11 +181,13 @@ class OnDemandStill(OutboxStill):
     """The budget had room for it, and the link had not, when that was last tried."""
     on_demand: OnDemandRequest = OnDemandRequest()
 
-    def repeats(self, request: OnDemandRequest, capture_ns: int) -> bool:
-        """Whether a request, for a frame of that time, is this one once more."""
-        if request != self.on_demand or self.state is not StillState.PENDING or self.job is None:
-            return False
-        return abs(capture_ns - self.job.header.capture_ns) <= _AGAIN_NS
+    def frame_if_again(self, request: OnDemandRequest, capture_ns: int) -> int | None:
+        """The index of its frame where a request, for a frame of that time, is this one once more."""
+        job = self.job  # which goes as it is sent, in another thread
+        if request != self.on_demand or self.state is not StillState.PENDING or job is None:
+            return None
+        near = abs(capture_ns - job.header.capture_ns) <= _AGAIN_NS
+        return job.header.frame_index if near else None
 
 
 @dataclass(eq=False)
@@ -238,8 +240,9 @@ class OnDemand:
         frame = frame_for(request, self.ring)
         with self._lock:
             last = self._last
-            if last is not None and last.repeats(request, frame.capture_ns):
-                return last.number, last.crop.header.frame_index
+            again = None if last is None else last.frame_if_again(request, frame.capture_ns)
+            if last is not None and again is not None:
+                return last.number, again
         self._check_queue()
         if request.track_id is not None:
             self._want_tracks(frame.capture_ns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -158,6 +159,26 @@ def test_a_request_whose_answer_was_lost_is_the_same_still():
     rig.run(150)
     assert len(rig.asked()) == 2
     assert rig.ask("still", track=5).still_request == first.still_request + 2, "another look"
+
+
+def test_the_same_request_while_its_still_goes_out_is_answered():
+    """The thread of stills takes the crop away between two looks at it, and the answer would be an error."""
+    rig = Rig("150kbps", share=0.9)
+    rig.run(30)
+    first = rig.ask("still", track=5)
+    pending = rig.outbox.on_demand
+    header = pending.crop.header
+
+    class Going:
+        frame_index = header.frame_index
+
+        @property
+        def capture_ns(self) -> int:
+            pending.job = None
+            return header.capture_ns
+
+    pending.job = SimpleNamespace(header=Going())
+    assert rig.ask("still", track=5) == first
 
 
 def test_whoever_waits_can_ask_what_became_of_it():
