@@ -180,7 +180,7 @@ class Watch(LinkWatch):
 
     def _explain(self) -> None:
         reasons = self._examine(self.config)
-        if self._stop.is_set() or not reasons:
+        if not reasons or self._check(time.monotonic()):  # it came meanwhile, or this ends
             return
         trouble = "; ".join(reasons)
         now_s = time.monotonic()

@@ -91,7 +91,11 @@ def _unreachable(place: _Place, error: OSError) -> str:
 
 def _plain(place: _Place, protocol: str) -> str:
     with closing(socket.create_connection((place.host, place.port), timeout=_STEP_S)) as tcp:
-        if _is_tls(tcp, place):
+        try:
+            tls = _is_tls(tcp, place)
+        except TimeoutError:  # Zenoh too says nothing to it
+            return "somebody listens there and says nothing: does the other side of HVT run, or stand still there?"
+        if tls:
             return (
                 f"this is a TLS port, and plain {protocol} does not get in: connect to tls/… with the keys of this "
                 "machine in --zenoh-config"
@@ -108,7 +112,7 @@ def _is_tls(tcp: socket.socket, place: _Place) -> bool:
             return True
     except ssl.SSLError as error:
         return "ALERT" in (error.reason or "")
-    except OSError:
+    except ConnectionError:
         return False
 
 
@@ -126,8 +130,8 @@ def _tls(place: _Place, files: TlsFiles) -> str:
         return _alert(error, files) or _no_tls(place)
     except TimeoutError:
         return (
-            f"what listens there does not answer TLS within {_STEP_S:g} s: it is a plain tcp/… port, or the link "
-            "carries next to nothing"
+            f"what listens there does not answer TLS within {_STEP_S:g} s: it is a plain tcp/… port, its program "
+            "stands still, or the link carries next to nothing"
         )
     except OSError:  # hung up at once
         return _no_tls(place)

@@ -11,6 +11,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import zenoh
@@ -79,7 +81,7 @@ def _server(answer: bytes | None) -> Iterator[int]:
         (b"", "does not speak TLS: connect to tcp/127.0.0.1:"),
         (
             None,
-            "does not answer TLS within 3 s: it is a plain tcp/… port, or the link carries next to nothing",
+            "does not answer TLS within 3 s: it is a plain tcp/… port, its program stands still, or the link",
         ),
     ],
     ids=["another protocol", "hangs up", "silent"],
@@ -96,6 +98,15 @@ def test_a_plain_endpoint_that_is_something_else(fleet: Fleet) -> None:
     """A web server on the port is no ground, and says nothing that Zenoh would pass on."""
     with _server(b"HTTP/1.1 400 Bad Request\r\n\r\n") as port:
         assert "no Zenoh link comes of it" in why_no_link(f"tcp/127.0.0.1:{port}", TlsFiles())
+
+
+def test_a_ground_that_stands_still_is_not_called_something_else() -> None:
+    """A ground that swaps for a moment would send its user to look for a wrong address."""
+    with _server(None) as port:
+        said = why_no_link(f"tcp/127.0.0.1:{port}", TlsFiles())
+    assert said.endswith(
+        "somebody listens there and says nothing: does the other side of HVT run, or stand still there?"
+    )
 
 
 @pytest.mark.parametrize("protocol", ["tcp", "tls"])
@@ -165,6 +176,31 @@ def test_the_watch_explains_once_and_is_quiet_when_the_link_comes(
     assert lines == [
         f"no link: {endpoint}: nobody listens on port {free_port} there: is the other side running?"
     ]
+
+
+def test_a_link_that_comes_while_its_lack_is_explored_is_not_missed(caplog: pytest.LogCaptureFixture) -> None:
+    """A ground that stood still for a moment would leave 'no link' as the last line of the log."""
+    links: list[SimpleNamespace] = []
+    looks: list[int] = []
+
+    def look() -> list[SimpleNamespace]:
+        looks.append(len(links))
+        return list(links)
+
+    def examine(_config: zenoh.Config) -> list[str]:
+        links.append(SimpleNamespace(auth_identifier=None))
+        return ["nobody is there"]
+
+    info = SimpleNamespace(
+        links=look,
+        routers_zid=list,
+        declare_link_events_listener=lambda *_, **__: SimpleNamespace(try_recv=lambda: None),
+    )
+    session = cast("zenoh.Session", SimpleNamespace(info=info))
+    settings = LinkSettings("edge", connect=("tcp/127.0.0.1:9",), name="uav-1")
+    with Watch(session, settings, served=lambda _: True, patience_s=0.05, examine=examine):
+        eventually(lambda: looks.count(1) > 1)
+    assert not caplog.records
 
 
 def test_a_second_link_that_does_not_come_is_said_once(
