@@ -20,6 +20,7 @@ from hvt_common.errors import Parser, UserError, check_not_read
 from hvt_common.runtime.reporting import say
 from hvt_ground.extras import all_extras, locators
 from hvt_ground.recordings.contract import Recorded
+from hvt_ground.sinks.rerun.stills import still_of_event
 
 _FOLDERS: dict[str, Callable[[Recorded, Path], None]] = {"coco": write_coco, "stills": write_stills}
 _SUFFIXES = {"mot": ".txt"}
@@ -67,8 +68,16 @@ def run(argv: Sequence[str]) -> int:
             write = (_FILES | brought)[kind]
         with whole_file(out, new=given.out is None) as part:
             write(recorded, part)
-    say(f"{out}: {recorded.edge}, {len(recorded.video)} pictures, {len(recorded.stills)} stills")
+    stills = f"{len(recorded.stills)} stills{_missing_stills(recorded)}"
+    say(f"{out}: {recorded.edge}, {len(recorded.video)} pictures, {stills}")
     return 0
+
+
+def _missing_stills(recorded: Recorded) -> str:
+    # Each that came has an event; a picture only as far as it was one and the recording had room.
+    came = {still_of_event(one.text) for one in recorded.notices} - {None}
+    missing = len(came) - len(recorded.stills)
+    return f"; {missing} more came whose pictures the recording does not hold" if missing > 0 else ""
 
 
 def _kind_of(out: Path | None) -> str:

@@ -20,6 +20,7 @@ from rerun.chunk import Chunk, RrdReader
 from hvt_ground.recordings.row import FileAccount, RecordingRow
 from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages, drop_footer
 from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
+from hvt_ground.sinks.rerun.stills import still_of_event
 
 SCRATCH = ".part"
 """Ends the name of a copy that is being made of a recording."""
@@ -27,7 +28,6 @@ _SPARE_BYTES = 2 * 2**20
 _PATIENCE_S = 600.0
 _VIDEO = "/base/video"
 _LAYERS = ("/base/tracks", "/base/reported", "/base/refined")
-_STILL = re.compile(r"(late )?still #(\d+) ")
 
 
 @contextmanager
@@ -128,8 +128,8 @@ class _Content:
                 self._tracks |= dict.fromkeys(zip(ids, classes, strict=False))
         elif path == "/events":
             for text in _values(chunk, "TextLog:text"):
-                if found := _STILL.match(text[0]):
-                    self._account.still(int(found[2]) + (2**31 if found[1] else 0))
+                if (number := still_of_event(text[0])) is not None:
+                    self._account.still(number)
 
     def account(self) -> FileAccount:
         """All of it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -22,6 +23,7 @@ Coded = tuple[bytes, tuple[int, int]]
 
 _FIRST_STORED = 2**31
 """Stills that were stored at the edge are numbered from here on."""
+_STILL = re.compile(r"(late )?still #(\d+) ")
 _QUALITIES_PCT = (75, 65, 55)
 _STILL_QUALITY_PCT = 85
 
@@ -176,6 +178,12 @@ def event_text(refinement: Refinement) -> str:
     number = refinement.still_sequence
     name = f"still #{number}" if number < _FIRST_STORED else f"late still #{number - _FIRST_STORED}"
     return f"{name} {outcome}  ({refinement.reason}; {size})"
+
+
+def still_of_event(text: str) -> int | None:
+    """The sequence number of the still that `event_text` tells of; None of another event."""
+    found = _STILL.match(text)
+    return None if found is None else int(found[2]) + (_FIRST_STORED if found[1] else 0)
 
 
 def still_picture(refinement: Refinement) -> Coded | None:

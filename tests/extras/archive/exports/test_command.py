@@ -182,6 +182,20 @@ def test_the_stills_come_with_what_the_base_showed(recording, events, tmp_path):
     assert any("→" in row["caption"] for row in rows)
 
 
+def test_an_export_says_how_many_stills_came_beyond_those_it_has(recording, events, tmp_path, capsys):
+    """Who counts its files would take the link or the method for worse than it was."""
+    export(recording, tmp_path / "whole.csv")
+    assert "does not hold" not in capsys.readouterr().out
+    still = next(one for one in events if isinstance(one, Refinement))
+    noise = np.random.default_rng(7).integers(0, 255, (400, 400, 3), np.uint8)  # as JPEG far more than came
+    path = tmp_path / "short.rrd"
+    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
+        for event in [*events, replace(still, still_sequence=9999, media_type="image/webp", still_bgr=noise)]:
+            recorder.log(event)
+    export(path, tmp_path / "short.csv")
+    assert "stills; 1 more came whose pictures the recording does not hold" in capsys.readouterr().out
+
+
 def test_mcap_has_video_boxes_stills_and_events(recording, events, tmp_path):
     """Foxglove would open an empty file, or show boxes of another moment."""
     found: dict[str, list] = {}
