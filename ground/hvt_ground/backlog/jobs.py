@@ -75,7 +75,8 @@ def show_video(units: Sequence[BacklogUnit], take: Take, *, worker: PerceptionWo
                         last = shown[0]
                         logged[last.frame_index] = lasts_s
                     yield
-                usable = target.able() or None
+                else:
+                    usable = target.able() or None
                 boxes = _find_boxes(units, logged.keys(), take)
                 if usable and logged and next(boxes, True) is None and not worker.submit(boxes, last=True):
                     boxes.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from contextlib import contextmanager, nullcontext
@@ -228,4 +229,17 @@ def test_what_a_failing_disk_took_along_is_new_when_it_comes_again(kind, monkeyp
     finish(getattr(outage, kind)())
     eventually(lambda: outage.said == [None, True], what="it is written")
     assert len(outage.file.written) == (30 if kind == "video" else 1)
+    outage.sink.close()
+
+
+def test_a_stretch_that_broke_off_comes_again_although_there_is_room_a_moment_later():
+    """It would be acknowledged, and its edge delete what nobody has."""
+    outage, asked = Outage(), itertools.count()
+    outage.file.ready.set()
+    outage.backlog.able = lambda: next(asked) != 10
+    finish(outage.video())
+    eventually(lambda: outage.said == [None], what="it is to come again")
+    finish(outage.video())
+    eventually(lambda: outage.said == [None, True], what="the rest is written")
+    assert outage.file.frames == list(range(30))
     outage.sink.close()
