@@ -68,15 +68,13 @@ class Arrival(Generic[T]):
     """The first unit of another session, or of one whose count was lost: reset whatever counts frames."""
     lost_before: int = 0
     """How many units were given up just before this one; above 0 it is the end of a gap."""
-    on_time: bool = True
-    """It did not wait behind a hole."""
     duplicate: bool = False
     """Foreign, and the present session goes on beside it: two edges of one name."""
 
 
 @dataclass(slots=True)
 class StreamCounters:
-    """Totals since whoever reads them has set new ones."""
+    """Counts of one session, and of what came between it and the one before."""
 
     gaps: int = 0
     """Holes in the sequence that were given up."""
@@ -204,8 +202,7 @@ class Reassembler(Generic[T]):
             if lost:
                 self._give_up(lost)
             verdict = self._take(unit := self._held.pop(first), now_ns)
-            on_time = unit.received_ns == now_ns
-            released.append(self._judged(unit, verdict, lost_before=lost, on_time=on_time))
+            released.append(self._judged(unit, verdict, lost_before=lost))
         return released
 
     def _give_up(self, lost: int) -> None:
@@ -275,7 +272,7 @@ class Reassembler(Generic[T]):
 
     def _leave(self) -> list[Arrival[T]]:
         # End the present session, if any; units that waited behind a hole are skipped.
-        resolved = [self._judged(unit, "skip", on_time=False) for _, unit in sorted(self._held.items())]
+        resolved = [self._judged(unit, "skip") for _, unit in sorted(self._held.items())]
         self._held.clear()
         self._synced = False
         return resolved
@@ -299,7 +296,6 @@ class Reassembler(Generic[T]):
         lost_before: int = 0,
         starts_session: bool = False,
         duplicate: bool = False,
-        on_time: bool = True,
     ) -> Arrival[T]:
         self.counters.duplicates += verdict == "duplicate"
         self.counters.replayed += verdict == "stale"
@@ -314,5 +310,4 @@ class Reassembler(Generic[T]):
             starts_session=starts_session,
             lost_before=lost_before,
             duplicate=duplicate,
-            on_time=on_time,
         )

@@ -153,10 +153,9 @@ class GroundSession:
         header, item = arrival.header, arrival.message
         decode = arrival.verdict == "decode"
         self._note_capture(header.capture_ns, item.received_ns)
-        if arrival.on_time:  # of one that waited behind a hole the time says nothing
-            at_ns = item.received_ns
-            delay_ms = self.reception.delay_ms(header.capture_ns, at_ns)
-            self.reception.base(header, size_bytes=item.size_bytes, arrived_ns=at_ns, delay_ms=delay_ms)
+        at_ns = item.received_ns  # its own, also where it waited behind a hole
+        delay_ms = self.reception.delay_ms(header.capture_ns, at_ns)
+        self.reception.base(header, size_bytes=item.size_bytes, arrived_ns=at_ns, delay_ms=delay_ms)
         good = self._access_unit(header, item, decode=decode, starts_run=arrival.starts_run)
         self.reception.time(Channel.BASE, item, header, handled=good and decode)
         return good

@@ -92,6 +92,32 @@ def bases(flight: Flight, *indices: int) -> list[Received]:
     return [flight.base(index) for index in indices]
 
 
+def test_a_unit_that_waited_behind_a_hole_is_reported_as_soon_as_it_is_given_out(flight):
+    """The edge would hold its next frames until it takes the link for lost."""
+    port, now_ns = Port(), [time.time_ns()]
+    port.flight = flight
+
+    def clock() -> int:
+        return now_ns[0]
+
+    sessions = EdgeSessions(
+        port,
+        open_session=lambda info, reports: GroundSession(
+            info, pipeline_of=pipeline_of, clock=clock, reports=reports, worker_of=patient_worker
+        ),
+        clock=clock,
+    )
+    for item in bases(flight, 0, 1, 2, 4):
+        now_ns[0] += 66_000_000
+        sessions.handle(replace(item, received_ns=now_ns[0]))
+    now_ns[0] += 150_000_000
+    sessions.housekeep(pending=False)
+    sessions.session.report()
+    last = port.reports[-1]
+    assert (last.base_sequence, last.base_held_us, last.lost) == (4, 150_000, 1)
+    sessions.close()
+
+
 def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
     """The operator would not see all there is; or the two sides' accounts would differ."""
     with Rig() as rig:
