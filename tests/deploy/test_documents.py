@@ -87,6 +87,8 @@ def test_files_exist(name: str) -> None:
     pattern = r"\b(?:common|edge|ground|study|lab|deploy|docs|tests)/(?!\s)[\w./@*-]*\w/?"
     named = {found.rstrip("/") for found in re.findall(pattern, text.replace("/opt/hvt/src/", ""))}
     missing = {path for path in named if "/" in path and not any(ROOT.glob(path))}
+    within = re.findall(r"`([\w/]+/\w+\.py)", text)  # a program or a room, such as hvt_edge/app.py
+    missing |= {path for path in within if not any(any(ROOT.glob(up + path)) for up in ("", "*/", "*/*/"))}
     assert missing == set()
 
 
