@@ -11,13 +11,8 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.host_names import check_port
-from hvt_fleet.checkup import (
-    Finding,
-    check_clock,
-    check_folder,
-    print_findings,
-    run_checks,
-)
+from hvt_fleet.checkup import Finding, check_clock, check_folder, print_findings, run_checks
+from programs.processes import eventually
 
 
 def refused() -> Finding:
@@ -33,20 +28,37 @@ def broken() -> Finding:
     raise ZeroDivisionError("division by zero")
 
 
-def test_one_that_fails_or_hangs_keeps_no_other_from_its_answer():
+HUNG: list[threading.Thread] = []
+
+
+class Patient(threading.Thread):
+    """Is waited for until it has ended, or hangs."""
+
+    def join(self, timeout: float | None = None) -> None:
+        """See there."""
+        assert timeout == 0.3
+        eventually(lambda: self in HUNG or not self.is_alive())
+
+
+def hanging() -> Finding:
+    HUNG.append(threading.current_thread())
+    return Finding("ok", str(threading.Event().wait()))
+
+
+def test_one_that_fails_or_hangs_keeps_no_other_from_its_answer(monkeypatch):
     """A camera that hangs would hide that the disk is full."""
-    never = threading.Event()
+    monkeypatch.setattr(threading, "Thread", Patient)
     checks = {
         "camera": refused,
         "bug": broken,
-        "hangs": lambda: Finding("ok", str(never.wait())),
+        "hangs": hanging,
         "last": lambda: Finding("ok", "it was checked"),
     }
     found = run_checks(checks, patience_s=0.3)
     assert found["camera"] == Finding("wrong", "camera /dev/video9 is not there", "name one that is")
     assert (found["bug"].state, found["bug"].found) == ("wrong", "ZeroDivisionError: division by zero")
     assert (found["hangs"].state, found["hangs"].found) == ("wrong", "no answer within 0.3 s")
-    warned = run_checks({"keys": lambda: logged("this key can be read by all")})["keys"]
+    warned = run_checks({"keys": lambda: logged("this key can be read by all")}, patience_s=0.3)["keys"]
     assert (warned.state, warned.todo) == ("warning", "this key can be read by all")
     assert found["last"] == Finding("ok", "it was checked")
 
