@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
+from typing import cast
 
 import av
 import pytest
@@ -15,6 +16,7 @@ from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.backlog.stage import BacklogStage, State
 from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.source.opening import open_source
 from hvt_edge.video.encoders.passthrough import Passthrough
@@ -91,6 +93,80 @@ def burst(tmp_path_factory):
     pictures = smooth_pictures(90, size=SIZE)
     pictures[35:50] = hard_pictures(15, size=SIZE)
     return frames_of(tmp_path_factory.mktemp("burst"), pictures, keyint=15, more="qp=28")
+
+
+LIVE, OFFLINE, RETURNING = State.LIVE, State.OFFLINE, State.RETURNING
+ANY, NO, YES = (False, True), (False,), (True,)
+ALL, LINK, STORE = ("", "link", "store"), ("link",), ("store",)
+
+# link, keyframe, where the unit before it went, admitted, probe due: where it goes. ANY, ALL: it does not matter.
+TABLE = [
+    (LIVE, YES, ALL, YES, ANY, "link"),
+    (LIVE, NO, LINK, YES, ANY, "link"),
+    (LIVE, NO, ("", "store"), YES, ANY, ""),
+    (LIVE, ANY, ALL, NO, ANY, ""),
+    (RETURNING, YES, ALL, YES, ANY, "link, resumes"),
+    (RETURNING, YES, ALL, NO, ANY, "store"),
+    (RETURNING, NO, STORE, ANY, ANY, "store"),
+    (RETURNING, NO, ("", "link"), ANY, ANY, ""),
+    (OFFLINE, YES, ALL, NO, ANY, "store"),
+    (OFFLINE, YES, ALL, YES, NO, "store"),
+    (OFFLINE, YES, ALL, YES, YES, "link, store"),
+    (OFFLINE, NO, STORE, NO, ANY, "store"),
+    (OFFLINE, NO, STORE, YES, NO, "store"),
+    (OFFLINE, NO, STORE, YES, YES, "link, store"),
+    (OFFLINE, NO, ("", "link"), ANY, ANY, ""),
+]
+
+
+class Store:
+    """As much of the backlog as a decision needs."""
+
+    state, segment_open, probes = LIVE, True, False
+
+    def probe_due(self, _now_ns: int) -> bool:
+        """As the table says."""
+        return self.probes
+
+    def resume(self) -> None:
+        """The link has the stream again."""
+
+
+def test_each_unit_goes_where_the_table_says(burst):
+    """A unit would be sent that builds on one which nobody has, or one be left out that could have gone."""
+    decided = {}
+    for *columns, goes in TABLE:
+        for row in product((columns[0],), *columns[1:]):
+            assert decided.setdefault(row, goes) == goes, "two lines of the table contradict"
+    assert len(decided) == 3 * 2 * 3 * 2 * 2
+    for (link, keyframe, before, admitted, probes), goes in decided.items():
+        room, store = [True], Store()
+        rig = Rig(admits=lambda *_, room=room: room[0], waits=False)
+        rig.stage.backlog = cast("BacklogStage", store)
+        if before:
+            store.state = LIVE if before == "link" else OFFLINE
+            rig.stage.encode(burst[0], rig.stage.decide(burst[0], now_ns=rig.now_ns), now_ns=rig.now_ns)
+        store.state, store.probes, room[0] = link, probes, admitted
+        unit, sent = replace(burst[1].camera_unit, keyframe=keyframe), rig.keyframes.sent
+        frame = replace(burst[1], camera_unit=unit)
+        decision = rig.stage.decide(frame, now_ns=rig.now_ns)
+        named = {"link": decision.to_link, "store": decision.to_store, "resumes": decision.resumes}
+        assert ", ".join(one for one, yes in named.items() if yes) == goes, (link, keyframe, before, probes)
+        assert (decision.codes, decision.keyframe) == (bool(goes), keyframe and bool(goes))
+        rig.stage.encode(frame, decision, now_ns=rig.now_ns)
+        assert rig.keyframes.sent == sent + (keyframe and bool(goes)), (
+            "the camera's own is the one that comes"
+        )
+
+
+def test_nothing_follows_a_unit_for_which_the_link_had_no_room_after_all(burst, monkeypatch):
+    """Every ground would show garbage up to the next keyframe."""
+    rig = Rig()
+    assert rig.play(burst[:3]) == [0, 1, 2]
+    with monkeypatch.context() as patched:
+        patched.setattr(rig.stage.transmitter, "base", lambda *_, **__: 0)
+        rig.play(burst[3:4])
+    assert rig.play(burst[4:18]) == [15, 16, 17]
 
 
 @pytest.mark.parametrize("waits", [True, False])
