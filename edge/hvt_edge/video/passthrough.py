@@ -103,7 +103,7 @@ class PassthroughStage(BaseStage):
             self.least_link.sent(line_bytes, now_ns=now_ns)
 
     def _leave_out(self, unit: AccessUnit) -> None:
-        self._sent_index = -2
+        self._sent_index, self._held_by = -2, "budget"
         self._note_left_out(unit)
 
     def _admitted(self, unit: AccessUnit, now_ns: int, *, live: bool) -> bool:

@@ -166,7 +166,9 @@ def test_nothing_follows_a_unit_for_which_the_link_had_no_room_after_all(burst, 
     with monkeypatch.context() as patched:
         patched.setattr(rig.stage.transmitter, "base", lambda *_, **__: 0)
         rig.play(burst[3:4])
-    assert rig.play(burst[4:18]) == [15, 16, 17]
+    decision = rig.stage.decide(burst[4], now_ns=rig.now_ns)
+    assert decision.held_by == "budget", "none was lost at the camera"
+    assert rig.play(burst[5:18]) == [15, 16, 17]
 
 
 @pytest.mark.parametrize("waits", [True, False])
