@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
@@ -59,6 +61,21 @@ def test_reports_tell_how_soon_a_keyframe_is_known_to_be_lost(tmp_path):
         soon_ns = rig.now_ns + SECOND_NS // 4
         assert rig.keyframes.request(soon_ns) is None
         assert rig.keyframes.due(soon_ns)
+    finally:
+        rig.backlog.close()
+
+
+def test_a_forged_number_of_a_still_in_a_report_takes_none_for_received(tmp_path):
+    """What the link has lost would never be sent again, nor stored when the link goes."""
+    rig = Rig(tmp_path / "store")
+    try:
+        rig.play(0, 15, reports=True)
+        rig.still(0)
+        forged = replace(rig.out.ground.report(rig.now_ns), still_sequence=2**32 - 9, missing_stills=())
+        rig.link_control.on_feedback(forged)
+        assert rig.outbox.unacknowledged == 1
+        rig.report()
+        assert rig.outbox.unacknowledged == 0
     finally:
         rig.backlog.close()
 
