@@ -19,7 +19,7 @@ from hvt_common.runtime.plug_ins import health_server
 from hvt_common.runtime.process import give_back_holes, notify_systemd
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.transport.link_doctor import LinkWatch, link_doctor
-from hvt_common.transport.session import open_session
+from hvt_common.transport.session import loses_declarations, open_session
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
@@ -138,7 +138,14 @@ class Ground:
                 group = stack.enter_context(GroundGroup(session, config.group, page=shown))
             log = next((one.message_log for one in services if one.message_log is not None), None)
             link = stack.enter_context(
-                GroundLink(session, edges=config.edges, clock=self._clock, group=group, log=log)
+                GroundLink(
+                    session,
+                    edges=config.edges,
+                    clock=self._clock,
+                    group=group,
+                    log=log,
+                    loses=loses_declarations(settings, session),
+                )
             )
             watch = stack.enter_context(link_doctor().watch(session, settings, served=link.is_known))
             self._on_started()

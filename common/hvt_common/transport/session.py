@@ -103,6 +103,29 @@ def _listening_ports() -> set[int]:
     return ports
 
 
+def loses_declarations(settings: LinkSettings, session: zenoh.Session) -> Callable[[], bool]:
+    """Whether a declaration may be lost on its way now: over UDP, here or, for all that is known, behind a router.
+
+    Zenoh makes each once, so who needs it makes it again, as `another_key` says. Not over TLS and QUIC: rights name
+    whole keys, so what one may use would be withdrawn for what one may not.
+    """
+    config = configure(settings)[0]
+    ends = "".join(str(config.get_json(f"{side}/endpoints")) for side in ("connect", "listen"))
+    if '"udp/' in ends:
+        return lambda: True
+    secret = '"tls/' in ends or '"quic/' in ends
+    return lambda: not secret and bool(session.info.routers_zid())
+
+
+def another_key(key: str, channel: Channel, *, number: int) -> str:
+    """An expression that meets that key of this channel alone, for the ``number``-th declaration after the first.
+
+    Zenoh gives a key its number once: where that datagram is lost, the same key is never understood again.
+    """
+    at = len(key) - number % (len(channel) + 1)
+    return f"{key[:at]}$*{key[at:]}" if number else key
+
+
 def declare_publisher(session: zenoh.Session, channel: Channel, *, keys: EdgeKeys) -> zenoh.Publisher:
     """A publisher of one channel, delivered as the key table says; ``put`` may block on a ``BLOCK`` channel."""
     delivery = DELIVERIES[channel]

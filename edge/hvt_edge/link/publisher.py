@@ -23,8 +23,14 @@ from hvt_common.protocol.messages import (
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.transport.inbox import FloodWatch
 from hvt_common.transport.link_doctor import link_doctor
-from hvt_common.transport.session import declare_publisher, open_session, serve
-from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_common.transport.session import (
+    another_key,
+    declare_publisher,
+    loses_declarations,
+    open_session,
+    serve,
+)
+from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
 from hvt_edge.link.transmitter import Outlet
 
@@ -81,12 +87,6 @@ class EdgeLink(Outlet, Protocol):
         ...
 
 
-def loses_messages(settings: LinkSettings) -> bool:
-    """Whether a declaration may be lost on the way: over UDP; no other transport loses one."""
-    config = configure(settings)[0]
-    return any('"udp/' in str(config.get_json(f"{side}/endpoints")) for side in ("connect", "listen"))
-
-
 class ZenohLink:
     """One Zenoh session with publishers of all channels; a context manager.
 
@@ -102,9 +102,9 @@ class ZenohLink:
         doctor = link_doctor()
         doctor.check_id(settings, self._keys)
         self._listener: EdgeListener | None = None
-        self._loses = loses_messages(settings)
         self._stack = ExitStack()
         self._session = self._stack.enter_context(open_session(settings, failures=failures))
+        self._loses = loses_declarations(settings, self._session)
         self._publishers = {
             channel: declare_publisher(self._session, channel, keys=self._keys) for channel in _PUBLISHED
         }
@@ -133,7 +133,7 @@ class ZenohLink:
         try:
             self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
             # A status goes about once a second.
-            if channel is Channel.STATUS and self._listener is not None and self._loses:
+            if channel is Channel.STATUS and self._listener is not None and self._loses():
                 self._listener.declare_again(there=self.has_ground())
         except zenoh.ZError as error:
             _log.debug("%s was not sent: %s", channel, error)
@@ -203,13 +203,10 @@ class EdgeListener:
             pause.failed(now_ns)
 
     def _declare(self, channel: Channel) -> None:
-        # Zenoh gives a key its number once: where that datagram is lost, the same key is never understood again.
-        key = self.keys.key(channel)
         if channel in self._declared:
             self._declared[channel].undeclare()  # type: ignore[no-untyped-call]
             self._again[channel] += 1
-            at = len(key) - 1 - self._again[channel] % (len(channel) - 1)
-            key = f"{key[:at]}$*{key[at:]}"
+        key = another_key(self.keys.key(channel), channel, number=self._again[channel])
         if channel is Channel.FEEDBACK:
             self._declared[channel] = self.session.declare_subscriber(key, self._on_feedback)
         else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import Counter
 from collections.abc import Callable
 from typing import Self
 
@@ -11,9 +12,10 @@ import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys, matches, parse_key, selector
 from hvt_common.runtime.clock import SteadyClock
-from hvt_common.runtime.failures import reason_of
+from hvt_common.runtime.failures import RetryPause, reason_of
 from hvt_common.transport.inbox import Received
-from hvt_common.transport.session import subscribe
+from hvt_common.transport.session import another_key, subscribe
+from hvt_common.units import SECOND_NS
 from hvt_ground.link.group import GroundGroup
 from hvt_ground.perception.stills.decode import readable_codecs
 from hvt_ground.session.edge_port import EdgePort
@@ -25,10 +27,23 @@ MAX_EDGES = 64
 token takes the place of one that has neither a token nor a session."""
 _MOST_SHARED = 16384
 """Edges of all members of a group together."""
+_QUIET_NS, _MOST_QUIET_NS = 2 * SECOND_NS, 64 * SECOND_NS
+"""So long an edge that is there may send nothing; the longest pause before its subscriptions are made again."""
 _SUBSCRIBED = (
     *(Channel.BASE, Channel.ROI, Channel.TRACKS),
     *(Channel.POSE, Channel.BACKLOG, Channel.STATUS),
 )
+
+
+class _General:
+    """Takes what comes by the subscriptions of all edges, but for those that have their own."""
+
+    def __init__(self, link: GroundLink) -> None:
+        self._link = link
+
+    def put(self, item: Received) -> None:
+        if not self._link.has_own(item.key):
+            self._link.put(item)
 
 
 class GroundLink:
@@ -36,7 +51,7 @@ class GroundLink:
 
     With a ``group`` only the edges that are this member's are subscribed to, and a port goes when its edge moves.
     ``log`` gets all that comes from an edge, in Zenoh's callbacks. ``still_codecs`` are those that edges are told to
-    send; without it all that are installed here.
+    send; without it all that are installed here. ``loses``: whether a subscription may be lost on its way now.
     """
 
     def __init__(
@@ -48,8 +63,10 @@ class GroundLink:
         group: GroundGroup | None = None,
         log: Callable[[Received], None] | None = None,
         still_codecs: tuple[str, ...] | None = None,
+        loses: Callable[[], bool] = lambda: False,
     ) -> None:
         self._session = session
+        self._loses = loses
         self._still_codecs = readable_codecs() if still_codecs is None else still_codecs
         self._group = group
         self._log = log
@@ -58,7 +75,11 @@ class GroundLink:
         self._unplaced: set[str] = set()
         """Edges that show their token and found no place; the first `MAX_EDGES` of them."""
         self._subscribers: dict[str, list[zenoh.Subscriber[None]]] = {}
-        """Subscriptions by edge, with a group."""
+        """Subscriptions by edge: all with a group, else those of edges that did not hear of the general ones."""
+        self._quiet: dict[str, RetryPause] = {}
+        """By edge that is there, until its subscriptions are made again."""
+        self._again = Counter[str]()
+        """How often that was."""
         self._leaving: set[str] = set()
         """Edges whose last session here is being closed; with a group."""
         self._clock = clock or SteadyClock()
@@ -70,17 +91,30 @@ class GroundLink:
         self._refused = False
         for row in () if group else _SUBSCRIBED:
             key_expr = selector(row, edges=edges)
-            subscribe(session, key_expr, inbox=self, clock=self._clock, on_error=self._fail)
+            subscribe(session, key_expr, inbox=_General(self), clock=self._clock, on_error=self._fail)
         self._presence = session.liveliness().declare_subscriber(
             selector(Channel.ALIVE, edges=edges), self._on_presence, history=True
         )
 
     def ports(self) -> list[EdgePort]:
         """All edges that are served; one without a session may leave again, and one that moved."""
+        with self._lock:
+            evicted = self._subscribers.keys() - self._ports.keys()
+        for edge in evicted:
+            self._unsubscribe(edge)
         if self._group is not None:
             self._share(self._group)
         with self._lock:
-            return list(self._ports.values())
+            ports = list(self._ports.values())
+        if self._loses():
+            for port in ports:
+                self._subscribe_again(port)
+        return ports
+
+    def has_own(self, key: str) -> bool:
+        """Whether a message comes by a subscription of its edge as well."""
+        parsed = parse_key(key)
+        return parsed is not None and parsed[0] in self._subscribers
 
     def closed(self, port: EdgePort) -> None:
         """The last session of a port that had left is closed: with a group another member may serve the edge."""
@@ -112,9 +146,6 @@ class GroundLink:
     def _share(self, group: GroundGroup) -> None:
         with self._lock:
             known = self._alive | self._ports.keys()
-            evicted = self._subscribers.keys() - self._ports.keys()
-        for edge in evicted:
-            self._unsubscribe(edge)
         for edge in sorted(known - self._leaving):
             served, serves = edge in self._subscribers, group.serves(edge)
             if serves and not served:
@@ -131,16 +162,39 @@ class GroundLink:
             return
         if edge in self._alive:
             port.present.set()
+        self._subscribe(edge)
+
+    def _subscribe(self, edge: str) -> None:
+        # First the new, then without the old: an edge that hears both sends on all the while.
+        former, keys, number = self._subscribers.get(edge, []), EdgeKeys(edge), self._again[edge]
         self._subscribers[edge] = [
             subscribe(
                 self._session,
-                EdgeKeys(edge).key(row),
+                another_key(keys.key(row), row, number=number),
                 inbox=self,
                 clock=self._clock,
                 on_error=self._fail,
             )
             for row in _SUBSCRIBED
         ]
+        for one in former:
+            one.undeclare()  # type: ignore[no-untyped-call]
+
+    def _subscribe_again(self, port: EdgePort) -> None:
+        # Once in any case, for one channel's may be lost alone; then while nothing comes from an edge that is there,
+        # which reports each second if it knows that somebody listens. Zenoh withdraws the token of one that does not.
+        now_ns, edge, there = self._clock(), port.edge, port.present.is_set()
+        if port.received_ns and not there:
+            self._quiet.pop(edge, None)
+            return
+        pause = self._quiet.setdefault(edge, RetryPause(_QUIET_NS, _MOST_QUIET_NS))
+        silent = now_ns - port.received_ns >= _QUIET_NS
+        tries = silent and (there or pause.pause_ns < _MOST_QUIET_NS)
+        if pause.due(now_ns) and (tries or pause.pause_ns <= _QUIET_NS):
+            if pause.pause_ns:
+                self._again[edge] += 1
+                self._subscribe(edge)
+            pause.failed(now_ns)
 
     def _leave(self, edge: str) -> None:
         self._unsubscribe(edge)
@@ -152,6 +206,8 @@ class GroundLink:
 
     def _unsubscribe(self, edge: str) -> None:
         # Not while the lock is held: Zenoh may wait for a callback that wants it.
+        for memory in (self._again, self._quiet):
+            memory.pop(edge, None)
         for one in self._subscribers.pop(edge):
             one.undeclare()  # type: ignore[no-untyped-call]
 
@@ -186,7 +242,7 @@ class GroundLink:
         for edge, port in self._ports.items():
             if not port.present.is_set() and not port.used.is_set():
                 del self._ports[edge]
-                if edge in self._subscribers:
+                if self._group is not None and edge in self._subscribers:
                     self._leaving.add(edge)
                 port.close()
                 return True

@@ -14,6 +14,7 @@ import threading
 import time
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgpack
 import pytest
@@ -26,6 +27,7 @@ from hvt_common.protocol.messages import BaseHeader, Command, ControlAnswer, Con
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.transport.session import (
     declare_publisher,
+    loses_declarations,
     open_session,
     query,
     serve,
@@ -512,3 +514,26 @@ def test_a_question_that_is_lost_is_asked_once_more(monkeypatch):
     there = False
     assert query(None, Channel.CONTROL, **told) is None
     assert len(asked_s) == 3, "nobody is there: who waits is told at once"
+
+
+def test_where_a_declaration_may_be_lost_it_is_made_again(tmp_path):
+    """Rights name whole keys: over TLS an edge would withdraw what its grounds may use for what they may not.
+
+    Behind a router the next link may be UDP, whatever this one is.
+    """
+    file = tmp_path / "link.json5"
+    file.write_text('{connect: {endpoints: ["udp/10.0.0.1:7447"]}}')
+    direct, routed = (
+        SimpleNamespace(info=SimpleNamespace(routers_zid=lambda found=found: found)) for found in ([], [7])
+    )
+
+    def loses(session, **link):
+        return loses_declarations(LinkSettings("edge", **link), session)()
+
+    assert loses(direct, connect=("udp/127.0.0.1:7447",))
+    assert loses(direct, listen=("udp/127.0.0.1:7447",))
+    assert loses(direct, zenoh_config=file)
+    assert not loses(direct)
+    assert loses(routed)
+    assert not loses(routed, connect=("tls/127.0.0.1:7447",))
+    assert not loses(routed, connect=("quic/127.0.0.1:7447",))

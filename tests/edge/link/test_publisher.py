@@ -11,7 +11,6 @@ import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import WIRE_VERSION, Feedback, Message
-from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
 from hvt_edge.link import publisher
 from rigs.messages import ANSWER, FEEDBACK, INFO_REQUEST, REQUEST
@@ -112,14 +111,3 @@ def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):
     assert (after(1, there=False), after(3, there=True)) == ((0, 0, 0), (1, 1, 1)), (
         "another, or on another way"
     )
-
-
-def test_only_over_udp_something_is_declared_again(tmp_path):
-    """Rights name whole keys: over TLS an edge would withdraw what its grounds may use for what they may not."""
-    file = tmp_path / "link.json5"
-    file.write_text('{connect: {endpoints: ["udp/10.0.0.1:7447"]}}')
-    assert publisher.loses_messages(LinkSettings("edge", connect=("udp/127.0.0.1:7447",)))
-    assert publisher.loses_messages(LinkSettings("edge", listen=("udp/127.0.0.1:7447",)))
-    assert publisher.loses_messages(LinkSettings("edge", zenoh_config=file))
-    assert not publisher.loses_messages(LinkSettings("edge"))
-    assert not publisher.loses_messages(LinkSettings("edge", connect=("tls/127.0.0.1:7447",)))

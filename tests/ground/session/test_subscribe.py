@@ -6,9 +6,11 @@ import logging
 import threading
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import msgpack
 import pytest
@@ -336,6 +338,59 @@ def test_silent_edges_hold_up_nobody(free_port: int) -> None:
             one.drop()
         for one in (*queryables, *tokens):
             one.undeclare()
+
+
+def test_an_edge_that_a_lost_subscription_keeps_silent_is_subscribed_to_again() -> None:
+    """One datagram that UDP loses held all subscriptions: the edge was there and never sent a picture."""
+    session, now_s, declared, gone = MagicMock(), [1000], {}, []
+
+    def declare(key: str, callback: Callable[[object], None]) -> MagicMock:
+        declared[key] = callback
+        return MagicMock(undeclare=lambda: gone.append(key))
+
+    def came(key: str) -> None:
+        said = {
+            "kind": zenoh.SampleKind.PUT,
+            "key_expr": "hvt/uav-1/status",
+            "attachment": None,
+            "encoding": "",
+        }
+        declared[key](SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: b"x"), **said))
+
+    session.declare_subscriber.side_effect = declare
+    link = GroundLink(session, edges="*", clock=lambda: now_s[0] * SECOND_NS, loses=lambda: True)
+    general = list(declared)
+    session.liveliness().declare_subscriber.call_args.args[1](
+        SimpleNamespace(kind=zenoh.SampleKind.PUT, key_expr="hvt/uav-1/alive")
+    )
+    made = []
+    for _ in range(16):
+        now_s[0] += 1
+        (port,) = link.ports()
+        made.append(len(declared))
+    assert made == [6] * 2 + [12] * 4 + [18] * 8 + [24] * 2, "after 2, 4 and 8 s"
+    own = [one for one in declared if one not in general]
+    assert gone == own[:12], "of the last alone it comes, or twice"
+    for key in own:
+        met = [one for one in Channel if zenoh.KeyExpr(key).intersects(EdgeKeys("uav-1").key(one))]
+        assert len(met) == 1
+        assert not zenoh.KeyExpr(key).intersects(EdgeKeys("uav-2").key(met[0]))
+    status = next(one for one in reversed(own) if one.startswith("hvt/uav-1/s"))
+    for key in ("hvt/*/status", status):
+        came(key)
+    assert port.inbox.get(timeout_s=0) is not None
+    assert port.inbox.get(timeout_s=0) is None, "it comes by two subscriptions, and is one message"
+    port.received_ns = 10_000 * SECOND_NS
+    now_s[0] += 100
+    link.ports()
+    assert len(declared) == 24, "it is heard"
+    port.present.clear()
+    link.ports()
+    port.present.set()
+    for _ in range(9):
+        now_s[0] += 1
+        link.ports()
+    assert len(declared) == 30, "on another way, once: one channel's may be lost alone"
 
 
 class Shared:
