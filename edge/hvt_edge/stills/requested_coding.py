@@ -34,6 +34,8 @@ _BEST_PCT = 95
 _STEP_PCT = 10
 _FLOOR_PCT = 20
 """Below it a smaller picture of better quality shows more."""
+_FILLED = 0.85
+"""What takes such a share of its limit is searched for no longer: a large picture is coded in half the time."""
 _SHRINKS = (0.7, 0.5, 0.35, 0.25)
 _LEAST_SIDE = 8
 
@@ -127,7 +129,7 @@ class _Tries:
         return one is not None and self.gain_db(one) >= _LEAST_GAIN_DB
 
     def fitting(self, limit_bytes: int, *, most_pct: int) -> _Tried | None:
-        """The best quality up to ``most_pct`` that fits."""
+        """The best quality up to ``most_pct`` that fits, or nearly that."""
         found = best_fitting(
             self.codec,
             self._coded_bgr,
@@ -135,6 +137,7 @@ class _Tries:
             low_pct=_FLOOR_PCT,
             high_pct=most_pct,
             tried=self.done,
+            enough=_FILLED,
         )
         return None if found is None else self.at(found[1])
 

@@ -35,6 +35,21 @@ def test_the_best_that_fits(name, limit_bytes):
     assert all(size > limit_bytes for quality, size in sizes.items() if quality > quality_pct)
 
 
+def test_a_search_for_enough_fits_and_takes_fewer_tries():
+    """A board would code a large closer look until its requester is told that there was no room."""
+    codec, tries = still_codec("jpeg"), {1.0: 0, 0.85: 0}
+    for limit_bytes in range(800, 4000, 200):
+        sizes = {}
+        for enough in tries:
+            tried = {}
+            coded, _ = best_fitting(codec, CROP, limit_bytes=limit_bytes, tried=tried, enough=enough, **WHOLE)
+            sizes[enough] = len(coded.data)
+            tries[enough] += len(tried)
+        assert sizes[0.85] <= limit_bytes
+        assert sizes[0.85] >= min(sizes[1.0], 0.85 * limit_bytes)
+    assert tries[0.85] < 0.8 * tries[1.0]
+
+
 @pytest.mark.parametrize("name", ["jpeg", "h264-intra", "residual"])
 @pytest.mark.parametrize("target_db", [31.0, 36.0, 40.5])
 def test_the_least_that_reaches(name, target_db):

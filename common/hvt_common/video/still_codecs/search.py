@@ -34,11 +34,13 @@ def best_fitting(
     high_pct: int,
     base_bgr: Image | None = None,
     tried: dict[int, CodedCrop] | None = None,
+    enough: float = math.inf,
 ) -> tuple[CodedCrop, int] | None:
     """The best quality from ``low_pct`` to ``high_pct`` (both included) whose data is at most ``limit_bytes``.
 
     With that quality in percent; None where nothing fits. ``base_bgr``: see `StillCodec.encode`. ``tried`` are
-    codings of this crop by quality: none is made again, and those that are made come in.
+    codings of this crop by quality: none is made again, and those that are made come in. One that
+    takes ``enough`` of the limit, a share, is as good as the best.
     """
     best = [steps[-1] for steps in _steps(codec, low_pct, high_pct)]
     tried = {} if tried is None else tried
@@ -51,7 +53,8 @@ def best_fitting(
         return math.log((len(tried[quality_pct].data) + 0.5) / (limit_bytes + 1))
 
     # Most often the best fits at once.
-    found = _first_above(excess, len(best), first=len(best) - 1, rise=_WHOLE_SIZE / max(1, len(best))) - 1
+    rise = _WHOLE_SIZE / max(1, len(best))
+    found = _first_above(excess, len(best), first=len(best) - 1, rise=rise, near=math.log(enough)) - 1
     return (tried[best[found]], best[found]) if found >= 0 else None
 
 
@@ -91,11 +94,14 @@ def _steps(codec: StillCodec, low_pct: int, high_pct: int) -> list[list[int]]:
     return [list(alike) for _, alike in itertools.groupby(range(low_pct, high_pct + 1), key=step_of)]
 
 
-def _first_above(value: Callable[[int], float], count: int, *, first: int, rise: float) -> int:
-    # Of values that rise; ``count`` where none is above 0. That place and the one before it were tried.
+def _first_above(
+    value: Callable[[int], float], count: int, *, first: int, rise: float, near: float = math.inf
+) -> int:
+    # Of values that rise; ``count`` where none is above 0. That place and the one before it were tried. A value of
+    # ``near`` or more that is not above 0 counts as the last before it.
     below, above = (-1, -math.inf), (count, math.inf)
     place, tries, last = first, 0, None
-    while above[0] - below[0] > 1:
+    while above[0] - below[0] > 1 and below[1] < near:
         here = (place, value(place))
         below, above = (below, here) if here[1] > 0 else (here, above)
         tries += 1
@@ -111,7 +117,7 @@ def _first_above(value: Callable[[int], float], count: int, *, first: int, rise:
         # Where it is guessed to be above 0 first, or just before, where that has been tried.
         guess = math.ceil(min(count, max(-1.0, zero)))
         place = min(above[0] - 1, max(below[0] + 1, guess))
-    return above[0]
+    return below[0] + 1
 
 
 def psnr_y_db(image_bgr: Image, source_bgr: Image) -> float:
