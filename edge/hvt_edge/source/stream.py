@@ -23,8 +23,6 @@ from hvt_edge.source.live import LEAST_PATIENCE_S, Shot, SignalLost
 LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "rtmp", "rtmps", "http", "https", "udp", "rtp", "tcp", "srt"})
 
 _OPEN_S = 10.0
-_RESTART_S = 0.5
-"""Beside the wait for its first picture."""
 _UNDECODED_S = 10.0
 """Without a picture, while something comes; where nothing does, `patience_s` counts."""
 _MOST_TIMES = 64
@@ -49,7 +47,8 @@ _OPTIONS = {
 class StreamGrabber:
     """Decodes a stream as it arrives, without frame threading, which would hold frames back.
 
-    A password in ``url`` is never printed; ``open_s`` bounds the first opening, ``read_s`` the wait for more.
+    A password in ``url`` is never printed; ``open_s`` bounds each opening, which takes two seconds from a
+    keyframe on; ``read_s`` bounds the wait for more.
     """
 
     notes: Notes | None = None
@@ -66,7 +65,7 @@ class StreamGrabber:
     def open(self) -> None:
         """Open, where it is not open yet. Raises `UserError` if there is no video within ``open_s``."""
         if self._container is None:
-            self._start(self._open_s)
+            self._start()
 
     @property
     def holds_a_clip(self) -> bool:
@@ -75,7 +74,7 @@ class StreamGrabber:
 
     def restart(self) -> None:
         self.close()
-        self._start(_RESTART_S + self._read_s)
+        self._start()
 
     def grab(self) -> Shot:
         """The next frame, at most the read timeout from now."""
@@ -95,8 +94,8 @@ class StreamGrabber:
             self._container.close()
             self._container = None
 
-    def _start(self, open_s: float) -> None:
-        container = _open(self._url, open_s=open_s, read_s=self._read_s)
+    def _start(self) -> None:
+        container = _open(self._url, open_s=self._open_s, read_s=self._read_s)
         stream = self._choose(container)
         if stream is None:
             container.close()
