@@ -9,7 +9,7 @@ anything is matched. A single object that is not asked for takes out the boxes o
 it nor the boxes that are on those.
 
 Sizes are COCO's, 32 and 96 pixels squared (Lin et al. 2014, https://cocodataset.org/#detection-eval), in *source*
-pixels: they mean the same object for every method. The pilot's "small" is a share of the frame: see `proxy`.
+pixels: they mean the same object for every method. The pilot's "small" is a share of the frame: see `proxies`.
 """
 
 from __future__ import annotations

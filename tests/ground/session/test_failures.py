@@ -108,11 +108,6 @@ class Rig:
         return [one.frames_decoded for one in self.consumer.sessions]
 
 
-def status_line(sessions: EdgeSessions) -> str:
-    """What an operator reads."""
-    return status_text(StateMaker(time.time_ns).make([("uav-1", sessions)]))
-
-
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     """Keyframes at 10, 20, 30 and 36."""
