@@ -17,8 +17,9 @@ from hvt_common.runtime.host_names import check_port
 from hvt_common.runtime.reporting import Finding, check_writable
 from hvt_fleet.checkup import check_clock, check_folder, check_link, print_findings, run_checks
 from hvt_ground.config import GroundConfig
-from hvt_ground.extras import checked, config_class, extras_of
+from hvt_ground.extras import checked, config_class, extras_of, written
 from hvt_ground.perception.models import Models
+from hvt_ground.wiring.files import is_file
 
 _DESCRIPTION = (
     "Check what a ground with these settings needs; takes the settings of hvt-ground. --json is for programs."
@@ -63,15 +64,10 @@ def _models(config: GroundConfig) -> Finding:
 
 
 def _recordings(config: GroundConfig) -> Finding:
-    of_extras = (one for extra in extras_of(config) for one in extra.writes(config))
-    named = {"--summary": config.summary, "--timing": config.timing, **dict(of_extras)}
-    if config.tracks is not None and config.tracks.suffix == ".csv" and not config.tracks.is_dir():
-        named["--tracks"] = config.tracks
-    folder = config.record_folder or Path()
-    if config.record is not None and config.record_folder is None:
-        named["--record"], folder = config.record, config.record.absolute().parent
-    for name, path in named.items():
-        check_writable(path, name=name)
+    for name, path, suffix in written(config):
+        if is_file(path, suffix):
+            check_writable(path, name=name)
+    folder = config.record_folder or (Path() if config.record is None else config.record.absolute().parent)
     free = check_folder(folder, name="--record")
     hours = 8 * free / _USUAL_BPS / 3600
     found = f"{folder.absolute()}: {free / 1e9:.1f} GB are free, {hours:.0f} hours of an edge at 1 Mbps"

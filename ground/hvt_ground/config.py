@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
-from hvt_common.errors import NotYetError, UserError, check_apart
+from hvt_common.errors import UserError, check_apart
 from hvt_common.inference.heads.choose import HEAD_NAMES
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, parts_of
@@ -18,6 +18,10 @@ from hvt_common.units import Limit, parse_limit
 
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
 
+
+Written = tuple[str, Path, str]
+"""What is written: the option that names it, the path, and its suffix, with which it is a file, and without which a
+folder that gets one for each session. Without a suffix it is always a file."""
 
 _LIMIT = SettingType("LIMIT", parse_limit)
 
@@ -121,7 +125,7 @@ class GroundConfig:
         PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
     )
     stills: Path | None = _FILES.option(
-        PATH, None, "also write each still as a picture, with a table of them: a folder that is there"
+        PATH, None, "also write each still as a picture, with a table of them: FILE.csv, or a folder"
     )
     timing: Path | None = _FILES_RARE.option(
         PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
@@ -138,6 +142,19 @@ class GroundConfig:
         choice(*LOG_FORMATS), "text", "json: one object a line, also the status now and then and the summary"
     )
     quiet: bool = _FILES.switch("no status line")
+
+    @property
+    def written(self) -> list[Written]:
+        """What is written."""
+        given = (
+            *(("--record", self.record, ".rrd"), ("--tracks", self.tracks, ".csv")),
+            *(
+                ("--stills", self.stills, ".csv"),
+                ("--timing", self.timing, ""),
+                ("--summary", self.summary, ""),
+            ),
+        )
+        return [(name, path, suffix) for name, path, suffix in given if path is not None]
 
     @property
     def record_folder(self) -> Path | None:
@@ -166,12 +183,14 @@ class GroundConfig:
         return 5.0 if self.once else 600.0
 
 
-def check(config: GroundConfig, *, files: Iterable[tuple[str, Path]] = ()) -> GroundConfig:
-    """Return the configuration; `UserError` where settings contradict.
-
-    ``files`` are further ones that are written, each with the option that names it.
-    """
-    _check_files(config, files)
+def check(config: GroundConfig, *, more: Iterable[Written] = ()) -> GroundConfig:
+    """Return the configuration; `UserError` where settings contradict. ``more`` is written, too."""
+    files = (
+        (name, path)
+        for name, path, suffix in (*config.written, *more)
+        if path.suffix == (suffix or path.suffix)
+    )
+    check_apart(files)  # files in a folder have names of their own
     if config.group is not None:
         GroupKeys(config.group)
     if config.view and config.serve:
@@ -189,18 +208,3 @@ def check(config: GroundConfig, *, files: Iterable[tuple[str, Path]] = ()) -> Gr
         classifier = EMBEDDED_CLASSIFIER if embedded else DETECTOR
         return replace(config, classifier=classifier)
     return config
-
-
-def _check_files(config: GroundConfig, more: Iterable[tuple[str, Path]]) -> None:
-    # Two files must not be one. Files in a folder have names of their own.
-    if config.stills is not None and not config.stills.is_dir():
-        kind = UserError if config.stills.exists() else NotYetError
-        raise kind(f"--stills {config.stills} is no folder: create it, or name one that is there")
-    files = [(name, path) for name, path, suffix in in_folders(config) if path.suffix == suffix]
-    check_apart([*files, ("--timing", config.timing), ("--summary", config.summary), *more])
-
-
-def in_folders(config: GroundConfig) -> list[tuple[str, Path, str]]:
-    """Option, path and suffix of what is one file, or a folder with a file for each session."""
-    both = (("--record", config.record, ".rrd"), ("--tracks", config.tracks, ".csv"))
-    return [(name, path, suffix) for name, path, suffix in both if path is not None]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.plug_ins import installed, loaded
-from hvt_ground.config import GroundConfig, check
+from hvt_ground.config import GroundConfig, Written, check
 
 if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no recording
     from hvt_common.protocol.messages import Info
@@ -132,12 +132,12 @@ class Extra(Generic[Options]):
         """The files that it reads: no output may be one of them."""
         return ()
 
-    def writes(self, config: Options) -> Iterable[tuple[str, Path]]:  # noqa: ARG002
-        """The files that it writes, each with the option that names it; no folders, no addresses."""
+    def writes(self, config: Options) -> Iterable[Written]:  # noqa: ARG002
+        """What it writes; no addresses. The ground looks whether that can be, and makes folders."""
         return ()
 
-    def check_outputs(self, config: Options, *, reads: Sequence[Path]) -> None:
-        """Raise `UserError` if it could not write, or send, as requested."""
+    def check_outputs(self, config: Options) -> None:
+        """Raise `UserError` if it could not send, or make, what is requested."""
 
     def checks(self, config: Options) -> Mapping[str, Callable[[], Finding]]:  # noqa: ARG002
         """Its checks in ``hvt-ground doctor``, by name."""
@@ -204,4 +204,13 @@ def checked(config: GroundConfig) -> GroundConfig:
     extras = extras_of(config)
     for extra in extras:
         extra.check(config)
-    return check(config, files=[one for extra in extras for one in extra.writes(config)])
+    return check(config, more=_written_by(extras, config))
+
+
+def written(config: GroundConfig) -> list[Written]:
+    """What is written, by extras too."""
+    return [*config.written, *_written_by(extras_of(config), config)]
+
+
+def _written_by(extras: Iterable[Extra[Any]], config: GroundConfig) -> list[Written]:
+    return [one for extra in extras for one in extra.writes(config)]

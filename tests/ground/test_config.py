@@ -72,7 +72,10 @@ def test_every_flag_explains_itself(capsys):
     assert "[hvt-<edge>-<time>.rrd here]" in out
 
 
-@pytest.mark.parametrize(("option", "file"), [("record", "a.rrd"), ("tracks", "a.csv")])
+@pytest.mark.parametrize(
+    ("option", "file"),
+    [("record", "a.rrd"), ("tracks", "a.csv"), ("stills", "a.csv"), ("mcap", "a.mcap")],
+)
 def test_a_folder_that_is_not_there_is_made_and_a_file_of_another_kind_refused(tmp_path, option, file):
     """All tracks of a flight would be lost."""
     folder = tmp_path / "flights" / "today"
@@ -86,6 +89,14 @@ def test_a_folder_that_is_not_there_is_made_and_a_file_of_another_kind_refused(t
         check_outputs(read(f"--{option}", str(tmp_path / "notes.txt")))
     with pytest.raises(UserError, match=f"--{option} .* cannot be made"):
         make_folders(read(f"--{option}", str(tmp_path / "notes.txt" / "in")))
+
+
+@pytest.mark.parametrize("words", ["--record a.rrd", "--log a", "--mcap a.mcap", "--ts a.ts", "--timing a"])
+def test_a_file_in_a_folder_that_is_not_there_is_refused(words):
+    """A flight would begin, and be written nowhere."""
+    option, file = words.split()
+    with pytest.raises(UserError, match=f"{option} absent/{file} is in a folder that does not exist"):
+        check_outputs(read(option, f"absent/{file}"))
 
 
 @given(

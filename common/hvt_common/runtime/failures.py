@@ -43,6 +43,8 @@ class Failure:
     since_ns: int
     """When it stopped, before all tries that were in vain."""
     working: bool = False
+    over: bool = False
+    """It has ended, and is not tried any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +76,14 @@ class Failures:
     @property
     def now(self) -> tuple[FailedPart, ...]:
         """Those that do not work now."""
-        return tuple(FailedPart(one.part, one.reason, one.since_ns) for one in self.parts if not one.working)
+        return tuple(
+            FailedPart(one.part, one.reason, one.since_ns)
+            for one in self.parts
+            if not (one.working or one.over)
+        )
 
-    def failed(self, part: str, reason: str) -> None:
-        """It has stopped. The log says so once, however often it is tried in vain.
+    def failed(self, part: str, reason: str) -> int:
+        """It has stopped, for the how manieth time. The log says so once, however often it is tried in vain.
 
         The ground, who watches the process and the summary are told the reason, without secrets of an address.
         """
@@ -93,6 +99,14 @@ class Failures:
             self._said.add(part)
             times = "" if count == 1 else f" ({count} failures so far)"
             _log.warning("%s: %s; all else goes on, and it is tried again%s", part, reason, times)
+        return count
+
+    def over(self, part: str, count: int) -> None:
+        """It has ended without working again. Where it failed since that time, another of the name is at work."""
+        with self._lock:
+            one = self._parts.get(part)
+            if one is not None and one.count == count and not one.working:
+                self._parts[part] = replace(one, over=True)
 
     def works(self, part: str) -> None:
         """It works, or works again."""

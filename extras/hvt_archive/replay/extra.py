@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hvt_common.config import BYTES, PATH, Group
 from hvt_common.errors import UserError
-from hvt_ground.config import GroundConfig
+from hvt_ground.config import GroundConfig, Written
 from hvt_ground.extras import Extra, Service
 
 if TYPE_CHECKING:  # ``--help`` is to open no log
@@ -50,17 +50,10 @@ class LogExtra(Extra[LogOptions]):
                 f"--log-size {config.log_size} bytes is not accepted: give at least {LEAST_LOG_BYTES // 10**6}MB"
             )
 
-    def writes(self, config: LogOptions) -> Iterable[tuple[str, Path]]:
+    def writes(self, config: LogOptions) -> Iterable[Written]:
         """The file that is named."""
         if config.log is not None:
-            yield "--log", config.log
-
-    def check_outputs(self, config: LogOptions, *, reads: Sequence[Path]) -> None:
-        """Refuse a file that cannot be written."""
-        from hvt_common.runtime.reporting import check_writable  # noqa: PLC0415
-
-        for name, path in self.writes(config):
-            check_writable(path, name=name, reads=reads)
+            yield "--log", config.log, ""
 
     def serve(self, config: LogOptions, *, clock: Callable[[], int], failures: Failures) -> Service | None:  # noqa: ARG002
         """Log all that comes."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -68,7 +68,7 @@ class CotExtra(Extra[CotOptions]):
         """The table of types."""
         return [config.cot_types] if config.cot_types is not None else []
 
-    def check_outputs(self, config: CotOptions, *, reads: Sequence[Path]) -> None:  # noqa: ARG002
+    def check_outputs(self, config: CotOptions) -> None:
         """Refuse types and certificates that cannot be used."""
         if config.cot:
             with needs_extra("'hvt[cot]'"):
@@ -83,7 +83,7 @@ class CotExtra(Extra[CotOptions]):
         return {"reports": partial(self._found, config)} if config.cot else {}
 
     def _found(self, config: CotOptions) -> Finding:
-        self.check_outputs(config, reads=())
+        self.check_outputs(config)
         from hvt_common.runtime.reporting import Finding  # noqa: PLC0415
 
         return Finding("ok", f"to {', '.join(config.cot)}; types and certificates can be read")
@@ -92,7 +92,7 @@ class CotExtra(Extra[CotOptions]):
         """Open the connections."""
         if not config.cot:
             return lambda _flight: ()
-        self.check_outputs(config, reads=())
+        self.check_outputs(config)
         from hvt_gateways.cot.connection import CotConnection  # noqa: PLC0415 - as above
         from hvt_gateways.cot.reporter import SessionReporter  # noqa: PLC0415 - as above
         from hvt_gateways.cot.schedule import STALE_NS  # noqa: PLC0415 - as above

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from hvt_common.config import PATH, Group
 from hvt_common.errors import needs_extra
-from hvt_ground.config import GroundConfig
+from hvt_ground.config import GroundConfig, Written
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 
 if TYPE_CHECKING:
@@ -33,18 +33,10 @@ class McapExtra(Extra[McapOptions]):
 
     options = McapOptions
 
-    def writes(self, config: McapOptions) -> Iterable[tuple[str, Path]]:
-        """The file that is named."""
-        if config.mcap is not None and config.mcap.suffix == ".mcap":
-            yield "--mcap", config.mcap
-
-    def check_outputs(self, config: McapOptions, *, reads: Sequence[Path]) -> None:
-        """Refuse a file that cannot be written."""
-        from hvt_common.runtime.reporting import check_writable  # noqa: PLC0415
-
-        for name, path in self.writes(config):
-            if not path.is_dir():
-                check_writable(path, name=name, reads=reads)
+    def writes(self, config: McapOptions) -> Iterable[Written]:
+        """What is named."""
+        if config.mcap is not None:
+            yield "--mcap", config.mcap, ".mcap"
 
     def start(self, config: McapOptions, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
         """`UserError` where the package is missing."""

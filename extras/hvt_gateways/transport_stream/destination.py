@@ -7,7 +7,7 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +19,6 @@ import av.error
 
 from hvt_common.errors import UserError, named_path
 from hvt_common.runtime.host_names import is_group
-from hvt_common.runtime.reporting import check_writable
 from hvt_ground.sinks.line_file import check_there
 
 _log = logging.getLogger(__name__)
@@ -76,15 +75,10 @@ def destination(text: str) -> Address | Path:
     return address
 
 
-def check_destination(text: str | None, *, reads: Iterable[Path] = ()) -> None:
-    """Refuse before anything is received what could not be written, or is of the ``reads``; `UserError`."""
-    if text is None:
-        return
-    where = destination(text)
-    if isinstance(where, Path):
-        if not where.is_dir():
-            check_writable(where, name="--ts", reads=reads)
-    elif where.scheme == "srt" and not _has_srt():
+def check_destination(text: str | None) -> None:
+    """Refuse before anything is received what could not be sent to; `UserError`."""
+    where = None if text is None else destination(text)
+    if isinstance(where, Address) and where.scheme == "srt" and not _has_srt():
         raise UserError(
             f"--ts {where.shown} needs SRT, and this PyAV {av.__version__} is built without it: "
             "give udp://HOST:PORT, which ffmpeg or a media server makes SRT of"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from hvt_common.config import TEXT, Group
 from hvt_common.errors import named_path
-from hvt_ground.config import GroundConfig
+from hvt_ground.config import GroundConfig, Written
 from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 
 if TYPE_CHECKING:  # what writes it opens PyAV, which settings alone do without
@@ -42,18 +42,16 @@ class TransportStreamExtra(Extra[TransportStreamOptions]):
     options = TransportStreamOptions
     exports = {"ts": _export}  # noqa: RUF012
 
-    def writes(self, config: TransportStreamOptions) -> Iterable[tuple[str, Path]]:
-        """The file that is named."""
+    def writes(self, config: TransportStreamOptions) -> Iterable[Written]:
+        """What is named, unless it is an address."""
         if config.ts is not None and "://" not in config.ts:
-            path = named_path(config.ts, name="--ts")
-            if path.suffix == ".ts":
-                yield "--ts", path
+            yield "--ts", named_path(config.ts, name="--ts"), ".ts"
 
-    def check_outputs(self, config: TransportStreamOptions, *, reads: Sequence[Path]) -> None:
-        """Refuse a destination that cannot be written or sent to."""
+    def check_outputs(self, config: TransportStreamOptions) -> None:
+        """Refuse a destination that is none, or cannot be sent to."""
         from hvt_gateways.transport_stream.destination import check_destination  # noqa: PLC0415
 
-        check_destination(config.ts, reads=reads)
+        check_destination(config.ts)
 
     def start(self, config: TransportStreamOptions, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
         """Make the function that opens the stream of a session."""

@@ -62,6 +62,8 @@ class QueuedSink(Generic[T]):
         self._ending = False
         self._hurry = threading.Event()
         self._failures = failures
+        self._failed = 0
+        """Times that the part has failed, at the newest failure here."""
         longest_ns = round(longest_pause_s * SECOND_NS)
         self._pause = RetryPause(min(SECOND_NS, longest_ns), longest_ns)
         self.files: list[Path] = []
@@ -171,6 +173,7 @@ class QueuedSink(Generic[T]):
             while not self._pause.due(time.monotonic_ns()):
                 with self._changed:
                     if self._changed.wait_for(lambda: self._ending, _POLL_S):
+                        self._failures.over(self.part, self._failed)
                         return
 
     def _use(self, open_sink: Callable[[], SinkWriter[T]]) -> bool:
@@ -244,7 +247,7 @@ class QueuedSink(Generic[T]):
             self._changed.notify_all()
         for done in lost:
             done(False)
-        self._failures.failed(self.part, reason_of(error))
+        self._failed = self._failures.failed(self.part, reason_of(error))
         _log.debug("%s failed", self.part, exc_info=error)
 
 

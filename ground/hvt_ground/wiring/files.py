@@ -9,8 +9,8 @@ from pathlib import Path
 
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.runtime.reporting import check_writable
-from hvt_ground.config import GroundConfig, in_folders
-from hvt_ground.extras import extras_of
+from hvt_ground.config import GroundConfig
+from hvt_ground.extras import extras_of, written
 from hvt_ground.sinks.line_file import claim_name
 
 
@@ -24,11 +24,9 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
     for extra in extras_of(config):
         reads += extra.reads(config)
     for extra in extras_of(config):
-        extra.check_outputs(config, reads=reads)
-    check_writable(config.summary, name="--summary", reads=reads)
-    check_writable(config.timing, name="--timing", reads=reads)
-    for name, path, suffix in in_folders(config):
-        if path.suffix == suffix and not path.is_dir():
+        extra.check_outputs(config)
+    for name, path, suffix in written(config):
+        if is_file(path, suffix):
             check_writable(path, name=name, reads=reads)
         elif path.exists() and not path.is_dir():
             raise UserError(
@@ -38,8 +36,8 @@ def check_outputs(config: GroundConfig, *, reads: Sequence[Path] = ()) -> None:
 
 def make_folders(config: GroundConfig) -> None:
     """Comes after all that may be refused at once: a start that is refused leaves nothing behind."""
-    for name, path, suffix in in_folders(config):
-        if path.suffix == suffix:
+    for name, path, suffix in written(config):
+        if is_file(path, suffix):
             continue
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -48,6 +46,11 @@ def make_folders(config: GroundConfig) -> None:
             raise kind(
                 f"{name} {path} cannot be made ({error.strerror}): give FILE{suffix} or a folder"
             ) from None
+
+
+def is_file(path: Path, suffix: str) -> bool:
+    """Whether this path of a `Written` is one file, not a folder for some."""
+    return not suffix or (path.suffix == suffix and not path.is_dir())
 
 
 def output_path(
@@ -60,7 +63,7 @@ def output_path(
     edge's id in it. A file that nobody named is never overwritten. Without ``claim`` the name is but the beginning of
     others, and no file.
     """
-    if target is None or target.is_dir() or target.suffix != suffix:
+    if target is None or not is_file(target, suffix):
         first = further = (target or Path()) / f"hvt-{edge}-{stamp}{suffix}"
     else:
         first, further = target, target.with_name(f"{target.stem}-{edge}{suffix}")

@@ -55,6 +55,26 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path, caplog):
     assert failures.parts == (), "slow is not broken"
 
 
+def test_one_that_has_ended_does_not_fail_any_more():
+    """The status line would tell of a recording for ever whose session is over; the summary does."""
+
+    def refused() -> SinkWriter[str]:
+        raise UserError("no room")
+
+    failures = Failures(time.time_ns)
+    sink = QueuedSink("recording of uav-1", refused, failures=failures)
+    eventually(lambda: failures.now, what="it has failed")
+    sink.close()
+    assert sink.join(time.monotonic() + 60)
+    assert failures.now == ()
+    assert [one.working for one in failures.parts] == [False]
+    failures.failed("recording of uav-1", "of the next session")
+    failures.over("recording of uav-1", 1)
+    assert [one.reason for one in failures.now] == ["of the next session"], (
+        "the first ends after it has begun"
+    )
+
+
 def test_one_that_waits_for_a_keyframe_has_it_asked_for_once():
     """An edge that makes none by itself would never show it a picture."""
 

@@ -58,7 +58,6 @@ def test_files_folders_and_urls(tmp_path):
         ("udp://host:5600?ttl=0", "ttl=1 to ttl=255 is"),
         ("udp://host:5600?ttl=x", "ttl=1 to ttl=255 is"),
         ("udp://host:5600?pkt_size=9000", "behind the question mark"),
-        ("absent/flight.ts", "--ts absent/flight.ts is in a folder that does not exist"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_sentence(text, said):
