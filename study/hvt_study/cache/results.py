@@ -114,6 +114,13 @@ def make_folder(folder: Path) -> Path:
     return folder
 
 
+def check_cache(folder: Path) -> None:
+    """Make the folder; `UserError` now where it cannot be made, or nothing be written into it."""
+    trial = make_folder(folder) / "trial"
+    write_whole(trial, b"")
+    trial.unlink(missing_ok=True)
+
+
 def read_whole(path: Path) -> bytes | None:
     """What `write_whole` put there; None where there is nothing, or nothing whole."""
     try:

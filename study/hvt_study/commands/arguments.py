@@ -15,12 +15,15 @@ from hvt_common.errors import UserError
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.labels import first_synonym
+from hvt_common.inference.runtimes.model import provider_here
 from hvt_common.inference.runtimes.plug_in import plug_in_of
+from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_DETECTOR, MOTION, parts_of
 from hvt_common.units import parse_size
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.source.contract import check_shape
 from hvt_ground.config import DETECTOR, NONE
+from hvt_study.cache.results import check_cache
 from hvt_study.datasets.class_map import joint_classes
 from hvt_study.datasets.layouts.uri import DATASETS, open_datasets
 from hvt_study.datasets.sequence import Sequence
@@ -152,6 +155,7 @@ def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True,
     written = "results.parquet, report.html, …" if writes else "not needed: nothing is written"
     option(parser, "--out", required=writes, help=written)
     option(parser, "--cache")
+    parser.set_defaults(writes=writes)
 
 
 def parse_rates(text: str) -> tuple[int, ...]:
@@ -198,8 +202,17 @@ def flown_frames(frames: int | None) -> int | None:
     return frames
 
 
+def check_means(arguments: argparse.Namespace) -> None:
+    """`UserError` at once for a provider that is not here (with Dask: not known), or a cache that takes no files."""
+    if not hasattr(arguments, "dask") or arguments.provider not in PROVIDERS:
+        provider_here(arguments.provider)
+    if hasattr(arguments, "cache") and arguments.writes:
+        check_cache(arguments.cache)
+
+
 def open_sequences(arguments: argparse.Namespace) -> tuple[tuple[str, Sequence], ...]:
     """(URI, sequence) of all that the arguments name; `UserError` where labels are asked for that nobody made."""
+    check_means(arguments)
     limit = getattr(arguments, "limit", None)
     found = tuple(open_datasets(arguments.datasets, limit=limit, only=arguments.only))
     for uri, one in found:

@@ -16,6 +16,7 @@ from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.arguments import (
     add_pool_arguments,
     base_size,
+    check_means,
     flown_frames,
     names_of,
     open_pool,
@@ -81,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fly, print the table, write it and the plot."""
+    check_means(arguments)
     plan = _plan(arguments)
     folder: Path = arguments.out
     file = make_out(folder, name="compare.json")

@@ -173,15 +173,14 @@ def _detect(arguments: argparse.Namespace) -> int:
                 frames.append((labels, view))
     if frames:
         recall_only = any(picture.one_target for picture in pictures)
+        every = judged(frames, word=word, classes=classes)
         used = judged(above(frames, confidence), word=word, classes=classes)
         about = {
             "detector": arguments.detector,
             "confidence": confidence,
             "pictures": len(frames),
             "skipped": len(pictures) - seen,
-            **picture_score(
-                used, detection_score(frames, word=word, classes=classes), recall_only=recall_only
-            ),
+            **picture_score(used, detection_score(every), recall_only=recall_only),
         }
         (arguments.out / "score.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
         _write_sheets(arguments.out, paths, used, classes=classes, recall_only=recall_only)

@@ -13,7 +13,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.runtime.reporting import write_json
 from hvt_common.values import Image
-from hvt_study.commands.arguments import base_size, flown_frames, option, parse_rates
+from hvt_study.commands.arguments import base_size, check_means, flown_frames, option, parse_rates
 from hvt_study.commands.output import (
     RunProgress,
     decimals,
@@ -59,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fly, read, print the table, write it and a sheet of examples."""
+    check_means(arguments)
     plan = _plan(arguments)
     file = make_out(arguments.out, name="read.json")
     with RunProgress("flights") as progress:

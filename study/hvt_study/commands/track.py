@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,33 +18,12 @@ from hvt_study.datasets.annotation_rows import LAST_FRAME, Rows, read_rows
 _MOT = "frame,id,x,y,w,h,score"
 
 
-@dataclass(frozen=True, slots=True)
-class MotRows:
-    """The boxes of a file, in its order."""
+def read_detections(path: Path) -> Rows:
+    """Read a file, whose scores are probabilities, and of which all or none have ids.
 
-    frames: npt.NDArray[np.int64]
-    """(N,) frame numbers as in the file, usually from 1."""
-    ids: npt.NDArray[np.int64]
-    """(N,) track ids; -1 in files of detections."""
-    boxes_xywh_px: npt.NDArray[np.float64]
-    """(N, 4) left, top, width, height; sizes may be zero or negative in bad files."""
-    scores: npt.NDArray[np.float64]
-    """(N,) confidence, usually 0…1."""
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-
-def read_mot(path: Path) -> MotRows:
-    """Read a file; columns after the score are ignored and blank lines skipped.
-
-    A `UserError` names the file that cannot be read, or the first line that is malformed.
+    Columns after the score are ignored and blank lines skipped. A `UserError` names the file that cannot be read, or
+    the first line that is malformed.
     """
-    return _meant(read_rows(path, columns=_MOT, least=7))
-
-
-def read_detections(path: Path) -> MotRows:
-    """The same of a file of detections, whose scores are probabilities, and of which all or none have ids."""
     rows = read_rows(path, columns=_MOT, least=7)
     score, ids = rows["score"], rows["id"]
     rows.only((score >= 0) & (score <= 1), accepted="a score from 0 to 1 in column 7")
@@ -55,30 +33,20 @@ def read_detections(path: Path) -> MotRows:
             (ids >= 0) == with_id,
             accepted=f"{'an id' if with_id else '-1'} in column 2, as in the first line",
         )
-    return _meant(rows)
+    return rows
 
 
-def _meant(rows: Rows) -> MotRows:
-    return MotRows(
-        frames=rows["frame"].astype(np.int64),
-        ids=rows["id"].astype(np.int64),
-        boxes_xywh_px=rows.table[:, 2:6],
-        scores=rows["score"],
-    )
-
-
-def detections_by_frame(rows: MotRows) -> Iterator[tuple[int, Detections]]:
+def detections_by_frame(rows: Rows) -> Iterator[tuple[int, Detections]]:
     """Every frame from 1 (or 0, where the file begins there) to the last, also those without detections.
 
     Boxes become x1 y1 x2 y2 float32 in the order of the file; all classes are 0, which the format does not know.
     """
     if not len(rows):
         return
-    order = np.argsort(rows.frames, kind="stable")
-    frames = rows.frames[order]
-    xywh = rows.boxes_xywh_px[order]
+    table = rows.table[np.argsort(rows["frame"], kind="stable")]
+    frames, xywh = table[:, 0], table[:, 2:6]
     boxes = np.concatenate((xywh[:, :2], xywh[:, :2] + xywh[:, 2:]), axis=1).astype(np.float32)
-    scores = rows.scores[order].astype(np.float32)
+    scores = table[:, 6].astype(np.float32)
     first, last = min(1, int(frames[0])), int(frames[-1])
     bounds = np.searchsorted(frames, np.arange(first, last + 2))
     for frame in range(first, last + 1):
@@ -86,36 +54,15 @@ def detections_by_frame(rows: MotRows) -> Iterator[tuple[int, Detections]]:
         yield frame, Detections(boxes[part], scores[part], np.zeros(len(scores[part]), np.int32))
 
 
-def rows_of_tracks(tracks: list[Tracks]) -> MotRows:
-    """All boxes of a list of frames as rows, by frame and then by id."""
-    boxes = np.concatenate([np.empty((0, 4)), *(each.boxes_xyxy_px.astype(np.float64) for each in tracks)])
-    boxes[:, 2:] -= boxes[:, :2]
-    return MotRows(
-        frames=np.repeat(
-            np.array([each.frame_index for each in tracks], np.int64), [len(each) for each in tracks]
-        ),
-        ids=np.concatenate([np.empty(0, np.int64), *(each.ids for each in tracks)]),
-        boxes_xywh_px=boxes,
-        scores=np.concatenate([np.empty(0), *(each.confidences.astype(np.float64) for each in tracks)]),
-    )
-
-
-def write_mot(path: Path, rows: MotRows) -> None:
-    """Write ``frame,id,x,y,w,h,score,-1,-1,-1`` lines; a `UserError` where the file cannot be written."""
-    lines = [
-        f"{frame},{track_id},{x:.4f},{y:.4f},{w:.4f},{h:.4f},{score:.4f},-1,-1,-1\n"
-        for frame, track_id, (x, y, w, h), score in zip(
-            rows.frames.tolist(),
-            rows.ids.tolist(),
-            rows.boxes_xywh_px.tolist(),
-            rows.scores.tolist(),
-            strict=True,
-        )
-    ]
-    try:
-        path.write_text("".join(lines), encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror or error}") from None
+def rows_of_tracks(tracks: list[Tracks]) -> npt.NDArray[np.float64]:
+    """(N, 7) ``frame,id,x,y,w,h,score`` of all boxes of a list of frames, by frame and then by id."""
+    rows = [np.empty((0, 7))]
+    for each in tracks:
+        boxes = each.boxes_xyxy_px.astype(np.float64)
+        boxes[:, 2:] -= boxes[:, :2]
+        frame = np.full(len(each), each.frame_index)
+        rows.append(np.column_stack((frame, each.ids, boxes, each.confidences.astype(np.float64))))
+    return np.concatenate(rows)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -146,10 +93,14 @@ def run(arguments: argparse.Namespace) -> int:
     tracker = ByteTracker(settings, fps=arguments.fps)
     tracks = [tracker.update(seen, frame_index=frame) for frame, seen in detections_by_frame(rows)]
     found = rows_of_tracks(tracks)
-    write_mot(out, found)
-    empty = np.count_nonzero((rows.boxes_xywh_px[:, 2:] <= 0).any(axis=1))
+    try:
+        with out.open("w", encoding="utf-8") as file:
+            np.savetxt(file, found, fmt="%d,%d" + 5 * ",%.4f" + 3 * ",-1")
+    except OSError as error:
+        raise UserError(f"{out} cannot be written: {error.strerror or error}") from None
+    empty = np.count_nonzero((rows.table[:, 4:6] <= 0).any(axis=1))
     print(
-        f"{out}: {len(tracks)} frames, {len(np.unique(found.ids))} tracks, {len(found)} boxes"
+        f"{out}: {len(tracks)} frames, {len(np.unique(found[:, 1]))} tracks, {len(found)} boxes"
         + (f"; {empty} detections without area left out" if empty else "")
     )
     return 0

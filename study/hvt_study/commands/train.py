@@ -270,7 +270,7 @@ def _frames(path: Path, held_out: Sequence[_Own], size: _Size) -> list[LabelledF
 
 
 def _ap50(path: Path, held_out: Sequence[_Own], size: _Size, classes: Sequence[str]) -> float:
-    found = detection_score(_frames(path, held_out, size), classes=classes).mean.at_50
+    found = detection_score(judged(_frames(path, held_out, size), classes=classes)).mean.at_50
     return 0.0 if math.isnan(found) else found
 
 
@@ -289,7 +289,7 @@ def _scored(
         return {"confidence": confidence, "by_class": {}}
     frames = _frames(path, held_out, size)
     used = judged(above(frames, confidence), word=word, classes=shared)
-    curve = detection_score(frames, word=word, classes=shared)
+    curve = detection_score(judged(frames, word=word, classes=shared))
     return {"confidence": confidence, **picture_score(used, curve)}
 
 

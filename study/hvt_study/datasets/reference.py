@@ -57,12 +57,6 @@ class ReferenceLabels:
         }
         return cls(frames, tuple(packed["class_set"]))
 
-    def __or__(self, other: ReferenceLabels) -> ReferenceLabels:
-        """Those of both: chunks of one sequence that were labelled apart."""
-        return ReferenceLabels(
-            {**self.frames, **other.frames}, tuple(sorted({*self.class_set, *other.class_set}))
-        )
-
 
 def reference_labels(
     sequence: Sequence,
@@ -70,18 +64,16 @@ def reference_labels(
     detector: Detector,
     classifier: Classifier | None = None,
     size: tuple[int, int] | None = None,
-    frames: range | None = None,
 ) -> ReferenceLabels:
-    """Label the source frames that the clip shows (all, or the range ``frames``), one at a time, brought to ``size``.
+    """Label the source frames that the clip shows, one at a time, brought to ``size``.
 
     Answers of the detector below `CONFIDENCE` are passed over. A classifier names each box anew, by its crop with the
     margin of stills.
     """
-    chosen = range(sequence.clip_frames) if frames is None else frames
     resizer = None if size is None else Resizer(sequence.source_size, size, fit="letterbox")
     found: dict[int, FrameLabels] = {}
     with closing(sequence.clip.images()) as images:
-        for frame_index, image in zip(chosen, islice(images, chosen.start, chosen.stop), strict=False):
+        for frame_index, image in enumerate(islice(images, sequence.clip_frames)):
             index = sequence.source_frame(frame_index)
             if index not in found:
                 found[index] = _label(np.asarray(image), detector, classifier, resizer)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
 from hvt_common.protocol.channels import Channel
@@ -19,65 +18,34 @@ from hvt_study.metrics.observed import RefinedObject, StillArrival
 Accounting: TypeAlias = Literal["span", "pilot"]
 
 
-@dataclass(frozen=True, slots=True)
-class BitSplit:
-    """Bits a second, of everything and of its parts; the parts add up to the whole."""
+def line_rates(row_bytes: Mapping[str, int], *, seconds: float) -> dict[str, float]:
+    """Line bits a second by row of the key table, of ``FlightReport.line_bytes``: ``total_bps`` and its parts.
 
-    base_bps: float
-    roi_bps: float
-    track_bps: float
-    """The edge's own tracks."""
-    other_bps: float
-    """Status, requests and whatever else crossed the line."""
-
-    @property
-    def total_bps(self) -> float:
-        """Everything."""
-        return self.base_bps + self.roi_bps + self.track_bps + self.other_bps
-
-
-@dataclass(frozen=True, slots=True)
-class StillCounts:
-    """The stills of a run."""
-
-    stills: int
-    stills_per_min: float
-    mean_bytes: float
-    """Payload of a still; NaN where there is none."""
-    tracks_refined: int
-    """Distinct tracks of the ground on whose class a still has spoken."""
-
-
-def bit_split(row_bytes: Mapping[str, int], *, seconds: float) -> BitSplit:
-    """Line bits a second by row of the key table, of ``FlightReport.line_bytes``.
-
+    ``track_bps`` is of the edge's own tracks, ``other_bps`` of status, requests and whatever else crossed the line.
     ``seconds`` go from the first processed frame to the end of the last, or, as the pilot's, over the whole clip.
     """
     _check(seconds)
-    known = {row: 8 * row_bytes.get(row, 0) / seconds for row in (Channel.BASE, Channel.ROI, Channel.TRACKS)}
-    return BitSplit(
-        base_bps=known[Channel.BASE],
-        roi_bps=known[Channel.ROI],
-        track_bps=known[Channel.TRACKS],
-        other_bps=sum(8 * size / seconds for row, size in row_bytes.items() if row not in known),
-    )
+    named = {Channel.BASE: "base_bps", Channel.ROI: "roi_bps", Channel.TRACKS: "track_bps"}
+    rates = {name: 8 * row_bytes.get(row, 0) / seconds for row, name in named.items()}
+    rates["other_bps"] = sum(8 * size / seconds for row, size in row_bytes.items() if row not in named)
+    return {"total_bps": sum(rates.values()), **rates}
 
 
 def still_counts(
-    stills: Sequence[StillArrival],
-    refined: Sequence[RefinedObject],
-    *,
-    seconds: float,
-) -> StillCounts:
-    """Count what arrived; ``seconds`` as in `bit_split`."""
+    stills: Sequence[StillArrival], refined: Sequence[RefinedObject], *, seconds: float
+) -> dict[str, float]:
+    """Count what arrived, and the distinct tracks of the ground on whose class a still has spoken.
+
+    ``seconds`` are as in `line_rates`; the mean size, of payloads, is NaN where there is none.
+    """
     _check(seconds)
     sizes = [one.size_bytes for one in stills]
-    return StillCounts(
-        stills=len(sizes),
-        stills_per_min=60 * len(sizes) / seconds,
-        mean_bytes=sum(sizes) / len(sizes) if sizes else math.nan,
-        tracks_refined=len({one.track_id for one in refined} - {NO_ID}),
-    )
+    return {
+        "stills": len(sizes),
+        "stills_per_min": 60 * len(sizes) / seconds,
+        "mean_still_bytes": sum(sizes) / len(sizes) if sizes else math.nan,
+        "tracks_refined": len({one.track_id for one in refined} - {NO_ID}),
+    }
 
 
 def _check(seconds: float) -> None:

@@ -13,22 +13,13 @@ Macro-F1 is scikit-learn's ``f1_score(average="macro")`` over the classes of the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from hvt_study.metrics.judged import (
-    LIMITS_PX2,
-    SIZES,
-    Judged,
-    LabelledFrames,
-    Size,
-    judged,
-    matched_rows,
-    of_size,
-)
+from hvt_study.metrics.judged import LIMITS_PX2, SIZES, Judged, Size, matched_rows, of_size
 
 _NOBODY = -1
 """Stands for the class of what has no partner."""
@@ -121,19 +112,13 @@ class _Pairs:
 
 
 def class_score(
-    labelled: LabelledFrames,
-    *,
-    refined: bool = True,
-    word: Callable[[str], str] = str,
-    classes: Collection[str] | None = None,
-    limits_px2: tuple[float, float] = LIMITS_PX2,
+    frames: Sequence[Judged], *, refined: bool = True, limits_px2: tuple[float, float] = LIMITS_PX2
 ) -> ClassScore:
-    """Count right classes over every frame of a sequence; ``word`` and ``classes`` as in `judged.judged`.
+    """Count right classes over every frame of a sequence.
 
     ``refined`` takes names as shown; False those before refinement, of the very same boxes. ``limits_px2`` are areas
     in source pixels between small and medium, and between medium and large.
     """
-    frames = judged(labelled, word=word, classes=classes)
     pairs = _paired(frames, refined=refined)
     every = np.ones(len(pairs.true), np.bool_)
     return ClassScore(

@@ -5,14 +5,13 @@ as the mean over 0.5, 0.55 … 0.95 (Lin et al. 2014, https://cocodataset.org/#d
 VisDrone's toolkit (Zhu et al. 2021, VisDrone2018-DET-toolkit) and not as in COCO: up to 500 boxes of a class count in
 a frame instead of 100, because aerial frames hold more; and ignored regions (see `judged`).
 
-The issue asks for it *on base frames*: hand over the frames that the ground has decoded and detected on
-(`FlightReport.detections`), not the list at every frame.
+In a flight it is of base frames: those that the ground has decoded and detected on, not the list at every frame.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -21,7 +20,7 @@ import numpy.typing as npt
 from faster_coco_eval import COCO
 from faster_coco_eval.core.faster_eval_api import COCOeval_faster
 
-from hvt_study.metrics.judged import LARGEST_PX2, LIMITS_PX2, SIZES, Judged, LabelledFrames, Size, judged
+from hvt_study.metrics.judged import LARGEST_PX2, LIMITS_PX2, SIZES, Judged, Size
 
 _MOST_BOXES: Final = 500
 _Precision = npt.NDArray[np.float64]
@@ -49,17 +48,8 @@ class DetectionScore:
     """Mean over classes, of labels of one size; boxes of other sizes that match nothing do not count."""
 
 
-def detection_score(
-    labelled: LabelledFrames,
-    *,
-    word: Callable[[str], str] = str,
-    classes: Collection[str] | None = None,
-) -> DetectionScore:
-    """Average precision of boxes and names as shown, by confidence, over frames that were detected on.
-
-    ``word`` and ``classes`` are as in `judged.judged`.
-    """
-    frames = judged(labelled, word=word, classes=classes)
+def detection_score(frames: Sequence[Judged]) -> DetectionScore:
+    """Average precision of boxes and names as shown, by confidence, over frames that were detected on."""
     names = sorted({name for one in frames for name in one.class_names})
     if not names:
         nothing = AveragePrecision()

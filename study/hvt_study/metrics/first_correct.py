@@ -9,7 +9,7 @@ method that misses much) nor the time that they waited.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.stats import CensoredData, ecdf
 
 from hvt_study.datasets.labels import NO_ID
-from hvt_study.metrics.judged import Judged, LabelledFrames, judged, matched_rows
+from hvt_study.metrics.judged import Judged, matched_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,39 +66,30 @@ class FirstCorrect:
 
 
 def first_correct(
-    labelled: LabelledFrames,
-    *,
-    fps: float,
-    shown_s: Sequence[float] | None = None,
-    refined: bool = True,
-    word: Callable[[str], str] = str,
-    classes: Collection[str] | None = None,
+    frames: Sequence[Judged], *, fps: float, shown_s: Sequence[float] | None = None
 ) -> FirstCorrect:
-    """Watch every true track.
+    """Watch every true track; labels without ids are of none.
 
     ``fps`` is that of frames; ``shown_s`` says of each when its list was shown, from the capture of the first: who
-    waits for a second pass waits for its classes. None: with its capture. The rest is as in `classes.class_score`.
-
-    Labels without ids are of no track and not watched.
+    waits for a second pass waits for its classes. None: with its capture.
     """
     first: dict[int, int] = {}
     last: dict[int, int] = {}
     right: dict[int, int] = {}
-    for frame_index, one in enumerate(judged(labelled, word=word, classes=classes)):
+    for frame_index, one in enumerate(frames):
         there = [track for track in one.ids.tolist() if track != NO_ID]
         first = dict.fromkeys(there, frame_index) | first
         last |= dict.fromkeys(there, frame_index)
-        right = dict.fromkeys(_right_ids(one, refined=refined), frame_index) | right
+        right = dict.fromkeys(_right_ids(one), frame_index) | right
     if shown_s is None:
-        shown_s = [frame_index / fps for frame_index in range(len(labelled))]
+        shown_s = [frame_index / fps for frame_index in range(len(frames))]
     end_s = [shown_s[right.get(track, last[track])] for track in first]
     waits_s = np.array(end_s, np.float64) - np.array(list(first.values()), np.float64) / fps
     return FirstCorrect(waits_s, np.array([track not in right for track in first], np.bool_))
 
 
-def _right_ids(one: Judged, *, refined: bool) -> list[int]:
+def _right_ids(one: Judged) -> list[int]:
     """True tracks that this frame shows with their class."""
-    shown = one.view.class_names if refined else one.view.names_before
     pairs = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px).tolist()
-    hits = [row for row, column in pairs if shown[column] == one.class_names[row]]
+    hits = [row for row, column in pairs if one.view.class_names[column] == one.class_names[row]]
     return [track for track in one.ids[hits].tolist() if track != NO_ID]

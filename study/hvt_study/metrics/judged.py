@@ -167,12 +167,10 @@ def _known(names: Sequence[str], classes: Collection[str] | None) -> npt.NDArray
     return np.array([classes is None or name == MOVING or name in classes for name in names], np.bool_)
 
 
-def matched_rows(
-    labels_xyxy_px: Floats, shown_xyxy_px: Floats, *, least_iou: float = LEAST_IOU
-) -> npt.NDArray[np.int64]:
+def matched_rows(labels_xyxy_px: Floats, shown_xyxy_px: Floats) -> npt.NDArray[np.int64]:
     """Match (N, 4) labels and (M, 4) boxes one to one, whatever their classes.
 
-    As many pairs as possible of an IoU of ``least_iou`` or more, and of those matchings the one with most overlap in
+    As many pairs as possible of an IoU of `LEAST_IOU` or more, and of those matchings the one with most overlap in
     all (Kuhn 1955, by `scipy.optimize.linear_sum_assignment`). Returns (K, 2): row of the label, row of the box, by
     row of the label.
     """
@@ -181,7 +179,7 @@ def matched_rows(
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - what needs no figures runs without it
 
     overlap = iou(labels_xyxy_px, shown_xyxy_px)
-    enough = overlap >= least_iou
+    enough = overlap >= LEAST_IOU
     # A pair that counts is worth more than any sum of overlaps.
     value = np.where(enough, overlap + min(overlap.shape), 0.0)
     rows, columns = linear_sum_assignment(value, maximize=True)

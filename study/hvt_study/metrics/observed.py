@@ -134,11 +134,6 @@ def detected_frames(lists: Sequence[ObservedFrame], labels: Iterable[FrameLabels
     return [(truth, found) for truth, found in pairs if found is not None]
 
 
-def shown_times_s(lists: Iterable[ObservedFrame]) -> list[float]:
-    """When each frame's list was there, from the capture of the first frame."""
-    return [one.shown_s for one in lists]
-
-
 def arrivals(lists: Iterable[ObservedFrame]) -> list[StillArrival]:
     """All stills, in order of arrival."""
     return [still for one in lists for still in one.stills]
@@ -152,42 +147,23 @@ def refined_objects(lists: Iterable[ObservedFrame]) -> list[RefinedObject]:
 SMALL_SHARE = 0.015
 
 
-@dataclass(frozen=True, slots=True)
-class ProxyScore:
-    """Means over some pairs; NaN where there is none."""
+def proxies(objects: Iterable[RefinedObject]) -> dict[str, float]:
+    """Means over all objects in stills of which both opinions are known, matched with a track or not.
 
-    pairs: int
-    confidence_base: float
-    confidence_still: float
-    gain: float
-    positive_rate: float
-    change_rate: float
-    entropy_gain_nats: float
-
-
-@dataclass(frozen=True, slots=True)
-class Proxies:
-    """Of one run."""
-
-    every: ProxyScore
-    small: ProxyScore
-    unpaired: int
-    """Objects in stills of which one of the two opinions is missing; they are in neither score."""
-
-
-def proxies(objects: Iterable[RefinedObject], *, small_share: float = SMALL_SHARE) -> Proxies:
-    """Score all objects in stills, matched with a track or not; ``small_share`` is a share of the base frame."""
-    everything = list(objects)
+    The same of the small ones under ``small_…``; NaN where there is none.
+    """
     pairs = [
         (one.base, one.still, one.area_share)
-        for one in everything
+        for one in objects
         if one.base is not None and one.still is not None
     ]
-    return Proxies(
-        every=_score([(base, still) for base, still, _ in pairs]),
-        small=_score([(base, still) for base, still, share in pairs if share < small_share]),
-        unpaired=len(everything) - len(pairs),
-    )
+    small = [(base, still) for base, still, share in pairs if share < SMALL_SHARE]
+    return {
+        "proxy_pairs": len(pairs),
+        "small_pairs": len(small),
+        **_means([(base, still) for base, still, _ in pairs]),
+        **{f"small_{name}": value for name, value in _means(small).items()},
+    }
 
 
 def score_entropy_nats(confidence: float, classes: int) -> float:
@@ -201,18 +177,18 @@ def score_entropy_nats(confidence: float, classes: int) -> float:
     return known - (rest * math.log(rest / (classes - 1)) if rest > 0 and classes > 1 else 0.0)
 
 
-def _score(pairs: Sequence[tuple[Opinion, Opinion]]) -> ProxyScore:
-    if not pairs:
-        return ProxyScore(0, *[math.nan] * 6)
-    base = np.array([(one.confidence, one.entropy_nats) for one, _ in pairs])
-    still = np.array([(one.confidence, one.entropy_nats) for _, one in pairs])
-    gains = still[:, 0] - base[:, 0]
-    return ProxyScore(
-        pairs=len(pairs),
-        confidence_base=float(base[:, 0].mean()),
-        confidence_still=float(still[:, 0].mean()),
-        gain=float(gains.mean()),
-        positive_rate=float((gains > 0).mean()),
-        change_rate=sum(one.class_name != other.class_name for one, other in pairs) / len(pairs),
-        entropy_gain_nats=float((base[:, 1] - still[:, 1]).mean()),
+def _means(pairs: Sequence[tuple[Opinion, Opinion]]) -> dict[str, float]:
+    base, still = (
+        np.array([(one.confidence, one.entropy_nats) for one in side]).reshape(-1, 2)
+        for side in (zip(*pairs, strict=True) if pairs else ((), ()))
     )
+    gains = still[:, 0] - base[:, 0]
+    columns = {
+        "confidence_base": base[:, 0],
+        "confidence_refined": still[:, 0],
+        "confidence_gain": gains,
+        "positive_rate": gains > 0,
+        "change_rate": np.array([one.class_name != other.class_name for one, other in pairs]),
+        "entropy_gain_nats": base[:, 1] - still[:, 1],
+    }
+    return {name: float(values.mean()) if pairs else math.nan for name, values in columns.items()}

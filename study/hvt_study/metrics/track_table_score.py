@@ -17,7 +17,7 @@ from hvt_common.files import MOST_TABLE_BYTES, read_text
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.mot import read_truth_rows
 from hvt_study.metrics.classes import ClassScore, class_score
-from hvt_study.metrics.judged import FrameView
+from hvt_study.metrics.judged import FrameView, judged
 
 _log = logging.getLogger(__name__)
 _MOST_HELD, _LEAST_GAPS = 15, 10
@@ -26,18 +26,17 @@ SMALL_SHARE = 0.0012
 """Objects of less than this share of the frame count as small: about 33x33 pixels of 1280x720."""
 
 
-def read_tracks(path: Path, *, column: str = "class") -> dict[int, FrameView]:
+def read_tracks(path: Path) -> dict[int, FrameView]:
     """Read a tracks table of the ground by frame, from 1 as in MOTChallenge.
 
-    ``column`` is ``class`` or ``base_class``. Tables of earlier versions have ``frame``, from 1, in place
-    of ``frame_index``.
+    Tables of earlier versions have ``frame``, from 1, in place of ``frame_index``.
 
     Where the edge codes each n-th frame, those between show the list of the one before.
     """
     rows: dict[int, tuple[list[list[float]], list[str]]] = defaultdict(lambda: ([], []))
     try:
         with io.StringIO(read_text(path, most=MOST_TABLE_BYTES), newline="") as file:
-            for frame, box, name in _lines(csv.DictReader(file), column):
+            for frame, box, name in _lines(csv.DictReader(file)):
                 rows[frame][0].append(box)
                 rows[frame][1].append(name)
     except OSError as error:
@@ -51,16 +50,16 @@ def read_tracks(path: Path, *, column: str = "class") -> dict[int, FrameView]:
     return _held({frame: FrameView.plain(*found) for frame, found in rows.items()})
 
 
-def _lines(table: csv.DictReader[str], column: str) -> Iterator[tuple[int, list[float], str]]:
+def _lines(table: csv.DictReader[str]) -> Iterator[tuple[int, list[float], str]]:
     # Frame, box and class of each line; KeyError, TypeError or ValueError where there are none.
-    if column not in (table.fieldnames or ()):
-        raise KeyError(column)
+    if "class" not in (table.fieldnames or ()):
+        raise KeyError("class")
     for line in table:
         x, y, w, h = (float(line[name]) for name in ("x", "y", "w", "h"))
         if not math.isfinite(x + y + w + h):
             raise ValueError(f"line {table.line_num} has no box")
         frame = int(line["frame_index"]) + 1 if "frame_index" in line else int(line["frame"])
-        yield frame, [x, y, x + w, y + h], line[column]
+        yield frame, [x, y, x + w, y + h], line["class"]
 
 
 def read_truth(path: Path, *, class_names: Sequence[str]) -> dict[int, FrameLabels]:
@@ -87,7 +86,7 @@ def score(
 ) -> ClassScore:
     """Match tracks to objects on every frame of the truth and count; small is less than `SMALL_SHARE` of a frame."""
     labelled = [(truth[frame], tracks.get(frame, FrameView())) for frame in sorted(truth)]
-    return class_score(labelled, limits_px2=(SMALL_SHARE * frame_area_px, math.inf))
+    return class_score(judged(labelled), limits_px2=(SMALL_SHARE * frame_area_px, math.inf))
 
 
 def _held(tracks: dict[int, FrameView]) -> dict[int, FrameView]:

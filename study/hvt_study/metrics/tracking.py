@@ -6,8 +6,7 @@ overwrites the headless OpenCV of HVT.
 
 CLEAR MOT: Bernardin and Stiefelhagen, "Evaluating Multiple Object Tracking Performance", 2008. IDF1: Ristani et al.,
 "Performance Measures and a Data Set for Multi-Target, Multi-Camera Tracking", 2016. A box is on a label from an IoU
-of 0.5 on, whatever the classes. All figures of several sequences are pooled by adding up their counts, as the
-benchmarks do.
+of 0.5 on, whatever the classes.
 
 Continuity says how steadily labelled objects are held. A gap is a run of an object's frames in which it is missed
 after it was found once; the time before is no gap: recall has it.
@@ -16,8 +15,8 @@ after it was found once; the time before is no gap: recall has it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
@@ -28,7 +27,7 @@ from scipy.optimize import linear_sum_assignment
 
 from hvt_common.values import iou
 from hvt_study.datasets.labels import NO_ID
-from hvt_study.metrics.judged import LEAST_IOU, LabelledFrames, judged, matched_rows
+from hvt_study.metrics.judged import LEAST_IOU, Judged, matched_rows
 
 ALPHAS: Final = np.arange(0.05, 0.99, 0.05)
 """(19,) least IoU of a match; HOTA is the mean over them (section 3.4 of the paper)."""
@@ -38,65 +37,21 @@ _EPSILON: Final = float(np.finfo(float).eps)
 IdBoxes = tuple[npt.NDArray[np.integer[Any]], npt.NDArray[np.floating[Any]]]
 """Ids (N,), each once, and their boxes (N, 4) x1 y1 x2 y2, of one frame."""
 
-_Overlaps = list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]]
 
+def hota(frames: Sequence[tuple[IdBoxes, IdBoxes]]) -> float:
+    """Mean over `ALPHAS` of sqrt(DetA AssA) (equations 12 and 17); NaN where no track was labelled.
 
-def _zeros() -> npt.NDArray[np.float64]:
-    return np.zeros(len(ALPHAS))
-
-
-@dataclass(frozen=True, slots=True)
-class Hota:
-    """Counts for each alpha, (19,); those of several sequences can be added up, which is how benchmarks pool them."""
-
-    true_positives: npt.NDArray[np.float64] = field(default_factory=_zeros)
-    false_negatives: npt.NDArray[np.float64] = field(default_factory=_zeros)
-    false_positives: npt.NDArray[np.float64] = field(default_factory=_zeros)
-    association: npt.NDArray[np.float64] = field(default_factory=_zeros)
-    """Sum of A(c) over all true positives c (equation 13)."""
-
-    def __add__(self, other: Hota) -> Hota:
-        return Hota(
-            self.true_positives + other.true_positives,
-            self.false_negatives + other.false_negatives,
-            self.false_positives + other.false_positives,
-            self.association + other.association,
-        )
-
-    @property
-    def hota(self) -> float:
-        """Mean over alpha of sqrt(DetA AssA) (equations 12 and 17); NaN where no track was labelled."""
-        return self._mean(np.sqrt(self._detection() * self._association()))
-
-    @property
-    def deta(self) -> float:
-        """Detection accuracy, mean over alpha of TP / (TP + FN + FP) (equation 14)."""
-        return self._mean(self._detection())
-
-    @property
-    def assa(self) -> float:
-        """Association accuracy, mean over alpha of the mean of A(c) (equation 15)."""
-        return self._mean(self._association())
-
-    def _detection(self) -> npt.NDArray[np.float64]:
-        total = self.true_positives + self.false_negatives + self.false_positives
-        return np.asarray(self.true_positives / np.maximum(1, total))
-
-    def _association(self) -> npt.NDArray[np.float64]:
-        return np.asarray(self.association / np.maximum(1, self.true_positives))
-
-    def _mean(self, values: npt.NDArray[np.float64]) -> float:
-        labelled = self.true_positives[0] + self.false_negatives[0] > 0
-        return float(values.mean()) if labelled else math.nan
-
-
-def hota(frames: Iterable[tuple[IdBoxes, IdBoxes]]) -> Hota:
-    """Of one sequence: for each frame the true tracks and those that are shown, in one pixel space.
-
+    For each frame of one sequence there are the true tracks and those that are shown, in one pixel space.
     As in the authors' program one matching serves all alphas of a frame: the assignment of the greatest sum of
     overlap times global alignment of the two tracks (section 3.3 of the paper and its appendix).
     """
-    overlaps, true_lengths, lengths = _overlaps(frames)
+    true_ids, true_lengths = _each([ids for (ids, _), _ in frames])
+    shown_ids, lengths = _each([ids for _, (ids, _) in frames])
+    overlaps = [
+        (np.searchsorted(true_ids, true), np.searchsorted(shown_ids, shown), iou(true_boxes, boxes))
+        for (true, true_boxes), (shown, boxes) in frames
+        if len(true) and len(shown)
+    ]
     together = np.zeros((len(true_lengths), len(lengths)))
     for true, shown, overlap in overlaps:
         rest = overlap.sum(axis=0)[None, :] + overlap.sum(axis=1)[:, None] - overlap
@@ -115,37 +70,16 @@ def hota(frames: Iterable[tuple[IdBoxes, IdBoxes]]) -> Hota:
     enough = np.concatenate(at)[None, :] >= ALPHAS[:, None] - _EPSILON
     matches = np.stack([np.bincount(pair[row], minlength=len(known)) for row in enough])  # (19, pairs)
     hits = matches.sum(axis=1).astype(np.float64)
-    return Hota(
-        true_positives=hits,
-        false_negatives=true_lengths.sum() - hits,
-        false_positives=lengths.sum() - hits,
-        association=(matches**2 / np.maximum(1, either.ravel()[known] - matches)).sum(axis=1),
-    )
+    detection = hits / np.maximum(1, true_lengths.sum() + lengths.sum() - hits)  # equation 14
+    alike = (matches**2 / np.maximum(1, either.ravel()[known] - matches)).sum(axis=1)  # equation 13
+    association = alike / np.maximum(1, hits)  # equation 15
+    return float(np.sqrt(detection * association).mean()) if len(true_ids) else math.nan
 
 
-def _overlaps(
-    frames: Iterable[tuple[IdBoxes, IdBoxes]],
-) -> tuple[_Overlaps, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Rows of true and of shown tracks with their IoU, of each frame that has both; then all lengths of tracks."""
-    true_of: dict[int, int] = {}
-    shown_of: dict[int, int] = {}
-    seen: list[list[int]] = [[], []]
-    overlaps: _Overlaps = []
-    for (true_ids, true_boxes), (ids, boxes) in frames:
-        true, shown = _numbered(true_ids, true_of), _numbered(ids, shown_of)
-        seen[0] += true.tolist()
-        seen[1] += shown.tolist()
-        if len(true) and len(shown):
-            overlaps.append((true, shown, iou(true_boxes, boxes)))
-    return overlaps, _lengths(seen[0], len(true_of)), _lengths(seen[1], len(shown_of))
-
-
-def _numbered(ids: npt.NDArray[np.integer[Any]], row_of: dict[int, int]) -> npt.NDArray[np.int64]:
-    return np.array([row_of.setdefault(one, len(row_of)) for one in ids.tolist()], np.int64)
-
-
-def _lengths(rows: Sequence[int], count: int) -> npt.NDArray[np.float64]:
-    return np.bincount(np.asarray(rows, np.int64), minlength=count).astype(np.float64)
+def _each(ids: Sequence[npt.NDArray[np.integer[Any]]]) -> tuple[npt.NDArray[Any], npt.NDArray[np.float64]]:
+    """All tracks, sorted, and the frames of each."""
+    known, lengths = np.unique(np.concatenate([np.empty(0, np.int64), *ids]), return_counts=True)
+    return known, lengths.astype(np.float64)
 
 
 _COUNTS: Final = {
@@ -161,22 +95,19 @@ _COUNTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class TrackingScore:
-    """Counts of one sequence, or, added up, of several."""
+    """Counts of one sequence."""
 
-    objects: int = 0
+    objects: int
     """Labels that belong to a track, over all frames."""
-    misses: int = 0
-    false_positives: int = 0
-    switches: int = 0
+    misses: int
+    false_positives: int
+    switches: int
     """How often a true track was found under another id than when it was last found."""
-    id_true_positives: int = 0
-    id_false_positives: int = 0
-    id_false_negatives: int = 0
-    higher_order: Hota = field(default_factory=Hota)
-
-    def __add__(self, other: TrackingScore) -> TrackingScore:
-        counts = {name: getattr(self, name) + getattr(other, name) for name in _COUNTS.values()}
-        return TrackingScore(**counts, higher_order=self.higher_order + other.higher_order)
+    id_true_positives: int
+    id_false_positives: int
+    id_false_negatives: int
+    hota: float
+    """See `hota`; NaN where no track was labelled."""
 
     @property
     def mota(self) -> float:
@@ -191,25 +122,18 @@ class TrackingScore:
         total = hits + self.id_false_positives + self.id_false_negatives
         return hits / total if self.objects else math.nan
 
-    @property
-    def hota(self) -> float:
-        """See `Hota.hota`; NaN where no track was labelled."""
-        return self.higher_order.hota
 
-
-def tracking_score(
-    labelled: LabelledFrames, *, word: Callable[[str], str] = str, classes: Collection[str] | None = None
-) -> TrackingScore:
-    """Compare what is shown at every frame with the labelled tracks; ``word`` and ``classes`` as in `judged.judged`.
+def tracking_score(frames: Iterable[Judged]) -> TrackingScore:
+    """Compare what is shown at every frame with the labelled tracks.
 
     Labels without ids say nothing of tracks: where none has one, every figure is NaN.
     """
-    frames: list[tuple[IdBoxes, IdBoxes]] = []
-    for one in judged(labelled, word=word, classes=classes):
+    sides: list[tuple[IdBoxes, IdBoxes]] = []
+    for one in frames:
         known, tracked = one.ids != NO_ID, one.view.ids != NO_ID
         true = one.ids[known], one.boxes_xyxy_px[known]
-        frames.append((true, (one.view.ids[tracked], one.view.boxes_xyxy_px[tracked])))
-    return compare_tracks(frames)
+        sides.append((true, (one.view.ids[tracked], one.view.boxes_xyxy_px[tracked])))
+    return compare_tracks(sides)
 
 
 def compare_tracks(
@@ -223,7 +147,8 @@ def compare_tracks(
     if not any(len(ids) for (ids, _), _ in sequence):
         # motmetrics has no answer here.
         false = sum(len(ids) for _, (ids, _) in sequence)
-        return TrackingScore(false_positives=false, id_false_positives=false, higher_order=hota(sequence))
+        counts = dict.fromkeys(_COUNTS.values(), 0) | {"false_positives": false, "id_false_positives": false}
+        return TrackingScore(**counts, hota=math.nan)
     events = motmetrics.MOTAccumulator()
     for number, ((true_ids, true_boxes), (ids, boxes)) in enumerate(sequence):
         distance = 1 - iou(true_boxes, boxes)  # motmetrics' own needs NumPy 1
@@ -231,7 +156,7 @@ def compare_tracks(
         events.update(true_ids.tolist(), ids.tolist(), distance, frameid=number)
     summary = _judge().compute(events, metrics=list(_COUNTS), return_dataframe=False)
     counts = {name: round(float(summary[key])) for key, name in _COUNTS.items()}
-    return TrackingScore(**counts, higher_order=hota(sequence))
+    return TrackingScore(**counts, hota=hota(sequence))
 
 
 @cache
@@ -250,12 +175,10 @@ class Continuity:
     longest_gap: int
 
 
-def continuity(
-    labelled: LabelledFrames, *, word: Callable[[str], str] = str, classes: Collection[str] | None = None
-) -> Continuity:
-    """Follow every object with an id through its frames; ``word`` and ``classes`` as in `judged.judged`."""
+def continuity(frames: Iterable[Judged]) -> Continuity:
+    """Follow every object with an id through its frames."""
     lives: dict[int, list[bool]] = {}
-    for one in judged(labelled, word=word, classes=classes):
+    for one in frames:
         pairs = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px)
         found = set(pairs[:, 0].tolist())
         for row, number in enumerate(one.ids.tolist()):

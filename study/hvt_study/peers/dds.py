@@ -226,7 +226,6 @@ def fly_dds(
     link_bps: int,
     size: tuple[int, int],
     detector: Detector,
-    edge_id: str = "edge-1",
     settings: DdsSettings = DdsSettings(),  # noqa: B008 - frozen
 ) -> FlightReport:
     """Fly the peer once; ``detector`` is the ground's, ``size`` (width, height) that of the base frames.
@@ -239,10 +238,8 @@ def fly_dds(
     frame rate.
     """
     settings = settings.resolved(budget_bps, size=size)
-    rates = pass_rates(budget_bps, size=size, settings=settings, edge_id=edge_id)
-    line = Line(
-        link_bps=link_bps, budget=RollingBudget(rates.budget), window_ns=settings.window_ns, edge_id=edge_id
-    )
+    rates = pass_rates(budget_bps, size=size, settings=settings)
+    line = Line(link_bps=link_bps, budget=RollingBudget(rates.budget), window_ns=settings.window_ns)
     coded = coded_frames(clip.frame_count, settings.rate)
     segments = _segments(coded, settings.segment_frames)
     most_bytes = int(budget_bps * clip.frame_count / NOMINAL_FPS / 8)

@@ -37,7 +37,7 @@ class PassRates:
     budget: BudgetSettings
 
 
-def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings, edge_id: str) -> PassRates:
+def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings) -> PassRates:
     """Share out a budget of line bits a second; `UserError` where x265 cannot follow what is left for a pass."""
     request_bps = settings.request_bps
     first_line = settings.share * (budget_bps - request_bps)
@@ -46,12 +46,8 @@ def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings,
     questions = NOMINAL_FPS / settings.segment_frames
     bundles = min(fps, max(questions, second_line / 8 / settings.bundle_bytes))
     small = settings.first_size(size)
-    first = first_line - _beside_bps(
-        first_line, Channel.BASE, small, fps=fps, messages_per_s=fps, edge_id=edge_id
-    )
-    second = second_line - _beside_bps(
-        second_line, Channel.ROI, size, fps=fps, messages_per_s=bundles, edge_id=edge_id
-    )
+    first = first_line - _beside_bps(first_line, Channel.BASE, small, fps=fps, messages_per_s=fps)
+    second = second_line - _beside_bps(second_line, Channel.ROI, size, fps=fps, messages_per_s=bundles)
     # Of the second pass most is black.
     for payload, least in ((first, minimum_bps(small, fps)), (second, 8 * _BLACK_FRAME_BYTES * fps)):
         if payload < least:
@@ -71,10 +67,10 @@ def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings,
 
 
 def _beside_bps(
-    line_bps: float, row: Channel, size: tuple[int, int], *, fps: float, messages_per_s: float, edge_id: str
+    line_bps: float, row: Channel, size: tuple[int, int], *, fps: float, messages_per_s: float
 ) -> float:
     """What of a pass's rate is not x265's to spend."""
-    headers = header_bps(line_bps, units_per_s=fps, messages_per_s=messages_per_s, row=row, edge_id=edge_id)
+    headers = header_bps(line_bps, units_per_s=fps, messages_per_s=messages_per_s, row=row)
     return headers + 8 * keyframe_floor_bytes(size) / _KEYFRAME_DEBT_S
 
 

@@ -20,6 +20,7 @@ HEADER_BYTES = 48
 """What a `BaseHeader` takes at most."""
 _SESSION = 1 << 40  # as many bytes on the wire as a random one
 _CHANNELS = {Channel.BASE: Account.BASE, Channel.ROI: Account.ROI, Channel.CONTROL: Account.META}
+_KEYS = EdgeKeys("edge-1")
 _VIDEO = DELIVERIES[Channel.BASE].encoding
 _FURTHER = struct.Struct(">II")
 """Before each access unit but the first: its frame and its length."""
@@ -33,21 +34,17 @@ class UnitMessage:
     units: tuple[AccessUnit, ...]
 
 
-def header_bps(
-    line_bps: float, *, units_per_s: float, messages_per_s: float, row: Channel, edge_id: str
-) -> float:
+def header_bps(line_bps: float, *, units_per_s: float, messages_per_s: float, row: Channel) -> float:
     """What headers and transport take of ``line_bps``."""
     payload = round(line_bps / 8 / messages_per_s)
-    around = HEADER_BYTES + overhead_bytes(
-        payload, HEADER_BYTES, key=EdgeKeys(edge_id).key(row), encoding=_VIDEO
-    )
+    around = HEADER_BYTES + overhead_bytes(payload, HEADER_BYTES, key=_KEYS.key(row), encoding=_VIDEO)
     return 8 * (messages_per_s * around + (units_per_s - messages_per_s) * _FURTHER.size)
 
 
 class Line:
     """Both directions. Edge to ground goes over a simulated link; what the ground asks takes its own time back."""
 
-    def __init__(self, *, link_bps: int, budget: RollingBudget, window_ns: int, edge_id: str) -> None:
+    def __init__(self, *, link_bps: int, budget: RollingBudget, window_ns: int) -> None:
         self.budget = budget
         self.ledger = Ledger(window_ns=window_ns, slack_ns=4 * window_ns)
         self.line_bytes: Counter[str] = Counter()
@@ -55,7 +52,6 @@ class Line:
         self.max_frame_bytes = 0
         self.arrivals: list[Arrival[None]] = []
         """Everything that crossed, without what was in it."""
-        self._keys = EdgeKeys(edge_id)
         self._link: SerialLink[UnitMessage] = SerialLink(rate_bps=link_bps)
         self._link_bps = link_bps
         self._digest = hashlib.sha256()
@@ -127,7 +123,7 @@ class Line:
         )
 
     def _weight(self, row: Channel, payload: bytes, attachment: bytes, *, encoding: str) -> int:
-        key = self._keys.key(row)
+        key = _KEYS.key(row)
         around = overhead_bytes(len(payload), len(attachment), key=key, encoding=encoding)
         return len(payload) + len(attachment) + around
 

@@ -19,10 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse.csgraph import connected_components
 
-from hvt_common.errors import UserError
 from hvt_common.inference.nms import suppress
 from hvt_common.values import Boxes, Detections, Image, iou
-from hvt_edge.video.encoder_settings import PRESETS
 from hvt_study.datasets.sequence import NOMINAL_FPS
 
 RATES = (NOMINAL_FPS, 7.5, 5.0, 3.0, 2.0)
@@ -33,10 +31,7 @@ _LEAST_BITS_PER_PX = 0.1
 
 @dataclass(frozen=True, slots=True)
 class DdsSettings:
-    """Sizes are shares of the picture, thresholds are confidences and IoUs (0…1).
-
-    Raises `UserError` where one of them is out of its range.
-    """
+    """Sizes are shares of the picture, thresholds are confidences and IoUs (0…1)."""
 
     share: float = 0.5
     """Of the budget without requests that the first pass takes; the second has the rest."""
@@ -73,18 +68,6 @@ class DdsSettings:
     request_bytes: int = 700
     """Line bytes that are kept free for each request. A larger one waits until there is room."""
 
-    def __post_init__(self) -> None:
-        for name, low, high in _RANGES:
-            value = getattr(self, name)
-            if value is None:  # by the budget
-                continue
-            if not low <= value <= high:  # also refuses NaN
-                raise UserError(f"DDS {name} {value:g} is not accepted; {low:g} to {high:g} is")
-        if self.low > self.high:
-            raise UserError(f"DDS low {self.low:g} is above high {self.high:g}; it may not be")
-        if self.preset not in PRESETS:
-            raise UserError(f"DDS preset {self.preset!r} is not known: choose from {', '.join(PRESETS)}")
-
     def resolved(self, budget_bps: int, *, size: tuple[int, int]) -> DdsSettings:
         """The same with a frame rate, chosen by the budget where none was given."""
         if self.fps is not None:
@@ -117,19 +100,6 @@ class DdsSettings:
         """(width, height) of the first pass, even numbers."""
         width, height = (max(2, 2 * math.floor(side * self.scale / 2 + 0.5)) for side in size)
         return width, height
-
-
-_RANGES: tuple[tuple[str, float, float], ...] = (
-    *((name, 0, 1) for name in ("low", "high", "overlap_iou", "max_area", "merge_iou", "nms_iou")),
-    *(
-        ("share", 0.05, 0.95),
-        ("segment_s", 1 / NOMINAL_FPS, 10),
-        ("fps", 0.5, NOMINAL_FPS),
-        ("scale", 0.1, 1),
-    ),
-    *(("enlarge", 0, 2), ("align_px", 2, 128), ("confidence", 0.01, 1)),
-    *(("bundle_bytes", 1, 100_000), ("request_bytes", 0, 100_000)),
-)
 
 
 Blocks = npt.NDArray[np.bool_]

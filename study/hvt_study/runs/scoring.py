@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from hvt_common.protocol.channels import Channel
 from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.flights.flight import FlightReport
-from hvt_study.metrics.bits import bit_split, still_counts
+from hvt_study.metrics.bits import line_rates, still_counts
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.first_correct import first_correct
-from hvt_study.metrics.judged import LabelledFrames
+from hvt_study.metrics.judged import Judged, judged
 from hvt_study.metrics.observed import (
     arrivals,
     detected_frames,
     proxies,
     refined_frames,
     refined_objects,
-    shown_times_s,
     still_delays_ms,
 )
 from hvt_study.metrics.tracking import continuity, tracking_score
@@ -36,14 +36,6 @@ _SAYS_OF_ONE = {
 
 
 _OF_A_LIST = ("named_f1", "false_per_frame", "recall", "precision", "f1")
-_OPINIONS = {
-    "confidence_base": "confidence_base",
-    "confidence_refined": "confidence_still",
-    "confidence_gain": "gain",
-    "positive_rate": "positive_rate",
-    "change_rate": "change_rate",
-    "entropy_gain_nats": "entropy_gain_nats",
-}
 
 
 def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:
@@ -51,30 +43,28 @@ def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:
     labelled = _labelled(report, context)
     if context.sequence.one_target:
         labelled = {name: value if name in _SAYS_OF_ONE else None for name, value in labelled.items()}
-    found = {**_bits(report, context), **labelled, **_delays(report), **_proxies(report)}
-    found |= {"digest": report.digest, "edge_cpu_ms": report.edge_cpu_ms}
+    found = {**_bits(report, context), **labelled, **_delays(report)}
+    found |= {
+        **proxies(refined_objects(report.lists)),
+        "digest": report.digest,
+        "edge_cpu_ms": report.edge_cpu_ms,
+    }
     return {name: _plain(value) for name, value in found.items()}
 
 
 def _bits(report: FlightReport, context: RunContext) -> dict[str, Any]:
-    stills, refined = arrivals(report.lists), refined_objects(report.lists)
-    counts = still_counts(stills, refined, seconds=report.duration_s)
-    span = bit_split(report.line_bytes, seconds=report.duration_s)
-    pilot = bit_split(report.line_bytes, seconds=context.sequence.duration_s)
+    seconds, clip_s = report.duration_s, context.sequence.duration_s
+    span, pilot = (line_rates(report.line_bytes, seconds=one) for one in (seconds, clip_s))
+    # Of a server its questions, which are a row of what crossed the line.
+    back_bytes = report.back_bytes + report.line_bytes.get(Channel.CONTROL, 0)
     return {
-        "duration_s": report.duration_s,
-        "clip_s": context.sequence.duration_s,
-        **{name: round(getattr(span, name)) for name in (*_RATES, "track_bps", "other_bps")},
-        # Of a server its questions, which are a row of what crossed the line.
-        "back_bps": round(
-            8 * (report.back_bytes + report.line_bytes.get(Channel.CONTROL, 0)) / report.duration_s
-        ),
-        **{f"{name}_pilot": round(getattr(pilot, name)) for name in _RATES},
-        "fps": report.messages.get("base", 0) / report.duration_s,
-        "stills": counts.stills,
-        "stills_per_min": counts.stills_per_min,
-        "mean_still_bytes": counts.mean_bytes,
-        "tracks_refined": counts.tracks_refined,
+        "duration_s": seconds,
+        "clip_s": clip_s,
+        **{name: round(value) for name, value in span.items()},
+        "back_bps": round(8 * back_bytes / seconds),
+        **{f"{name}_pilot": round(pilot[name]) for name in _RATES},
+        "fps": report.messages.get("base", 0) / seconds,
+        **still_counts(arrivals(report.lists), refined_objects(report.lists), seconds=seconds),
     }
 
 
@@ -82,13 +72,11 @@ def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
     words: dict[str, Any] = {"word": context.classes.word, "classes": context.classes.classes}
     if context.sequence.one_target:  # a box of any class finds it
         words["classes"] = None
-    labelled = refined_frames(report.lists, context.labels)
-    detection = detection_score(detected_frames(report.lists, context.labels), **words)
-    after = class_score(labelled, **words)
-    before = class_score(labelled, refined=False, **words)
-    tracking = tracking_score(labelled, **words)
-    held = continuity(labelled, **words)
-    first = first_correct(labelled, fps=NOMINAL_FPS, shown_s=shown_times_s(report.lists), **words)
+    frames = judged(refined_frames(report.lists, context.labels), **words)
+    detection = detection_score(judged(detected_frames(report.lists, context.labels), **words))
+    after, before = class_score(frames), class_score(frames, refined=False)
+    tracking, held = tracking_score(frames), continuity(frames)
+    first = first_correct(frames, fps=NOMINAL_FPS, shown_s=[one.shown_s for one in report.lists])
     return {
         "map_50": detection.mean.at_50,
         "map_50_95": detection.mean.at_50_95,
@@ -99,7 +87,7 @@ def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
         "top1": after.counts.top1_found,
         "top1_all_before": before.counts.top1_all,
         "top1_all": after.counts.top1_all,
-        **_halves(labelled, words),
+        **_halves(frames),
         "macro_f1_before": before.macro_f1_found,
         "macro_f1": after.macro_f1_found,
         "macro_f1_all_before": before.macro_f1_all,
@@ -119,12 +107,12 @@ def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
     }
 
 
-def _halves(labelled: LabelledFrames, words: dict[str, Any]) -> dict[str, float]:
+def _halves(frames: Sequence[Judged]) -> dict[str, float]:
     """Of the list in each half of the clip: what is tuned on one half must hold in the other."""
-    middle = len(labelled) // 2
+    middle = len(frames) // 2
     found: dict[str, float] = {}
-    for half, part in enumerate((labelled[:middle], labelled[middle:]), start=1):
-        one = class_score(part, **words)
+    for half, part in enumerate((frames[:middle], frames[middle:]), start=1):
+        one = class_score(part)
         found |= {f"{name}_half_{half}": getattr(one, name) for name in _OF_A_LIST}
         found[f"top1_half_{half}"] = one.counts.top1_found
     return found
@@ -141,14 +129,6 @@ def _delays(report: FlightReport) -> dict[str, Any]:
         "worst_queue_bytes": report.link.worst_queue_bytes,
         "max_frame_bytes": report.max_frame_bytes,
     }
-
-
-def _proxies(report: FlightReport) -> dict[str, Any]:
-    said = proxies(refined_objects(report.lists))
-    found: dict[str, Any] = {"proxy_pairs": said.every.pairs, "small_pairs": said.small.pairs}
-    for prefix, one in (("", said.every), ("small_", said.small)):
-        found |= {f"{prefix}{column}": getattr(one, field) for column, field in _OPINIONS.items()}
-    return found
 
 
 def _plain(value: Any) -> Any:

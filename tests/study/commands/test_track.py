@@ -10,7 +10,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_study.cli import main
-from hvt_study.commands.track import detections_by_frame, read_mot
+from hvt_study.commands.track import detections_by_frame, read_detections
 from studies.clear_mot import score
 
 LINE = "{frame},-1,{x},20,40,60,{score},-1,-1,-1\n"
@@ -81,9 +81,9 @@ def test_frames_without_detections_are_stepped(tmp_path: Path) -> None:
     for gap, ids in ((20, [1]), (60, [1, 2])):
         source = write(tmp_path / f"{gap}.txt", moving([*range(1, 10), *range(10 + gap, 20 + gap)]))
         assert main(["track", str(source), "--out", str(out)]) == 0
-        rows = read_mot(out)
-        assert sorted(set(rows.ids.tolist())) == ids
-        assert rows.frames.max() == 19 + gap
+        rows = read_detections(out)
+        assert sorted(set(rows["id"].tolist())) == ids
+        assert rows["frame"].max() == 19 + gap
 
 
 def test_options_reach_the_tracker(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_options_reach_the_tracker(tmp_path: Path) -> None:
 
     def boxes(*options: str) -> int:
         assert main(["track", str(source), "--out", str(out), *options]) == 0
-        return len(read_mot(out))
+        return len(read_detections(out))
 
     assert boxes() == 0
     assert boxes("--track-thresh", "0.3") == 7
@@ -110,7 +110,7 @@ def test_unordered_lines_blank_lines_and_further_columns_are_read(tmp_path: Path
     path.write_bytes(
         b"\xef\xbb\xbf3,-1,1,2,10,20,0.5,-1,-1,-1\r\n\r\n1, -1, 5,6,7,8, 0.25\r\n3,-1,1,2,10,20,0.75,x\r\n"
     )
-    frames = dict(detections_by_frame(read_mot(path)))
+    frames = dict(detections_by_frame(read_detections(path)))
     assert sorted(frames) == [1, 2, 3]
     assert len(frames[2]) == 0
     np.testing.assert_allclose(frames[1].boxes_xyxy_px, [[5, 6, 12, 14]])
@@ -181,7 +181,7 @@ def test_wrong_files_and_arguments_are_one_sentence(
 def test_reading_raises_what_the_command_prints(tmp_path: Path) -> None:
     """Other subcommands that read such files would end in a traceback."""
     with pytest.raises(UserError, match="line 1 is 'x'"):
-        read_mot(write(tmp_path / "bad.txt", ["x\n"]))
+        read_detections(write(tmp_path / "bad.txt", ["x\n"]))
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, VISDRONE_NAMES
 from hvt_study.datasets.class_map import joint_classes
 from hvt_study.metrics.classes import class_score
+from hvt_study.metrics.judged import judged
 from studies.metric_frames import labels, square, view
 
 UAVDT = ("bus", "car", "truck")
@@ -23,8 +24,8 @@ def test_a_right_still_is_right_in_whatever_words():
         (square(200), "van", 3, 0.9, "van"),
     )
     frames = [(truth, shown)]
-    after = class_score(frames, word=found.word, classes=found.classes)
-    before = class_score(frames, refined=False, word=found.word, classes=found.classes)
+    after = class_score(judged(frames, word=found.word, classes=found.classes))
+    before = class_score(judged(frames, word=found.word, classes=found.classes), refined=False)
     assert (after.counts.right, before.counts.right) == (3, 2)
     assert after.counts.top1_all == 1.0
 

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from hvt_study.datasets.labels import NO_ID
-from hvt_study.metrics.bits import StillCounts, bit_split, still_counts
+from hvt_study.metrics.bits import line_rates, still_counts
 from hvt_study.metrics.observed import (
     Opinion,
     RefinedObject,
@@ -31,31 +31,26 @@ def named(number, track, *, share=0.01, base=None, seen=None):
 def test_the_parts_add_up_to_the_whole():
     """A channel that is forgotten would give its method free bits."""
     rows = {"base": 150_000, "roi": 30_000, "tracks": 2_000, "status": 500, "backlog": 300}
-    split = bit_split(rows, seconds=2.0)
-    assert (split.base_bps, split.roi_bps, split.track_bps, split.other_bps) == (
-        600_000,
-        120_000,
-        8_000,
-        3_200,
-    )
-    assert split.total_bps == 8 * sum(rows.values()) / 2
-    assert bit_split({}, seconds=1.0).total_bps == 0
+    split = line_rates(rows, seconds=2.0)
+    parts = {"base_bps": 600_000, "roi_bps": 120_000, "track_bps": 8_000, "other_bps": 3_200}
+    assert split == {"total_bps": 8 * sum(rows.values()) / 2, **parts}
+    assert line_rates({}, seconds=1.0)["total_bps"] == 0
 
 
 def test_the_pilots_accounting():
     """59 stills of 300 frames at 15 fps; the pilot printed 1.123 a second, which is by a clip of 52.5 s."""
     stills = [still(number, size=1500) for number in range(59)]
     span_s, clip_s = 300 / 15, 52.5
-    assert still_counts(stills, [], seconds=clip_s).stills_per_min / 60 == pytest.approx(1.124, abs=0.001)
-    assert still_counts(stills, [], seconds=span_s).stills_per_min / 60 == pytest.approx(2.95)
-    rates = [bit_split({"roi": 59 * 1500}, seconds=one).roi_bps for one in (span_s, clip_s)]
+    assert still_counts(stills, [], seconds=clip_s)["stills_per_min"] / 60 == pytest.approx(1.124, abs=0.001)
+    assert still_counts(stills, [], seconds=span_s)["stills_per_min"] / 60 == pytest.approx(2.95)
+    rates = [line_rates({"roi": 59 * 1500}, seconds=one)["roi_bps"] for one in (span_s, clip_s)]
     assert rates[0] / rates[1] == pytest.approx(2.625)
 
 
 def test_no_time_to_divide_by():
     """A rate of nothing by nothing must not stand in a table."""
     with pytest.raises(ValueError, match="divided by nan s, must be above 0"):
-        bit_split({"base": 1}, seconds=math.nan)
+        line_rates({"base": 1}, seconds=math.nan)
     with pytest.raises(ValueError, match="must be above 0"):
         still_counts([], [], seconds=0.0)
 
@@ -67,10 +62,10 @@ def test_stills_and_the_tracks_that_they_named():
         [named(1, 7), named(2, 7), named(2, 8), named(3, NO_ID)],
         seconds=30.0,
     )
-    assert counts == StillCounts(stills=3, stills_per_min=6.0, mean_bytes=1000.0, tracks_refined=2)
+    assert counts == {"stills": 3, "stills_per_min": 6.0, "mean_still_bytes": 1000.0, "tracks_refined": 2}
     nothing = still_counts([], [], seconds=30.0)
-    assert (nothing.stills, nothing.stills_per_min, nothing.tracks_refined) == (0, 0.0, 0)
-    assert math.isnan(nothing.mean_bytes)
+    assert (nothing["stills"], nothing["stills_per_min"], nothing["tracks_refined"]) == (0, 0.0, 0)
+    assert math.isnan(nothing["mean_still_bytes"])
 
 
 def test_delay_of_a_flight():
@@ -88,18 +83,18 @@ def test_proxies():
         named(4, 9, share=0.001, seen=Opinion("van", 0.9, 0.1)),
     ]
     score = proxies(objects)
-    assert (score.every.pairs, score.small.pairs, score.unpaired) == (3, 2, 1)
-    assert score.every.confidence_base == pytest.approx(1.7 / 3)
-    assert score.every.confidence_still == pytest.approx(1.8 / 3)
-    assert score.every.gain == pytest.approx(0.1 / 3)
-    assert score.every.positive_rate == pytest.approx(1 / 3)
-    assert score.every.change_rate == pytest.approx(1 / 3)
-    assert score.every.entropy_gain_nats == pytest.approx(0.1)
-    assert score.small.gain == pytest.approx(0.15)
-    assert score.small.entropy_gain_nats == pytest.approx(0.3)
+    assert (score["proxy_pairs"], score["small_pairs"]) == (3, 2)
+    assert score["confidence_base"] == pytest.approx(1.7 / 3)
+    assert score["confidence_refined"] == pytest.approx(1.8 / 3)
+    assert score["confidence_gain"] == pytest.approx(0.1 / 3)
+    assert score["positive_rate"] == pytest.approx(1 / 3)
+    assert score["change_rate"] == pytest.approx(1 / 3)
+    assert score["entropy_gain_nats"] == pytest.approx(0.1)
+    assert score["small_confidence_gain"] == pytest.approx(0.15)
+    assert score["small_entropy_gain_nats"] == pytest.approx(0.3)
     nothing = proxies([])
-    assert (nothing.every.pairs, nothing.unpaired) == (0, 0)
-    assert math.isnan(nothing.small.gain)
+    assert (nothing["proxy_pairs"], nothing["small_pairs"]) == (0, 0)
+    assert math.isnan(nothing["small_confidence_gain"])
 
 
 def test_entropy_of_a_detectors_score():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from hvt_study.metrics.judged import judged
 from hvt_study.metrics.tracking import continuity
 from studies.metric_frames import labels, square, view
 
@@ -17,19 +18,19 @@ def flight(life):
 
 def test_gaps_begin_after_the_first_find_and_no_stray_box_counts():
     """A target that is lost again and again would look as good as one that is held, or one that is found late."""
-    one = continuity(flight("--+++-++---+-"))
+    one = continuity(judged(flight("--+++-++---+-")))
     assert (one.objects, one.gaps, one.longest_gap) == (1, 3, 3)
     assert one.found_share == 6 / 13
 
 
 def test_what_is_never_found_has_no_gaps():
     """Else who never finds it would hold it best."""
-    one = continuity(flight("---"))
+    one = continuity(judged(flight("---")))
     assert (one.found_share, one.gaps, one.longest_gap) == (0.0, 0, 0)
 
 
 def test_labels_without_ids_say_nothing():
     """Reference labels do not know which object is which."""
-    one = continuity([(labels((square(0), "car")), view((square(0), "car")))])
+    one = continuity(judged([(labels((square(0), "car")), view((square(0), "car")))]))
     assert one.objects == 0
     assert math.isnan(one.found_share)

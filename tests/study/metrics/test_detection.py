@@ -11,7 +11,7 @@ import pytest
 from hvt_common.inference.class_names import kind_of
 from hvt_common.values import iou
 from hvt_study.metrics.detection import detection_score
-from hvt_study.metrics.judged import FrameView
+from hvt_study.metrics.judged import FrameView, judged
 from studies.metric_frames import labels, square, view
 
 
@@ -19,7 +19,7 @@ def test_a_curve_drawn_by_hand():
     """Another interpolation than COCO's would give figures that no published one can be compared with."""
     truth = labels((square(0), "car"), (square(100), "car"))
     shown = view((square(0), "car", 0, 0.9), (square(500), "car", 1, 0.8), (square(100), "car", 2, 0.7))
-    score = detection_score([(truth, shown)])
+    score = detection_score(judged([(truth, shown)]))
     # Precision 1 up to recall 0.5 (51 of 101 points), 2/3 from there on.
     assert score.mean.at_50 == pytest.approx((51 + 50 * 2 / 3) / 101)
     assert score.mean.at_50_95 == pytest.approx(score.mean.at_50)
@@ -28,7 +28,7 @@ def test_a_curve_drawn_by_hand():
 def test_loose_boxes_count_at_loose_thresholds_only():
     """A method whose boxes drift must lose at the strict thresholds."""
     truth, shown = labels(((0, 0, 100, 10), "car")), view(((0, 0, 62, 10), "car"))  # IoU 0.62
-    score = detection_score([(truth, shown)])
+    score = detection_score(judged([(truth, shown)]))
     assert score.mean.at_50 == 1.0
     assert score.mean.at_50_95 == pytest.approx(3 / 10)  # at 0.50, 0.55 and 0.60
 
@@ -37,7 +37,7 @@ def test_classes_are_averaged():
     """One class that is always missed would vanish among many cars."""
     truth = labels((square(0), "car"), (square(100), "car"), (square(200), "bus"))
     shown = view((square(0), "car"), (square(100), "car"), (square(200), "car", 2, 0.3))
-    score = detection_score([(truth, shown)])
+    score = detection_score(judged([(truth, shown)]))
     assert score.by_class["car"].at_50 == pytest.approx(1.0)
     assert score.by_class["bus"].at_50 == 0.0
     assert score.mean.at_50 == pytest.approx(0.5)
@@ -46,17 +46,17 @@ def test_classes_are_averaged():
 def test_words_are_brought_into_one_vocabulary():
     """A COCO detector on VisDrone labels calls a van a car."""
     frame_index = (labels((square(0), "van")), view((square(0), "car")))
-    assert detection_score([frame_index]).mean.at_50 == 0.0
-    assert detection_score([frame_index], word=kind_of).mean.at_50 == 1.0
+    assert detection_score(judged([frame_index])).mean.at_50 == 0.0
+    assert detection_score(judged([frame_index], word=kind_of)).mean.at_50 == 1.0
 
 
 def test_classes_that_labels_do_not_know_are_left_out():
     """UAVDT labels no people: whoever finds them must not pay for it, nor who is not asked for them."""
     shown = view((square(300), "person", 0, 0.9), (square(0), "car", 1, 0.5))
-    assert detection_score([(labels((square(0), "car")), shown)]).mean.at_50 == 1.0
+    assert detection_score(judged([(labels((square(0), "car")), shown)])).mean.at_50 == 1.0
     both = labels((square(0), "car"), (square(100), "person"))
-    assert detection_score([(both, shown)]).mean.at_50 == pytest.approx(0.5)
-    score = detection_score([(both, shown)], classes={"car"})
+    assert detection_score(judged([(both, shown)])).mean.at_50 == pytest.approx(0.5)
+    score = detection_score(judged([(both, shown)], classes={"car"}))
     assert (score.mean.at_50, set(score.by_class)) == (1.0, {"car"})
 
 
@@ -65,14 +65,14 @@ def test_ignored_regions_go_by_half_the_box(left, counts):
     """VisDrone leaves crowds unlabelled; a box with half of its area there is neither right nor wrong."""
     truth = labels((square(0), "car"), ignored=[(50, 0, 60, 10), (50, 5, 90, 90)])
     shown = view((square(left), "car", 0, 0.9), (square(0), "car", 1, 0.5))
-    score = detection_score([(truth, shown)])
+    score = detection_score(judged([(truth, shown)]))
     assert score.mean.at_50 == (pytest.approx(0.5) if counts else 1.0)
 
 
 def test_labels_in_ignored_regions_do_not_count_either():
     """Whoever rightly shows nothing there would be charged with a miss."""
     truth = labels((square(0), "car"), (square(52), "car"), ignored=[(50, 0, 90, 90)])
-    score = detection_score([(truth, view((square(0), "car")))])
+    score = detection_score(judged([(truth, view((square(0), "car")))]))
     assert score.mean.at_50 == 1.0
 
 
@@ -85,10 +85,10 @@ def test_what_is_in_front_of_an_object_that_is_not_asked_for_counts():
     )
     on_him = ((22, 20, 62, 100), "person", 0, 0.5)
     nobody = [((200, 20, 240, 100), "person", 1, 0.8), (car, "person", 2, 0.7), (other, "person", 3, 0.6)]
-    score = detection_score([(truth, view(on_him, *nobody))])
+    score = detection_score(judged([(truth, view(on_him, *nobody))]))
     assert score.mean.at_50 == pytest.approx(51 / 101)  # he is found, and nothing is wrong
     beyond = ((290, 20, 330, 100), "person", 4, 0.95)  # a quarter of it on the car
-    score = detection_score([(truth, view(on_him, beyond))])
+    score = detection_score(judged([(truth, view(on_him, beyond))]))
     assert score.mean.at_50 == pytest.approx(51 / 101 / 2)
 
 
@@ -96,7 +96,7 @@ def test_sizes():
     """The issue's question is about small objects; large ones must not hide them."""
     boxes = [square(0, side=20), square(200, side=50), square(400, side=100)]
     truth = labels(*((box, "car") for box in boxes))
-    score = detection_score([(truth, view((boxes[1], "car"), (boxes[2], "car")))])
+    score = detection_score(judged([(truth, view((boxes[1], "car"), (boxes[2], "car")))]))
     assert score.by_size["small"].at_50 == 0.0
     assert score.by_size["medium"].at_50 == score.by_size["large"].at_50 == 1.0
 
@@ -105,17 +105,17 @@ def test_crowded_frames_count_whole():
     """COCO's limit of 100 boxes a frame would cap the recall on VisDrone, which has several hundred."""
     boxes = [square(20 * column, 20 * row) for row in range(10) for column in range(15)]
     frame_index = labels(*((box, "car") for box in boxes)), view(*((box, "car") for box in boxes))
-    assert detection_score([frame_index]).mean.at_50 == pytest.approx(1.0)
+    assert detection_score(judged([frame_index])).mean.at_50 == pytest.approx(1.0)
 
 
 def test_nothing():
     """An empty road, a blind ground and a sequence that is ignored altogether are answers, not crashes."""
-    assert math.isnan(detection_score([]).mean.at_50)
-    assert math.isnan(detection_score([(labels(), view((square(0), "car")))]).mean.at_50_95)
-    blind = detection_score([(labels((square(0), "car")), FrameView())])
+    assert math.isnan(detection_score(judged([])).mean.at_50)
+    assert math.isnan(detection_score(judged([(labels(), view((square(0), "car")))])).mean.at_50_95)
+    blind = detection_score(judged([(labels((square(0), "car")), FrameView())]))
     assert blind.mean.at_50 == 0.0
     everything = labels((square(0), "car"), ignored=[(0, 0, 999, 999)])
-    score = detection_score([(everything, view((square(0), "car")))])
+    score = detection_score(judged([(everything, view((square(0), "car")))]))
     assert math.isnan(score.mean.at_50)
 
 
@@ -150,7 +150,7 @@ def test_a_second_implementation_agrees():
         stray = square(300)
         shown = [(box, "car", 0, float(rng.uniform())) for box in [*moved.tolist(), stray]]
         frames.append((labels(*((box, "car") for box in boxes.tolist())), view(*shown)))
-    score = detection_score(frames)
+    score = detection_score(judged(frames))
     expected = [average_precision(frames, threshold) for threshold in np.linspace(0.5, 0.95, 10)]
     assert 0.2 < score.mean.at_50 < 0.9
     assert score.mean.at_50 == pytest.approx(expected[0], abs=1e-9)

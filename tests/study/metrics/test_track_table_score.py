@@ -99,7 +99,6 @@ def test_the_table_of_the_ground_reads_back(tmp_path: Path) -> None:
     assert set(read) == {1, 5}
     assert read[1].class_names == ("car", "van")
     np.testing.assert_allclose(read[1].boxes_xyxy_px[0], (1, 2, 11, 22))
-    assert read_tracks(path, column="base_class")[5].class_names == ("moving",)
 
 
 def test_perfect_tracks_of_the_demo_score_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

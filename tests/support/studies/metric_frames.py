@@ -6,7 +6,7 @@ import numpy as np
 
 from hvt_study.datasets.labels import NO_ID, FrameLabels
 from hvt_study.metrics.classes import class_score
-from hvt_study.metrics.judged import FrameView
+from hvt_study.metrics.judged import FrameView, judged
 
 
 def square(x, y=0, side=10):
@@ -41,4 +41,4 @@ def list_f1(report, frames, there):
     for frame in frames:
         boxes, names = there(frame)
         pairs.append((labels(*zip(boxes, names, strict=True)), report.lists[frame].refined_view()))
-    return class_score(pairs).f1
+    return class_score(judged(pairs)).f1

@@ -199,12 +199,7 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
     settings = settings or ModelSettings()
     if is_ir(path):
         return _open_ir(path, settings)
-    choice = choose_provider(
-        settings.provider,
-        onnxruntime=_onnxruntime().get_available_providers(),
-        openvino=find_openvino,
-        light=path.is_file() and path.stat().st_size < LIGHT_BYTES,
-    )
+    choice = provider_here(settings.provider, light=path.is_file() and path.stat().st_size < LIGHT_BYTES)
     check_onnx_file(path)
     try:
         model = _open(path, settings, choice)
@@ -218,6 +213,12 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
         raise UserError(f"model {path} cannot be opened: a name in it is not text") from error
     _log.info("%s runs on %s: %s", path.name, model.provider.provider, model.provider.why)
     return model
+
+
+def provider_here(wanted: str, *, light: bool = False) -> ProviderChoice:
+    """`choose_provider` among those that are installed."""
+    known = _onnxruntime().get_available_providers()
+    return choose_provider(wanted, onnxruntime=known, openvino=find_openvino, light=light)
 
 
 def find_openvino() -> OpenVinoCpu | None:

@@ -29,6 +29,7 @@ from hvt_study.flights.flight_ground import GroundSide, SharedModels
 from hvt_study.flights.flight_link import Arrival
 from hvt_study.matrix.plan import StudyPlan
 from hvt_study.metrics.classes import class_score
+from hvt_study.metrics.judged import judged
 from hvt_study.metrics.observed import refined_frames, refined_objects
 from hvt_study.report.example.choice import (
     CropExample,
@@ -209,11 +210,11 @@ def _rates(
 
 def _scores(report: FlightReport, context: RunContext) -> dict[str, tuple[float, ...]]:
     """Of each second, by the metrics of the table."""
-    frames = refined_frames(report.lists, context.labels)
-    words: dict[str, Any] = {"word": context.classes.word, "classes": context.classes.classes}
+    listed, known = refined_frames(report.lists, context.labels), context.classes
+    frames = judged(listed, word=known.word, classes=known.classes)
     parts = [frames[first : first + _SECOND_FRAMES] for first in range(0, len(frames), _SECOND_FRAMES)]
-    after = [class_score(part, **words) for part in parts]
-    before = [class_score(part, refined=False, **words) for part in parts]
+    after = [class_score(part) for part in parts]
+    before = [class_score(part, refined=False) for part in parts]
     return {
         "f1": tuple(one.f1 for one in after),
         "named_before": tuple(one.counts.top1_all for one in before),

@@ -133,12 +133,11 @@ def drawn(
     height_in: float,
     caption: str,
     alternative: str,
-    width_in: float = WIDTH_IN,
 ) -> Drawing:
     """Let ``paint`` fill a figure and write it as SVG and PDF; the same figure gives the same bytes."""
     own: Any = {**_RC, "svg.hashsalt": name}
     with mpl.rc_context(own):
-        figure = Figure(figsize=(width_in, height_in), layout="constrained")
+        figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
         paint(figure)
         svg, pdf = io.BytesIO(), io.BytesIO()
         figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
