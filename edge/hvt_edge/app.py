@@ -11,7 +11,6 @@ from typing import Any
 
 from hvt_common.errors import FlightError, UserError
 from hvt_common.inference.detect import FailingDetector
-from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.inference.retried import RetriedDetector
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
@@ -44,7 +43,6 @@ from hvt_edge.wiring import (
     open_for_flight,
     qualify_encoder,
     say_size,
-    track_confidence,
     try_scene,
 )
 from hvt_edge.world import World
@@ -124,9 +122,9 @@ class Edge:
             if not self._lockstep:  # whose result would be of something else
                 detector = RetriedDetector(
                     lambda: ready.pop() if ready else world.open_detector(config),
+                    "detector",
                     self._failures,
                     clock=world.clock,
-                    hint=FewFoundHint(config.detector, confidence=track_confidence(config)),
                 )
             beginning = try_scene(config, source, detector=detector, clock=world.clock, stop=self._stop)
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))

@@ -1,7 +1,7 @@
 """Detectors and classifiers: others use `detect`, `tiles`, `classify`, `class_names`, `labels`, `nms`.
 
-`retried` opens a model again after a failure. `few_found` says when the embedded one finds little or does not know a
-view, `scale_search` finds the scale at which one promises most objects. `labels` also reads whether a model's scores
+`retried` opens a model again after a failure. `view_trust` says when the embedded one does not know a view,
+`scale_search` finds the scale at which one promises most objects. `labels` also reads whether a model's scores
 are calibrated.
 
 `letterbox` makes of an image what a network sees. The room `runtimes` runs a network, `heads` tells

@@ -10,8 +10,8 @@ from typing import Literal, Protocol
 import numpy as np
 
 from hvt_common.inference.detect import FailingDetector
-from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.scale_search import ScaleSearch
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.runtime.statistics import SequenceWindow
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View

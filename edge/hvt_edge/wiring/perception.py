@@ -15,7 +15,6 @@ from hvt_common.inference.detect import (
     open_detector,
     warm_up,
 )
-from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.labels import (
     declared_class_names,
     default_confidence,
@@ -26,6 +25,7 @@ from hvt_common.inference.retried import RetriedDetector
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
 from hvt_common.inference.tiles import detect_whole, searches_scale, tiled
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.values import Detections, Image, View
 from hvt_edge.config import EdgeConfig

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from hvt_common.inference.detect import FailingDetector
-from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import fitted_class_names

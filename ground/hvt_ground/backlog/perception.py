@@ -11,7 +11,7 @@ import numpy as np
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import FailingDetector
-from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import Detections, Image

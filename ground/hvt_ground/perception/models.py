@@ -11,7 +11,6 @@ from typing import Self
 
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import FailingDetector, open_detector, warm_up
-from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.inference.labels import default_confidence, is_calibrated, uncalibrated
 from hvt_common.inference.retried import RetriedClassifier, RetriedDetector
 from hvt_common.runtime.clock import SteadyClock
@@ -134,8 +133,7 @@ class Models:
             threads=config.threads,
             provider=config.provider,
         )
-        hint = FewFoundHint(config.detector, confidence=self.facts.track_confidence)
-        return RetriedDetector(open_one, self.failures, hint=hint)
+        return RetriedDetector(open_one, "detector", self.failures)
 
     def _check(self, opened: ModelSet) -> None:
         # Refuse a classifier that has nothing to say of the detector's tracks; say which scores mean little.

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.detect import FailingDetector
-from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.scale_search import ScaleSearch
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.statistics import SequenceWindow
 from hvt_common.tracking.bytetrack import ByteTracker

@@ -7,11 +7,11 @@ from typing import Literal, cast
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import FailingDetector, detect_every, detect_still_every
-from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.retried import RetriedDetector
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import searches_scale
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_ground.backlog.perception import BacklogPerception

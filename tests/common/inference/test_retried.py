@@ -25,7 +25,7 @@ def test_a_model_whose_run_raises_is_opened_again_with_growing_pauses(tmp_path, 
         opened.append(now_ns[0] // SECOND_NS)
         return open_detector(str(path))
 
-    detector = RetriedDetector(open_one, failures, clock=lambda: now_ns[0])
+    detector = RetriedDetector(open_one, "detector", failures, clock=lambda: now_ns[0])
     assert detector.detect(DARK) is not None
     for second in range(1, 21):
         now_ns[0] = second * SECOND_NS

@@ -9,7 +9,7 @@ from contextlib import contextmanager, nullcontext
 
 import pytest
 
-from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import BacklogUnit, RoiHeader, parse_backlog_units
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings

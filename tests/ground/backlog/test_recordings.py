@@ -7,7 +7,7 @@ import threading
 import time
 from dataclasses import replace
 
-from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings

@@ -15,7 +15,7 @@ import av
 import numpy as np
 import pytest
 
-from hvt_common.inference.few_found import ViewTrust
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import (
     AcknowledgedRange,

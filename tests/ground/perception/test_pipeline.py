@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.scale_search import ScaleSearch
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import AlsoShown, RoiHeader
 from hvt_common.values import Detections, View
 from hvt_common.video.base_crop import base_crop

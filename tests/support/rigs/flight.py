@@ -12,9 +12,9 @@ from functools import partial
 import cv2
 import numpy as np
 
-from hvt_common.inference.few_found import ViewTrust
 from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.channels import MSGPACK_ENCODING
 from hvt_common.protocol.messages import (
     BaseHeader,

@@ -1,0 +1,73 @@
+"""The sentence that a view is unlike what the detector knows, and what follows from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hvt_common.inference.view_trust import ViewTrust
+from hvt_common.values import Detections
+
+
+def many(*confidences: float) -> Detections:
+    """Detections of these confidences."""
+    count = len(confidences)
+    return Detections(
+        np.zeros((count, 4), np.float32), np.array(confidences, np.float32), np.zeros(count, np.int32)
+    )
+
+
+WATER = many(0.7, 0.45, 0.43, 0.2, 0.1)
+STREET = many(0.9, 0.8, 0.45, 0.2)
+
+
+def test_a_view_that_it_does_not_know_is_said_once_and_left_again(caplog):
+    """Boxes that are right half the time would look like those that are right nine times in ten."""
+    trust = ViewTrust("aerial-nano", hence="are drawn thin and unnamed")
+    for _ in range(14):
+        trust.take(WATER)
+    assert not trust.unlike
+    trust.take(WATER)
+    assert trust.unlike
+    (record,) = caplog.records
+    assert "its last 45 boxes have a mean confidence of 0.53" in record.getMessage()
+    for way in ("hvt-models fetch yolox-s", "--detector yolox-s", "hvt-study train"):
+        assert way in record.getMessage()
+    for _ in range(45):
+        trust.take(STREET)
+    assert not trust.unlike
+    for _ in range(45):
+        trust.take(WATER)
+    assert trust.unlike
+    assert len(caplog.records) == 1
+
+
+def test_another_scene_is_told_from_the_one_before_within_seconds():
+    """Boxes of water would pass for cars for a quarter of a minute after a street of a hundred of them."""
+    trust = ViewTrust("aerial-nano", hence="")
+    for _ in range(45):
+        trust.take(many(*[0.8] * 100))
+    for _ in range(15):
+        assert not trust.unlike
+        trust.take(WATER)
+    assert trust.unlike
+    for _ in range(10):
+        trust.take(many(*[0.8] * 100))
+    assert not trust.unlike
+
+
+@pytest.mark.parametrize("view", [STREET, many(), many(0.41)])
+def test_a_view_that_it_knows_or_that_is_nearly_empty_is_trusted(view):
+    """A field with one far car now and then would be called unknown."""
+    trust = ViewTrust("aerial-nano", hence="are drawn thin and unnamed")
+    for index in range(200):
+        trust.take(view if index % 2 or view is STREET else many())
+        assert not trust.unlike
+
+
+def test_scores_that_are_no_probabilities_say_nothing():
+    """A network whose scores are low by habit would never have a name."""
+    trust = ViewTrust("boat.onnx", hence="")
+    for _ in range(200):
+        trust.take(WATER)
+    assert not trust.unlike
