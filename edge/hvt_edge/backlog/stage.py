@@ -17,11 +17,15 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import FIRST_STORED, SEGMENT_NS, Entry
-from hvt_edge.backlog.outage import SILENCE_NS, Outage
 from hvt_edge.backlog.worker import ChunkAllowance, IntakeStill, StoreWorker
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
 
+SILENCE_NS = 3 * SECOND_NS // 2
+"""Three reports in a row that did not come."""
+_LEFT_NS = 15 * SECOND_NS
+"""Who is silent for so long on a link that Zenoh still has, has left; others may subscribe that never report. As in
+`hvt_edge.link.pacer`."""
 _STEADY_NS = 2 * SECOND_NS
 """The link is back for so long before stored objects are sent: the picture comes first."""
 _PROBE_NS = SECOND_NS
@@ -31,6 +35,47 @@ _TRICKLE_BYTES = 1_400
 """Size of a chunk while live stills are pending: one packet."""
 _FINISH_NS, _STUCK_NS, _POLL_S = 60 * SECOND_NS, 6 * SECOND_NS, 0.05
 """How long sending goes on after the end of a clip: in all, and without getting on."""
+
+
+class Outage:
+    """Whether the link is down. Time is an argument. ``live``: the source is a camera, which waits for nobody.
+
+    It is down if nobody subscribes any more (Zenoh notices that some seconds after the link broke), or if a ground
+    that used to report is silent (it reports twice a second whatever it receives, so this is noticed much sooner).
+    """
+
+    def __init__(self, *, live: bool) -> None:
+        self._live = live
+        self._subscribed = False
+        self._linked = False
+        self._reported_ns: int | None = None
+        self.reports = False
+        """Whether a ground ever reported on this session: without reports nobody knows what has arrived."""
+
+    def reported(self, now_ns: int) -> None:
+        """A ground has reported on this session (any thread)."""
+        self._reported_ns = now_ns
+        self.reports = True
+
+    def reports_now(self, now_ns: int) -> bool:
+        reported_ns = self._reported_ns
+        return reported_ns is not None and now_ns - reported_ns <= SILENCE_NS
+
+    def offline(self, now_ns: int, *, linked: bool) -> bool:
+        """Whether the link is away; called before each frame. ``linked``: Zenoh reports a subscriber.
+
+        Before anybody ever subscribed, only a live source is stored: a clip plays again.
+        """
+        if not linked:
+            self._linked = False
+            return self._subscribed or self._live
+        if not self._linked:  # a new path: the silence of before says nothing about it
+            self._linked = self._subscribed = True
+            self._reported_ns = None
+        reported_ns = self._reported_ns
+        if reported_ns is not None and now_ns - reported_ns > _LEFT_NS:
+            self._reported_ns = reported_ns = None
+        return reported_ns is not None and now_ns - reported_ns > SILENCE_NS
 
 
 class State(Enum):

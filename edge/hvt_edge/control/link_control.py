@@ -77,7 +77,7 @@ class LinkControl:
         if self.pacer is None:
             return True
         wait_ns = self.transmitter.base_wait_ns(now_ns + coding_ns, line_bytes=line_bytes)
-        most_ns = max(_MOST_WAIT_NS, SECOND_NS / 2 / self.reconfiguration.settings.nominal_fps)
+        most_ns = max(_MOST_WAIT_NS, SECOND_NS / 2 / self.reconfiguration.nominal_fps)
         return self.pacer.admits_base(now_ns, coding_ns=coding_ns) and wait_ns <= most_ns
 
     def holder(self, now_ns: int) -> FrameGroup:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -19,10 +19,13 @@ _EARLY: Final = 0.95
 """Steps come a little early or late: one that is due nearly is due."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrackReportSettings:
-    """Limits of the tracks channel."""
+@dataclass(eq=False)
+class TrackReporter:
+    """Tells the ground of the tracks at decision steps."""
 
+    sender: Transmitter
+    _: KW_ONLY
+    session_id: int
     most_per_s: float = 3.0
     """Steps a second of capture time at most."""
     most_bps: int = 12_000
@@ -32,16 +35,8 @@ class TrackReportSettings:
     refresh_ns: int = SECOND_NS
     """Capture time after which a step stands by itself: a lost one hurts no longer."""
 
-
-class TrackReporter:
-    """Tells the ground of the tracks at decision steps."""
-
-    def __init__(
-        self, sender: Transmitter, *, session_id: int, settings: TrackReportSettings = TrackReportSettings()
-    ) -> None:
-        self._sender = sender
-        self._settings = settings
-        self._encoder = TrackStepEncoder(session_id=session_id, refresh_ns=settings.refresh_ns)
+    def __post_init__(self) -> None:
+        self._encoder = TrackStepEncoder(session_id=self.session_id, refresh_ns=self.refresh_ns)
         self._last_ns: int | None = None
         self._last_bytes = 0
 
@@ -53,10 +48,10 @@ class TrackReporter:
         capture_ns = seen.frame.capture_ns
         if not seen.detected or not self._due(capture_ns):
             return False
-        tracks = _fresh(seen.tracks, most_frames=self._settings.fresh_frames)
+        tracks = _fresh(seen.tracks, most_frames=self.fresh_frames)
         encoder = copy(self._encoder)  # the next step builds on the last one that was sent
         step = encoder.encode(tracks, capture_ns=capture_ns)
-        if not self._sender.metadata(
+        if not self.sender.metadata(
             Channel.TRACKS,
             lambda at_ns: replace(step, send_delay_ns=at_ns - capture_ns).pack(),
             now_ns=now_ns,
@@ -68,7 +63,7 @@ class TrackReporter:
     def _due(self, capture_ns: int) -> bool:
         if self._last_ns is None:
             return True
-        pause_s = max(1 / self._settings.most_per_s, 8 * self._last_bytes / self._settings.most_bps)
+        pause_s = max(1 / self.most_per_s, 8 * self._last_bytes / self.most_bps)
         return capture_ns - self._last_ns >= SECOND_NS * pause_s * _EARLY
 
 

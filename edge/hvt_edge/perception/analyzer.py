@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -17,21 +17,6 @@ from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_edge.perception.cpu_budget import CpuBudget
-
-
-@dataclass(frozen=True, slots=True)
-class AnalyzerSettings:
-    """``candidates`` says on which pixels the detector runs and the tracker follows the camera.
-
-    Of the source means before it is coded, at the finer of its two sizes: a source that the base enlarges is
-    analyzed enlarged, as by the ground's detector, which finds less in fewer pixels.
-    """
-
-    detect_every: int = 5
-    """Source frames from one detection to the next; see `Analyzer.analyze` for streams that code fewer."""
-    candidates: Literal["decoded", "source"] = "decoded"
-    detect_still_every: int = 0
-    """The same while the picture is still; no fewer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +44,13 @@ class AnalyzedFrame:
         return self._bgr[0]
 
 
-class _Decoder(Protocol):
-    def decode_yuv(self, data: bytes) -> YuvPicture | None: ...
-
-
 class Analyzer:
     """Decodes the edge's own access units, detects on every n-th frame and tracks on each.
+
+    ``candidates`` says on which pixels the detector runs and the tracker follows the camera. Of the source means
+    before it is coded, at the finer of its two sizes: a source that the base enlarges is analyzed enlarged, as by the
+    ground's detector, which finds less in fewer pixels. ``detect_every`` source frames are from one detection to the
+    next, see `analyze` for streams that code fewer; ``detect_still_every``, no fewer, while the picture is still.
 
     While the detector gives None the tracks are carried on. ``trust`` is told what it finds. ``search`` finds the
     scale; without it that is as given. A detection that is due waits until ``cpu_budget`` admits it; decoding and
@@ -77,8 +63,9 @@ class Analyzer:
         tracker: ByteTracker,
         *,
         view: View,
-        settings: AnalyzerSettings = AnalyzerSettings(),
-        decoder: _Decoder | None = None,
+        detect_every: int = 5,
+        candidates: Literal["decoded", "source"] = "decoded",
+        detect_still_every: int = 0,
         trust: ViewTrust | None = None,
         search: ScaleSearch | None = None,
         cpu_budget: CpuBudget | None = None,
@@ -86,11 +73,11 @@ class Analyzer:
         self._detector = detector
         self._tracker = tracker
         self._view = view
-        self._settings = settings
+        self._every, self._still_every, self._candidates = detect_every, detect_still_every, candidates
         self._trust = trust
         self._search = search
         self.cpu_budget = cpu_budget or CpuBudget()
-        self._decoder = decoder or BaseDecoder()
+        self._decoder = BaseDecoder()
         self._detected_index: int | None = None
         self.detected_ns: int | None = None
         """Capture time of the newest picture that was searched for objects; None before the first."""
@@ -105,8 +92,7 @@ class Analyzer:
     @property
     def detect_every(self) -> int:
         """Source frames from one detection to the next, where there is time for it and each of them is coded."""
-        every = self._settings.detect_every
-        return every if self._search is None else self._search.interval(every)
+        return self._every if self._search is None else self._search.interval(self._every)
 
     @property
     def view_unlike(self) -> bool:
@@ -163,9 +149,9 @@ class Analyzer:
 
     def _analyze(self, frame: Frame, unit: AccessUnit | None) -> AnalyzedFrame:
         picture = None if unit is None else self._decode(frame.index, unit)
-        bgr = [picture.bgr()] if picture is not None and self._settings.candidates == "decoded" else []
+        bgr = [picture.bgr()] if picture is not None and self._candidates == "decoded" else []
         pixels = bgr[0] if bgr else None
-        if self._settings.candidates == "source":
+        if self._candidates == "source":
             pixels = frame.base_bgr
         due = self.cpu_budget.admits_detection(
             frame.capture_ns, due=self._due(frame.index, coded=unit is not None)
@@ -197,14 +183,14 @@ class Analyzer:
         every, last = self.detect_every, self._detected_index
         rested = last is None or index - last >= every
         new_scene = last is not None and self._tracker.scene_began > last
-        if rested and last is not None and index - last < self._settings.detect_still_every:
+        if rested and last is not None and index - last < self._still_every:
             rested = not self._tracker.still
         rested = rested or new_scene
         since_coded = 0 if self._coded_index is None else index - self._coded_index
         sparse = max(self._coded_gap, since_coded) > every
         if coded:
             return rested or sparse
-        return rested and sparse and self._settings.candidates == "source"
+        return rested and sparse and self._candidates == "source"
 
     def _found(self, image_bgr: Image) -> Detections | None:
         whole = self._detector.detect(image_bgr)
@@ -212,7 +198,7 @@ class Analyzer:
 
     def _detect(self, frame: Frame, base_bgr: Sequence[Image]) -> Detections | None:
         # ``base_bgr`` is the one decoded picture, where candidates are of that.
-        if self._settings.candidates == "decoded":
+        if self._candidates == "decoded":
             assert base_bgr, "detection on the decoded stream is due on coded frames only"
             return self._found(base_bgr[0])
         if self._view.enlarges:

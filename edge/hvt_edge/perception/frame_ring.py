@@ -31,14 +31,6 @@ _UNCODED_NS = 6 * SECOND_NS // 10
 
 
 @dataclass(frozen=True, slots=True)
-class RingSettings:
-    """The bounds of all but the newest; with no bytes, nothing is kept."""
-
-    max_bytes: int = 24_000_000
-    max_age_ns: int = 5_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
 class RingFrame:
     """A source frame with its tracks."""
 
@@ -83,11 +75,12 @@ class RingFrame:
 class FrameRing:
     """One thread adds, one captures, others look; time is the frames' own.
 
-    Who wants a ``tracked`` frame gets one that was analyzed.
+    Who wants a ``tracked`` frame gets one that was analyzed. ``max_bytes`` and ``max_age_ns`` bound all but the
+    newest; with no bytes, nothing is kept.
     """
 
-    def __init__(self, settings: RingSettings = RingSettings()) -> None:
-        self._settings = settings
+    def __init__(self, *, max_bytes: int = 24_000_000, max_age_ns: int = 5_000_000_000) -> None:
+        self._max_bytes, self._max_age_ns = max_bytes, max_age_ns
         self._frames: list[RingFrame] = []
         """Oldest first; all but the newest, and the newest that was coded, are packed and lie on the grid that
         `_spacing_ns` makes."""
@@ -118,7 +111,7 @@ class FrameRing:
     def capture(self, frame: Frame) -> None:
         """The camera gave a frame, newer than all before."""
         height, width = frame.source_bgr.shape[:2]
-        if self._settings.max_bytes:
+        if self._max_bytes:
             self._captured = RingFrame(
                 frame.index, frame.capture_ns, (width, height), frame.source_bgr, Tracks.none(frame.index)
             )
@@ -128,7 +121,7 @@ class FrameRing:
         height, width = frame.source_bgr.shape[:2]
         newest = RingFrame(frame.index, frame.capture_ns, (width, height), frame.source_bgr, tracks, base)
         with self._lock:
-            if not self._settings.max_bytes:
+            if not self._max_bytes:
                 return
             frames = self._frames
             if frames and frames[-1].base is None and self._stands_for(frames[-1]):
@@ -140,7 +133,7 @@ class FrameRing:
                 if not frames or self._gap_ns(last) >= self._spacing_ns(last):
                     frames.append(last.packed())
             frames.append(newest)
-            self._let_go(frame.capture_ns - self._settings.max_age_ns)
+            self._let_go(frame.capture_ns - self._max_age_ns)
 
     def near_time(self, capture_ns: int, *, tracked: bool = True) -> RingFrame | None:
         """The frame kept that was taken nearest to this time; None where that is further back than the ring goes."""
@@ -186,15 +179,15 @@ class FrameRing:
 
     def _spacing_ns(self, frame: RingFrame) -> int:
         # The least time between two frames on the grid, for them to reach back all the seconds.
-        count = self._settings.max_bytes // (frame.packed_bytes + frame.base_bytes)
-        return self._settings.max_age_ns // max(1, count - 1)  # one more is about to grow too old
+        count = self._max_bytes // (frame.packed_bytes + frame.base_bytes)
+        return self._max_age_ns // max(1, count - 1)  # one more is about to grow too old
 
     def _gap_ns(self, newer: RingFrame) -> int:
         return newer.capture_ns - self._frames[-1].capture_ns
 
     def _let_go(self, oldest_ns: int) -> None:
         while len(self._frames) > 1 and (
-            self.size_bytes > self._settings.max_bytes or self._frames[0].capture_ns < oldest_ns
+            self.size_bytes > self._max_bytes or self._frames[0].capture_ns < oldest_ns
         ):
             self._frames.pop(0)
 

@@ -49,6 +49,14 @@ _LEAST_MORE = 0.5
 """Least difference between the ground's number of objects and the edge's."""
 _BASE_NAMES = 1 / 3
 """How often the base's name is right if base and source name an object differently."""
+_REST_NS, _QUICK_REST_NS = SECOND_NS, SECOND_NS // 3
+"""Capture time from one comparison to the next, at least; at first they are made in quick order, …"""
+_QUICK_COMPARISONS = 2.5
+"""… so few, because nothing is known."""
+_MEMORY_S = 8.0
+"""Time constant with which former comparisons fade."""
+_MATCH_IOU = 0.3
+"""The ground's own limit for one object: boxes of 15 pixels from two pictures seldom overlap more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,23 +129,6 @@ class GroundDifference:
         if self._worth_ns is not None:
             self._worth *= math.exp(-max(0, now_ns - self._worth_ns) / SECOND_NS / self._memory_s)
         self._worth_ns = now_ns
-
-
-@dataclass(frozen=True, slots=True)
-class ShadowSettings:
-    """Rate of the comparisons, and their memory."""
-
-    confidence: float
-    """From where a detection starts a track, at the edge and at the ground."""
-    rest_ns: int = SECOND_NS
-    """Capture time from one comparison to the next, at least."""
-    quick_rest_ns: int = SECOND_NS // 3
-    quick_comparisons: float = 2.5
-    """At first so few comparisons are made in quick order, because nothing is known."""
-    memory_s: float = 8.0
-    """Time constant with which former comparisons fade."""
-    match_iou: float = 0.3
-    """The ground's own limit for one object: boxes of 15 pixels from two pictures seldom overlap more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,7 +237,8 @@ UNMEASURED = Shadow()
 class ShadowGround:
     """Looks now and then, where ``cpu_budget`` admits it.
 
-    ``detect`` is the detector on a whole picture, as the ground runs it; None of it while it does not work.
+    ``detect`` is the detector on a whole picture, as the ground runs it; None of it while it does not work. From
+    ``confidence`` on a detection starts a track, at the edge and at the ground.
     It goes on from what was measured of the scene ``before``.
     """
 
@@ -254,12 +246,12 @@ class ShadowGround:
         self,
         detect: Callable[[Image], Detections | None],
         *,
-        settings: ShadowSettings,
+        confidence: float,
         cpu_budget: CpuBudget | None = None,
         before: Shadow = UNMEASURED,
     ) -> None:
         self._detect = detect
-        self._settings = settings
+        self._confidence = confidence
         self._cpu_budget = cpu_budget or CpuBudget()
         self._next_ns = 0
         self._last_ns: int | None = None
@@ -272,7 +264,7 @@ class ShadowGround:
         """The share of the base's sure objects that the source shows too."""
         self.now = before
         """For a ground with the edge's detector."""
-        self._difference = GroundDifference(memory_s=settings.memory_s, grace_ns=settings.rest_ns)
+        self._difference = GroundDifference(memory_s=_MEMORY_S, grace_ns=_REST_NS)
 
     @property
     def measured(self) -> Measured:
@@ -295,7 +287,7 @@ class ShadowGround:
         if not seen.detected or seen.base is None or capture_ns < self._next_ns:
             return False
         if not self._next_ns:  # the first picture of a stream is coarser than any other
-            self._next_ns = capture_ns + self._settings.quick_rest_ns
+            self._next_ns = capture_ns + _QUICK_REST_NS
             self._last_ns = capture_ns  # what was measured before is no older
             return False
         if not self._cpu_budget.admits_comparison(capture_ns):
@@ -304,11 +296,8 @@ class ShadowGround:
         assert base_bgr is not None, "checked"
         with self._cpu_budget.spending("compare"):
             found = self._detect(base_bgr)
-        settings = self._settings
-        rest_ns = (
-            settings.rest_ns if self.now.comparisons >= settings.quick_comparisons else settings.quick_rest_ns
-        )
-        self._next_ns = capture_ns + rest_ns
+        quick = self.now.comparisons < _QUICK_COMPARISONS
+        self._next_ns = capture_ns + (_QUICK_REST_NS if quick else _REST_NS)
         if found is None:
             return False
         one = self._compared(seen, found)
@@ -325,12 +314,12 @@ class ShadowGround:
         self._shown_ids = np.empty(0, np.int64)
 
     def _compared(self, seen: AnalyzedFrame, found: Detections) -> Shadow:
-        tracks, least = seen.tracks, self._settings.confidence
+        tracks, least = seen.tracks, self._confidence
         rows = np.flatnonzero(tracks.seen_frames == tracks.frame_index)
         boxes, p = tracks.boxes_xyxy_px[rows], tracks.confidences[rows].astype(float)
         # A track that has begun goes on with weak detections too, so that they show an object.
         overlaps = iou(found.boxes_xyxy_px, boxes)
-        same = overlaps >= self._settings.match_iou
+        same = overlaps >= _MATCH_IOU
         strong = found.confidences >= least
         began = np.isin(tracks.ids[rows], self._shown_ids)
         shown = (same & (strong[:, None] | began)).any(axis=0)
@@ -376,7 +365,7 @@ class ShadowGround:
     def _take(self, one: Shadow, capture_ns: int) -> None:
         weight = 0.0
         if self._last_ns is not None:
-            weight = math.exp(-max(0, capture_ns - self._last_ns) / SECOND_NS / self._settings.memory_s)
+            weight = math.exp(-max(0, capture_ns - self._last_ns) / SECOND_NS / _MEMORY_S)
         self._last_ns = capture_ns
         worth = weight * self.now.comparisons + 1
         means = {

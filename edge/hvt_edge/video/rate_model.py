@@ -125,12 +125,16 @@ def sizes_of(source_size: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 class FrameSkip:
-    """Each ``decimation``-th source frame. Where one was missed, the next is coded in its place."""
+    """Each ``decimation``-th source frame. Where one was missed, the next is coded in its place.
 
-    def __init__(self, decimation: int = 1) -> None:
+    No more frames than ``least_decimation()`` allows at the time of a keyframe.
+    """
+
+    def __init__(self, decimation: int = 1, *, least_decimation: Callable[[], int] = lambda: 1) -> None:
         assert decimation >= 1
-        self.decimation = decimation
-        """Changed by `at_keyframe` only."""
+        self.decimation = self._wanted = decimation
+        """Changed by `at_keyframe` only; and what it would be without the limit."""
+        self._least_decimation = least_decimation
         self._next: int | None = None
 
     def codes(self, index: int) -> bool:
@@ -147,13 +151,17 @@ class FrameSkip:
 
     def at_keyframe(self, index: int) -> int:
         """Decide on ``decimation`` from this frame on, which will be a keyframe."""
-        del index
+        self._decide(index)
+        self.decimation = max(self._wanted, self._least_decimation())
         return self.decimation
 
     def wants_keyframe(self, index: int) -> bool:
         """Whether more frames are worth a keyframe of their own after this one."""
         del index
         return False
+
+    def _decide(self, index: int) -> None:
+        del index
 
 
 class MeasuredFrameSkip(FrameSkip):
@@ -172,8 +180,9 @@ class MeasuredFrameSkip(FrameSkip):
         window_frames: int,
         band: QuantiserBand = SPARING,
         own_keyframes: bool = False,
+        least_decimation: Callable[[], int] = lambda: 1,
     ) -> None:
-        super().__init__(decimation)
+        super().__init__(decimation, least_decimation=least_decimation)
         self._most_decimation = most_decimation
         self._rest_frames = rest_frames
         self._window_frames = window_frames
@@ -193,16 +202,13 @@ class MeasuredFrameSkip(FrameSkip):
         while self._quantisers and self._quantisers[0][0] <= index - self._window_frames:
             self._quantisers.popleft()
 
-    def at_keyframe(self, index: int) -> int:
-        if not self._may_decide(index):
-            return self.decimation
-        self.decimation = self._better()
-        self._decided_index = index
-        self._quantisers.clear()
-        return self.decimation
-
     def wants_keyframe(self, index: int) -> bool:
-        return self._own_keyframes and self._may_decide(index) and self._better() < self.decimation
+        return self._own_keyframes and self._may_decide(index) and self._better() < self._wanted
+
+    def _decide(self, index: int) -> None:
+        if self._may_decide(index):
+            self._wanted, self._decided_index = self._better(), index
+            self._quantisers.clear()
 
     def _may_decide(self, index: int) -> bool:
         decided = self._decided_index
@@ -210,28 +216,8 @@ class MeasuredFrameSkip(FrameSkip):
 
     def _better(self) -> int:
         return better_decimation(
-            self.decimation,
+            self._wanted,
             mean_qp=sum(qp for _, qp in self._quantisers) / len(self._quantisers),
             most_decimation=self._most_decimation,
             band=self._band,
         )
-
-
-class LimitedFrameSkip(FrameSkip):
-    """Another choice, with no more frames than ``least_decimation()`` allows at the time of a keyframe."""
-
-    def __init__(self, preferred: FrameSkip, least_decimation: Callable[[], int]) -> None:
-        super().__init__(preferred.decimation)
-        self._preferred = preferred
-        self._least_decimation = least_decimation
-
-    def coded(self, index: int, *, keyframe: bool, mean_qp: float) -> None:
-        super().coded(index, keyframe=keyframe, mean_qp=mean_qp)
-        self._preferred.coded(index, keyframe=keyframe, mean_qp=mean_qp)
-
-    def at_keyframe(self, index: int) -> int:
-        self.decimation = max(self._preferred.at_keyframe(index), self._least_decimation())
-        return self.decimation
-
-    def wants_keyframe(self, index: int) -> bool:
-        return self._preferred.wants_keyframe(index)

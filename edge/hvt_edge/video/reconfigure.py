@@ -17,22 +17,6 @@ _WORTH = 0.04
 """At a keyframe that comes anyway, a base rate that is off by less is left as it is."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReconfigurationSettings:
-    """The settings that bound the rates."""
-
-    size: tuple[int, int]
-    nominal_fps: float
-    """Source frames a second."""
-    least_fps: float
-    """The lowest rate of coded frames."""
-    edge_id: str
-    metadata_bps: int
-    """The rate of tracks, part of the budget."""
-    min_budget_bps: int
-    """The floor of the link's rate, unless the budget is lower itself."""
-
-
 OpenEncoder = Callable[[Rates], Encoder]
 """Opens the encoder for these rates."""
 
@@ -47,8 +31,17 @@ class EncoderReconfiguration:
     """
 
     operating: Operating
-    settings: ReconfigurationSettings
     _: KW_ONLY
+    size: tuple[int, int]
+    nominal_fps: float
+    """Source frames a second."""
+    least_fps: float
+    """The lowest rate of coded frames."""
+    edge_id: str
+    metadata_bps: int
+    """The rate of tracks, part of the budget."""
+    min_budget_bps: int
+    """The floor of the link's rate, unless the budget is lower itself."""
     open_encoder: OpenEncoder
     budget: RollingBudget
     split: Split | None
@@ -58,8 +51,7 @@ class EncoderReconfiguration:
 
     def __post_init__(self) -> None:
         self._trigger = ReconfigurationTrigger()
-        settings = self.settings
-        self._least_base_bps = least_base_bps(settings.size, settings.least_fps, edge_id=settings.edge_id)
+        self._least_base_bps = least_base_bps(self.size, self.least_fps, edge_id=self.edge_id)
         now = self.operating.now
         self._opened = Rates(now.budget_bps, now.base_bps, now.decimation)
         """For which x265 was last opened."""
@@ -92,11 +84,10 @@ class EncoderReconfiguration:
         """At the link's rate, each n-th source frame at the most can be coded: x265 has a least for each frame."""
         if self.pacer is None:
             return 1
-        settings = self.settings
-        base_bps, nominal_fps = self._base_of(self.pacer.steady_bps), settings.nominal_fps
-        most = max(1, int(nominal_fps / settings.least_fps))
+        base_bps = self._base_of(self.pacer.steady_bps)
+        most = max(1, int(self.nominal_fps / self.least_fps))
         for decimation in range(1, most):
-            if base_bps >= least_base_bps(settings.size, nominal_fps / decimation, edge_id=settings.edge_id):
+            if base_bps >= least_base_bps(self.size, self.nominal_fps / decimation, edge_id=self.edge_id):
                 return decimation
         return most
 
@@ -107,12 +98,12 @@ class EncoderReconfiguration:
         """
         if self.pacer is None:
             return last_bytes
-        now, settings = self.operating.now, self.settings
+        now = self.operating.now
         base_bps = self._base_of(min(now.budget_bps, self.pacer.steady_bps))
         if base_bps >= now.base_bps:
             return last_bytes
-        fps = settings.nominal_fps / max(now.decimation, self.least_decimation())
-        return min(last_bytes, most_keyframe_bytes(settings.size, fps, base_bps))
+        fps = self.nominal_fps / max(now.decimation, self.least_decimation())
+        return min(last_bytes, most_keyframe_bytes(self.size, fps, base_bps))
 
     def wants_keyframe(self, now_ns: int) -> bool:
         """Whether rates are so far off that it is worth a keyframe of its own; once a second."""
@@ -148,7 +139,7 @@ class EncoderReconfiguration:
     ) -> Encoder | None:
         now = self.operating.now
         if changed:
-            floor_bps = min(now.budget_bps, self.settings.min_budget_bps)
+            floor_bps = min(now.budget_bps, self.min_budget_bps)
             pacer.set_ceiling(now.budget_bps, floor_bps=floor_bps)
         self._proposed_bps(decimation, changed=changed)  # which moves the share
         base_bps = self._base_of(pacer.steady_bps)
@@ -173,7 +164,7 @@ class EncoderReconfiguration:
 
     def _set_budget(self, now_ns: int) -> None:
         now = self.operating.now
-        fps = self.settings.nominal_fps / now.decimation
+        fps = self.nominal_fps / now.decimation
         self.budget.set_total(now.total_bps, now.base_bps, fps, now_ns=now_ns)
 
     def _base_of(self, total_bps: int) -> int:
@@ -191,7 +182,7 @@ class EncoderReconfiguration:
 
     @property
     def _metadata_bps(self) -> int:
-        return self.settings.metadata_bps if self.operating.now.levers.tracks else 0
+        return self.metadata_bps if self.operating.now.levers.tracks else 0
 
     @property
     def _moving(self) -> bool:

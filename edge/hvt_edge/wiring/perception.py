@@ -29,9 +29,9 @@ from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.values import Detections, Image, View
 from hvt_edge.config import EdgeConfig
-from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
+from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.cpu_budget import CpuBudget
-from hvt_edge.perception.shadow import UNMEASURED, Shadow, ShadowGround, ShadowSettings
+from hvt_edge.perception.shadow import UNMEASURED, Shadow, ShadowGround
 from hvt_edge.stills.policy.registry import method
 
 _log = logging.getLogger(__name__)
@@ -95,13 +95,9 @@ def make_analyzer(
         detector,
         ByteTracker(settings, fps=config.nominal_fps),
         view=view,
-        settings=AnalyzerSettings(
-            detect_every=detect_every(config.detect_every, fps=config.nominal_fps),
-            candidates=cast('Literal["decoded", "source"]', config.candidates),
-            detect_still_every=detect_still_every(
-                config.detect_every, fps=config.nominal_fps, lockstep=steady
-            ),
-        ),
+        detect_every=detect_every(config.detect_every, fps=config.nominal_fps),
+        candidates=cast('Literal["decoded", "source"]', config.candidates),
+        detect_still_every=detect_still_every(config.detect_every, fps=config.nominal_fps, lockstep=steady),
         trust=trust,
         search=_scale_search(config, detector),
         cpu_budget=cpu_budget,
@@ -134,7 +130,7 @@ def make_shadow(
         return None
     return ShadowGround(
         _whole(detector),
-        settings=ShadowSettings(confidence=track_confidence(config)),
+        confidence=track_confidence(config),
         before=before,
         cpu_budget=cpu_budget,
     )

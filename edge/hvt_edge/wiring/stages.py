@@ -30,7 +30,7 @@ from hvt_edge.loop.pose import PoseSource, PoseStage
 from hvt_edge.operating import LoopClock, Operating, Rates, base_rate_bps
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.cpu_budget import CpuBudget
-from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.perception.levers import LeverControl
 from hvt_edge.report.state import Heartbeat
 from hvt_edge.report.status import InfoReporter, StatusReporter
@@ -42,8 +42,6 @@ from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Gate
 from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.video.encoder_settings import PresetControl, share_of
 from hvt_edge.video.passthrough import PassthroughStage
-from hvt_edge.video.rate_model import LimitedFrameSkip
-from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage, LocalCopy
 from hvt_edge.video.x265 import TrackRegions
 from hvt_edge.wiring.link import (
@@ -63,7 +61,7 @@ from hvt_edge.wiring.video import (
     encoder_opener,
     make_frame_skip,
     make_keyframes,
-    reconfiguration_settings,
+    make_reconfiguration,
 )
 
 
@@ -135,9 +133,10 @@ class Link:
             clock=None if lockstep else flight.loop_clock,
         )
         self.split = make_split(config, size, first_share=beginning.share)
-        self.reconfiguration = EncoderReconfiguration(
+        self.reconfiguration = make_reconfiguration(
+            config,
             self.operating,
-            reconfiguration_settings(config, size),
+            size,
             open_encoder=open_encoder,
             budget=budget,
             split=self.split,
@@ -155,7 +154,7 @@ class Stills:
         self.readers = StillReaders(clock)
         maker = make_maker(config, readable=self.readers.read)
         on_demand = OnDemand(
-            FrameRing(RingSettings(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS))),
+            FrameRing(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS)),
             outbox=outbox,
             maker=maker,
             view=view,
@@ -262,7 +261,6 @@ class Video:
             )
             return
         size = source.view.base_size
-        frame_skip = make_frame_skip(config, flight.beginning.decimation, size=size)
         self.stage = BaseStage(
             link.encoder,
             encoder_name=config.encoder,
@@ -271,7 +269,12 @@ class Video:
             local_copy=local_copy,
             first_keyframe_bytes=link.operating.now.base_bps // 40,  # .2 s: what the VBV lets through
             regions=TrackRegions(size, depth=config.roi_depth) if config.roi_depth else None,
-            frame_skip=LimitedFrameSkip(frame_skip, link.reconfiguration.least_decimation),
+            frame_skip=make_frame_skip(
+                config,
+                flight.beginning.decimation,
+                size=size,
+                least_decimation=link.reconfiguration.least_decimation,
+            ),
             reconfigure=link.reconfiguration,
             keyframe_bytes=link.reconfiguration.keyframe_bytes,
             admits=self.control.admits,

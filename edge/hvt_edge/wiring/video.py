@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
 
 from hvt_common.config import AUTO
 from hvt_common.errors import UserError
@@ -41,7 +41,7 @@ from hvt_edge.video.rate_model import (
     most_decimation,
     sizes_of,
 )
-from hvt_edge.video.reconfigure import OpenEncoder, ReconfigurationSettings
+from hvt_edge.video.reconfigure import EncoderReconfiguration, OpenEncoder
 from hvt_edge.video.x265 import BaseEncoder
 
 _log = logging.getLogger(__name__)
@@ -140,10 +140,12 @@ def _least_fps(config: EdgeConfig, size: tuple[int, int]) -> float:
     return max(LEAST_FPS, min(_AUTO_LEAST_FPS, keyframes_fps))
 
 
-def make_frame_skip(config: EdgeConfig, decimation: int, *, size: tuple[int, int]) -> FrameSkip:
+def make_frame_skip(
+    config: EdgeConfig, decimation: int, *, size: tuple[int, int], least_decimation: Callable[[], int]
+) -> FrameSkip:
     """Which source frames are coded."""
     if not config.auto_fps:
-        return FrameSkip(decimation)
+        return FrameSkip(decimation, least_decimation=least_decimation)
     most = most_decimation(config.nominal_fps, least_fps=_least_fps(config, size))
     return MeasuredFrameSkip(
         decimation,
@@ -152,6 +154,7 @@ def make_frame_skip(config: EdgeConfig, decimation: int, *, size: tuple[int, int
         window_frames=round((_AUTO_WINDOW_S if config.measures else _REST_S) * config.nominal_fps),
         band=PROMPT if config.measures else SPARING,
         own_keyframes=config.measures,
+        least_decimation=least_decimation,
     )
 
 
@@ -301,14 +304,19 @@ def _qualify_camera(config: EdgeConfig, source: Source) -> None:
         _log.warning("%s", warning)
 
 
-def reconfiguration_settings(config: EdgeConfig, size: tuple[int, int]) -> ReconfigurationSettings:
-    return ReconfigurationSettings(
+def make_reconfiguration(
+    config: EdgeConfig, operating: Operating, size: tuple[int, int], **parts: Any
+) -> EncoderReconfiguration:
+    """What changes rates in flight; ``parts`` are what it does so with."""
+    return EncoderReconfiguration(
+        operating,
         size=size,
         nominal_fps=config.nominal_fps,
         least_fps=LEAST_FPS,
         edge_id=config.edge_id,
         metadata_bps=config.metadata_bps,
         min_budget_bps=least_rate_bps(config, size),
+        **parts,
     )
 
 

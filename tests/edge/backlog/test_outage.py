@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.outage import Outage
+from hvt_edge.backlog.stage import Outage
 from hvt_edge.link.flight import BaseInFlight
 
 S = 1_000_000_000

@@ -26,7 +26,7 @@ from hvt_edge.link.rate_control import (
     RateSettings,
     ReconfigurationTrigger,
 )
-from hvt_edge.video.rate_model import FrameSkip, LimitedFrameSkip
+from hvt_edge.video.rate_model import FrameSkip
 from hvt_edge.wiring.link import make_pacer
 from rigs.messages import counted, feedback
 
@@ -683,7 +683,7 @@ def test_the_budget_takes_another_total_at_once():
 def test_few_frames_where_x265_can_do_no_more():
     """At a rate that x265 cannot follow the link would be overrun for good."""
     least = [1]
-    frame_skip = LimitedFrameSkip(FrameSkip(2), lambda: least[0])
+    frame_skip = FrameSkip(2, least_decimation=lambda: least[0])
     assert frame_skip.at_keyframe(0) == 2
     least[0] = 5
     assert frame_skip.decimation == 2  # at keyframes only

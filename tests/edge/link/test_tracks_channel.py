@@ -6,7 +6,7 @@ import numpy as np
 
 from hvt_common.protocol.messages import TrackStep, TrackStepDecoder
 from hvt_common.values import Frame
-from hvt_edge.link.tracks_channel import TrackReporter, TrackReportSettings
+from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from media.clips import START_NS
 from rigs.examples import tracks_of
@@ -46,7 +46,7 @@ class Line:
 def told(shown: list[AnalyzedFrame], **settings) -> list[TrackStep]:
     """What leaves the edge."""
     line = Line()
-    reporter = TrackReporter(line, session_id=77, settings=TrackReportSettings(**settings))
+    reporter = TrackReporter(line, session_id=77, **settings)
     for one in shown:
         reporter.report(one, now_ns=one.frame.capture_ns + 5_000_000)
     return line.steps
@@ -100,7 +100,7 @@ def test_an_empty_scene_is_told():
 def test_a_step_without_room_is_left_out_and_the_next_is_understood():
     """The ground would read changes of a step that it never got, and show no track until the next whole one."""
     line, reader = Line(), TrackStepDecoder()
-    reporter = TrackReporter(line, session_id=77, settings=TrackReportSettings(refresh_ns=10**12))
+    reporter = TrackReporter(line, session_id=77, refresh_ns=10**12)
     shown = [seen(index) for index in range(0, 60, 5)]
     line.full_ns = {one.frame.capture_ns for one in shown[2:9:3]}
     sent = [reporter.report(one, now_ns=one.frame.capture_ns) for one in shown]

@@ -22,7 +22,7 @@ from hvt_common.values import Frame, View
 from hvt_common.video.hevc import YuvPicture
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.keyframes import Keyframes
-from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
+from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
@@ -52,9 +52,7 @@ VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 def make(*, detector=None, view: View = VIEW, search: ScaleSearch | None = None, **settings) -> Analyzer:
     """The edge's analyzer."""
     tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15)
-    return Analyzer(
-        detector or RedSquares(), tracker, view=view, settings=AnalyzerSettings(**settings), search=search
-    )
+    return Analyzer(detector or RedSquares(), tracker, view=view, **settings, search=search)
 
 
 def test_every_frame_is_decoded_and_each_nth_is_searched():
@@ -114,8 +112,7 @@ def test_a_picture_is_converted_where_somebody_looks_at_it(monkeypatch):
     convert = YuvPicture.bgr
     monkeypatch.setattr(YuvPicture, "bgr", lambda self: converted.append(1) or convert(self))
     tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
-    settings = AnalyzerSettings(detect_every=5, candidates="source")
-    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, settings=settings)
+    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, detect_every=5, candidates="source")
     for frame, unit in zip(FRAMES, UNITS, strict=True):
         seen = analyzer.analyze(frame, unit)
         if seen.detected:
@@ -148,8 +145,8 @@ def test_a_detector_that_is_to_look_rarely_is_not_called_too_slow():
 def test_a_standing_picture_is_searched_less_often_until_something_moves():
     """A hovering drone's processor would go into what it has seen; or a car drive through between two looks."""
     tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
-    settings = AnalyzerSettings(detect_every=5, detect_still_every=15, candidates="source")
-    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, settings=settings)
+    rates = {"detect_every": 5, "detect_still_every": 15}
+    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, candidates="source", **rates)
     standing = [replace(FRAMES[0], index=index) for index in range(20)]
     seen = [analyzer.analyze(frame, unit) for frame, unit in zip(standing + FRAMES[20:], UNITS, strict=True)]
     assert [one.frame.index for one in seen if one.detected] == [0, 15, 21, 26]
@@ -158,8 +155,7 @@ def test_a_standing_picture_is_searched_less_often_until_something_moves():
 def test_another_scene_is_searched_at_once():
     """Boxes of the scene before, and its tracks, went to the ground until the next look was due."""
     tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
-    settings = AnalyzerSettings(detect_every=8, candidates="source")
-    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, settings=settings)
+    analyzer = Analyzer(RedSquares(), tracker, view=VIEW, detect_every=8, candidates="source")
     other = np.random.default_rng(2).integers(0, 2, (6, 10, 3), np.uint8) * 200
     other = cv2.resize(other, SIZE, interpolation=cv2.INTER_CUBIC)
     other[100:132, 50:82] = (20, 20, 220)
@@ -269,8 +265,7 @@ def test_with_candidates_of_the_source_the_camera_is_followed_on_the_source():
 
     for candidates, primary in (("source", True), ("decoded", False)):
         tracker = Watched(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
-        settings = AnalyzerSettings(candidates=candidates)
-        sparse(Analyzer(RedSquares(), tracker, view=VIEW, settings=settings), every=2)
+        sparse(Analyzer(RedSquares(), tracker, view=VIEW, candidates=candidates), every=2)
         assert set(given) == {primary}
         given.clear()
 

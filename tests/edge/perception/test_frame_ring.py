@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.values import Frame
-from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.on_demand import OnDemandRequest, frame_for
 from hvt_edge.stills.requested_coding import RefusedError
 from media.clips import START_NS
@@ -32,7 +32,7 @@ def filled(ring: FrameRing, count: int, *, fps: float = 15.0) -> FrameRing:
 
 def test_with_room_every_frame_of_the_last_seconds_is_there():
     """An operator who saw something a moment ago would get the frame beside it."""
-    ring = filled(FrameRing(RingSettings(max_bytes=300 * 200, max_age_ns=2 * SECOND_NS)), 100)
+    ring = filled(FrameRing(max_bytes=300 * 200, max_age_ns=2 * SECOND_NS), 100)
     assert len(ring) == 31
     assert [ring.near_index(index).frame_index for index in (69, 80, 99)] == [69, 80, 99]
     assert ring.near_index(68) is None
@@ -41,7 +41,7 @@ def test_with_room_every_frame_of_the_last_seconds_is_there():
 
 def test_with_little_memory_it_goes_back_as_far_with_frames_left_out():
     """On a 4K camera "three seconds ago" would be refused, because 250 MB are gone after 0.7 s."""
-    ring = filled(FrameRing(RingSettings(max_bytes=300 * 10, max_age_ns=5 * SECOND_NS)), 400)
+    ring = filled(FrameRing(max_bytes=300 * 10, max_age_ns=5 * SECOND_NS), 400)
     assert ring.size_bytes <= 3000
     assert ring.reach_s() == pytest.approx(5.0, abs=0.7)
     kept = [
@@ -61,7 +61,7 @@ def test_with_little_memory_it_goes_back_as_far_with_frames_left_out():
 )
 def test_its_bounds_hold_and_the_newest_is_always_there(count, max_bytes, age_s, fps):
     """A drone would run out of memory in flight, or "now" would be a picture of before."""
-    ring = FrameRing(RingSettings(max_bytes=max_bytes, max_age_ns=round(age_s * SECOND_NS)))
+    ring = FrameRing(max_bytes=max_bytes, max_age_ns=round(age_s * SECOND_NS))
     for index in range(count):
         ring.add(frame(index, fps=fps), tracks_at(index, {}))
         assert ring.size_bytes == 300 * max(0, len(ring) - 1) <= max_bytes
@@ -97,7 +97,7 @@ def test_a_frame_of_before_is_what_the_camera_saw(size, error):
 
 def test_a_frame_that_is_gone_or_to_come_is_not_replaced_by_another():
     """The operator would be shown another moment than he asked for, and not know."""
-    ring = filled(FrameRing(RingSettings(max_age_ns=SECOND_NS)), 60)
+    ring = filled(FrameRing(max_age_ns=SECOND_NS), 60)
     newest_ns = ring.newest().capture_ns
     assert ring.near_index(60) is None
     assert ring.near_time(newest_ns - 2 * SECOND_NS) is None
@@ -131,7 +131,7 @@ def test_now_is_the_newest_frame_from_the_camera_and_a_track_is_where_it_was_ana
 
 def test_without_a_ring_nothing_is_kept_of_the_newest_frame_either():
     """Whoever wants no pictures kept would have one kept."""
-    ring = FrameRing(RingSettings(max_bytes=0))
+    ring = FrameRing(max_bytes=0)
     ring.capture(frame(0))
     with pytest.raises(RefusedError, match="none is kept"):
         frame_for(OnDemandRequest(), ring)

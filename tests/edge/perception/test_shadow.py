@@ -11,8 +11,8 @@ from hvt_common.inference.detect import Detector, open_detector
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Detections, Frame
-from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer, AnalyzerSettings
-from hvt_edge.perception.shadow import Detected, Shadow, ShadowGround, ShadowSettings
+from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
+from hvt_edge.perception.shadow import Detected, Shadow, ShadowGround
 from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.video.encoder_settings import encoder_settings
@@ -21,7 +21,7 @@ from rigs.examples import tracks_of
 
 FPS = 15
 PERIOD_NS = 1_000_000_000 // FPS
-SETTINGS = ShadowSettings(confidence=0.4)
+CONFIDENCE = 0.4
 PICTURE = np.random.default_rng(3).integers(0, 255, (64, 96, 3), np.uint8)
 
 
@@ -51,7 +51,7 @@ def seen(index: int, confidences: dict[int, float], picture: np.ndarray = PICTUR
 def compared(*answers: Detections, confidences: dict[int, float], every: int = 30) -> ShadowGround:
     """A shadow ground whose detector said this of the base, one look after the other."""
     left = list(answers)
-    shadow = ShadowGround(lambda _image: left.pop(0) if left else found(), settings=SETTINGS)
+    shadow = ShadowGround(lambda _image: left.pop(0) if left else found(), confidence=CONFIDENCE)
     assert not shadow.compare(seen(0, confidences)), "the first picture is coarser than any other"
     for number in range(len(answers)):
         assert shadow.compare(seen((number + 1) * every, confidences))
@@ -110,7 +110,7 @@ def test_what_was_measured_before_the_flight_counts():
     """Else the first comparison in flight alone would move the levers."""
     before = compared(found(0), found(0), confidences={0: 0.9, 1: 0.9}).now
     assert before.hidden == 1
-    shadow = ShadowGround(lambda _image: found(0, 1), settings=SETTINGS, before=before)
+    shadow = ShadowGround(lambda _image: found(0, 1), confidence=CONFIDENCE, before=before)
     assert not shadow.compare(seen(0, {0: 0.9, 1: 0.9}))
     assert shadow.now == before
     assert shadow.compare(seen(6, {0: 0.9, 1: 0.9}))
@@ -126,7 +126,7 @@ def reporting(
 ) -> ShadowGround:
     """So many of twenty objects are shown by the base to the edge's detector, and so many detected at the ground."""
     objects = TWENTY if objects is None else objects
-    shadow = ShadowGround(lambda _image: found(*range(shown)), settings=SETTINGS)
+    shadow = ShadowGround(lambda _image: found(*range(shown)), confidence=CONFIDENCE)
     for index in range(0, 15 * seconds, 5):
         shadow.compare(seen(index, objects))
         shadow.take_detected(Detected(receiver_id=1, frame_index=index, objects=detected))
@@ -175,7 +175,7 @@ def test_the_only_object_there_is_counts():
 def test_a_crowd_that_leaves_is_hidden_from_nobody():
     """The mean of what was there falls slowly, and the ground's count at once: tracks would be sent of nothing."""
     objects, shown = dict(TWENTY), list(range(20))
-    shadow = ShadowGround(lambda _image: found(*shown), settings=SETTINGS)
+    shadow = ShadowGround(lambda _image: found(*shown), confidence=CONFIDENCE)
     gains = []
     for index in range(0, 15 * 40, 5):
         if index == 150:
@@ -191,7 +191,7 @@ def test_a_crowd_that_leaves_is_hidden_from_nobody():
 
 def test_reports_of_the_scene_before_say_nothing_of_this_one():
     """Two seconds late they would tell of a ground that sees nothing of the new scene."""
-    shadow = ShadowGround(lambda _image: found(*range(20)), settings=SETTINGS)
+    shadow = ShadowGround(lambda _image: found(*range(20)), confidence=CONFIDENCE)
     other = np.random.default_rng(9).integers(0, 255, PICTURE.shape, np.uint8)
     for index in range(0, 300, 5):
         shadow.compare(seen(index, TWENTY, PICTURE if index < 150 else other))
@@ -293,12 +293,12 @@ def _measured(detector: Detector, source: DemoSource, frames: list[Frame], kbps:
         base_bps=1000 * kbps,
         edge_id="edge-1",
     )
-    shadow, encoder = ShadowGround(detector.detect, settings=SETTINGS), BaseEncoder(settings)
+    shadow, encoder = ShadowGround(detector.detect, confidence=CONFIDENCE), BaseEncoder(settings)
     analyzer = Analyzer(
         detector,
         ByteTracker(TrackerSettings.starting_at(0.4, camera_motion="off"), fps=FPS),
         view=source.view,
-        settings=AnalyzerSettings(candidates="source"),
+        candidates="source",
     )
     for frame in frames:
         shadow.compare(analyzer.analyze(frame, encoder.encode(frame)))

@@ -16,7 +16,7 @@ from hvt_common.values import Frame, Still, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import Candidate, TrackMemory
-from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
@@ -78,7 +78,7 @@ class Rig:
             method or ByScore(),
             suppression=Suppression.for_cooldown(cooldown),
             memory=self.memory,
-            on_demand=OnDemand(FrameRing(RingSettings(max_bytes=0)), line=None, **shared),
+            on_demand=OnDemand(FrameRing(max_bytes=0), line=None, **shared),
             **shared,
             settings=ChooserSettings(fps=3, most_bytes=most_bytes, **settings),
             on_outcome=lambda outcome, reason: self.outcomes.update([(outcome, reason)]),

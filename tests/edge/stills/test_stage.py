@@ -24,7 +24,7 @@ from hvt_common.video.still_codecs import JpegCodec, StillCodec
 from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
+from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemandRequest
@@ -54,7 +54,8 @@ def make_analyzer(candidates: str = "decoded", *, detector=None, every: int = 5)
         detector or RedSquares(),
         ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         view=VIEW,
-        settings=AnalyzerSettings(detect_every=every, candidates=candidates),
+        detect_every=every,
+        candidates=candidates,
     )
 
 

@@ -15,7 +15,7 @@ from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.commands import Commands
-from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
+from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.policy.registry import method
 from media.base_coded import StandIn
@@ -42,7 +42,7 @@ class StillRig(Rig):
                 RedSquares(),
                 ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
                 view=VIEW,
-                settings=AnalyzerSettings(detect_every=5),
+                detect_every=5,
             ),
             keyframes=self.keyframes,
             outcomes=self.chosen,

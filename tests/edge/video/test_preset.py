@@ -12,10 +12,9 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.operating import Operating
 from hvt_edge.video.encoder_settings import PresetControl, choose_preset, share_of
-from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring import video
-from hvt_edge.wiring.video import encoder_opener, make_encoder, reconfiguration_settings
+from hvt_edge.wiring.video import encoder_opener, make_encoder, make_reconfiguration
 
 SECOND = 1_000_000_000
 MOST = 0.4
@@ -96,9 +95,10 @@ def test_a_step_opens_x265_at_the_same_rates_and_video_goes_on(monkeypatch):
         budget_bps=300_000, video_share=1.0, base_bps=280_000, method="M0", decimation=1, preset="veryfast"
     )
     control = PresetControl(operating, nominal_fps=15, most_cores=1e-9)
-    reconfiguration = EncoderReconfiguration(
+    reconfiguration = make_reconfiguration(
+        config,
         operating,
-        reconfiguration_settings(config, (320, 192)),
+        (320, 192),
         open_encoder=encoder_opener(config, operating, size=(320, 192), headroom=1.0, presets=control),
         budget=SimpleNamespace(set_total=lambda *_rates, **_when: None),
         split=None,

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from hvt_edge.operating import Levers, Operating, Rates
 from hvt_edge.perception.candidates import BaseLoss, Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import CostEstimate, Step
-from hvt_edge.video.reconfigure import EncoderReconfiguration, ReconfigurationSettings
+from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.share import FIRST_SHARE, Split, SplitSettings
 from rigs.examples import candidate
 
 SECOND = 1_000_000_000
+BOUNDS = {"size": (1280, 720), "nominal_fps": 15, "least_fps": 2, "edge_id": "e", "min_budget_bps": 50_000}
 
 
 def moment(seconds: float, *, from_source: bool = False) -> Step:
@@ -193,9 +194,8 @@ def test_reconfiguration_tells_the_split_how_many_frames_are_coded():
     opened = []
     reconfiguration = EncoderReconfiguration(
         operating,
-        ReconfigurationSettings(
-            size=(1280, 720), nominal_fps=15, least_fps=2, edge_id="e", metadata_bps=0, min_budget_bps=50_000
-        ),
+        **BOUNDS,
+        metadata_bps=0,
         open_encoder=opened.append,
         budget=SimpleNamespace(set_total=lambda *_rates, **_when: None),
         split=split(300_000, most_sparse_share=0.9),
@@ -210,12 +210,10 @@ def test_reconfiguration_tells_the_split_how_many_frames_are_coded():
 def test_what_stills_leave_while_they_pause_goes_back_to_the_base():
     """A tenth of a thin link would lie idle until the next scheduled keyframe, up to a minute later."""
     operating = Operating(budget_bps=300_000, video_share=None, base_bps=255_000, method="M6", decimation=2)
-    bounds = ReconfigurationSettings(
-        size=(1280, 720), nominal_fps=15, least_fps=2, edge_id="e", metadata_bps=8_000, min_budget_bps=50_000
-    )
     reconfiguration = EncoderReconfiguration(
         operating,
-        bounds,
+        **BOUNDS,
+        metadata_bps=8_000,
         open_encoder=lambda _rates: pytest.fail("only a keyframe opens it"),
         budget=None,
         split=split(300_000, metadata_bps=8_000),

@@ -18,7 +18,7 @@ from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import TrackMemory
-from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
@@ -59,7 +59,7 @@ class Rig:
         self.outbox = Outbox()
         self.maker = maker
         self.on_demand = OnDemand(
-            FrameRing(RingSettings(max_bytes=100_000_000, max_age_ns=round(ring_s * 1e9))),
+            FrameRing(max_bytes=100_000_000, max_age_ns=round(ring_s * 1e9)),
             outbox=self.outbox,
             maker=maker,
             view=VIEW,

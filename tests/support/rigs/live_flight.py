@@ -35,7 +35,6 @@ from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.encoders.registry import Encoder
-from hvt_edge.video.rate_model import LimitedFrameSkip
 from hvt_edge.wiring.link import make_budget, make_pacer
 from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, make_frame_skip
 from rigs.kept import INFO
@@ -231,8 +230,8 @@ class LiveFlight:
             self.transmitter,
             keyframes=self.keyframes,
             first_keyframe_bytes=config.base_bps // 40,
-            frame_skip=LimitedFrameSkip(
-                make_frame_skip(config, decimation, size=size), reconfiguration.least_decimation
+            frame_skip=make_frame_skip(
+                config, decimation, size=size, least_decimation=reconfiguration.least_decimation
             ),
             reconfigure=reconfiguration,
             keyframe_bytes=reconfiguration.keyframe_bytes,

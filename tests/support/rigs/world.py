@@ -20,7 +20,7 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import Operating
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
-from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
@@ -29,7 +29,8 @@ from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Suppression
 from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
-from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
+from hvt_edge.wiring.video import make_encoder
+from hvt_edge.wiring.video import make_reconfiguration as reconfiguration_of
 
 
 class Puts:
@@ -101,8 +102,7 @@ def make_reconfiguration(
 ) -> EncoderReconfiguration:
     """Of a real encoder, with fixed shares."""
     plain = {"open_encoder": partial(make_encoder, config, size=size), "split": None, "pacer": None}
-    settings = reconfiguration_settings(config, size)
-    return EncoderReconfiguration(operating, settings, budget=transmitter.budget, **(plain | parts))
+    return reconfiguration_of(config, operating, size, budget=transmitter.budget, **(plain | parts))
 
 
 def make_still_stage(
@@ -125,7 +125,7 @@ def make_still_stage(
     Grounds may request stills of what ``ring`` holds.
     """
     outbox, maker = Outbox() if outbox is None else outbox, maker or StillMaker()
-    ring = FrameRing(RingSettings(max_bytes=0)) if ring is None else ring
+    ring = FrameRing(max_bytes=0) if ring is None else ring
     on_demand = OnDemand(
         ring, outbox=outbox, maker=maker, view=view, class_names=class_names, line=transmitter
     )

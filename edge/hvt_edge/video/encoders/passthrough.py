@@ -172,7 +172,7 @@ class CameraRates:
     def observe(self, unit: AccessUnit) -> None:
         """Take in each unit of the camera, sent or not."""
         at_ns = unit.capture_ns
-        size_bytes = line_bytes(len(unit.data), self._reconfiguration.settings.edge_id)
+        size_bytes = line_bytes(len(unit.data), self._reconfiguration.edge_id)
         held_bytes = self._window.add(size_bytes, at_ns=at_ns)
         if self._since_ns is None or not 0 <= at_ns - self._since_ns < _MEMORY_NS:
             self._former_bytes, self._newest_bytes, self._since_ns = self._newest_bytes, 0, at_ns
