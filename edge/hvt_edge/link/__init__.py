@@ -1,5 +1,5 @@
 """The edge's end of the link: `transmitter` sends as `budget`, `pacer`, `rate_control` allow, `publisher` is Zenoh.
 
-`flight` is the account of what is under way, `stills` has a still with its header, and what grounds decode.
+`stills` has a still with its header, and what grounds decode.
 `tracks_channel` is what is told of tracks. `feedback` takes in what grounds report, and judges which of them steers.
 """

@@ -37,8 +37,7 @@ from hvt_common.protocol.messages import (
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, RollingBudget
-from hvt_edge.link.flight import BaseInFlight
-from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.pacer import BaseInFlight, Pacer
 from hvt_edge.link.stills import StillEnvelope
 
 STILL_ATTACHMENT_BYTES = 60

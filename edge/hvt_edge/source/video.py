@@ -21,7 +21,6 @@ from hvt_edge.source.decoding.container import (
     name_of,
     open_video,
     said_rate,
-    shown_times,
     survey,
     without_stamps,
 )
@@ -69,13 +68,10 @@ class VideoSource(ClipSource):
         return float(1 / self._stamps.period_s)
 
     def shown_frames(self) -> tuple[int, tuple[int, ...]]:
-        """Number of frames of the clip, and the one that each base frame shows, by its packets: nothing is decoded.
-
-        A clip of which frames cannot be decoded plays fewer.
-        """
+        """Number of frames of the clip, and the one that each base frame shows: as it is played."""
         container, stream = open_video(self._spec)
         with container:
-            times = shown_times(container, stream, stamps=self._stamps)
+            times = [at_s for at_s, _ in decoded(container, stream, name=self._name, stamps=self._stamps)]
             slack_s = Fraction(stream.time_base or 0) if self._stamps.usable else Fraction(0)
         timed = ((at_s, index) for index, at_s in enumerate(times))
         held = hold(timed, fps=exact_rate(self.fps), tail_s=self._stamps.period_s, slack_s=slack_s)

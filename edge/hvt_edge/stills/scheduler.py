@@ -10,14 +10,14 @@ import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 
-from hvt_common.values import Still, View
+from hvt_common.values import Still
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import BaseLoss, Candidate, TrackMemory
 from hvt_edge.stills.crop_job import CropJob, expected_bytes
-from hvt_edge.stills.maker import Allowance, NoStill, StillMaker
+from hvt_edge.stills.maker import Allowance, NoStill
 from hvt_edge.stills.merging import group
 from hvt_edge.stills.on_demand import OnDemand, OnDemandStill
-from hvt_edge.stills.outbox import Outbox, OutboxStill
+from hvt_edge.stills.outbox import OutboxStill
 from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, CostModel, Method, Request, Step
 
 
@@ -162,18 +162,16 @@ class Chooser:
 
     method: Method
     _: KW_ONLY
-    outbox: Outbox
     suppression: Suppression
-    maker: StillMaker
     memory: TrackMemory
-    view: View
-    class_names: tuple[str, ...]
     settings: ChooserSettings
     on_outcome: Callable[[str, str], None]
     on_demand: OnDemand
     observe: Callable[[Sequence[Candidate], Step], None] | None = None
 
     def __post_init__(self) -> None:
+        self.outbox, self.maker = self.on_demand.outbox, self.on_demand.maker
+        self.view, self.class_names = self.on_demand.view, self.on_demand.class_names
         self.most_bytes = self.settings.most_bytes
         """The largest admission that the budget can give from now on, payload."""
         self._costs: dict[str, CostModel] = {}

@@ -165,11 +165,7 @@ class Stills:
         chooser = Chooser(
             make_method(config, view),
             suppression=make_suppression(config),
-            outbox=outbox,
-            maker=maker,
             memory=TrackMemory(padding=config.padding),
-            view=view,
-            class_names=class_names,
             settings=ChooserSettings(
                 fps=config.nominal_fps,
                 most_bytes=link.transmitter.most_still_bytes(),

@@ -17,8 +17,7 @@ from hvt_common.protocol.messages import Feedback
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import PrimaryReceiver
-from hvt_edge.link.flight import Flight
-from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.pacer import Flight, Pacer
 from hvt_edge.link.rate_control import (
     LeastDelay,
     Progress,

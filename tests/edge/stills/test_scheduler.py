@@ -68,18 +68,19 @@ class Rig:
         view = View.fitted(SIZE, SIZE, fit="letterbox")
         self.steps: list[tuple[Sequence[Candidate], Step]] = []
         self.outbox = Outbox(OutboxSettings(max_pending=3))
-        shared = {
-            "outbox": self.outbox,
-            "maker": maker or StillMaker(),
-            "view": view,
-            "class_names": ("car",),
-        }
+        on_demand = OnDemand(
+            FrameRing(max_bytes=0),
+            outbox=self.outbox,
+            maker=maker or StillMaker(),
+            view=view,
+            class_names=("car",),
+            line=None,
+        )
         self.chooser = Chooser(
             method or ByScore(),
             suppression=Suppression.for_cooldown(cooldown),
             memory=self.memory,
-            on_demand=OnDemand(FrameRing(max_bytes=0), line=None, **shared),
-            **shared,
+            on_demand=on_demand,
             settings=ChooserSettings(fps=3, most_bytes=most_bytes, **settings),
             on_outcome=lambda outcome, reason: self.outcomes.update([(outcome, reason)]),
             observe=lambda candidates, step: self.steps.append((candidates, step)),

@@ -68,12 +68,8 @@ class Rig:
         )
         self.chooser = Chooser(
             method(name),
-            outbox=self.outbox,
             suppression=Suppression.for_cooldown(0),
-            maker=maker,
             memory=TrackMemory(),
-            view=VIEW,
-            class_names=("car",),
             settings=ChooserSettings(fps=15, most_bytes=self.sender.most_still_bytes()),
             on_outcome=lambda *outcome: self.outcomes.update([outcome]),
             on_demand=self.on_demand,

@@ -131,12 +131,8 @@ def make_still_stage(
     )
     chooser = Chooser(
         method("M1"),
-        outbox=outbox,
         suppression=Suppression.for_cooldown(0),
-        maker=maker,
         memory=TrackMemory() if memory is None else memory,
-        view=view,
-        class_names=class_names,
         settings=ChooserSettings(fps=15, most_bytes=10_000),
         on_outcome=lambda *outcome: outcomes.update([outcome]),
         on_demand=on_demand,

@@ -20,7 +20,7 @@ from av.stream import Disposition
 
 from hvt_common.errors import NotYetError, UserError
 from hvt_common.redaction import redacted
-from hvt_edge.source.decoding.timeline import LONG_PAUSE_S, LONG_STEP_S, Stamps, presented, surveyed
+from hvt_edge.source.decoding.timeline import LONG_PAUSE_S, LONG_STEP_S, Stamps, surveyed
 
 _log = logging.getLogger(__name__)
 
@@ -194,20 +194,6 @@ def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
     reorders = bool(stream.codec_context.has_b_frames)
     stamps = surveyed(times, said_fps=rate, reorders=reorders)
     return replace(stamps, long_s=LONG_STEP_S if container.format.flags & _MAY_JUMP else LONG_PAUSE_S), first
-
-
-def shown_times(container: Any, stream: Any, *, stamps: Stamps) -> list[Fraction]:
-    """The time of each frame, in seconds and in presentation order, by packets alone: nothing is decoded.
-
-    The same times as of `decoded`, where all decodes.
-    """
-    packets = [
-        (_seconds(one.pts, one.time_base), _seconds(one.dts, one.time_base))
-        for one in _packets(container, stream)
-        if not isinstance(one, Exception) and one.size and not one.is_discard
-    ]
-    timeline = stamps.timeline(stream)
-    return [timeline.at(stamp) for stamp in presented(packets, stamps)]
 
 
 def decoded(

@@ -65,37 +65,6 @@ def surveyed(
     return Stamps(usual_s, usable=True, ordered=not unsorted and len(shown) * 2 > len(packets))
 
 
-def presented(
-    packets: Sequence[tuple[Fraction | None, Fraction | None]], stamps: Stamps
-) -> list[Fraction | None]:
-    """The stamps of packets, (presentation, decoding) seconds in decoding order, in the order that frames are shown.
-
-    A decoder sorts no further than to where the stamps of the decoding jump.
-    """
-    if not stamps.usable:
-        return [None] * len(packets)
-    if not stamps.ordered:
-        return [coded for _, coded in packets]
-    most_s = max(stamps.long_s, _LONG_STEPS * stamps.period_s)
-    parts: list[list[Fraction | None]] = [[]]
-    before_s: Fraction | None = None
-    for shown, coded in packets:
-        at_s = shown if coded is None else coded
-        if at_s is not None and before_s is not None:
-            step_s = at_s - before_s
-            if step_s > most_s or step_s < -_LONG_STEPS * stamps.period_s:
-                parts.append([])
-        parts[-1].append(shown)
-        before_s = before_s if at_s is None else at_s
-    return [stamp for part in parts for stamp in _sorted(part)]
-
-
-def _sorted(stamps: list[Fraction | None]) -> Sequence[Fraction | None]:
-    # As they are where some are not known.
-    known = [stamp for stamp in stamps if stamp is not None]
-    return sorted(known) if len(known) == len(stamps) else stamps
-
-
 class Timeline:
     """One reading of a stream, whose stamps are whole ``quantum_s``.
 
