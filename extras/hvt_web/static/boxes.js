@@ -8,6 +8,7 @@ import { boxWords } from "./words.js";
 const MOST = 4000;
 export const OLD_MS = 500; // a list so old says nothing of this picture
 const LOOK_BACK = 900; // frames
+const PACE_FRAMES = 5; // over so many a track's pace is taken: a box that was put right is no motion
 const FADED_MS = 200;
 const CLICK_SHARE = 0.12; // of the picture's width: what a click beside all boxes asks for
 const CROWD = 30; // objects: from so many on only names that matter are written
@@ -85,10 +86,11 @@ export class Boxes {
     this.draw();
   }
 
-  /** The list of this picture, or the newest of those shortly before it. */
+  /** The list of this picture, or the newest of those shortly before it, whose tracks go on at their pace. */
   current() {
     const found = this.newest();
-    return found && this.captured - found.captured < OLD_MS ? found : null;
+    if (!found || this.captured - found.captured >= OLD_MS) return null;
+    return { ...found, tracks: carried(found, this.newest(found.frame - PACE_FRAMES), this.captured) };
   }
 
   /** The newest list of a picture or of one before it, however old; null where there is none. */
@@ -247,6 +249,20 @@ export class Boxes {
       this.onPick([x - half, y - half, x + half, y + half], null);
     }
   }
+}
+
+/**
+ * The tracks of a list where they would be later, by how far they have gone since a list before it.
+ * @param {Overlay} list @param {Overlay | null} before @param {number} captured of the later picture, ms
+ */
+export function carried(list, before, captured) {
+  const share = before && before.captured < list.captured ? (captured - list.captured) / (list.captured - before.captured) : 0;
+  if (!before || share <= 0 || share > 2) return list.tracks;
+  const boxes = new Map(before.tracks.map(({ id, box }) => [id, box]));
+  return list.tracks.map((track) => {
+    const was = boxes.get(track.id);
+    return was ? { ...track, box: track.box.map((value, side) => value + share * (value - was[side])) } : track;
+  });
 }
 
 /** @param {number[]} box */

@@ -116,6 +116,24 @@ def test_every_sentence_of_the_page_is_read():
         assert not re.search(r"undefined|null|NaN|\[object|\$\{|_|  ", said), said
 
 
+@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+def test_boxes_go_on_with_their_objects_until_the_next_list_comes():
+    """The picture is on the screen before its list: a car of 12 px a frame has left its box by then."""
+    before = {"frame": 0, "captured": 1000, "tracks": [{"id": 1, "box": [0, 0, 20, 10]}]}
+    parked = {"id": 2, "box": [50, 50, 60, 60]}
+    found = {"frame": 5, "captured": 1300, "tracks": [{"id": 1, "box": [60, 0, 80, 10]}, parked]}
+    boxes = ran(
+        f"""
+      import {{ carried }} from {json.dumps((STATIC / "boxes.js").as_uri())};
+      const [found, before] = {json.dumps([found, before])};
+      const at = (list, captured) => carried(found, list, captured).map(({{ box }}) => box);
+      console.log(JSON.stringify([at(before, 1500), at(before, 1300), at(null, 1500), at(found, 1500)]));
+    """
+    )
+    seen = [[60, 0, 80, 10], parked["box"]]
+    assert boxes == [[[100, 0, 120, 10], parked["box"]], seen, seen, seen]
+
+
 def texts(found: Any) -> list[str]:
     """All texts within."""
     if isinstance(found, dict):
