@@ -126,64 +126,6 @@ def test_a_budget_whose_window_holds_no_keyframe_is_refused_with_the_least_that_
         settled(*argv, "--budget", f"{least_bps / 1000 - 2:.0f}kbps")
 
 
-@pytest.mark.parametrize(
-    ("argv", "said"),
-    [
-        (["--regime", "low", "--budget", "1Mbps"], "--regime low already sets"),
-        (["--regime", "low", "--video-share", "0.5"], "--regime low already sets"),
-        (["--video-share", "0"], "--video-share 0 leaves no base stream"),
-        (["--video-share", "1e-320"], "leaves no base stream: give 0.01 to 1"),
-        (["--config=--"], "--config [] is not accepted"),
-        (["--budget", "60kbps", "--size", "1280x720"], "give at least 118 kbps, lower --size or --fps"),
-        (["--budget", "500kbps", "--video-share", "0.1", "--size", "1280x720"], "or raise --video-share 0.1"),
-        (["--window", "10ms"], "--window 0.01s is not accepted"),
-        (["--window", "61s"], "--window 61s is not accepted"),
-        (["--size", "1281x720"], "size 1281x720 is impossible"),
-        (["--size", "32x32"], "is impossible"),
-        (["--edge-id", "UAV 1"], "edge id 'UAV 1' is not usable"),
-        (["--edge-id", "a" * 33], "is not usable"),
-    ],
-)
-def test_settings_that_contradict_are_one_sentence(argv, said):
-    """The user would guess which of two settings won, or get a traceback."""
-    with pytest.raises(UserError, match=re.escape(said)):
-        settled(*argv)
-
-
-@pytest.mark.parametrize(
-    "argv",
-    [
-        ["--method", "M9"],
-        ["--fps", "0"],
-        ["--fps", "nan"],
-        ["--fps", "300"],
-        ["--detect-every", "0"],
-        ["--jpeg-quality", "100"],
-        ["--padding", "-1"],
-        ["--confidence", "2"],
-        ["--preset", "placebo"],
-        ["--fit", "stretch"],
-        ["--pace", "fast"],
-        ["--candidates", "both"],
-        ["--camera-motion", "gps"],
-        ["--max-frames", "0"],
-        ["--seed", "-1"],
-        ["--keyframe-interval", "9" * 400],
-        ["--cooldown", "-2s"],
-    ],
-)
-def test_values_out_of_range_name_their_flag(argv):
-    """A typing error would start another flight than the one that was meant, or none, without a word why."""
-    with pytest.raises(UserError, match=argv[0]):
-        settled(*argv)
-
-
-def test_a_source_is_needed():
-    """The edge would start and send nothing."""
-    with pytest.raises(UserError, match="--source is missing"):
-        check(EdgeConfig())
-
-
 def test_the_short_help_is_short_and_grouped(capsys):
     """A first reader would look for --budget among sixty settings."""
     with pytest.raises(SystemExit):

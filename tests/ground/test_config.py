@@ -34,16 +34,11 @@ def test_without_flags_it_listens_and_needs_no_model():
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        (["--view", "--serve"], "--view and --serve are both given"),
-        (["--labels", "names.txt"], "--labels names.txt names a classifier's classes"),
         (["--labels", "names.txt", "--classifier", "detector"], "--classifier is no file"),
-        (["--refine", "vote"], "choose one of replace, fuse"),
         (["--timing", "a.csv", "--tracks", "./a.csv"], "--tracks and --timing both name a.csv: give each"),
         (["--timing", "a.csv", "--summary", "b/../a.csv"], "--timing and --summary both name b/../a.csv"),
         (["--record", "a.rrd", "--summary", "a.rrd"], "--record and --summary both name a.rrd"),
         (["--ts", "a.ts", "--summary", "./a.ts"], "--summary and --ts both name a.ts"),
-        (["--detect-every", "0"], "whole number from 1"),
-        (["--threads", "many"], "whole number from 1"),
     ],
 )
 def test_settings_that_contradict_are_one_sentence(argv, said):

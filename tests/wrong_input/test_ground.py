@@ -70,6 +70,7 @@ def test_a_file_that_cannot_be_written(ground, here, flag, path):
     [
         ("refine", "guess", "replace, fuse"),
         ("detect-every", "0", "1 to 1000"),
+        ("threads", "many", "whole number from 1"),
         ("confidence", "2", "0.01 to 1"),
         ("camera-motion", "yes", "off, flow"),
         ("wait", "-1s", "2s"),
@@ -106,7 +107,7 @@ PLACES = (
         (f"{KEEPS} 1GB --keep 2GB", ["both given: give one time and one size"]),
         *((f"--listen tcp/{host}:7999", [host, "--insecure"]) for host in ("0.0.0.0", "[::]")),
         *((f"--edges '{pattern}'", ["edge", pattern]) for pattern in ("UAV_*", "", "a/b", "**/x")),
-        ("--view --serve", ["--view", "--serve"]),
+        ("--view --serve", ["--view and --serve are both given"]),
         *((word, [word]) for word in ("--bogus", "stray")),
         *((f"--cot '{url}'", [redacted(url), "--cot", "tls://HOST:PORT"]) for url in PLACES),
     ],

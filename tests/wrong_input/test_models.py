@@ -81,7 +81,7 @@ def test_labels_without_a_classifier(program, here):
     """The names would silently not count."""
     Path("names.txt").write_text("car\n")
     sentence = program("hvt-ground", "--labels", "names.txt")
-    assert "--labels names.txt" in sentence
+    assert "--labels names.txt names a classifier's classes" in sentence
     assert "--classifier" in sentence
 
 
