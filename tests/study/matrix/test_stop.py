@@ -45,7 +45,7 @@ def test_a_full_disk_is_one_sentence_and_what_is_finished_stays(scene, tmp_path,
 def test_killed_in_the_middle_it_goes_on_from_there(scene, tmp_path):
     """A lost machine would cost all that was flown on it."""
     out, words = tmp_path / "out", (*METHODS, "--jobs", "2")
-    process = study("run", *arguments(scene, out, *words), folder=tmp_path)
+    process = study("run", *arguments(scene, out, *words), folder=tmp_path, held=True)
     until(process, lambda: len(flights(out / "cache")) >= 2)
     os.killpg(process.pid, signal.SIGKILL)
     assert process.wait(PATIENT_S) == -signal.SIGKILL
@@ -65,7 +65,7 @@ def test_killed_in_the_middle_it_goes_on_from_there(scene, tmp_path):
 def test_nothing_is_left_running(scene, tmp_path, how):
     """Interrupted, it would go on in the background for hours, beside the study that is started again."""
     out = tmp_path / "out"
-    process = study("run", *arguments(scene, out, *METHODS, "--jobs", "2"), folder=tmp_path)
+    process = study("run", *arguments(scene, out, *METHODS, "--jobs", "2"), folder=tmp_path, held=True)
     until(process, lambda: flights(out / "cache"))
     children = psutil.Process(process.pid).children(recursive=True)
     assert len(children) >= 2
@@ -74,7 +74,7 @@ def test_nothing_is_left_running(scene, tmp_path, how):
     else:
         process.kill()
     assert process.wait(PATIENT_S) == (130 if how == signal.SIGINT else -signal.SIGKILL)
-    _, alive = psutil.wait_procs(children, timeout=30)
+    _, alive = psutil.wait_procs(children, timeout=PATIENT_S)
     assert not alive
     words = said(tmp_path)
     assert "Traceback" not in words

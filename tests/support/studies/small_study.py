@@ -23,6 +23,16 @@ _MAIN = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"  # a shell's background job ignores it
     "from hvt_study.cli import main; raise SystemExit(main())"
 )
+_HELD = """
+import signal
+from hvt_study.cache.results import ResultCache
+put = ResultCache.put
+def put_and_hold(cache, key, result):
+    put(cache, key, result)
+    while "flights" in cache._folder.parts and cache.count() >= 2:
+        signal.pause()
+ResultCache.put = put_and_hold
+"""
 FRAMES = 30
 _CLOCKS = frozenset({"wall_s", "edge_cpu_ms"})
 """Columns that a second flight on another day fills in otherwise."""
@@ -49,8 +59,16 @@ def detector(uri: str) -> str:
     return str(Path(uri.removeprefix("visdrone:").removesuffix("?fps=15")) / "red.onnx")
 
 
-def study(command: str, *words: str, folder: Path, **named: Any) -> subprocess.Popen[str]:
-    """``hvt-study`` as a process of a group of its own; what it says is in study.out and study.err there."""
+def study(command: str, *words: str, folder: Path, held: bool = False, **named: Any) -> subprocess.Popen[str]:
+    """``hvt-study`` as a process of a group of its own; what it says is in study.out and study.err there.
+
+    ``held`` stands still for ever once two flights are kept, however fast the machine.
+    """
+    environment = {**os.environ, "COLUMNS": "200"}
+    if held:
+        (folder / "held").mkdir()
+        (folder / "held" / "sitecustomize.py").write_text(_HELD)
+        environment["PYTHONPATH"] = str(folder / "held")
     with (folder / "study.out").open("w") as out, (folder / "study.err").open("w") as err:
         return subprocess.Popen(
             [sys.executable, "-c", _MAIN, command, *words],
@@ -59,7 +77,7 @@ def study(command: str, *words: str, folder: Path, **named: Any) -> subprocess.P
             stderr=err,
             text=True,
             start_new_session=True,
-            env={**os.environ, "COLUMNS": "200"},
+            env=environment,
             **named,
         )
 
