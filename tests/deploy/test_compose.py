@@ -93,7 +93,7 @@ def test_the_image_holds_what_the_commands_name(compose: dict[str, Any]) -> None
 
 
 @pytest.mark.integration
-@pytest.mark.realtime  # a flight of two seconds, which a ground that starts slowly would miss
+@pytest.mark.nightly
 def test_the_commands_do_what_the_file_promises(
     compose: dict[str, Any], tmp_path: Path, free_port: int
 ) -> None:
@@ -115,8 +115,9 @@ def test_the_commands_do_what_the_file_promises(
     with start("router") as router:
         passed = partial(subprocess.run, [sys.executable, *check[1:]], check=False, capture_output=True)
         eventually(lambda: passed().returncode == 0, what="the health check passes")
-        with start("ground", "--quiet", "--once") as ground:
-            with start("edge", "--quiet", "--wait=60s", "--max-frames=30") as edge:
+        with start("ground", "--quiet", "--once", "--detector=motion", "--classifier=none") as ground:
+            small = ("--max-frames=30", "--size=320x192", "--detector=motion", "--preset=ultrafast")
+            with start("edge", "--quiet", "--wait=200s", "--pace=lockstep", *small) as edge:
                 assert edge.wait(PATIENT_S) == 0
             assert ground.wait(PATIENT_S) == 0
         router.send_signal(signal.SIGINT)

