@@ -52,15 +52,12 @@ class Camera:
 
     def pose(self, t_s: float) -> Matrix:
         """World metres to source pixels, (3, 3); pixel (0, 0) covers 0…1, so its centre maps from 0.5."""
-        share = min(1.0, max(0.0, t_s / self.duration_s))
-        eased = _ease(share)
+        share, centre, roll_deg = self._on_its_way(t_s)
         wide, high = self.size
-        centre = [a + (b - a) * eased for a, b in zip(self.start_m, self.end_m, strict=True)]
-        roll = math.radians(
-            self.appearance.roll_deg[0] + (self.appearance.roll_deg[1] - self.appearance.roll_deg[0]) * eased
-        )
         shake = self._shake(t_s)
-        roll += 0.0006 * self.appearance.shake_px * math.sin(1.9 * t_s + self.phases[3])
+        roll = math.radians(roll_deg) + 0.0006 * self.appearance.shake_px * math.sin(
+            1.9 * t_s + self.phases[3]
+        )
         scale = wide / self._width_m(share)
         cosine, sine = scale * math.cos(roll), scale * math.sin(roll)
         plane = np.array(
@@ -75,12 +72,7 @@ class Camera:
 
     def place(self, t_s: float) -> CameraPlace:
         """Where the pinhole stands that `pose` is of, but for its shake, which is of the picture."""
-        share = min(1.0, max(0.0, t_s / self.duration_s))
-        eased = _ease(share)
-        centre = [a + (b - a) * eased for a, b in zip(self.start_m, self.end_m, strict=True)]
-        roll_deg = (
-            self.appearance.roll_deg[0] + (self.appearance.roll_deg[1] - self.appearance.roll_deg[0]) * eased
-        )
+        share, centre, roll_deg = self._on_its_way(t_s)
         turn, tilt = math.radians(roll_deg), math.radians(self.appearance.tilt_deg)
         range_m = _FOCAL_WIDTHS * self._width_m(share)  # along the optical axis
         back_m = range_m * math.sin(tilt)
@@ -92,6 +84,14 @@ class Camera:
             pitch_deg=self.appearance.tilt_deg - 90,
             hfov_deg=math.degrees(2 * math.atan(0.5 / _FOCAL_WIDTHS)),
         )
+
+    def _on_its_way(self, t_s: float) -> tuple[float, list[float], float]:
+        """Share of the time, place and roll."""
+        share = min(1.0, max(0.0, t_s / self.duration_s))
+        eased = _ease(share)
+        first, last = self.appearance.roll_deg
+        centre = [a + (b - a) * eased for a, b in zip(self.start_m, self.end_m, strict=True)]
+        return share, centre, first + (last - first) * eased
 
     def _width_m(self, share: float) -> float:
         first, middle, last = self.appearance.width_m

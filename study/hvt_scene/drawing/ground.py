@@ -128,19 +128,15 @@ class _Painter:
             self._slabs(rect, step_m=1.5 if kind == "paving" else 5.0)
 
     def _slabs(self, rect: Rect, *, step_m: float) -> None:
+        colour = _gain(self._appearance.paving_bgr, 0.84)
         for x in np.arange(rect.x0 + step_m, rect.x1, step_m):
-            self.stroke(
-                (x, rect.y0), (x, rect.y1), wide_m=0.05, colour=_gain(self._appearance.paving_bgr, 0.84)
-            )
+            self.stroke((x, rect.y0), (x, rect.y1), wide_m=0.05, colour=colour)
         for y in np.arange(rect.y0 + step_m, rect.y1, step_m):
-            self.stroke(
-                (rect.x0, y), (rect.x1, y), wide_m=0.05, colour=_gain(self._appearance.paving_bgr, 0.84)
-            )
+            self.stroke((rect.x0, y), (rect.x1, y), wide_m=0.05, colour=colour)
 
     def frame(self, rect: Rect, *, wide_m: float, colour: Bgr) -> None:
         """Draw a rectangle's edge."""
-        corners = [(rect.x0, rect.y0), (rect.x1, rect.y0), (rect.x1, rect.y1), (rect.x0, rect.y1)]
-        for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
+        for start, end in zip(rect.corners, rect.corners[1:] + rect.corners[:1], strict=True):
             self.stroke(start, end, wide_m=wide_m, colour=colour)
 
     def stroke(self, start: Sequence[float], end: Sequence[float], *, wide_m: float, colour: Bgr) -> None:
@@ -152,9 +148,7 @@ class _Painter:
 
     def block(self, rect: Rect, *, colour: Bgr) -> None:
         """Fill a rectangle."""
-        self.poly(
-            [(rect.x0, rect.y0), (rect.x1, rect.y0), (rect.x1, rect.y1), (rect.x0, rect.y1)], colour=colour
-        )
+        self.poly(rect.corners, colour=colour)
 
     def poly(self, points: Sequence[Sequence[float]], *, colour: Bgr) -> None:
         """Fill a polygon."""
@@ -171,9 +165,9 @@ class _Painter:
         """Darken what lies in the shade of buildings and trees."""
         dx, dy = self._appearance.shadow_vector
         for building in layout.buildings:
-            rect, height = building.rect, building.height_m
-            foot = np.array([(rect.x0, rect.y0), (rect.x1, rect.y0), (rect.x1, rect.y1), (rect.x0, rect.y1)])
-            hull = cv2.convexHull(self._fixed(np.concatenate([foot, foot + np.array([dx, dy]) * height])))
+            foot = np.array(building.rect.corners)
+            roof = foot + np.array([dx, dy]) * building.height_m
+            hull = cv2.convexHull(self._fixed(np.concatenate([foot, roof])))
             cv2.fillConvexPoly(self._shade, hull, 255, cv2.LINE_AA, _SHIFT)
         for tree in layout.trees:
             reach = 1.1 * tree.r
@@ -322,7 +316,7 @@ def _paint_ridge(painter: _Painter, rect: Rect) -> None:
     middle = (rect.x0 + rect.x1) / 2
     hip = rect.size[0] / 2
     ends = ((middle, rect.y0 + hip * 0.8), (middle, rect.y1 - hip * 0.8))
-    corners = ((rect.x0, rect.y0), (rect.x1, rect.y0), (rect.x1, rect.y1), (rect.x0, rect.y1))
+    corners = rect.corners
     sides = (
         ([corners[0], corners[1], ends[0]], 1.12),
         ([corners[1], corners[2], ends[1], ends[0]], 0.84),

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -308,14 +307,10 @@ def _other(rng: _Rng, *, small: bool) -> Sprite:
     return canvas.sprite(height_m=(2.6, 1.1, 1.3)[kind])
 
 
-class _Sized(Protocol):
-    def __call__(self, rng: _Rng, *, small: bool) -> Sprite: ...
-
-
 _DRAW: dict[str, Callable[[_Rng], Sprite]] = {
     "car": _car,
     "bus": _bus,
     "motor": _motor,
     "pedestrian": _pedestrian,
 }
-_DRAW_SIZED: dict[str, _Sized] = {"van": _van, "truck": _truck, "other": _other}
+_DRAW_SIZED: dict[str, Callable[..., Sprite]] = {"van": _van, "truck": _truck, "other": _other}

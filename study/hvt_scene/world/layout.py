@@ -36,6 +36,11 @@ class Rect:
         """(width, depth) in metres."""
         return (self.x1 - self.x0, self.y1 - self.y0)
 
+    @property
+    def corners(self) -> list[tuple[float, float]]:
+        """From the north-west one, clockwise."""
+        return [(self.x0, self.y0), (self.x1, self.y0), (self.x1, self.y1), (self.x0, self.y1)]
+
     def inset(self, margin: float) -> Rect:
         """The rectangle with ``margin`` taken off every side."""
         return Rect(self.x0 + margin, self.y0 + margin, self.x1 - margin, self.y1 - margin)
@@ -93,12 +98,9 @@ def plan(rng: _Rng, appearance: Appearance) -> Layout:
     layout = Layout(main_y=WORLD_M[1] / 2 + float(rng.uniform(-3, 3)), side_x=float(rng.uniform(122, 144)))
     for block, kinds in zip(_blocks(layout), _kinds(rng), strict=True):
         split = block.x0 + block.size[0] * float(rng.uniform(0.46, 0.56))
-        _fill(
-            layout, Rect(block.x0, block.y0, split, block.y1), kind=kinds[0], rng=rng, appearance=appearance
-        )
-        _fill(
-            layout, Rect(split, block.y0, block.x1, block.y1), kind=kinds[1], rng=rng, appearance=appearance
-        )
+        plots = Rect(block.x0, block.y0, split, block.y1), Rect(split, block.y0, block.x1, block.y1)
+        for plot, kind in zip(plots, kinds, strict=True):
+            _fill(layout, plot, kind=kind, rng=rng, appearance=appearance)
     _roadside(layout, rng)
     return layout
 

@@ -59,18 +59,14 @@ def estimate(plan: StudyPlan, sequences: tuple[Sequence, ...], *, frame_s: float
     """Count what `hvt_study.matrix.schedule.run_all` would do; ``frame_s`` is what a flight takes for a frame."""
     frames = sum(one.limited(plan.max_frames).clip_frames for one in sequences)
     video = [method for method in plan.methods if method.kind is Kind.VIDEO]
-    each = len(plan.regimes) * len(plan.models)
-    others = [method for method in plan.methods if method.kind is not Kind.VIDEO]
-    hybrids = each * sum(_variants(one, plan) for one in others)
-    at_budget = each * sum(_variants(one, plan) * _flights(one) for one in plan.methods)
-    at_totals = each * sum(
-        _variants(one, plan) for one in others if plan.matched_to is None or one.name in plan.matched_to
-    )
-    matched = at_totals * sum(_flights(one) for one in video)
+    first = list(first_runs(replace(plan, sequences=plan.sequences[:1])))  # of each sequence
+    at_budget = sum(_flights(METHODS[one.method]) for one in first)
+    at_totals = sum(map(plan.is_matched, first))
+    matched = at_totals * sum(map(_flights, video))
     labelled = plan.labels == "reference"
     flights = at_budget + matched * (1 + _USUAL_WEIGHTS * _WEIGHT_SHARE) + labelled * len(plan.models)
     detections = (at_budget + matched) / plan.detect_every + labelled * len(plan.models)
-    runs = len(sequences) * (hybrids + each * len(video) + at_totals * len(video))
+    runs = len(sequences) * (len(first) + at_totals * len(video))
     return Estimate(
         sequences=len(sequences),
         frames=frames,
@@ -98,10 +94,6 @@ def time_of_a_frame(plan: StudyPlan) -> float:
     if row["failed"]:
         raise UserError(f"{spec.method} at {spec.regime} cannot be flown: {row['failed']}")
     return took_s / context.sequence.clip_frames
-
-
-def _variants(method: Method, plan: StudyPlan) -> int:
-    return len(plan.still_codecs) if method.sends_stills else 1
 
 
 def _flights(method: Method) -> int:

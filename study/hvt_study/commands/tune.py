@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from concurrent.futures import Executor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,45 +27,12 @@ from hvt_study.commands.arguments import (
 )
 from hvt_study.commands.output import RunProgress, make_out, print_columns, print_lines, writing
 from hvt_study.matrix.plan import StudyPlan, spec_of
-from hvt_study.matrix.schedule import Pool
 from hvt_study.matrix.tuning import tuning_texts
 from hvt_study.runs.execute import run_spec
 from hvt_study.runs.methods import METHODS as FLOWN
 
 _REACH = 4.0
 """A parameter is looked for between its default over this and its default times this, on a logarithmic scale."""
-
-
-@dataclass(frozen=True, slots=True)
-class HeldOut:
-    """One sequence that the search has not seen."""
-
-    dataset: str
-    sequence: str
-    regime: str
-    default: float
-    """Worth with the method's defaults, 0…1."""
-    tuned: float
-    default_bps: int
-    tuned_bps: int
-
-
-@dataclass(frozen=True, slots=True)
-class Tuned:
-    """What the search found."""
-
-    method: str
-    parameters: Mapping[str, float]
-    train_default: float
-    """Mean worth over the training flights with the defaults."""
-    train_tuned: float
-    trials: int
-    held_out: tuple[HeldOut, ...]
-
-    @property
-    def gain(self) -> float:
-        """Mean gain on what was held out: this alone says whether the search found anything."""
-        return sum(one.tuned - one.default for one in self.held_out) / len(self.held_out)
 
 
 def tunable(method: str, names: Iterable[str] = ()) -> dict[str, float]:
@@ -113,68 +81,78 @@ def tune(
     train: Sequence[tuple[str, str]],
     held_out: Sequence[tuple[str, str]],
     trials: int,
-    pool: Pool,
+    pool: Executor,
     seed: int = 0,
     on_trial: Callable[[int, float, float], None] = lambda *_: None,
-) -> Tuned:
-    """Search; ``on_trial(number, worth, best)`` is called after each.
+) -> dict[str, Any]:
+    """Search, and return what ``tune.json`` holds; ``on_trial(number, worth, best)`` is called after each.
 
-    Raises `UserError` where the method cannot be flown with its defaults.
+    Of all that is found ``held_out_gain`` alone, the mean gain on what the search has not seen, says whether it is
+    any better. Raises `UserError` where the method cannot be flown with its defaults.
     """
-    desk = _Desk(plan, method, pool)
-    default = desk.mean_worth(train, ())
-    as_it_is = desk.rows(held_out, ())  # what cannot be flown is told before the search, not after
+
+    def mean_worth(texts: tuple[str, ...]) -> float:
+        rows = _flown(plan, method, pool, train, texts)
+        return sum(map(_worth, rows)) / len(rows)
+
+    default = mean_worth(())
+    as_it_is = _flown(plan, method, pool, held_out, ())  # what cannot be flown is told before the search
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     search = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed))
     search.add_trial(_known(parameters, default))
     for number in range(trials):
         trial = search.ask()
-        worth = desk.mean_worth(train, tuning_texts(_proposed(trial, parameters)))
+        worth = mean_worth(tuning_texts(_proposed(trial, parameters)))
         search.tell(trial, worth)
         on_trial(number + 1, worth, search.best_value)
     better = search.best_trial.number > 0  # the first is the defaults
     best = (
         {name: _rounded(value) for name, value in search.best_params.items()} if better else dict(parameters)
     )
-    return Tuned(
-        method=method,
-        parameters=best,
-        train_default=default,
-        train_tuned=search.best_value,
-        trials=trials,
-        held_out=tuple(_pairs(as_it_is, desk.rows(held_out, tuning_texts(best) if better else ()))),
-    )
+    tuned = _flown(plan, method, pool, held_out, tuning_texts(best) if better else ())
+    pairs = [
+        {
+            **{name: one[name] for name in ("dataset", "sequence", "regime")},
+            "default": _worth(one),
+            "tuned": _worth(other),
+            "default_bps": one["total_bps"] or 0,
+            "tuned_bps": other["total_bps"] or 0,
+        }
+        for one, other in zip(as_it_is, tuned, strict=True)
+    ]
+    return {
+        "method": method,
+        "parameters": best,
+        "train_default": default,  # mean worth over the training flights
+        "train_tuned": search.best_value,
+        "trials": trials,
+        "held_out": pairs,
+        "held_out_gain": sum(one["tuned"] - one["default"] for one in pairs) / len(pairs),
+    }
 
 
-@dataclass(frozen=True, slots=True)
-class _Desk:
-    """Flies one method with some parameters over some sequences."""
-
-    plan: StudyPlan
-    method: str
-    pool: Pool
-
-    def mean_worth(self, sequences: Sequence[tuple[str, str]], texts: tuple[str, ...]) -> float:
-        rows = self.rows(sequences, texts)
-        return sum(_worth(row) for row in rows) / len(rows)
-
-    def rows(self, sequences: Sequence[tuple[str, str]], texts: tuple[str, ...]) -> list[dict[str, Any]]:
-        plan = self.plan
-        specs = [
-            replace(
-                spec_of(plan, dataset, sequence, FLOWN[self.method], regime, models, plan.still_codecs[0]),
-                tune=texts,
-            )
-            for dataset, sequence in sequences
-            for models in plan.models
-            for regime in plan.regimes
-        ]
-        run = partial(run_spec, cache=plan.cache, folder=Path.cwd())  # as of workers started elsewhere
-        rows = [future.result() for future in [self.pool.submit(run, spec) for spec in specs]]
-        for row in rows:
-            if row["failed"] and not texts:
-                raise UserError(f"{self.method} cannot be flown over {row['sequence']}: {row['failed']}")
-        return rows
+def _flown(
+    plan: StudyPlan,
+    method: str,
+    pool: Executor,
+    sequences: Sequence[tuple[str, str]],
+    texts: tuple[str, ...],
+) -> list[dict[str, Any]]:
+    """The rows of one method with some parameters over some sequences."""
+    specs = [
+        replace(
+            spec_of(plan, dataset, sequence, FLOWN[method], regime, models, plan.still_codecs[0]), tune=texts
+        )
+        for dataset, sequence in sequences
+        for models in plan.models
+        for regime in plan.regimes
+    ]
+    run = partial(run_spec, cache=plan.cache, folder=Path.cwd())  # as of workers started elsewhere
+    rows = [future.result() for future in [pool.submit(run, spec) for spec in specs]]
+    for row in rows:
+        if row["failed"] and not texts:
+            raise UserError(f"{method} cannot be flown over {row['sequence']}: {row['failed']}")
+    return rows
 
 
 def _known(parameters: Mapping[str, float], worth: float) -> optuna.trial.FrozenTrial:
@@ -204,19 +182,6 @@ def _rounded(value: float) -> float:
 
 def _worth(row: Mapping[str, Any]) -> float:
     return 0.0 if row["failed"] or row["named_f1"] is None else float(row["named_f1"])
-
-
-def _pairs(default: Sequence[Mapping[str, Any]], tuned: Sequence[Mapping[str, Any]]) -> Iterable[HeldOut]:
-    for one, other in zip(default, tuned, strict=True):
-        yield HeldOut(
-            dataset=one["dataset"],
-            sequence=one["sequence"],
-            regime=one["regime"],
-            default=_worth(one),
-            tuned=_worth(other),
-            default_bps=one["total_bps"] or 0,
-            tuned_bps=other["total_bps"] or 0,
-        )
 
 
 _MOST_TRIALS = 100_000
@@ -269,25 +234,25 @@ def run(arguments: argparse.Namespace) -> int:
             on_trial=on_trial,
         )
     with writing(arguments.out):
-        write_json(written, {**asdict(found), "held_out_gain": found.gain})
+        write_json(written, found)
     _print(found, written)
     return 0
 
 
-def _print(found: Tuned, written: Path) -> None:
+def _print(found: Mapping[str, Any], written: Path) -> None:
     rows = (
         (
-            *(one.sequence, one.regime, f"{one.default:.4f}", f"{one.tuned:.4f}"),
-            *(f"{one.default_bps / 1e3:.0f}", f"{one.tuned_bps / 1e3:.0f}"),
+            *(one["sequence"], one["regime"], f"{one['default']:.4f}", f"{one['tuned']:.4f}"),
+            *(f"{one['default_bps'] / 1e3:.0f}", f"{one['tuned_bps'] / 1e3:.0f}"),
         )
-        for one in found.held_out
+        for one in found["held_out"]
     )
     heads = ("sequence", "regime", "default", "tuned", "kbps", "kbps")
     title = "held out: objects shown with their class, of all"
     print_columns(title, heads, rows, words=("sequence", "regime"), gap=2)
-    flags = ",".join(f"{name}={value:g}" for name, value in found.parameters.items())
+    flags = ",".join(f"{name}={value:g}" for name, value in found["parameters"].items())
     print_lines(
-        f"training {found.train_default:.4f} to {found.train_tuned:.4f}, held out {found.gain:+.4f}: "
-        f"--method {found.method} --tune {flags}",
-        f"against video of the same bits: hvt-study run … --methods M0,{found.method} --tune {written}",
+        f"training {found['train_default']:.4f} to {found['train_tuned']:.4f}, "
+        f"held out {found['held_out_gain']:+.4f}: --method {found['method']} --tune {flags}",
+        f"against video of the same bits: hvt-study run … --methods M0,{found['method']} --tune {written}",
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
-from concurrent.futures import FIRST_COMPLETED, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,6 @@ from hvt_study.cache.results import FLIGHTS, ResultCache
 from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.sequence import NOMINAL_FPS, Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, open_camera
-from hvt_study.matrix.schedule import Pool
 from hvt_study.matrix.time_left import TimeLeft
 from hvt_study.runs.methods import METHODS, Method
 from hvt_study.runs.spec import ModelChoice, RunSpec
@@ -128,7 +127,7 @@ class CompareResult:
 def compare(
     plan: ComparePlan,
     *,
-    pool: Pool,
+    pool: Executor,
     workers: int,
     on_flights: Callable[[int, int, float | None], None] = lambda *_: None,
 ) -> CompareResult:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Any, Protocol
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from typing import Any
 
 from hvt_study.matrix.plan import StudyPlan, first_runs, matched_runs
 from hvt_study.runs.methods import Kind
@@ -19,18 +19,10 @@ from hvt_study.runs.video_shape import grid_target
 RunRow = dict[str, Any]
 
 
-class Pool(Protocol):
-    """Where runs are done."""
-
-    def submit(self, fn: Callable[..., RunRow], /, *arguments: Any) -> Future[RunRow]:
-        """Do this some time."""
-        ...
-
-
 def run_all(
     plan: StudyPlan,
     *,
-    pool: Pool,
+    pool: Executor,
     run: Callable[[RunSpec], RunRow],
     at_once: int,
     on_row: Callable[[RunRow, int, int], None] = lambda *_: None,

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self, TypeVar
 
 from hvt_edge.source.contract import size_within
 from hvt_study.runs.spec import MATCH_TOLERANCE
@@ -106,13 +105,6 @@ class VideoShape:
     """(width, height) of the base stream in pixels; None: that of the run."""
 
 
-class _Comparable(Protocol):
-    def __lt__(self, other: Self, /) -> bool: ...
-
-
-_Worth = TypeVar("_Worth", bound=_Comparable)
-
-
 def competing_sizes(nominal: tuple[int, int], source: tuple[int, int]) -> tuple[tuple[int, int], ...]:
     """Sizes that video alone may have, smallest first: from 640x360 up to the run's or the source's, the larger one.
 
@@ -131,7 +123,7 @@ def competing_sizes(nominal: tuple[int, int], source: tuple[int, int]) -> tuple[
 
 
 def search_shape(
-    fly: Callable[[VideoShape], _Worth | None],
+    fly: Callable[[VideoShape], tuple[float, float] | None],
     *,
     rates: Sequence[float],
     sizes: Sequence[tuple[int, int]],
@@ -141,18 +133,17 @@ def search_shape(
 
     ``fly`` says what a flight was worth, None where it cannot be flown.
     """
-    worth: dict[float, Any] = {fps: fly(VideoShape(fps)) for fps in rates}
-    flown = [fps for fps in rates if worth[fps] is not None]
-    if not flown:
+    worth = {fps: one for fps in rates if (one := fly(VideoShape(fps))) is not None}
+    if not worth:
         return
-    best = max(flown, key=lambda fps: worth[fps])
+    best = max(worth, key=lambda fps: worth[fps])
     at = rates.index(best)
     near = rates[max(0, at - 1) : at + 2]
     middle = sizes.index(nominal)
     for path in (sizes[:middle][::-1], sizes[middle + 1 :]):
         before = worth[best]
         for size in path:
-            found: list[Any] = [one for fps in near if (one := fly(VideoShape(fps, size))) is not None]
+            found = [one for fps in near if (one := fly(VideoShape(fps, size))) is not None]
             if not found or max(found) < before:
                 break
             before = max(found)

@@ -33,7 +33,8 @@ def flown(worth):
 
     def fly(shape):
         seen.append(shape)
-        return worth(shape.fps, shape.size or NOMINAL)
+        found = worth(shape.fps, shape.size or NOMINAL)
+        return None if found is None else (found, 0.0)
 
     search_shape(fly, rates=RATES, sizes=SIZES, nominal=NOMINAL)
     assert len(seen) == len(set(seen))

@@ -6,7 +6,6 @@ Words of the edge's source may stand among the seeds: ``demo:0-4,codes,4k`` (`hv
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import lru_cache, partial
 
 from hvt_common.units import exact_rate
@@ -23,35 +22,21 @@ _LEAST_VISIBLE = 0.5
 """An object of which less is to be seen is not judged."""
 
 
-@dataclass(frozen=True, slots=True)
-class DemoLabels:
-    """The drawn truth of a seed. Objects of which less than half is to be seen are passed over."""
-
-    seed: int
-    spec: str = "demo"
-
-    def __call__(self, index: int) -> FrameLabels:
-        """Of the frame at ``index / 15`` seconds."""
-        truth = _scene(self.seed, self.spec).truth(index / NOMINAL_FPS)
-        judged = truth.visible >= _LEAST_VISIBLE
-        return FrameLabels(
-            boxes_xyxy_px=truth.boxes_source_px[judged],
-            ids=truth.ids[judged],
-            class_names=tuple(CLASS_NAMES[kind] for kind in truth.class_ids[judged].tolist()),
-            beside_xyxy_px=truth.boxes_source_px[~judged],
-        )
+def demo_labels(seed: int, spec: str, index: int) -> FrameLabels:
+    """The drawn truth of a seed, of the frame at ``index / 15`` seconds; what is mostly hidden is passed over."""
+    truth = _scene(seed, spec).truth(index / NOMINAL_FPS)
+    judged = truth.visible >= _LEAST_VISIBLE
+    return FrameLabels(
+        boxes_xyxy_px=truth.boxes_source_px[judged],
+        ids=truth.ids[judged],
+        class_names=tuple(CLASS_NAMES[kind] for kind in truth.class_ids[judged].tolist()),
+        beside_xyxy_px=truth.boxes_source_px[~judged],
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class DemoCodes:
-    """The codes on the roofs of a scene that has some."""
-
-    seed: int
-    spec: str
-
-    def __call__(self, index: int) -> tuple[CodeInView, ...]:
-        """In the frame at ``index / 15`` seconds, by object."""
-        return _scene(self.seed, self.spec).codes(index / NOMINAL_FPS)
+def demo_codes(seed: int, spec: str, index: int) -> tuple[CodeInView, ...]:
+    """The codes on the roofs of a scene that has some, in the frame at ``index / 15`` seconds, by object."""
+    return _scene(seed, spec).codes(index / NOMINAL_FPS)
 
 
 def open_demo(uri: str, place: str) -> Mapping[str, Callable[[], Sequence]]:
@@ -80,10 +65,10 @@ def _open(seed: int, spec: str) -> Sequence:
         frame_count=count,
         fps=NOMINAL_FPS,
         source_size=size,
-        labels=DemoLabels(seed, spec),
+        labels=partial(demo_labels, seed, spec),
         class_set=tuple(sorted(CLASS_NAMES)),
         attributes={"scene": words} if words else {},
-        codes=DemoCodes(seed, spec) if drawn.get("codes") else None,
+        codes=partial(demo_codes, seed, spec) if drawn.get("codes") else None,
     )
 
 

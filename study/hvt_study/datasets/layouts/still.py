@@ -8,7 +8,6 @@ labels, and boxes that follow exactly; the way is drawn from a seed. See `hvt_st
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -22,22 +21,11 @@ from hvt_study.datasets.sequence import NOMINAL_FPS, Clip, Sequence
 from hvt_study.datasets.virtual_camera import SCHEME, USUAL_VIEW, VirtualCamera, annotation_file
 
 
-@dataclass(frozen=True, slots=True)
-class StillLabels:
-    """What the virtual camera sees."""
-
-    picture: Path
-    view: float
-    seed: int
-    classes: tuple[str, ...] = ()
-
-    def __call__(self, index: int) -> FrameLabels:
-        """Of frame ``index``, in the camera's pixels; each mirror image of an object is one of its own."""
-        labels = _camera(
-            self.picture, self.view, self.seed, True, self.classes, _stamps(self.picture)
-        ).labels(index)
-        assert labels is not None, "made for annotated pictures only"
-        return labels
+def still_labels(picture: Path, view: float, seed: int, classes: tuple[str, ...], index: int) -> FrameLabels:
+    """What the virtual camera sees in frame ``index``, in its pixels; each mirror image is an object of its own."""
+    labels = _camera(picture, view, seed, True, classes, _stamps(picture)).labels(index)
+    assert labels is not None, "made for annotated pictures only"
+    return labels
 
 
 def open_stills(place: Path, options: Options) -> Mapping[str, Callable[[], Sequence]]:
@@ -96,7 +84,7 @@ def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
         frame_count=camera.frame_count,
         fps=NOMINAL_FPS,
         source_size=camera.size,
-        labels=None if known is None else StillLabels(picture, view, seed, options.classes),
+        labels=None if known is None else partial(still_labels, picture, view, seed, options.classes),
         class_set=camera.class_set,
         attributes={"view": f"{view:g}", "seed": str(seed)},
         files=(picture,) if known is None else (picture, annotation_file(picture)),
