@@ -215,7 +215,7 @@ def test_no_setting_is_accepted_and_ignored():
 
 def test_the_least_gain_reaches_the_suppression():
     """`--min-gain` decides how much bits go to tracks that look the same as before."""
-    from hvt_edge.wiring.stills import make_suppression
+    from hvt_edge.wiring.perception import make_suppression
 
     config = check(load(EdgeConfig, ["--source", "demo", "--min-gain", "3"], program="p", description="")[0])
     assert make_suppression(config).min_gain == 3

@@ -18,7 +18,7 @@ from hvt_edge.stills.maker import Allowance, NoStill
 from hvt_edge.stills.merging import group
 from hvt_edge.stills.on_demand import OnDemand, OnDemandStill
 from hvt_edge.stills.outbox import OutboxStill
-from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, CostModel, Method, Request, Step
+from hvt_edge.stills.policy.base import CostModel, Method, Request, Step
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,21 +132,6 @@ _PATIENCE_SHARE = 0.75
 gets what it is expected to need must not hold up all others for ever."""
 
 
-@dataclass(frozen=True, slots=True)
-class ChooserSettings:
-    """``most_bytes`` is the largest admission the budget can ever give, payload."""
-
-    fps: float
-    most_bytes: int
-    gate: Gate = field(default_factory=Gate)
-    share: bool = False
-    """Neighbours share one still where that is cheaper."""
-    overhead_bytes: float = STILL_OVERHEAD_BYTES
-    """Line bytes of a still beside its payload."""
-    from_source: bool = False
-    """Whether candidates were found on the source, and may be unknown to the ground."""
-
-
 @dataclass(eq=False)
 class Chooser:
     """Decides at each step which candidates get a still, and codes pending stills as the budget allows.
@@ -164,7 +149,14 @@ class Chooser:
     _: KW_ONLY
     suppression: Suppression
     memory: TrackMemory
-    settings: ChooserSettings
+    fps: float
+    most_bytes: int
+    """The largest admission that the budget can give from now on, payload."""
+    gate: Gate = field(default_factory=Gate)
+    share: bool = False
+    """Neighbours share one still where that is cheaper."""
+    from_source: bool = False
+    """Whether candidates were found on the source, and may be unknown to the ground."""
     on_outcome: Callable[[str, str], None]
     on_demand: OnDemand
     observe: Callable[[Sequence[Candidate], Step], None] | None = None
@@ -172,8 +164,6 @@ class Chooser:
     def __post_init__(self) -> None:
         self.outbox, self.maker = self.on_demand.outbox, self.on_demand.maker
         self.view, self.class_names = self.on_demand.view, self.on_demand.class_names
-        self.most_bytes = self.settings.most_bytes
-        """The largest admission that the budget can give from now on, payload."""
         self._costs: dict[str, CostModel] = {}
         self._put_off = False
         self._held_up: dict[int, int] = {}
@@ -200,12 +190,11 @@ class Chooser:
         step = Step(
             frame_index=analyzed.frame.index,
             now_ns=now_ns,
-            fps=self.settings.fps,
+            fps=self.fps,
             base_size=self.view.base_size,
             cost=self._cost_of(self.maker.preferred.name).estimate(),
             allowance_bytes=allowance_bytes,
-            still_overhead_bytes=self.settings.overhead_bytes,
-            from_source=self.settings.from_source,
+            from_source=self.from_source,
         )
         candidates = self.memory.candidates(
             analyzed.tracks,
@@ -229,15 +218,14 @@ class Chooser:
         return [one for one in allowed if not self._gated(one, now_ns=now_ns)]
 
     def _gated(self, candidate: Candidate, *, now_ns: int) -> bool:
-        gate = self.settings.gate
-        if not gate.on or candidate.loss is None or not gate.good_enough(candidate.loss()):
+        if not self.gate.on or candidate.loss is None or not self.gate.good_enough(candidate.loss()):
             return False
         self._refuse(candidate, "base_good", now_ns=now_ns)
         return True
 
     def _requests(self, candidates: list[Candidate], step: Step) -> list[Request]:
         requests = self.method.requests(candidates, step)
-        if not self.settings.share:
+        if not self.share:
             return requests
         joined = group(
             requests,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING
 
 from hvt_edge.stills.policy.base import Step
@@ -24,10 +24,14 @@ FIRST_SHARE = 0.85
 objects (0.8) at 200 kbps."""
 
 
-@dataclass(frozen=True, slots=True)
-class SplitSettings:
-    """Rates in line bits a second."""
+@dataclass(eq=False)
+class Split:
+    """Watches decision steps, which may come from another thread, and proposes a share at keyframes.
 
+    Rates are in line bits a second.
+    """
+
+    _: KW_ONLY
     total_bps: int
     least_base_bps: int
     """The lowest B_v at which x265 follows its target (`rate.least_base_bps`)."""
@@ -52,24 +56,13 @@ class SplitSettings:
     """Of the budget; a share that is off by so much is worth a keyframe of its own."""
     own_rest_s: float = 20.0
     """The least time between two of these, and before the first: a keyframe on a thin link is seen for seconds."""
+    share: float = FIRST_SHARE
+    """The base's share of the budget: the first, then the one last proposed."""
 
-
-class Split:
-    """Watches decision steps, which may come from another thread, and proposes a share at keyframes."""
-
-    def __init__(
-        self,
-        settings: SplitSettings,
-        *,
-        first_share: float = FIRST_SHARE,
-        gain: ExpectedGain | None = None,
-    ) -> None:
+    def __post_init__(self) -> None:
         self.lock = threading.RLock()
         """Held by whoever says something and asks for the share that follows."""
-        self._settings = settings
-        self._gain = gain or ExpectedGain()
-        self.share = first_share
-        """The base's share of the budget: the first, then the one last proposed."""
+        self._gain = ExpectedGain()
         self._stills, self._sparse = True, False
         self._need_bytes = 0.0
         self._shown = 1.0
@@ -86,7 +79,7 @@ class Split:
         if self._observed_ns is None:
             self._changed_ns = step.now_ns
         else:
-            decay = math.exp(-max(0, step.now_ns - self._observed_ns) / 1e9 / self._settings.memory_s)
+            decay = math.exp(-max(0, step.now_ns - self._observed_ns) / 1e9 / self.memory_s)
         with self.lock:
             self._need_bytes = decay * self._need_bytes + (1 - decay) * need_bytes
             self._shown = decay * self._shown + (1 - decay) * shown
@@ -94,16 +87,15 @@ class Split:
 
     def set_total(self, total_bps: int) -> None:
         """Another budget from now on; the share stays as it is, unless x265 could not follow it any more."""
-        self._settings = replace(self._settings, total_bps=total_bps)
-        self.share = max(self.share, min(1.0, self._settings.least_base_bps / total_bps))
+        self.total_bps = total_bps
+        self.share = max(self.share, min(1.0, self.least_base_bps / total_bps))
 
     def set_beside(self, *, metadata_bps: int, stills: bool, sparse: bool) -> None:
         """Set whether stills are sent from now on; without them the base has their share.
 
         ``sparse``: not all source frames are coded.
         """
-        self._settings = replace(self._settings, metadata_bps=metadata_bps)
-        self._stills, self._sparse = stills, sparse
+        self.metadata_bps, self._stills, self._sparse = metadata_bps, stills, sparse
 
     def propose(self) -> float | None:
         """The base's share of the budget from the keyframe that is due now; None to leave it as it is."""
@@ -111,41 +103,39 @@ class Split:
             return None
         share = self._target()
         over = self._sparse and self.share > self._most_sparse_share()
-        if abs(share - self.share) < self._settings.least_change - 1e-9 and not over:
+        if abs(share - self.share) < self.least_change - 1e-9 and not over:
             return None
         self.share, self._changed_ns = share, self._observed_ns
         return share
 
     def wants_keyframe(self, now_ns: int) -> bool:
         """Whether the scene has changed so much that the split should not wait for the next keyframe that comes."""
-        if self._observed_ns is None or now_ns - self._changed_ns < self._settings.own_rest_s * 1e9:
+        if self._observed_ns is None or now_ns - self._changed_ns < self.own_rest_s * 1e9:
             return False
-        return abs(self._target() - self.share) >= self._settings.own_change - 1e-9
+        return abs(self._target() - self.share) >= self.own_change - 1e-9
 
     def _target(self) -> float:
         share = 1 - self._metadata_share() - self._still_share()
         return round(min(share, self._most_sparse_share()) if self._sparse else share, 2)
 
     def _most_sparse_share(self) -> float:
-        settings = self._settings
-        return max(settings.most_sparse_share, min(1.0, settings.least_base_bps / settings.total_bps))
+        return max(self.most_sparse_share, min(1.0, self.least_base_bps / self.total_bps))
 
     def _need(self, candidate: Candidate, step: Step) -> float:
-        part = min(1.0, self._gain.gain(candidate, step) / self._settings.full_gain)
+        part = min(1.0, self._gain.gain(candidate, step) / self.full_gain)
         return part * (step.cost.of(candidate) + step.still_overhead_bytes)
 
     def _still_share(self) -> float:
-        settings = self._settings
         if not self._stills:
             return 0.0
-        wanted = 8 * self._need_bytes / settings.horizon_s / settings.total_bps
-        wanted = min(settings.most_still_share, max(settings.least_still_share, wanted))
-        return max(0.0, min(wanted, 1 - self._metadata_share() - self._floor_bps() / settings.total_bps))
+        wanted = 8 * self._need_bytes / self.horizon_s / self.total_bps
+        wanted = min(self.most_still_share, max(self.least_still_share, wanted))
+        return max(0.0, min(wanted, 1 - self._metadata_share() - self._floor_bps() / self.total_bps))
 
     def _floor_bps(self) -> float:
         # The least for the base: more, the more of the objects it shows by itself.
-        least = self._settings.least_base_bps
-        return least + self._shown * max(0, self._settings.visible_base_bps - least)
+        least = self.least_base_bps
+        return least + self._shown * max(0, self.visible_base_bps - least)
 
     def _metadata_share(self) -> float:
-        return self._settings.metadata_bps / self._settings.total_bps
+        return self.metadata_bps / self.total_bps

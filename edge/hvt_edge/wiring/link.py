@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from hvt_common.protocol.channels import DELIVERIES, Channel, Direction
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
@@ -18,8 +16,8 @@ from hvt_edge.source.contract import CameraStream
 from hvt_edge.video.encoder_settings import least_base_bps
 from hvt_edge.video.encoders.passthrough import CameraRates, LeastLink, measure_camera, needed_bps
 from hvt_edge.video.reconfigure import EncoderReconfiguration
-from hvt_edge.video.share import Split, SplitSettings
-from hvt_edge.wiring.stills import shows_details
+from hvt_edge.video.share import Split
+from hvt_edge.wiring.perception import shows_details
 from hvt_edge.wiring.video import least_rate_bps
 
 _AUTO_STILL_SHARE = 0.15
@@ -73,19 +71,16 @@ def make_split(config: EdgeConfig, size: tuple[int, int], *, first_share: float)
     if not isinstance(config.video_share, str):
         return None
     fps = LEAST_FPS if config.auto_fps else config.nominal_fps
-    settings = SplitSettings(
+    split = Split(
         total_bps=config.budget_bps,
         least_base_bps=least_base_bps(size, fps, edge_id=config.edge_id),
         metadata_bps=config.metadata_bps,
+        share=first_share,
     )
     if config.measures:  # stills have to earn more
-        settings = replace(
-            settings,
-            most_still_share=_AUTO_STILL_SHARE,
-            most_sparse_share=SPARSE_SHARE,
-            own_rest_s=_AUTO_REST_S,
-        )
-    return Split(settings, first_share=first_share)
+        split.most_still_share, split.most_sparse_share = _AUTO_STILL_SHARE, SPARSE_SHARE
+        split.own_rest_s = _AUTO_REST_S
+    return split
 
 
 def lever_settings(config: EdgeConfig, view: View) -> LeverSettings:

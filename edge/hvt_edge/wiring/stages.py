@@ -17,6 +17,8 @@ from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import fitted_class_names
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
+from hvt_edge.backlog.disk import Store
+from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
 from hvt_edge.control.commands import Commands
 from hvt_edge.control.link_control import LinkControl
@@ -38,7 +40,7 @@ from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Gate
+from hvt_edge.stills.scheduler import Chooser, Gate
 from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.video.encoder_settings import PresetControl, share_of
 from hvt_edge.video.passthrough import PassthroughStage
@@ -53,9 +55,8 @@ from hvt_edge.wiring.link import (
     make_pacer,
     make_split,
 )
-from hvt_edge.wiring.perception import make_analyzer, make_shadow
-from hvt_edge.wiring.stills import make_maker, make_method, make_suppression
-from hvt_edge.wiring.storing import make_backlog, open_local_copy
+from hvt_edge.wiring.perception import make_analyzer, make_maker, make_method, make_shadow, make_suppression
+from hvt_edge.wiring.storing import open_local_copy, store_folder
 from hvt_edge.wiring.trial import Beginning
 from hvt_edge.wiring.video import (
     encoder_opener,
@@ -166,13 +167,11 @@ class Stills:
             make_method(config, view),
             suppression=make_suppression(config),
             memory=TrackMemory(padding=config.padding),
-            settings=ChooserSettings(
-                fps=config.nominal_fps,
-                most_bytes=link.transmitter.most_still_bytes(),
-                gate=Gate(psnr_y_db=config.gate),
-                share=config.group_stills,
-                from_source=config.candidates == "source",
-            ),
+            fps=config.nominal_fps,
+            most_bytes=link.transmitter.most_still_bytes(),
+            gate=Gate(psnr_y_db=config.gate),
+            share=config.group_stills,
+            from_source=config.candidates == "source",
             on_outcome=link.transmitter.outcome,
             on_demand=on_demand,
             observe=None if link.split is None else link.split.observe,
@@ -187,18 +186,26 @@ class Stills:
             still_codecs=lambda: maker.codec_names,
             clock=clock,
         )
-        self.backlog = make_backlog(
-            config,
-            link.transmitter,
-            live=flight.source.live,
-            has_subscriber=partial(flight.ends.has_subscriber, Channel.BACKLOG),
-            outbox=outbox,
-            keyframes=link.keyframes,
-            clock=clock,
-            info=self.info.info,
-            failures=flight.failures,
-        )
-        if self.backlog is not None:
+        self.backlog = None
+        if max_bytes := config.store_bytes(live=flight.source.live):
+            self.backlog = BacklogStage(
+                Store(
+                    store_folder(config),
+                    max_bytes=max_bytes,
+                    session_id=flight.session_id,
+                    info=self.info.info,
+                    oldest_ns=max(0, clock() - round(config.store_age * SECOND_NS)),
+                    clock=clock,
+                ),
+                link.transmitter,
+                live=flight.source.live,
+                has_subscriber=partial(flight.ends.has_subscriber, Channel.BACKLOG),
+                stills_pending=lambda: outbox.any_pending,
+                stills_in_flight=lambda: outbox.unacknowledged,
+                keyframes=link.keyframes,
+                clock=clock,
+                failures=flight.failures,
+            )
             flight.stack.callback(self.backlog.close)
         sender = StillSender(outbox, maker=maker, transmitter=link.transmitter, backlog=self.backlog)
         flight.stack.callback(lambda: sender.close(clock()))

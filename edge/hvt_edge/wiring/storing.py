@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import cast
@@ -12,14 +11,8 @@ from hvt_common.errors import NotYetError, UserError, check_apart
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.plug_ins import loaded, the_one
 from hvt_common.runtime.reporting import check_writable
-from hvt_common.units import SECOND_NS
-from hvt_edge.backlog.disk import Store
-from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
-from hvt_edge.keyframes import Keyframes
-from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.source.folder import names_picture
-from hvt_edge.stills.outbox import Outbox
 from hvt_edge.video.stage import LocalCopy
 
 _COPIES = "hvt.edge_copies"
@@ -88,40 +81,3 @@ def check_store(config: EdgeConfig, *, live: bool) -> None:
             f"--store-folder {path} cannot be used, because {there} is no folder that can be written: name another, "
             "or give --store 0 to store nothing"
         )
-
-
-def make_backlog(
-    config: EdgeConfig,
-    line: Transmitter,
-    *,
-    live: bool,
-    has_subscriber: Callable[[], bool],
-    outbox: Outbox,
-    keyframes: Keyframes,
-    clock: Callable[[], int],
-    info: Callable[[], bytes],
-    failures: Failures,
-) -> BacklogStage | None:
-    """Make the store for an outage; None without ``--store``. Starts a thread: to be closed."""
-    max_bytes = config.store_bytes(live=live)
-    if not max_bytes:
-        return None
-    oldest_ns = max(0, clock() - round(config.store_age * SECOND_NS))
-    return BacklogStage(
-        Store(
-            store_folder(config),
-            max_bytes=max_bytes,
-            session_id=line.session_id,
-            info=info,
-            oldest_ns=oldest_ns,
-            clock=clock,
-        ),
-        line,
-        live=live,
-        has_subscriber=has_subscriber,
-        stills_pending=lambda: outbox.any_pending,
-        stills_in_flight=lambda: outbox.unacknowledged,
-        keyframes=keyframes,
-        clock=clock,
-        failures=failures,
-    )

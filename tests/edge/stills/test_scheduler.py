@@ -22,7 +22,7 @@ from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox, OutboxSettings, OutboxStill
 from hvt_edge.stills.policy.base import CostModel, Request, Step
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Gate, Suppression
+from hvt_edge.stills.scheduler import Chooser, Gate, Suppression
 from media.base_coded import StandIn
 from media.clips import START_NS, hard_pictures
 from rigs.examples import tracks_of
@@ -81,7 +81,9 @@ class Rig:
             suppression=Suppression.for_cooldown(cooldown),
             memory=self.memory,
             on_demand=on_demand,
-            settings=ChooserSettings(fps=3, most_bytes=most_bytes, **settings),
+            fps=3,
+            most_bytes=most_bytes,
+            **settings,
             on_outcome=lambda outcome, reason: self.outcomes.update([(outcome, reason)]),
             observe=lambda candidates, step: self.steps.append((candidates, step)),
         )

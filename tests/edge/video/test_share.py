@@ -13,7 +13,7 @@ from hvt_edge.operating import Levers, Operating, Rates
 from hvt_edge.perception.candidates import BaseLoss, Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import CostEstimate, Step
 from hvt_edge.video.reconfigure import EncoderReconfiguration
-from hvt_edge.video.share import FIRST_SHARE, Split, SplitSettings
+from hvt_edge.video.share import FIRST_SHARE, Split
 from rigs.examples import candidate
 
 SECOND = 1_000_000_000
@@ -42,7 +42,7 @@ def car(track_id: int, *, lost: float, confidence: float = 0.6, side: float = 30
 
 def split(total_bps: int, **changes) -> Split:
     """At 720p15."""
-    return Split(SplitSettings(total_bps=total_bps, least_base_bps=90_000, **changes))
+    return Split(total_bps=total_bps, least_base_bps=90_000, **changes)
 
 
 def after(

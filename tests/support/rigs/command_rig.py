@@ -23,7 +23,7 @@ from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.registry import method
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Suppression
+from hvt_edge.stills.scheduler import Chooser, Suppression
 from hvt_edge.stills.stage import StillSender
 from media.base_coded import StandIn
 from media.clips import START_NS
@@ -70,7 +70,8 @@ class Rig:
             method(name),
             suppression=Suppression.for_cooldown(0),
             memory=TrackMemory(),
-            settings=ChooserSettings(fps=15, most_bytes=self.sender.most_still_bytes()),
+            fps=15,
+            most_bytes=self.sender.most_still_bytes(),
             on_outcome=lambda *outcome: self.outcomes.update([outcome]),
             on_demand=self.on_demand,
         )

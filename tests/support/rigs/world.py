@@ -25,7 +25,7 @@ from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.registry import method
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings, Suppression
+from hvt_edge.stills.scheduler import Chooser, Suppression
 from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
@@ -133,7 +133,8 @@ def make_still_stage(
         method("M1"),
         suppression=Suppression.for_cooldown(0),
         memory=TrackMemory() if memory is None else memory,
-        settings=ChooserSettings(fps=15, most_bytes=10_000),
+        fps=15,
+        most_bytes=10_000,
         on_outcome=lambda *outcome: outcomes.update([outcome]),
         on_demand=on_demand,
     )

@@ -9,7 +9,7 @@ from hvt_common.values import View
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.stills.policy.m6 import ExpectedGain
 from hvt_edge.wiring.link import lever_settings
-from hvt_edge.wiring.stills import make_method
+from hvt_edge.wiring.perception import make_method
 
 
 def settings(*flags: str) -> EdgeConfig:
