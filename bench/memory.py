@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 
@@ -23,25 +24,40 @@ _PLAYED_S = 25.0
 
 
 def rows() -> list[dict[str, object]]:
-    edge_mb, ground_mb = _demo()
-    clip_mb, clip_threads = _clip("--method", "M0")
-    auto_mb, auto_threads = _clip()
-    (one_mb, one_threads), (all_mb, all_threads) = _played(1), _played(_EDGES)
+    edge, ground = _demo()
+    video, default = _clip("--method", "M0"), _clip()
+    one, all_of = _played(1), _played(_EDGES)
+    further = _Peak(*((many - few) / (_EDGES - 1) for few, many in zip(one, all_of, strict=True)))
     return [
-        measured("edge at its defaults on the 1080p demo, peak MB", edge_mb),
-        measured("ground of that edge, peak MB", ground_mb),
-        measured("M0 on a 720p clip, peak MB of the edge", clip_mb),
-        measured("M0 on a 720p clip, threads of the edge", clip_threads),
-        measured("defaults on a 720p clip, peak MB of the edge", auto_mb),
-        measured("defaults on a 720p clip, threads of the edge", auto_threads),
-        measured("each further edge at the ground, MB", (all_mb - one_mb) / (_EDGES - 1)),
-        measured("each further edge at the ground, threads", (all_threads - one_threads) / (_EDGES - 1)),
-        measured("ground of one edge of 640x360, peak MB", one_mb),
-        measured("ground of one edge of 640x360, threads", one_threads),
+        *_memory("edge at its defaults on the 1080p demo, peak MB", edge),
+        *_memory("ground of that edge, peak MB", ground),
+        *_memory("M0 on a 720p clip, peak MB of the edge", video),
+        measured("M0 on a 720p clip, threads of the edge", video.threads),
+        *_memory("defaults on a 720p clip, peak MB of the edge", default),
+        measured("defaults on a 720p clip, threads of the edge", default.threads),
+        *_memory("each further edge at the ground, MB", further),
+        measured("each further edge at the ground, threads", further.threads),
+        *_memory("ground of one edge of 640x360, peak MB", one),
+        measured("ground of one edge of 640x360, threads", one.threads),
     ]
 
 
-def _demo() -> tuple[float, float]:
+class _Peak(NamedTuple):
+    mb: float
+    resident_mb: float
+    threads: float
+
+
+def _memory(measure: str, peak: _Peak) -> list[dict[str, object]]:
+    # Its own, which has the bar, and with pages of files.
+    return [measured(measure, peak.mb), measured(f"{measure}, with pages of files", peak.resident_mb)]
+
+
+def _peaks_of(peaks: Peaks) -> list[_Peak]:
+    return [_Peak(*one) for one in zip(peaks.mb, peaks.resident_mb, peaks.threads, strict=True)]
+
+
+def _demo() -> list[_Peak]:
     endpoint = free_endpoint()
     with tempfile.TemporaryDirectory() as folder:
         record = Path(folder) / "bench.rrd"
@@ -54,20 +70,20 @@ def _demo() -> tuple[float, float]:
             peaks = Peaks([edge, ground])
             peaks.until_ended(edge, patience_s=180)
             peaks.until_ended(ground, patience_s=60)
-    return peaks.mb[0], peaks.mb[1]
+    return _peaks_of(peaks)
 
 
-def _clip(*settings: str) -> tuple[float, int]:
-    """Peak MB and most threads of an edge to which nobody listens."""
+def _clip(*settings: str) -> _Peak:
+    """Of an edge to which nobody listens."""
     nobody = ("--wait", "0s", "--connect", free_endpoint(), "--quiet")
     with running("hvt_edge.cli", "--source", clip(), *nobody, *settings) as edge:
         peaks = Peaks([edge])
         peaks.until_ended(edge, patience_s=180)
-    return peaks.mb[0], peaks.threads[0]
+    return _peaks_of(peaks)[0]
 
 
-def _played(count: int) -> tuple[float, int]:
-    """Peak MB and threads of a ground that so many edges send to."""
+def _played(count: int) -> _Peak:
+    """Of a ground that so many edges send to."""
     endpoint = free_endpoint()
     # Two seconds.
     units = coded(
@@ -80,7 +96,7 @@ def _played(count: int) -> tuple[float, int]:
         )
         peaks = Peaks([ground])
         played(stack, count, endpoint, units, fps=_FPS, lasts_s=_PLAYED_S, on_round=peaks.sample)
-    return peaks.mb[0], peaks.threads[0]
+    return _peaks_of(peaks)[0]
 
 
 if __name__ == "__main__":

@@ -12,7 +12,13 @@ from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.redaction import Redaction
 from hvt_common.runtime.log import START_LOGGER, start_log
 from hvt_common.runtime.plug_ins import loaded, the_one
-from hvt_common.runtime.process import leave, limit_malloc_arenas, put_video_first, stop_on_signals
+from hvt_common.runtime.process import (
+    leave,
+    limit_malloc_arenas,
+    put_video_first,
+    share_zenoh_threads,
+    stop_on_signals,
+)
 from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
 
 _EXTRA_COMMANDS = "hvt.edge_commands"
@@ -61,6 +67,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
     limit_malloc_arenas()
     put_video_first()
+    share_zenoh_threads()
     world = World()
     log = start_log(
         "hvt-edge",

@@ -183,6 +183,17 @@ def with_lower_priority(call: Callable[[], T]) -> T:
         return pool.submit(call).result()
 
 
+def share_zenoh_threads() -> None:
+    """Have Zenoh take two threads in place of five: one empties the link's queues, one does all else.
+
+    Who fills a queue may have to wait until it is emptied, so that these two stay apart. Call it before a session is
+    opened; what the environment says goes first.
+    """
+    os.environ.setdefault(
+        "ZENOH_RUNTIME", "(rx: (handover: app), net: (handover: app), acc: (handover: app))"
+    )
+
+
 def limit_malloc_arenas() -> None:
     """Have all threads allocate from two arenas, which reuse what is freed for the next frame; only with glibc.
 
