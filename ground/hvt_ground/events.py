@@ -6,8 +6,8 @@ are the two timelines of a recording.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -112,6 +112,23 @@ class Overlay:
             if not len(getattr(self, name)):
                 object.__setattr__(self, name, value)
 
+    @classmethod
+    def none(cls, frame_index: int, capture_ns: int, *, stored: bool = False) -> Overlay:
+        """No tracks."""
+        boxes, none = np.empty((0, 4), np.float32), np.empty(0, np.float32)
+        return cls(
+            frame_index, capture_ns, np.empty(0, np.int64), boxes, (), (), none, _nowhere(), stored=stored
+        )
+
+    def take(self, rows: npt.NDArray[np.intp]) -> Overlay:
+        """Those tracks alone; without places."""
+        each = {name: getattr(self, name) for name in _OF_TRACKS}
+        kept: dict[str, Any] = {
+            name: one[rows] if isinstance(one, np.ndarray) else tuple(one[row] for row in rows.tolist())
+            for name, one in each.items()
+        }
+        return replace(self, **kept)
+
     @property
     def words(self) -> tuple[str, ...]:
         """N of `shown_word`."""
@@ -121,6 +138,12 @@ class Overlay:
     def firm(self) -> npt.NDArray[np.bool_]:
         """(N,) True where a still has refined the class, and nothing doubts it: drawn thick."""
         return self.refined & ~self.doubted
+
+
+_OF_TRACKS = (
+    *("track_ids", "boxes_base_px", "base_classes", "classes", "confidences", "refined"),
+    *("origins", "doubted", "sure", "vague"),
+)
 
 
 @dataclass(frozen=True, slots=True)

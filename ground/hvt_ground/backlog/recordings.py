@@ -14,9 +14,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hvt_common.protocol.messages import Info
-from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice, Refinement
+from hvt_ground.events import Event, Notice
+from hvt_ground.perception.session import SessionPerception
 from hvt_ground.sinks import QueuedSink
 
 MOST_OPEN = 4
@@ -30,7 +30,7 @@ _OPEN_S = 0.5
 class BacklogRecording:
     """The recording of one session that is over."""
 
-    def __init__(self, info: Info, *, sink: QueuedSink[Event], perception: BacklogPerception) -> None:
+    def __init__(self, info: Info, *, sink: QueuedSink[Event], perception: SessionPerception) -> None:
         self.users = 0
         """Jobs that have it in hand, or wait for it."""
         self.sink = sink
@@ -39,7 +39,6 @@ class BacklogRecording:
             log=sink.log,
             perception=perception,
             read=lambda still: perception.read(still, emit=self._emit),
-            able=sink.is_open,
             outputs=[sink],
         )
 
@@ -52,8 +51,7 @@ class BacklogRecording:
         self.sink.close()
 
     def _emit(self, event: Event) -> None:
-        if isinstance(event, Refinement):
-            self.backlog.note(event)
+        self.backlog.note(event)
         self.sink.log(event)
 
 

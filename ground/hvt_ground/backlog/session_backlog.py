@@ -15,9 +15,9 @@ from hvt_common.runtime.statistics import Newest, SequenceWindow
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image, iou
 from hvt_common.video.hevc import BaseDecoder
-from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.link.reception import StillSequenceWindow
+from hvt_ground.perception.session import SessionPerception
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.sinks import QueuedSink, Receipt
@@ -108,8 +108,8 @@ class LateStills:
 class SessionBacklog:
     """Of one session, open or over. Safe for the receiving thread and the perception worker's.
 
-    ``log`` takes events that may lie before others it has; ``stills`` is the session's own where it is open. ``able``
-    says whether ``outputs``, the sinks behind ``log`` that the edge may rely on, will write what is logged now.
+    ``log`` takes events that may lie before others it has; ``stills`` is the session's own where it is open.
+    ``outputs`` are the sinks behind ``log`` that the edge may rely on.
     """
 
     def __init__(
@@ -117,18 +117,15 @@ class SessionBacklog:
         info: Info,
         *,
         log: Callable[[Event], None],
-        perception: BacklogPerception | None,
+        perception: SessionPerception | None,
         read: Callable[[ReceivedStill], None],
         stills: StillSequenceWindow | None = None,
-        able: Callable[[], bool] = lambda: True,
         outputs: Sequence[QueuedSink[Event]] = (),
     ) -> None:
         self.info = info
         self.perception = perception
         self.video = BacklogVideo(base_size=info.base_size)
         self.log = log
-        self.able = able
-        """Whether logged objects will be written. Otherwise they must come again: the edge would forget them."""
         self._outputs = outputs
         self._read = read
         self._stills = stills or StillSequenceWindow()
@@ -145,6 +142,10 @@ class SessionBacklog:
         with self._lock:
             self._frames.add([frame_index])
         self.video.live(frame_index, data, keyframe=keyframe, after_gap=after_gap)
+
+    def able(self) -> bool:
+        """Whether what is logged now will be written. Otherwise it must come again: the edge would forget it."""
+        return all(one.is_open() for one in self._outputs)
 
     def is_new_still(self, sequence: int) -> bool:
         """Note the number of a still; whether none of it has come before, on whichever way."""
@@ -176,9 +177,10 @@ class SessionBacklog:
                 self._frames.discard(frame_index)
         self._count(frames=-len(lengths_s), video_s=-sum(lengths_s.values()))
 
-    def note(self, still: Refinement) -> None:
-        """Note the outcome of a still, for the boxes of its frame should it be a stored one."""
-        self._late.take(still)
+    def note(self, event: Event) -> None:
+        """Note the outcome of a still, for the boxes of its frame should it be a stored one; others pass by."""
+        if isinstance(event, Refinement):
+            self._late.take(event)
 
     def log_boxes(self, event: Event) -> None:
         """Log boxes of stored video, named by the stills."""
@@ -207,19 +209,7 @@ class SessionBacklog:
         with self._lock:
             if last.frame_index + 1 in self._frames:
                 return
-        self.log(
-            Overlay(
-                frame_index=last.frame_index + 1,
-                capture_ns=last.capture_ns + self._frame_ns,
-                track_ids=np.empty(0, np.int64),
-                boxes_base_px=np.empty((0, 4), np.float32),
-                base_classes=(),
-                classes=(),
-                confidences=np.empty(0, np.float32),
-                refined=np.empty(0, np.bool_),
-                stored=True,
-            )
-        )
+        self.log(Overlay.none(last.frame_index + 1, last.capture_ns + self._frame_ns, stored=True))
 
     def _count(self, **what: Any) -> None:
         with self._lock:

@@ -1,4 +1,4 @@
-"""Decoded base in, tracks out: a `pipeline` for each session, the `worker` it runs in, the `models` they share.
+"""Decoded base in, tracks out: `session` makes a `pipeline` for each, a `worker` runs it, all share the `models`.
 
 `history` is what was decoded lately; `fusion` makes one list of all tracks, `stills` refines them,
 and `guesses` are those that are more likely nothing.

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import wait
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +28,7 @@ from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import History, as_bgr
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.perception.stills.refine import Refiner, ShownClasses
+from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 
@@ -57,8 +56,6 @@ _MOST_HISTORY_BYTES = 128 * 2**20
 
 _LEAST_INSIDE = 0.5
 """Tracks are carried on for a while. A box of which more than half has left the picture is of what nobody can see."""
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,9 +109,7 @@ class NothingPerceived:
 class Pipeline:
     """One session's perception. Used by one thread; ``emit`` takes the events.
 
-    Detections are at least ``detect_every`` frames apart, while the picture is still ``detect_still_every``;
-    ``wants_base``: the reader uses the base frame of a
-    still.
+    Detections are at least ``detect_every`` frames apart, while the picture is still ``detect_still_every``.
     """
 
     def __init__(
@@ -126,7 +121,6 @@ class Pipeline:
         detect_every: int,
         detect_still_every: int = 0,
         emit: Callable[[Event], None],
-        wants_base: bool = False,
     ) -> None:
         self._parts = parts
         self._detect_every, self._detect_still_every = detect_every, detect_still_every
@@ -155,7 +149,6 @@ class Pipeline:
             history=self._history,
             fusion=parts.fusion,
             view=view,
-            wants_base=wants_base,
             gap_frames=gap_frames,
             emit=emit,
         )
@@ -299,9 +292,10 @@ class Pipeline:
         if frame_index < self._now.picture_index:
             raise ValueError(f"frame {frame_index} lies before the newest frame, {self._now.picture_index}")
         fused = self._parts.fusion.listed(self._own_at(frame_index))
-        shown = self._parts.refiner.preview(fused.tracks)
-        shown = self._doubting(fused, shown)
-        return _overlay(fused, shown, self._capture_ns(frame_index), base_size=self._base_size)
+        shown = self._parts.refiner.preview(
+            fused.tracks, capture_ns=self._capture_ns(frame_index), origins=fused.origins
+        )
+        return self._inside(self._doubting(shown))
 
     def take_results(self) -> list[StillResult]:
         """Return and forget the results of stills that the edge has not been sent yet."""
@@ -418,25 +412,29 @@ class Pipeline:
         if own.frame_index > self._listed_frame:
             step = self._parts.path.between(max(0, self._listed_frame), own.frame_index)
             self._listed_frame = own.frame_index
-            shown = self._parts.refiner.shown(fused.tracks)
+            shown = self._parts.refiner.shown(fused.tracks, capture_ns=capture_ns, origins=fused.origins)
             if self._parts.guesses is not None:
                 self._parts.guesses.update(fused.tracks, shown.base_classes, step, scores=fused.means)
             self.doubted = int(shown.doubted.sum())
-            shown = self._doubting(fused, shown)
-            overlay = _overlay(fused, shown, capture_ns, base_size=self._base_size)
             if self._detection is not None and capture_ns - self._due_ns > _LATE_NS:
                 looked_ns = self._due_ns
-            self._emit(replace(overlay, looked_ns=looked_ns))
+            self._emit(replace(self._inside(self._doubting(shown)), looked_ns=looked_ns))
 
-    def _doubting(self, fused: FusedTracks, shown: ShownClasses) -> ShownClasses:
+    def _doubting(self, shown: Overlay) -> Overlay:
         # In a view that our detector does not know all its tracks are guesses, and no class is certain. What the
         # edge's alone sees is its own affair.
         guesses, sure = self._parts.guesses, shown.sure
-        doubted = np.zeros(len(sure), np.bool_) if guesses is None else guesses.among(fused.tracks.ids)
+        doubted = np.zeros(len(sure), np.bool_) if guesses is None else guesses.among(shown.track_ids)
         if self.trust.unlike:
-            doubted |= np.array([origin == "base" for origin in fused.origins], np.bool_)
+            doubted |= np.array([origin == "base" for origin in shown.origins], np.bool_)
             sure = np.zeros_like(sure)
         return replace(shown, doubted=shown.doubted | doubted & ~shown.refined, sure=sure)
+
+    def _inside(self, shown: Overlay) -> Overlay:
+        # The tracker lets boxes leave the picture.
+        boxes = np.clip(shown.boxes_base_px, 0, np.array([*self._base_size, *self._base_size], np.float32))
+        rows = np.flatnonzero(_areas(boxes) > _LEAST_INSIDE * _areas(shown.boxes_base_px))
+        return replace(shown, boxes_base_px=boxes).take(rows)
 
     def _carry_merges(self) -> None:
         for survivor_id, merged_id in self._parts.fusion.take_merged():
@@ -444,33 +442,6 @@ class Pipeline:
             self._history.rename_track(survivor_id, merged_id)
 
 
-def _overlay(
-    fused: FusedTracks, shown: ShownClasses, capture_ns: int, *, base_size: tuple[int, int]
-) -> Overlay:
-    tracks = fused.tracks
-    limits = np.array([*base_size, *base_size], np.float32)  # the tracker lets boxes leave the picture
-    boxes = np.clip(tracks.boxes_xyxy_px, 0, limits)
-    rows = np.flatnonzero(_areas(boxes) > _LEAST_INSIDE * _areas(tracks.boxes_xyxy_px))
-    return Overlay(
-        frame_index=tracks.frame_index,
-        capture_ns=capture_ns,
-        track_ids=tracks.ids[rows],
-        boxes_base_px=boxes[rows],
-        base_classes=_of(shown.base_classes, rows),
-        classes=_of(shown.classes, rows),
-        confidences=shown.confidences[rows],
-        refined=shown.refined[rows],
-        origins=_of(fused.origins, rows),
-        doubted=shown.doubted[rows],
-        sure=shown.sure[rows],
-        vague=shown.vague[rows],
-    )
-
-
 def _areas(boxes: Boxes) -> npt.NDArray[np.float32]:
     wide, high = (boxes[:, 2:] - boxes[:, :2]).T
     return np.asarray(wide * high)
-
-
-def _of(words: tuple[T, ...], rows: npt.NDArray[np.intp]) -> tuple[T, ...]:
-    return tuple(words[row] for row in rows.tolist())

@@ -33,13 +33,13 @@ from hvt_common.transport.inbox import Received, TokenBucket
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
-from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, StillsRead, Traffic, VideoSample
 from hvt_ground.link.reassemble import Arrival
 from hvt_ground.link.reception import ReceptionStatistics
 from hvt_ground.perception.models import NotOpenError
 from hvt_ground.perception.pipeline import DecodedFrame, NothingPerceived, Pipeline, ReceivedStill
+from hvt_ground.perception.session import SessionPerception
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.poses import NOWHERE, Locator, SessionPoses
 from hvt_ground.session.edge_port import ReceiverReports
@@ -86,7 +86,7 @@ class GroundSession:
         pipeline_of: Callable[[Callable[[Event], None]], Pipeline],
         clock: Callable[[], int],
         reports: ReceiverReports | None = None,
-        backlog_perception: BacklogPerception | None = None,
+        backlog_perception: SessionPerception | None = None,
         worker_of: WorkerFactory | None = None,
         locator: Locator = NOWHERE,
     ) -> None:
@@ -134,15 +134,13 @@ class GroundSession:
                 )
             )
         self.worker = worker_of(self._analyze, self._step, _perceives(self._read_stills))
-        outputs = [one for one in self._queued if one.for_backlog]
         self.backlog = SessionBacklog(
             info,
             log=self._emit,
             perception=backlog_perception,
             read=lambda still: self._read_stills([still]),
             stills=self.reception.sequences,
-            able=lambda: all(one.is_open() for one in outputs),
-            outputs=outputs,
+            outputs=[one for one in self._queued if one.for_backlog],
         )
         """What of this session was stored at the edge while the link was down."""
 
@@ -467,8 +465,7 @@ class GroundSession:
     # Events
 
     def _emit(self, event: Event) -> None:
-        if isinstance(event, Refinement):
-            self.backlog.note(event)
+        self.backlog.note(event)
         if self.poses.has_pose and isinstance(event, Overlay) and not event.stored:
             event = self.poses.located(event)
         for sink in self.sinks:

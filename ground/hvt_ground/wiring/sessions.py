@@ -19,6 +19,7 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Refinement
 from hvt_ground.extras import Flight, Service, extras_of, locators
 from hvt_ground.perception.models import Models
+from hvt_ground.perception.session import SessionPerception
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.session.edge_port import ReceiverReports
@@ -29,7 +30,6 @@ from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.wiring.files import backlog_path, free_path, output_path
-from hvt_ground.wiring.perception import SessionPerception
 
 S = TypeVar("S", bound=SinkWriter[Any])
 
@@ -131,7 +131,7 @@ class SessionFactory:
             pipeline_of=perception.pipeline,
             clock=self._clock,
             reports=reports,
-            backlog_perception=perception.stored(),
+            backlog_perception=perception,
             locator=locator,
         )
 
@@ -142,7 +142,7 @@ class SessionFactory:
         names = partial(backlog_path, self._config.record, edge=info.edge, stamp=stamp)
         part = f"backlog recording of {info.edge}"
         sink = self._outputs.open(part, partial(self._opened, self._files(settings, backlog=True), names))
-        perception = SessionPerception(self._config, self._models, info).stored()
+        perception = SessionPerception(self._config, self._models, info)
         return BacklogRecording(info, sink=sink, perception=perception)
 
     def _new_file(

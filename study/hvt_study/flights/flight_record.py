@@ -20,7 +20,7 @@ from hvt_ground.events import Overlay, Refinement
 from hvt_ground.perception.pipeline import Pipeline
 from hvt_ground.perception.stills.classify import object_crops
 from hvt_ground.perception.stills.decode import DecodedStill
-from hvt_ground.perception.stills.refine import Refiner, ShownClasses
+from hvt_ground.perception.stills.refine import Refiner
 from hvt_study.datasets.labels import NO_ID, inside_frame
 from hvt_study.flights.flight_link import Arrival
 from hvt_study.metrics.judged import FrameView
@@ -52,15 +52,15 @@ class Watch:
         found, self._found = self._found, None
         return found
 
-    def shown(self, tracks: Tracks) -> ShownClasses:
+    def shown(self, tracks: Tracks, **about: Any) -> Overlay:
         """As the refiner does."""
         self.listed = tracks
-        return self._refiner.shown(tracks)
+        return self._refiner.shown(tracks, **about)
 
-    def preview(self, tracks: Tracks) -> ShownClasses:
+    def preview(self, tracks: Tracks, **about: Any) -> Overlay:
         """As the refiner does."""
         self.listed = tracks
-        return self._refiner.preview(tracks)
+        return self._refiner.preview(tracks, **about)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._refiner, name)

@@ -9,12 +9,9 @@ from contextlib import contextmanager, nullcontext
 
 import pytest
 
-from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import BacklogUnit, RoiHeader, parse_backlog_units
 from hvt_common.runtime.failures import Failures, RetryPause
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_ground.backlog.jobs import read_still, show_video
-from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.perception.stills.decode import ReceivedStill
@@ -24,7 +21,7 @@ from hvt_ground.sinks.contract import SinkWriter
 from programs.processes import eventually
 from rigs.backlog_chunks import video_object
 from rigs.examples import refinement
-from rigs.flight import Flight, RedSquares, SameAnswer, patient_worker
+from rigs.flight import Flight, StoredPerception, patient_worker
 
 
 def test_work_that_was_never_begun_lets_its_recording_go():
@@ -39,15 +36,7 @@ def test_work_that_was_never_begun_lets_its_recording_go():
             last_shown.set()
             go_on.wait(timeout=60)
 
-    perception = BacklogPerception(
-        info,
-        take_models=lambda: (RedSquares(), None),
-        tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
-        reader_of=lambda _detector, _classifier: SameAnswer(),
-        detect_every=3,
-        trust=ViewTrust("motion", hence=""),
-    )
-    former = SessionBacklog(info, log=log, perception=perception, read=lambda _still: None)
+    former = SessionBacklog(info, log=log, perception=StoredPerception(info), read=lambda _still: None)
 
     @contextmanager
     def take():
@@ -115,7 +104,6 @@ class Outage:
             log=self.sink.log,
             perception=None,
             read=self._read,
-            able=self.sink.is_open,
             outputs=[self.sink],
         )
         self.units = [

@@ -7,29 +7,13 @@ import threading
 import time
 from dataclasses import replace
 
-from hvt_common.inference.view_trust import ViewTrust
-from hvt_common.protocol.messages import Info
 from hvt_common.runtime.failures import Failures
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
-from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.line_file import LineFile
 from programs.processes import eventually
-from rigs.flight import Flight, RedSquares, SameAnswer
-
-
-def perception(info: Info) -> BacklogPerception:
-    """That of a session."""
-    return BacklogPerception(
-        info,
-        take_models=lambda: (RedSquares(), None),
-        tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
-        reader_of=lambda _detector, _classifier: SameAnswer(),
-        detect_every=3,
-        trust=ViewTrust("motion", hence=""),
-    )
+from rigs.flight import Flight, StoredPerception
 
 
 def test_a_ground_that_runs_for_months_takes_former_sessions_every_day(tmp_path):
@@ -39,7 +23,7 @@ def test_a_ground_that_runs_for_months_takes_former_sessions_every_day(tmp_path)
     def open_one(info) -> BacklogRecording:
         path = tmp_path / f"{info.session_id}.csv"
         made.append(QueuedSink("recording", lambda: LineFile(path, ("a",)), failures=Failures(time.time_ns)))
-        return BacklogRecording(info, sink=made[-1], perception=perception(info))
+        return BacklogRecording(info, sink=made[-1], perception=StoredPerception(info))
 
     recordings = BacklogRecordings(open_one, most_files=2, open_s=20.0, clock=lambda: now_s)
     first, second, third = (replace(Flight(1).info(), session_id=number) for number in (1, 2, 3))
@@ -68,7 +52,7 @@ def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):
     def open_one(info) -> BacklogRecording:
         sinks.append(QueuedSink("recording", lambda: LineFile(pipe, ("a",)), failures=Failures(time.time_ns)))
         opened.set()
-        return BacklogRecording(info, sink=sinks[-1], perception=perception(info))
+        return BacklogRecording(info, sink=sinks[-1], perception=StoredPerception(info))
 
     recordings = BacklogRecordings(open_one, open_s=60.0)
     acquired: list[SessionBacklog | None] = []

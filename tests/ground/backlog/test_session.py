@@ -26,14 +26,13 @@ from hvt_common.protocol.messages import (
     pack_backlog_units,
 )
 from hvt_common.runtime.failures import Failures
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Posterior
 from hvt_common.video.hevc import BaseDecoder
-from hvt_ground.backlog.perception import FIRST_TRACK_ID, BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
 from hvt_ground.backlog.session_backlog import LateStills
 from hvt_ground.perception.pipeline import DecodedFrame
+from hvt_ground.perception.session import FIRST_TRACK_ID
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.report.status import completed, summary, table
@@ -49,24 +48,21 @@ from programs.rrd import Recording
 from programs.small_disk import small_disk
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
 from rigs.examples import overlay, seen
-from rigs.flight import CLASSES, Flight, Port, RedSquares, SameAnswer, patient_worker, pipeline_of, square_box
+from rigs.flight import (
+    CLASSES,
+    Flight,
+    Port,
+    RedSquares,
+    SameAnswer,
+    StoredPerception,
+    patient_worker,
+    pipeline_of,
+    square_box,
+)
 from rigs.handled import WatchedInbox, check, end
 
 FIRST_STORED = 2**31
 PICTURE = DecodedFrame(0, 0, 0, np.zeros((8, 8, 3), np.uint8))
-
-
-class Models:
-    """Gives red-square detectors."""
-
-    def __init__(self, class_names=CLASSES):
-        self._class_names = class_names
-
-    def take(self):
-        """One for each."""
-        detector = RedSquares()
-        detector.class_names = self._class_names
-        return detector, None
 
 
 def settings(info: Info, path: Path, **changes) -> RecorderSettings:
@@ -82,19 +78,6 @@ def settings(info: Info, path: Path, **changes) -> RecorderSettings:
     )
 
 
-def look_of(info: Info, models=None, trust: ViewTrust | None = None, tilt=None) -> BacklogPerception:
-    """What looks at kept things."""
-    return BacklogPerception(
-        info,
-        take_models=(models or Models()).take,
-        tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
-        reader_of=lambda _detector, _classifier: SameAnswer(),
-        detect_every=3,
-        trust=trust or ViewTrust("motion", hence=""),
-        tilt=tilt,
-    )
-
-
 class Rig:
     """A receiver with a port; sessions and former sessions with recordings in a folder."""
 
@@ -104,7 +87,7 @@ class Rig:
         flight: Flight,
         *,
         pipeline=pipeline_of,
-        models=None,
+        detector_of=RedSquares,
         timing=None,
         most_files=32,
         ended_patience_s=2.0,
@@ -113,7 +96,7 @@ class Rig:
     ):
         self.folder = folder
         self.backlog_folder: Path | None = None
-        self._models = models or Models()
+        self._detector_of = detector_of
         self._pipeline = pipeline
         self._timing = timing
         self._worker_of = worker_of
@@ -154,7 +137,7 @@ class Rig:
             pipeline_of=self._pipeline,
             clock=time.time_ns,
             reports=reports,
-            backlog_perception=look_of(info, self._models),
+            backlog_perception=StoredPerception(info, detector_of=self._detector_of),
             worker_of=None if info.pace == "lockstep" else self._worker_of,
         )
         self.opened.append(session)
@@ -162,7 +145,7 @@ class Rig:
 
     def _open_backlog(self, info: Info) -> BacklogRecording:
         path = (self.backlog_folder or self.folder) / f"backlog-{next(self._backlog_numbers)}.rrd"
-        return BacklogRecording(info, sink=self._sink(info, path), perception=look_of(info))
+        return BacklogRecording(info, sink=self._sink(info, path), perception=StoredPerception(info))
 
     def _sink(self, info: Info, path: Path) -> QueuedSink:
         made = settings(info, path, **self._recorder)
@@ -302,7 +285,7 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
 def test_stored_video_of_an_unknown_view_is_doubted_as_it_is_live(flight):
     """Boxes that were dashed and unnamed before an outage were certain in the middle of it."""
     trust, found = ViewTrust("motion", hence=""), []
-    perception, decoder = look_of(flight.info(), trust=trust), BaseDecoder()
+    perception, decoder = StoredPerception(flight.info(), trust=trust), BaseDecoder()
     analyze = perception.track(found.append)
     for unit in flight.units[:6]:
         trust.unlike = unit.frame_index >= 3
@@ -312,8 +295,12 @@ def test_stored_video_of_an_unknown_view_is_doubted_as_it_is_live(flight):
 
 def test_a_bus_of_stored_video_is_called_as_it_is_live(flight):
     """Seen aslant it was a vehicle before the outage and after it, and a bus in the middle."""
+
+    class Buses(RedSquares):
+        class_names = ("bus",)
+
     found, decoder, tilt = [], BaseDecoder(), ViewTilt(vague_kinds=True)
-    perception = look_of(flight.info(), models=Models(("bus",)), tilt=tilt)
+    perception = StoredPerception(flight.info(), detector_of=Buses, tilt=tilt)
     analyze = perception.track(found.append)
     for unit in flight.units[:6]:
         tilt.aslant = unit.frame_index >= 3
@@ -323,7 +310,7 @@ def test_a_bus_of_stored_video_is_called_as_it_is_live(flight):
 
 def test_stored_video_tells_the_tilt_of_its_view(flight):
     """Of a session that is over nothing else does."""
-    perception, decoder, taken = look_of(flight.info()), BaseDecoder(), []
+    perception, decoder, taken = StoredPerception(flight.info()), BaseDecoder(), []
     perception.tilt.take = lambda tracks, _names, *, height_px: taken.append((len(tracks), height_px))
     analyze = perception.track(lambda _: None)
     for unit in flight.units[:6]:
@@ -597,7 +584,7 @@ def test_a_recording_in_use_stays_open(flight, tmp_path):
     def open_one(info: Info) -> BacklogRecording:
         path = tmp_path / f"{len(made)}.rrd"
         sink = outputs.open("recording", lambda: Recorder(settings(info, path)))
-        made.append(BacklogRecording(info, sink=sink, perception=look_of(info)))
+        made.append(BacklogRecording(info, sink=sink, perception=StoredPerception(info)))
         return made[-1]
 
     recordings = BacklogRecordings(open_one, most=2, open_s=20)
@@ -787,12 +774,8 @@ def test_a_still_is_read_in_the_middle_of_a_stretch(flight, tmp_path):
             order.append("still")
             return super().read(stills, base_bgr)
 
-    class Stepped:
-        def take(self):
-            return Stepwise(), None
-
     with Rig(
-        tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Reader()), models=Stepped()
+        tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Reader()), detector_of=Stepwise
     ) as rig:
         rig.base(*range(25))
         for item in backlog(flight, "base", 40, video_object(flight, range(40, 60))):

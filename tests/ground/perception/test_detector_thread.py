@@ -15,8 +15,8 @@ from hvt_common.values import Detections
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.detector_thread import DetectorThread
 from hvt_ground.perception.pipeline import DecodedFrame
+from hvt_ground.perception.session import SessionPerception
 from hvt_ground.wiring import Models
-from hvt_ground.wiring.perception import SessionPerception
 from programs.processes import eventually
 from rigs.flight import Flight, NothingSeen, patient_worker
 

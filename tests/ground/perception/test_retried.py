@@ -17,7 +17,7 @@ from hvt_ground.config import GroundConfig, check
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.models import Models
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
-from hvt_ground.wiring.perception import SessionPerception
+from hvt_ground.perception.session import SessionPerception
 from media.onnx_models import colour_classifier, colour_detector
 from rigs.flight import Flight
 
@@ -131,4 +131,4 @@ def test_a_session_begins_though_the_files_of_the_models_are_gone(tmp_path: Path
     detector.unlink()
     classifier.unlink()
     SessionPerception(config, models, info).pipeline(lambda _: None).end()
-    SessionPerception(config, models, info).stored().track(lambda _: None)
+    SessionPerception(config, models, info).track(lambda _: None)

@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -29,13 +31,16 @@ from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Detections, Image, Posterior, Tracks, View
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
+from hvt_ground.config import GroundConfig
 from hvt_ground.perception.detector_thread import Detection, DetectorThread
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.models import ModelFacts, Models
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
+from hvt_ground.perception.session import SessionPerception
 from hvt_ground.perception.stills.classify import FrameReadings, ObjectReading
 from hvt_ground.perception.stills.decode import DecodedStill
-from hvt_ground.perception.stills.refine import Refiner
+from hvt_ground.perception.stills.refine import Refiner, ViewTilt
 from hvt_ground.perception.stills.vocabulary import Vocabulary
 from hvt_ground.perception.worker import RealtimeWorker
 from media.clips import START_NS, framed, smooth_pictures
@@ -115,6 +120,7 @@ class SameAnswer:
 
     class_names: tuple[str, ...] = CLASSES
     knows: bool = True
+    wants_base: bool = False
     had_base: list[bool] = field(default_factory=list)
     found: Detections = field(default_factory=Detections.none)
     """What it sees besides, in each frame with stills."""
@@ -153,7 +159,6 @@ def pipeline_of(
     detect_every: int = 1,
     detect_still_every: int = 0,
     edge_classes: Sequence[str] = CLASSES,
-    wants_base: bool = False,
     trust: ViewTrust | None = None,
     search: ScaleSearch | None = None,
     detector_thread: DetectorThread | None = None,
@@ -185,8 +190,28 @@ def pipeline_of(
         detect_every=detect_every,
         detect_still_every=detect_still_every,
         emit=emit,
-        wants_base=wants_base,
     )
+
+
+class StoredPerception(SessionPerception):
+    """Looks at each third stored picture with ``detector_of()``, and reads every still as a bus."""
+
+    def __init__(
+        self,
+        info: Info,
+        *,
+        detector_of: Callable[[], RedSquares] = RedSquares,
+        trust: ViewTrust | None = None,
+        tilt: ViewTilt | None = None,
+    ) -> None:
+        self._detector_of = detector_of
+        facts = ModelFacts(track_confidence=0.25, calibrated=False, stills_calibrated=False)
+        config = GroundConfig(detector=MOTION, detect_every=3, camera_motion="off")
+        super().__init__(config, cast("Models", SimpleNamespace(facts=facts)), info)
+        self._trust, self.tilt = trust or self._trust, tilt or self.tilt
+
+    def _taken(self) -> tuple[RedSquares, SameAnswer]:
+        return self._detector_of(), SameAnswer()
 
 
 class Flight:

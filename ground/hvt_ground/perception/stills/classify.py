@@ -52,6 +52,10 @@ class StillReader(Protocol):
     """Names the objects in stills."""
 
     @property
+    def wants_base(self) -> bool:
+        """It uses the base frame: all stills wait for theirs, not only residuals."""
+
+    @property
     def class_names(self) -> tuple[str, ...]:
         """The classes of the posteriors, and of ``found``."""
 
@@ -69,6 +73,7 @@ def _silent(stills: Sequence[DecodedStill]) -> FrameReadings:
 class NoReader:
     """Shows stills without any names: the reader of a ground without models."""
 
+    wants_base = False
     class_names: tuple[str, ...] = ("object",)
 
     def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:  # noqa: ARG002
@@ -78,6 +83,8 @@ class NoReader:
 
 class CropReader:
     """An image classifier on the crop alone, all objects of a frame's stills in one call."""
+
+    wants_base = False
 
     def __init__(self, classifier: Classifier, *, view: View) -> None:
         self._classifier = classifier
@@ -107,6 +114,8 @@ class Redetection:
     is larger than the base, so is the composite, and the stills keep their detail. A class or a box counts from the
     detector's confidence on, an object that nobody has named from ``new_confidence`` on.
     """
+
+    wants_base = True
 
     def __init__(self, detector: FailingDetector, *, view: View, new_confidence: float = 0.5) -> None:
         self._detector = detector

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from hvt_common.inference.class_names import VEHICLE_KINDS, kind_of
 from hvt_common.values import Tracks
-from hvt_ground.events import Refinement
+from hvt_ground.events import Origin, Overlay, Refinement
 from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.match import Matcher, Outcome, StillSeen, TrackMatch
 from hvt_ground.perception.stills.posterior import SURE, ClassEstimate, TrackPosterior
@@ -37,24 +37,6 @@ _REMEMBERED_STILLS = 4096
 
 def _unknown(_edge_track_id: int) -> None:
     """No track: the edge reports none."""
-
-
-@dataclass(frozen=True, slots=True)
-class ShownClasses:
-    """Classes of N tracks, parallel to the given `Tracks`; fields of `events.Overlay`."""
-
-    base_classes: tuple[str, ...]
-    classes: tuple[str, ...]
-    confidences: npt.NDArray[np.float32]
-    """(N,) of ``classes``, 0…1."""
-    refined: npt.NDArray[np.bool_]
-    """(N,) True once a still has refined it."""
-    doubted: npt.NDArray[np.bool_]
-    """(N,) True where stills say that it is nothing of mine."""
-    sure: npt.NDArray[np.bool_]
-    """(N,) True where stills agree on the class with a calibrated probability above .9."""
-    vague: npt.NDArray[np.bool_]
-    """(N,) True where it is a vehicle, and its class rather a guess."""
 
 
 class Refiner:
@@ -150,17 +132,17 @@ class Refiner:
             self._track_posteriors.setdefault(survivor_id, class_posterior)
         self._matcher.merge(survivor_id, merged_id)
 
-    def shown(self, tracks: Tracks) -> ShownClasses:
-        """The classes to show for the tracks of one frame; frames must not go back."""
+    def shown(self, tracks: Tracks, *, capture_ns: int = 0, origins: tuple[Origin, ...] = ()) -> Overlay:
+        """The tracks of one frame with the classes to show; frames must not go back."""
         for track_id in tracks.ids.tolist():
             class_posterior = self._track_posteriors.get(track_id)
             if class_posterior is not None:
                 self._touch(track_id, class_posterior, tracks.frame_index)
         self._forget(tracks.frame_index)
-        return self.preview(tracks)
+        return self.preview(tracks, capture_ns=capture_ns, origins=origins)
 
-    def preview(self, tracks: Tracks) -> ShownClasses:
-        """The classes that would be shown for these tracks; changes nothing, so any frame may be requested."""
+    def preview(self, tracks: Tracks, *, capture_ns: int = 0, origins: tuple[Origin, ...] = ()) -> Overlay:
+        """What would be shown for these tracks; changes nothing, so any frame may be requested."""
         names = self._vocabulary.names
         base_classes = tuple(names[class_id] for class_id in tracks.class_ids)
         classes = list(base_classes)
@@ -176,7 +158,20 @@ class Refiner:
             doubted[row] = reading.class_id == self._vocabulary.nothing
             sure[row] = self._is_sure(reading)
             vague[row] = self.tilt.is_vague(classes[row], known=reading.sure)
-        return ShownClasses(base_classes, tuple(classes), confidences, refined, doubted, sure, vague)
+        return Overlay(
+            frame_index=tracks.frame_index,
+            capture_ns=capture_ns,
+            track_ids=tracks.ids,
+            boxes_base_px=tracks.boxes_xyxy_px,
+            base_classes=base_classes,
+            classes=tuple(classes),
+            confidences=confidences,
+            refined=refined,
+            origins=origins,
+            doubted=doubted,
+            sure=sure,
+            vague=vague,
+        )
 
     # One frame's stills.
 

@@ -46,8 +46,7 @@ class Progress:
 class StillStage:
     """One session's stills. Used by one thread; ``emit`` takes the events.
 
-    ``vocabulary`` is that of ``reader`` and ``refiner``. ``wants_base``: ``reader`` uses the base frame, so all
-    stills wait for theirs, not only residuals.
+    ``vocabulary`` is that of ``reader`` and ``refiner``.
     """
 
     def __init__(
@@ -59,7 +58,6 @@ class StillStage:
         history: History,
         fusion: Fusion,
         view: View,
-        wants_base: bool,
         gap_frames: int,
         emit: Callable[[Event], None],
     ) -> None:
@@ -70,7 +68,6 @@ class StillStage:
         self._gap_frames = gap_frames
         self._fusion = fusion
         self._view = view
-        self._wants_base = wants_base
         self._emit = emit
         self._pending: list[ReceivedStill] = []
         self._results: list[StillResult] = []
@@ -125,7 +122,7 @@ class StillStage:
         # Whether its picture may yet come. A residual is nothing without it; others wait for the next frame only.
         if header.frame_index <= now.picture_index:
             return False
-        return needs_base(header) or (self._wants_base and header.frame_index >= now.frame_index)
+        return needs_base(header) or (self._reader.wants_base and header.frame_index >= now.frame_index)
 
     def _read(self, stills: Sequence[ReceivedStill], now: Progress) -> None:
         by_frame: dict[int, list[tuple[ReceivedStill, DecodedStill]]] = {}
