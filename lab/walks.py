@@ -40,7 +40,7 @@ _WALKS = {
         "a command, from hvt-ground set-budget to the encoder",
         38,
     ),
-    ("EdgeSessions.handle",): ("a message at the ground, received", 41),
+    ("EdgeSessions.handle",): ("a message at the ground, received", 40),
     ("SessionPerception.pipeline",): ("a session's perception at the ground, made", 27),
     ("Pipeline.analyze",): ("a frame at the ground, analyzed", 34),
     ("Recorder.log",): ("an event at the ground, recorded", 13),

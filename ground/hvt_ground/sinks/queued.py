@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
+from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
-from hvt_ground.sinks.contract import SinkWriter, is_stored, size_bytes
+from hvt_ground.events import Overlay, Refinement, VideoSample
+from hvt_ground.sinks.contract import SinkWriter
 
 _log = logging.getLogger(__name__)
 
@@ -22,6 +24,9 @@ T = TypeVar("T")
 _MOST_ITEMS = 4096
 _MOST_BYTES = 32 * 2**20
 """Some minutes of a thin link, or some hundred large stills."""
+_SMALL_BYTES = 512
+_TRACK_BYTES = 64
+"""Of an overlay, each."""
 _POLL_S = 0.2
 _AT_ONCE = threading.Event()
 _AT_ONCE.set()
@@ -249,6 +254,26 @@ class QueuedSink(Generic[T]):
             done(False)
         self._failed = self._failures.failed(self.part, reason_of(error))
         _log.debug("%s failed", self.part, exc_info=error)
+
+
+def is_stored(item: object) -> bool:
+    """Whether an edge has stored it and forgets it when it is acknowledged."""
+    return isinstance(item, VideoSample | Refinement) and item.stored
+
+
+def size_bytes(item: object) -> int:
+    """About the memory of an item."""
+    match item:
+        case Received():
+            return item.size_bytes + _SMALL_BYTES
+        case VideoSample():
+            return len(item.data) + _SMALL_BYTES
+        case Refinement():
+            pictures = (item.still_bgr, item.base_crop_bgr)
+            return len(item.still) + sum(one.nbytes for one in pictures if one is not None) + _SMALL_BYTES
+        case Overlay():
+            return _TRACK_BYTES * len(item.track_ids) + _SMALL_BYTES
+    return _SMALL_BYTES
 
 
 class Receipt:
