@@ -23,7 +23,7 @@ from rasterio.windows import Window
 
 from hvt_common.errors import UserError, absent
 from hvt_common.geodesy import metres_per_degree, turned_deg
-from hvt_geo.surface import Points
+from hvt_geo.camera import Points
 
 TILE_M: Final = 15_000.0
 """Half the side of the part in memory."""

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from hvt_common.geodesy import metres_per_degree, turned_deg
 from hvt_common.runtime.failures import RetryPause
 from hvt_common.values import Pose
+from hvt_geo.camera import LEAST_DEPRESSION_DEG, Points, Rays
 from hvt_geo.elevation import TILE_M, ElevationModel, ModelError, Tile
-from hvt_geo.surface import LEAST_DEPRESSION_DEG, Points, Rays
 
 _log = logging.getLogger(__name__)
 
