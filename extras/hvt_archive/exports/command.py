@@ -22,12 +22,11 @@ from hvt_ground.extras import all_extras, locators
 from hvt_ground.recordings.contract import Recorded
 from hvt_ground.sinks.rerun.stills import still_of_event
 
-_FOLDERS: dict[str, Callable[[Recorded, Path], None]] = {"coco": write_coco, "stills": write_stills}
+_Write = Callable[[Recorded, Path], None]
+_FOLDERS: dict[str, _Write] = {"coco": write_coco, "stills": write_stills}
 _SUFFIXES = {"mot": ".txt"}
 """The suffixes other than the kind's own name."""
-
-
-_FILES: dict[str, Callable[[Recorded, Path], None]] = {
+_FILES: dict[str, _Write] = {
     "csv": write_csv,
     "geojson": write_geojson,
     "kml": write_kml,
@@ -36,13 +35,13 @@ _FILES: dict[str, Callable[[Recorded, Path], None]] = {
 }
 
 
-def _kinds() -> tuple[str, ...]:
-    return tuple(dict.fromkeys((*CONTAINERS, *_FILES, *_brought(), *_FOLDERS)))
-
-
-def _brought() -> dict[str, Callable[[Recorded, Path], None]]:
-    """Kinds of the extras, which may take the place of a plain container."""
-    return {kind: write for extra in all_extras() for kind, write in extra.exports.items()}
+def _kinds(*, burn_in: bool = False) -> dict[str, _Write]:
+    """The writer of each; those of extras take the place of a plain container, but where boxes are drawn."""
+    plain: dict[str, _Write] = {
+        kind: partial(write_video, container=kind, burn_in=burn_in) for kind in CONTAINERS
+    }
+    brought = {kind: write for extra in all_extras() for kind, write in extra.exports.items()}
+    return plain | _FILES | brought | _FOLDERS | (plain if burn_in else {})
 
 
 def run(argv: Sequence[str]) -> int:
@@ -56,18 +55,8 @@ def run(argv: Sequence[str]) -> int:
     check_not_read(out, reads, name="--out")
     locator = locators(given.terrain)(given.recordings[0].name)
     recorded = read_recordings(given.recordings, locator=locator)
-    if kind in _FOLDERS:
-        with whole_folder(out) as part:
-            _FOLDERS[kind](recorded, part)
-    else:
-        brought = {} if given.burn_in else _brought()
-        write: Callable[[Recorded, Path], None]
-        if kind in CONTAINERS and kind not in brought:
-            write = partial(write_video, container=kind, burn_in=given.burn_in)
-        else:
-            write = (_FILES | brought)[kind]
-        with whole_file(out, new=given.out is None) as part:
-            write(recorded, part)
+    with whole_folder(out) if kind in _FOLDERS else whole_file(out, new=given.out is None) as part:
+        _kinds(burn_in=given.burn_in)[kind](recorded, part)
     stills = f"{len(recorded.stills)} stills{_missing_stills(recorded)}"
     say(f"{out}: {recorded.edge}, {len(recorded.video)} pictures, {stills}")
     return 0

@@ -30,20 +30,32 @@ ET.register_namespace("", _KML)
 ET.register_namespace("gx", _GX)
 
 
+_DIGITS: Final = 7
+"""Digits of degrees: a centimetre."""
+
+
 @dataclass(frozen=True, slots=True)
-class _Spot:
-    """A track at one moment."""
+class Fix:
+    """A place of a way."""
 
     capture_ns: int
-    latitude_deg: float
     longitude_deg: float
-    ellipse: tuple[float, float, float]
-    """Half its axes in metres, and the longer one's direction."""
+    latitude_deg: float
+    height_m: float | None = None
+    """Above the ground."""
 
     @property
-    def fix(self) -> Fix:
-        """Place and time."""
-        return Fix(self.capture_ns, self.longitude_deg, self.latitude_deg)
+    def position(self) -> list[float]:
+        """A position for GeoJSON."""
+        return [round(self.longitude_deg, _DIGITS), round(self.latitude_deg, _DIGITS)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Spot(Fix):
+    """A track at one moment."""
+
+    ellipse: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Half its axes in metres, and the longer one's direction."""
 
 
 @dataclass(slots=True)
@@ -83,9 +95,9 @@ def write_geojson(recorded: Recorded, path: Path) -> None:
     features = [_camera_feature(recorded)]
     for track_id, track in _tracks(recorded).items():
         spot = track.surest
-        geometry: dict[str, Any] = {"type": "Point", "coordinates": spot.fix.position}
+        geometry: dict[str, Any] = {"type": "Point", "coordinates": spot.position}
         if track.moved:
-            geometry = line(parts_of([one.fix for one in track.spots]))
+            geometry = line(parts_of(track.spots))
         properties = {
             "kind": "track",
             "id": track_id,
@@ -128,7 +140,7 @@ def write_kml(recorded: Recorded, path: Path) -> None:
             _with(_with(facts, "Data", {"name": name}), value=value)
         shapes = _with(place, "MultiGeometry")
         if track.moved:
-            _timed_way(shapes, [one.fix for one in track.spots])
+            _timed_way(shapes, track.spots)
         else:
             _with(_with(shapes, "Point"), coordinates=f"{spot.longitude_deg:.7f},{spot.latitude_deg:.7f}")
         ring = _with(_with(_with(shapes, "Polygon"), "outerBoundaryIs"), "LinearRing")
@@ -163,7 +175,9 @@ def _tracks(recorded: Recorded) -> dict[int, _Track]:
             track.last_ns = overlay.capture_ns
             if not track.spots or overlay.capture_ns - track.spots[-1].capture_ns >= _EVERY_NS:
                 major, minor, azimuth = places.ellipses[row].tolist()
-                track.spots.append(_Spot(overlay.capture_ns, latitude, longitude, (major, minor, azimuth)))
+                track.spots.append(
+                    _Spot(overlay.capture_ns, longitude, latitude, ellipse=(major, minor, azimuth))
+                )
     return dict(sorted(tracks.items()))
 
 
@@ -228,26 +242,6 @@ def _with(
     for name, text in texts.items():
         ET.SubElement(element, f"{{{_KML}}}{name}").text = "".join(c for c in text if c.isprintable())
     return element
-
-
-_DIGITS: Final = 7
-"""Digits of degrees: a centimetre."""
-
-
-@dataclass(frozen=True, slots=True)
-class Fix:
-    """A place of a way."""
-
-    capture_ns: int
-    longitude_deg: float
-    latitude_deg: float
-    height_m: float | None = None
-    """Above the ground."""
-
-    @property
-    def position(self) -> list[float]:
-        """A position for GeoJSON."""
-        return [round(self.longitude_deg, _DIGITS), round(self.latitude_deg, _DIGITS)]
 
 
 def line(parts: Sequence[Sequence[Fix]]) -> dict[str, Any]:

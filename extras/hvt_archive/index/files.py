@@ -8,17 +8,16 @@ import re
 import shutil
 import subprocess
 import tempfile
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rerun.chunk import Chunk, RrdReader
+from rerun.chunk import Chunk
 
 from hvt_ground.recordings.row import FileAccount, RecordingRow
-from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages, drop_footer
+from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages, drop_footer, id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 from hvt_ground.sinks.rerun.stills import still_of_event
 
@@ -73,24 +72,20 @@ def described(path: Path) -> RecordingRow | None:
 def _described(path: Path) -> RecordingRow | None:
     content = _Content()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that there is no footer
-            reader = RrdReader(path)
-        (entry,) = reader.recordings()
+        reader = open_rrd(path)
+        whose = id_of(reader)
         for chunk in reader.stream():
             content.add(chunk)
         state = path.stat()
     except (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError):
         return None
-    edge = entry.application_id.removeprefix("hvt-")
-    session = entry.recording_id.removeprefix(f"{edge}-")
-    if not re.fullmatch(r"[0-9a-f]+", session):
+    if not re.fullmatch(r"[0-9a-f]+", whose.session):
         return None
     account = content.account()
     return RecordingRow(
         file=path.name,
-        edge=edge,
-        session=session,
+        edge=whose.edge,
+        session=whose.session,
         begin_ns=account.begin_ns,
         end_ns=account.end_ns,
         written_ns=state.st_mtime_ns,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from hvt_archive.reading.spool import SpooledRows, Timed
@@ -28,19 +27,9 @@ def of_file(row: Timed, component: str, *, number: int) -> Timed:
     return frame, capture_ns, value
 
 
-@dataclass(frozen=True, slots=True)
-class DrawnBox:
-    """A box of a track as it stood at a frame."""
-
-    track_id: int
-    box: tuple[float, float, float, float]
-    """x1 y1 x2 y2, base pixels."""
-    base_class: str
-    class_name: str
-    word: str
-    """What it is called."""
-    confidence: float
-    origin: Origin
+DrawnBox = tuple[int, tuple[float, float, float, float], str, str, str, float, Origin]
+"""A track with its box as it stood at a frame, x1 y1 x2 y2, base pixels; its base class, its class, the word that it
+is called by, its confidence and origin."""
 
 
 class DrawnLayer:
@@ -78,7 +67,7 @@ class DrawnLayer:
         for track, ((x, y), (w, h)), was, named, shown, percent, origin in zip(
             ids, places, before, now, words, percents, origins, strict=False
         ):
-            yield DrawnBox(
+            yield (
                 track,
                 (x - w, y - h, x + w, y + h),
                 self._names.get(was, "?"),

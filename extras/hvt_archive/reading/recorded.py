@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import logging
 import tempfile
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rerun.chunk import Chunk, RrdReader
+from rerun.chunk import Chunk
 
 from hvt_archive.reading.drawn_layer import TRACK_COMPONENTS, DrawnLayer, of_file
 from hvt_archive.reading.spool import Mapped, Spool, SpooledRows, Timed
@@ -41,7 +41,8 @@ from hvt_ground.sinks.rerun.blueprint import (
     VIDEO,
 )
 from hvt_ground.sinks.rerun.map_rows import pose_of
-from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages
+from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages, id_of, open_rrd
+from hvt_ground.sinks.rerun.sdk import RecordingId
 
 _log = logging.getLogger(__name__)
 
@@ -78,24 +79,28 @@ class _Read(Recorded):
     def _overlay(self, frame: int, capture_ns: int) -> Overlay:
         rows = sorted(
             (
-                (row, path)
+                (*row, path)
                 for path, layer in self._layers.items()
                 for row in layer.at(frame, reported=path == REPORTED)
             ),
-            key=lambda one: one[0].track_id,
+            key=itemgetter(0),
         )
+        columns = zip(*rows, strict=True) if rows else iter(((),) * 8)
+        ids, boxes, base_classes, classes, words, confidences, origins, paths = columns
         overlay = Overlay(
             frame_index=frame,
             capture_ns=capture_ns,
-            track_ids=np.array([row.track_id for row, _ in rows], np.int64),
-            boxes_base_px=np.array([row.box for row, _ in rows], np.float32).reshape(-1, 4),
-            base_classes=tuple(row.base_class for row, _ in rows),
-            classes=tuple(row.class_name for row, _ in rows),
-            confidences=np.array([row.confidence for row, _ in rows], np.float32),
-            refined=np.array([self._is_refined(row.track_id, path, frame) for row, path in rows], np.bool_),
-            origins=tuple(row.origin for row, _ in rows),
-            doubted=np.array([path == DOUBTED for _, path in rows], np.bool_),
-            vague=np.array([row.word == VEHICLE != row.class_name for row, _ in rows], np.bool_),
+            track_ids=np.array(ids, np.int64),
+            boxes_base_px=np.array(boxes, np.float32).reshape(-1, 4),
+            base_classes=base_classes,
+            classes=classes,
+            confidences=np.array(confidences, np.float32),
+            refined=np.array([self._is_refined(one, path, frame) for one, *_, path in rows], np.bool_),
+            origins=origins,
+            doubted=np.array([path == DOUBTED for path in paths], np.bool_),
+            vague=np.array(
+                [word == VEHICLE != name for word, name in zip(words, classes, strict=True)], np.bool_
+            ),
         )
         return self._located(overlay)
 
@@ -130,7 +135,7 @@ def read_recordings(paths: Sequence[Path], *, locator: Locator = NOWHERE) -> Rec
     spool = Spool()
     opened = (_opened(path, spool, number) for number, path in enumerate(paths))
     files = sorted(opened, key=lambda one: one.first)
-    names = {one.name for one in files}
+    names = {one.whose for one in files}
     rows: _Rows = {}
     for file in files:
         file.go_on_from(rows)
@@ -149,14 +154,14 @@ def read_recordings(paths: Sequence[Path], *, locator: Locator = NOWHERE) -> Rec
             f"{', '.join(map(str, paths))}: no recording of one edge: give the files that hvt-ground wrote"
         )
     try:
-        return _recorded(*names.pop(), rows, locator, spool)
+        return _recorded(names.pop(), rows, locator, spool)
     except _ODD as error:
         raise UserError(
             f"{', '.join(map(str, paths))}: not as hvt-ground writes a recording ({type(error).__name__}: {error})"
         ) from None
 
 
-def _recorded(edge: str, session: str, rows: _Rows, locator: Locator, spool: Spool) -> Recorded:
+def _recorded(whose: RecordingId, rows: _Rows, locator: Locator, spool: Spool) -> Recorded:
     layers = {path: DrawnLayer() for path in _LAYERS}
     for (entity, component), found in rows.items():
         if entity in layers:
@@ -165,8 +170,8 @@ def _recorded(edge: str, session: str, rows: _Rows, locator: Locator, spool: Spo
     assert isinstance(samples, SpooledRows)
     samples.sort(unique=True)
     return _Read(
-        edge=edge,
-        session=session,
+        edge=whose.edge,
+        session=whose.session,
         info=_info(rows.get((SESSION, _INFO), [])),
         video=Mapped(samples, _sample),
         stills=_stills(rows),
@@ -180,7 +185,7 @@ def _recorded(edge: str, session: str, rows: _Rows, locator: Locator, spool: Spo
 
 @dataclass(frozen=True, slots=True)
 class _File:
-    name: tuple[str, str]
+    whose: RecordingId
     rows: _Rows
     ours: bool
     """It has the entities of a recording of one edge."""
@@ -241,10 +246,7 @@ def _opened(path: Path, spool: Spool, number: int) -> _File:
 
 def _read(path: Path, spool: Spool, number: int) -> _File:
     rows: _Rows = {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that there is no footer
-        reader = RrdReader(path)
-    (entry,) = reader.recordings()
+    reader = open_rrd(path)
     ours = False
     for chunk in reader.stream():
         ours |= chunk.entity_path.startswith("/base/")
@@ -264,8 +266,7 @@ def _read(path: Path, spool: Spool, number: int) -> _File:
             everything.sort()
         else:
             everything.sort(key=lambda row: row[0])
-    edge = entry.application_id.removeprefix("hvt-")
-    return _File((edge, entry.recording_id.removeprefix(f"{edge}-")), rows, ours=ours)
+    return _File(id_of(reader), rows, ours=ours)
 
 
 def _rows(chunk: Chunk) -> Iterator[tuple[str, list[Timed]]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -53,17 +54,9 @@ class McapExtra(Extra[McapOptions]):
 
 
 def _export(recorded: Recorded, path: Path) -> None:
-    from hvt_ground.recordings.contract import RecordedStill  # noqa: PLC0415 - it brings PyAV
-
-    file = _file()(path, edge=recorded.edge)
-    try:
+    with closing(_file()(path, edge=recorded.edge)) as file:
         for item in recorded.all():
-            if isinstance(item, RecordedStill):
-                file.still(item.jpeg, frame_index=item.frame_index, capture_ns=item.capture_ns)
-            else:
-                file.log(item)
-    finally:
-        file.close()
+            file.log(item)
 
 
 McapExtra.exports = {"mcap": _export}

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -30,6 +29,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
 from hvt_gateways.decodable import DecodableRun
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, VideoSample
+from hvt_ground.recordings.contract import RecordedStill
 from hvt_ground.sinks import SinkWriter
 from hvt_ground.sinks.line_file import check_there
 from hvt_ground.sinks.palette import Rgb, class_colour
@@ -42,12 +42,6 @@ _THIN_PX, _THICK_PX = 1.0, 3.0
 _FONT_PX = 12.0
 _Message = CompressedVideo | CompressedImage | ImageAnnotations | LocationFix | Log
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
-
-
-@dataclass(frozen=True, slots=True)
-class _At:
-    frame_index: int
-    capture_ns: int
 
 
 class McapFile(SinkWriter[Event]):
@@ -63,8 +57,8 @@ class McapFile(SinkWriter[Event]):
         except OSError as error:
             raise UserError(f"MCAP file {path} cannot be created: {error.strerror}") from None
 
-    def log(self, item: Event) -> None:
-        """Write events that have a schema; ignore the rest."""
+    def log(self, item: Event | RecordedStill) -> None:
+        """Write events that have a schema, and stills that were read back; ignore the rest."""
         match item:
             case VideoSample():
                 data = self._run.decodable(item)
@@ -75,17 +69,14 @@ class McapFile(SinkWriter[Event]):
             case Refinement():
                 picture = still_picture(item)
                 if picture is not None:
-                    self.still(picture[0], frame_index=item.frame_index, capture_ns=item.capture_ns)
+                    self._write("stills", CompressedImage(data=picture[0], format="jpeg"), item)
                 self._write("events", Log(level=Log.INFO, message=event_text(item)), item)
+            case RecordedStill():
+                self._write("stills", CompressedImage(data=item.jpeg, format="jpeg"), item)
             case PoseUpdate():
                 self._write("location", _location(item.pose), item)
             case Notice():
                 self._write("events", Log(level=_LEVELS[item.level], message=item.text), item)
-
-    def still(self, jpeg: bytes, *, frame_index: int, capture_ns: int) -> None:
-        """Write a still, a JPEG."""
-        at = _At(frame_index, capture_ns)
-        self._write("stills", CompressedImage(data=jpeg, format="jpeg"), at)
 
     def skipped(self, count: int) -> None:
         """So many events are missing: video goes on at its next keyframe."""
@@ -103,7 +94,7 @@ class McapFile(SinkWriter[Event]):
         finally:
             self._file.close()
 
-    def _write(self, topic: str, message: _Message, at: _At | FrameEvent) -> None:
+    def _write(self, topic: str, message: _Message, at: FrameEvent | RecordedStill) -> None:
         if self._file.closed:
             return
         # What no timestamp can hold is held at its end: times come from the wire.

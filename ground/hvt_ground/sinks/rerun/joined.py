@@ -6,15 +6,15 @@
 from __future__ import annotations
 
 import argparse
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-from rerun.chunk import Chunk, RrdReader
+from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError, check_not_read, exit_with_sentence
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.blueprint import comparison
+from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
 _FLUSH_S = 10.0
@@ -49,14 +49,10 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
 def _read(path: Path) -> tuple[str, list[Chunk]]:
     # The edge's id, and everything but the file's own entities.
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that there is no footer
-            reader = RrdReader(path)
-        application = reader.recordings()[0].application_id
-        chunks = [one for one in reader.stream() if not one.entity_path.startswith("/__")]
-    except (OSError, RuntimeError, ValueError, IndexError) as error:
+        reader = open_rrd(path)
+        return id_of(reader).edge, [one for one in reader.stream() if not one.entity_path.startswith("/__")]
+    except (OSError, RuntimeError, ValueError) as error:
         raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
-    return application.removeprefix("hvt-"), chunks
 
 
 def main(argv: Sequence[str] | None = None) -> int:

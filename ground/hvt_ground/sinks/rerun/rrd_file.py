@@ -120,7 +120,7 @@ class RrdFile:
         try:
             recording.save(scratch)
             send_blueprint(recording, self._id, self._screen)
-            for chunk in _chunks(self.path):
+            for chunk in open_rrd(self.path).stream():
                 if hurry and hurry.is_set():
                     return
                 recording.send_chunks([chunk])
@@ -161,11 +161,18 @@ class RrdFile:
         self.size_bytes = end
 
 
-def _chunks(path: Path) -> Iterator[Chunk]:
+def open_rrd(path: Path) -> RrdReader:
+    """A reader of a file, which may be none of ours; of one with or without a footer."""
     with _filters, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that there is no footer
-        reader = RrdReader(path)
-    yield from reader.stream()
+        return RrdReader(path)
+
+
+def id_of(reader: RrdReader) -> RecordingId:
+    """Whose recording it is; `ValueError` where that is not one recording's."""
+    (entry,) = reader.recordings()
+    edge = entry.application_id.removeprefix("hvt-")
+    return RecordingId(edge, entry.recording_id.removeprefix(f"{edge}-"))
 
 
 def _messages(stream: bytes) -> bytes:
