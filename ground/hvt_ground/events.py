@@ -123,11 +123,11 @@ class Overlay:
     def take(self, rows: npt.NDArray[np.intp]) -> Overlay:
         """Those tracks alone; without places."""
         each = {name: getattr(self, name) for name in _OF_TRACKS}
-        kept: dict[str, Any] = {
+        chosen: dict[str, Any] = {
             name: one[rows] if isinstance(one, np.ndarray) else tuple(one[row] for row in rows.tolist())
             for name, one in each.items()
         }
-        return replace(self, **kept)
+        return replace(self, **chosen)
 
     @property
     def words(self) -> tuple[str, ...]:
