@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"demo: a process ended with code {code}: see {FOLDER}/*.log", file=sys.stderr)
         return code
     recordings = [next(FOLDER.glob(f"hvt-{name}-*.rrd")) for name in EDGES]
-    join = [sys.executable, "-m", "hvt_ground.sinks.rerun.joined", *recordings, "--out", arguments.out]
+    join = [sys.executable, "-m", "hvt_archive.joined", *recordings, "--out", arguments.out]
     join += ["--size", arguments.size]
     subprocess.run(join, check=True)
     settings = {"--seed": arguments.seed, "--picture": arguments.picture}

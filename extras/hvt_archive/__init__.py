@@ -1,4 +1,5 @@
 """What comes after the recording: an `index` of a folder, `exports` for other programs, `replay` with other models.
 
-`reading` opens recordings for the others, `local_copy` is the edge's own. Nothing of the ground imports one.
+`reading` opens recordings for the others, `joined` makes one of several, `screenshot` a picture; `local_copy` is the
+edge's own. Nothing of the ground imports one.
 """

@@ -24,13 +24,13 @@ from motmetrics.io import loadtxt
 
 import hvt_ground.cli
 from hvt_archive.exports.whole import whole_file
+from hvt_archive.joined import join_recordings
 from hvt_common.errors import UserError
 from hvt_common.units import Limit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks.palette import GREY, SKY
-from hvt_ground.sinks.rerun.joined import join_recordings
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs.rrd import Recording

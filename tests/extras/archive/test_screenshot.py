@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from hvt_archive.screenshot import main, screenshot
 from hvt_common.errors import UserError
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.rerun.screenshot import main, screenshot
 from media.recorded_feed import coded, drawn_frames, session
 
 needs_viewer = pytest.mark.skipif(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from hvt_archive.joined import join_recordings
 from hvt_common.errors import UserError
 from hvt_ground.events import Notice
-from hvt_ground.sinks.rerun.joined import join_recordings
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from programs.rrd import Recording
 

@@ -1,6 +1,6 @@
 """Several recordings as one that opens on their base pictures beside each other, each with a tab of its own.
 
-``python -m hvt_ground.sinks.rerun.joined A.rrd B.rrd … --out ALL.rrd``: for flights of the same scene.
+``python -m hvt_archive.joined A.rrd B.rrd … --out ALL.rrd``: for flights of the same scene.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _read(path: Path) -> tuple[str, list[Chunk]]:
 def main(argv: Sequence[str] | None = None) -> int:
     """The command line; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="hvt_ground.sinks.rerun.joined", description="Several recordings as one, beside each other."
+        prog="hvt_archive.joined", description="Several recordings as one, beside each other."
     )
     parser.add_argument("recordings", type=Path, nargs="+", help=".rrd files, one an edge")
     parser.add_argument("--out", type=Path, required=True, help="the .rrd to write")
@@ -71,4 +71,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(exit_with_sentence(main, program="hvt_ground.sinks.rerun.joined", argv=None))
+    raise SystemExit(exit_with_sentence(main, program="hvt_archive.joined", argv=None))

@@ -1,4 +1,4 @@
-"""A picture of a recording's screen, without a screen: ``python -m hvt_ground.sinks.rerun.screenshot FILE.rrd``.
+"""A picture of a recording's screen, without a screen: ``python -m hvt_archive.screenshot FILE.rrd``.
 
 Needs what the viewer needs: a Vulkan driver (Mesa's software one will do; Debian: mesa-vulkan-drivers) and, for HEVC,
 ``ffmpeg`` on the PATH (5.1 or later).
@@ -78,7 +78,7 @@ def _without_menu(png: bytes) -> bytes:
 def main(argv: Sequence[str] | None = None) -> int:
     """The command line; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="hvt_ground.sinks.rerun.screenshot", description="A picture of a recording's screen."
+        prog="hvt_archive.screenshot", description="A picture of a recording's screen."
     )
     parser.add_argument("recording", type=Path, help="an .rrd file")
     parser.add_argument("--frame", type=int, default=0, help="value of the frame timeline (default 0)")
@@ -91,4 +91,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(exit_with_sentence(main, program="hvt_ground.sinks.rerun.screenshot", argv=None))
+    raise SystemExit(exit_with_sentence(main, program="hvt_archive.screenshot", argv=None))
