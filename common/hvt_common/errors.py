@@ -126,6 +126,15 @@ def check_not_read(path: Path, reads: Iterable[Path], *, name: str) -> None:
             raise UserError(f"{name} {path} is {one} itself, which is read: name another file")
 
 
+@contextmanager
+def telling(what: str, rest: str = "") -> Iterator[None]:
+    """Of an `OSError` make a `UserError`: ``what``, the system's reason, and the ``rest`` of the sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{what}{error.strerror}{rest}") from error
+
+
 def check_apart(files: Iterable[tuple[str, Path | None]]) -> None:
     """Raise `UserError` where two of the (name, path), which are to be written, are one file.
 

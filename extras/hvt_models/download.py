@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from hvt_common import __version__
-from hvt_common.errors import UserError
+from hvt_common.errors import telling
 
 Progress = Callable[[int], None]
 """Gets the bytes that are there so far; they may become fewer when a server starts over."""
@@ -121,12 +121,8 @@ def _start_of(url: str, response: http.client.HTTPResponse, *, offset: int, size
 
 
 def _opened(part: Path, start: int) -> BinaryIO:
-    try:
+    with telling(f"{part} cannot be written (", "): free space, or set HVT_MODELS"):
         return cast("BinaryIO", part.open("ab" if start else "wb"))
-    except OSError as error:
-        raise UserError(
-            f"{part} cannot be written ({error.strerror}): free space, or set HVT_MODELS"
-        ) from error
 
 
 def _copy(
@@ -137,13 +133,10 @@ def _copy(
         held += len(chunk)
         if held > size_bytes:
             raise DownloadError(f"{response.url} sends more than the {size_bytes} bytes that are pinned")
-        try:
+        rest = f"): free {size_bytes - held} bytes, or set HVT_MODELS"
+        with telling(f"{file.name} cannot be written (", rest):
             file.write(chunk)
             file.flush()
-        except OSError as error:
-            raise UserError(
-                f"{file.name} cannot be written ({error.strerror}): free {size_bytes - held} bytes, or set HVT_MODELS"
-            ) from error
         progress(held)
     if held < size_bytes:
         raise _InterruptedError(f"broke off after {held} of {size_bytes} bytes")

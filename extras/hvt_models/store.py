@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hvt_common.errors import UserError, named_path
+from hvt_common.errors import UserError, named_path, telling
 from hvt_common.files import read_text
 from hvt_models.manifest import (
     MAX_SIZE_BYTES,
@@ -43,11 +43,8 @@ def cache_folder() -> Path:
 
 def file_digest(path: Path) -> str:
     """SHA-256 of a file in 64 hexadecimal digits. Raises `UserError` where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise UserError(f"model file {path} cannot be read ({error.strerror})") from error
+    with telling(f"model file {path} cannot be read (", ")"), path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 class Store:
@@ -240,11 +237,9 @@ class Store:
             entries = {**self._added(), entry.name: entry}
             tables = {name: _table(one) for name, one in entries.items()}
             scratch = file.with_name(f"{_ADDED}.part")
-            try:
+            with telling(f"{file} cannot be written (", ")"):
                 scratch.write_text(tomli_w.dumps(tables), encoding="utf-8")
                 scratch.replace(file)
-            except OSError as error:
-                raise UserError(f"{file} cannot be written ({error.strerror})") from error
 
     def _part(self, path: Path, file: PinnedFile) -> Path:
         # The digest is in the name: what was fetched for one pin is never carried on for another.
@@ -254,7 +249,7 @@ class Store:
     def _lock(self, name: str, on_wait: Callable[[], None] = lambda: None) -> Iterator[None]:
         import filelock  # noqa: PLC0415 - as above
 
-        try:
+        with telling(f"models folder {self.folder} cannot be written (", "): set HVT_MODELS to one that can"):
             self.folder.mkdir(parents=True, exist_ok=True)
             lock = filelock.FileLock(self.folder / f".{name}.lock")
             try:
@@ -262,10 +257,6 @@ class Store:
             except filelock.Timeout:
                 on_wait()
                 lock.acquire()
-        except OSError as error:
-            raise UserError(
-                f"models folder {self.folder} cannot be written ({error.strerror}): set HVT_MODELS to one that can"
-            ) from error
         try:
             yield
         finally:
@@ -321,22 +312,21 @@ def _from_address(
 
 
 def _copy_file(source: Path, target: Path) -> None:
-    try:
-        with source.open("rb") as read, target.open("wb") as write:
-            while chunk := read.read(_CHUNK_BYTES):
-                write.write(chunk)
-    except OSError as error:
-        raise UserError(f"{source} cannot be copied to {target} ({error.strerror})") from error
+    with (
+        telling(f"{source} cannot be copied to {target} (", ")"),
+        source.open("rb") as read,
+        target.open("wb") as write,
+    ):
+        while chunk := read.read(_CHUNK_BYTES):
+            write.write(chunk)
 
 
 def _put_in_place(part: Path, path: Path) -> None:
     # Give the whole file its name, in one step and for good.
-    try:
+    with telling(f"{path} cannot be written (", ")"):
         with part.open("rb") as file:
             os.fsync(file.fileno())
         part.replace(path)
-    except OSError as error:
-        raise UserError(f"{path} cannot be written ({error.strerror})") from error
 
 
 def _table(entry: ModelEntry) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from typing import Self, TypeVar
 import cv2
 import zenoh
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, telling
 from hvt_common.protocol.channels import Channel, EdgeKeys, parse_key, selector
 from hvt_common.protocol.messages import (
     Command,
@@ -93,10 +93,8 @@ class RequestedStill:
         if path.suffix.lower() == ".png" or self.header.codec != "jpeg":
             options = [] if path.suffix.lower() == ".png" else [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY_PCT]
             data = cv2.imencode(path.suffix.lower(), self.image_bgr, options)[1].tobytes()
-        try:
+        with telling(f"{path} cannot be written (", "): name a file that can"):
             path.write_bytes(data)
-        except OSError as error:
-            raise UserError(f"{path} cannot be written ({error.strerror}): name a file that can") from None
 
 
 def check_suffix(path: Path) -> None:

@@ -20,7 +20,7 @@ from typing import BinaryIO
 
 import msgpack
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, telling
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES, READ_VERSIONS, Info, WireError
 from hvt_common.runtime.statistics import Newest
@@ -79,13 +79,9 @@ class MessageLog(SinkWriter[Received]):
         self._append(record)
 
     def _begin_anew(self) -> None:
-        try:
+        with telling(f"message log {self.path} cannot be written any further: "):
             check_there(self._file.fileno(), self.path)
             self.path.replace(self.before)
-        except OSError as error:
-            raise UserError(
-                f"message log {self.path} cannot be written any further: {error.strerror}"
-            ) from error
         self._file.close()
         self._file = _created(self.path)
         for answer in self._answers.values():
@@ -120,12 +116,10 @@ def _is_info(payload: bytes) -> bool:
 
 
 def _created(path: Path) -> BinaryIO:
-    try:
+    with telling(f"message log {path} cannot be created: "):
         file = path.open("wb", buffering=0)
         file.write(_MAGIC)
-    except OSError as error:
-        raise UserError(f"message log {path} cannot be created: {error.strerror}") from None
-    return file
+        return file
 
 
 def read_log(path: Path) -> Iterator[Received]:
@@ -134,18 +128,15 @@ def read_log(path: Path) -> Iterator[Received]:
     Raises:
         UserError: it cannot be read, or is no message log.
     """
-    try:
-        with path.open("rb") as file:
-            if file.read(len(_MAGIC)) != _MAGIC:
-                raise UserError(f"{path} is no message log of hvt-ground --log")
+    with telling(f"message log {path} cannot be read: "), path.open("rb") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise UserError(f"{path} is no message log of hvt-ground --log")
+        end = file.tell()
+        while (item := _read(file)) is not None:
             end = file.tell()
-            while (item := _read(file)) is not None:
-                end = file.tell()
-                yield item
-            if left := os.fstat(file.fileno()).st_size - end:
-                _say_broken(path, left)
-    except OSError as error:
-        raise UserError(f"message log {path} cannot be read: {error.strerror}") from None
+            yield item
+        if left := os.fstat(file.fileno()).st_size - end:
+            _say_broken(path, left)
 
 
 @cache

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, telling
 
 CA_DAYS = 3650
 MACHINE_DAYS = 825
@@ -126,10 +126,8 @@ class Authority:
         """Delete the files of a machine. A copy elsewhere still holds: only rules without its name end it."""
         for suffix in ("key", "pem", "json5"):
             path = self.folder / f"{name}.{suffix}"
-            try:
+            with telling(f"{path} cannot be deleted (", ")"):
                 path.unlink(missing_ok=True)
-            except OSError as error:
-                raise UserError(f"{path} cannot be deleted ({error.strerror})") from None
 
 
 def _dated(
@@ -150,10 +148,8 @@ def _host(text: str) -> x509.GeneralName:
 
 
 def _make_folder(folder: Path) -> None:
-    try:
+    with telling(f"the folder {folder} cannot be made (", ")"):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"the folder {folder} cannot be made ({error.strerror})") from None
 
 
 def _write_pair(

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hvt_common.errors import Parser, UserError, needs_extra
+from hvt_common.errors import Parser, UserError, needs_extra, telling
 from hvt_common.runtime.reporting import say
 from hvt_fleet.pki.roster import GroundMember, Roster, RouterMember
 from hvt_fleet.pki.zenoh_files import KEYS_FOLDER, edge_file, ground_file, router_file
@@ -111,12 +111,10 @@ def _write_files(roster: Roster, folder: Path, *, given: Mapping[str, str]) -> l
     changed = []
     for name, text in files.items():
         path = folder / f"{name}.json5"
-        try:
+        with telling(f"{path} cannot be written (", ")"):
             if path.exists() and path.read_text(encoding="utf-8") == text:
                 continue
             path.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise UserError(f"{path} cannot be written ({error.strerror})") from None
         changed.append(name)
     return changed
 

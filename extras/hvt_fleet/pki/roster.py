@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, telling
 from hvt_common.protocol.channels import EdgeKeys, check_edge_pattern, matches
 
 _FILE = "fleet.json"
@@ -76,11 +76,9 @@ class Roster:
         """Write it into the folder."""
         path = folder / _FILE
         fresh = path.with_name(_FILE + ".new")
-        try:
+        with telling(f"{path} cannot be written (", ")"):
             fresh.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
             fresh.replace(path)
-        except OSError as error:
-            raise UserError(f"{path} cannot be written ({error.strerror})") from None
 
     @property
     def names(self) -> dict[str, str]:

@@ -24,7 +24,7 @@ from foxglove_schemas_protobuf.TextAnnotation_pb2 import TextAnnotation
 from google.protobuf.timestamp_pb2 import Timestamp
 from mcap_protobuf.writer import Writer
 
-from hvt_common.errors import UserError
+from hvt_common.errors import telling
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
 from hvt_gateways.decodable import DecodableRun
@@ -51,11 +51,9 @@ class McapFile(SinkWriter[Event]):
         self.path: Path = path
         self._edge = edge
         self._run = DecodableRun()
-        try:
+        with telling(f"MCAP file {path} cannot be created: "):
             self._file: BinaryIO = path.open("wb")
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
-        except OSError as error:
-            raise UserError(f"MCAP file {path} cannot be created: {error.strerror}") from None
 
     def log(self, item: Event | RecordedStill) -> None:
         """Write events that have a schema, and stills that were read back; ignore the rest."""
@@ -87,12 +85,8 @@ class McapFile(SinkWriter[Event]):
         """Write index and footer, and close."""
         if self._file.closed:
             return
-        try:
+        with self._file, telling(f"MCAP file {self.path} cannot be finished: "):
             self._writer.finish()  # type: ignore[no-untyped-call]
-        except OSError as error:
-            raise UserError(f"MCAP file {self.path} cannot be finished: {error.strerror}") from error
-        finally:
-            self._file.close()
 
     def _write(self, topic: str, message: _Message, at: FrameEvent | RecordedStill) -> None:
         if self._file.closed:
@@ -104,7 +98,7 @@ class McapFile(SinkWriter[Event]):
             message.frame_id = self._edge
         elif isinstance(message, Log):
             message.name = self._edge
-        try:
+        with telling(f"MCAP file {self.path} cannot be written any further: "):
             check_there(self._file.fileno(), self.path)
             self._writer.write_message(
                 f"/{self._edge}/{topic}",
@@ -114,10 +108,6 @@ class McapFile(SinkWriter[Event]):
                 sequence=max(0, at.frame_index) & 0xFFFFFFFF,
             )
             self._file.flush()  # nothing to do but after a chunk
-        except OSError as error:
-            raise UserError(
-                f"MCAP file {self.path} cannot be written any further: {error.strerror}"
-            ) from error
 
 
 def _location(pose: Pose) -> LocationFix:

@@ -17,7 +17,7 @@ from urllib.parse import SplitResult, parse_qs, urlsplit
 import av
 import av.error
 
-from hvt_common.errors import UserError, named_path
+from hvt_common.errors import UserError, named_path, telling
 from hvt_common.runtime.host_names import is_group
 from hvt_ground.sinks.line_file import check_there
 
@@ -194,22 +194,16 @@ class StreamFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
-        try:
+        with telling(f"MPEG-TS file {path} cannot be created: "):
             self._file = os.open(path, flags, 0o644)
-        except OSError as error:
-            raise UserError(f"MPEG-TS file {path} cannot be created: {error.strerror}") from None
 
     def write(self, data: bytes) -> int:
         """See `Output.write`."""
         left = memoryview(data)
-        try:
+        with telling(f"MPEG-TS file {self._path} cannot be written any further: "):
             check_there(self._file, self._path)
             while left:
                 left = left[os.write(self._file, left) :]
-        except OSError as error:
-            raise UserError(
-                f"MPEG-TS file {self._path} cannot be written any further: {error.strerror}"
-            ) from error
         return len(data)
 
     def close(self) -> None:

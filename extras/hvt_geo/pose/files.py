@@ -22,7 +22,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, telling
 from hvt_common.files import decoded, read_bytes
 from hvt_common.geodesy import turned_deg
 from hvt_common.units import SECOND_NS
@@ -84,10 +84,8 @@ def read_poses(path: Path, *, hfov_deg: float | None) -> PoseTable:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise UserError(f"pose file {path} is none of .csv, .srt (DJI) or .gpx")
-    try:
+    with telling(f"pose file {path} cannot be read: "):
         text = _text(read_bytes(path, most=_MOST_BYTES))
-    except OSError as error:
-        raise UserError(f"pose file {path} cannot be read: {error.strerror}") from None
     try:
         poses = _good(reader(text, path), path)
     except csv.Error as error:

@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hvt_common.errors import UserError
+from hvt_common.errors import telling
 from hvt_common.units import utc_text
 from hvt_ground.events import Event, MessageTiming, Overlay, Places, Refinement, StillsRead
 from hvt_ground.sinks.contract import Sink, SinkWriter
@@ -95,10 +95,8 @@ class StillFiles(_EventTable):
         picture = picture_of(item, self.path)
         if item.still_sequence != self._last:
             _, data = cv2.imencode(".png", item.still_bgr)
-            try:
+            with telling(f"still {picture} cannot be written: "):
                 picture.write_bytes(data.tobytes())
-            except OSError as error:
-                raise UserError(f"still {picture} cannot be written: {error.strerror}") from error
             self._last = item.still_sequence
         self._append(_still_row(item, picture.name))
 

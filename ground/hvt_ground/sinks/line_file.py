@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, telling
 from hvt_ground.sinks.contract import SinkWriter
 
 
@@ -52,10 +52,8 @@ class LineFile(SinkWriter[str]):
         self.path: Path = path
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
         self._size_bytes, fresh = 0, has_nothing(path)
-        try:
+        with telling(f"table {path} cannot be created: "):
             self._file = os.open(path, flags, 0o644)
-        except OSError as error:
-            raise UserError(f"table {path} cannot be created: {error.strerror}") from None
         try:
             self.log(",".join(columns) + "\n")
         except UserError:

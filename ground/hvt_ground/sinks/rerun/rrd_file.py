@@ -28,7 +28,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import Chunk, RrdReader
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, telling
 from hvt_ground.sinks.line_file import check_there, has_nothing
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
@@ -228,10 +228,8 @@ def _created(path: Path) -> int:
     if not path.parent.is_dir():
         raise UserError(f"recording {path} cannot be created: its folder {path.parent} does not exist")
     for _ in range(_LOCK_TRIES):
-        try:
+        with telling(f"recording {path} cannot be created: "):
             file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        except OSError as error:
-            raise UserError(f"recording {path} cannot be created: {error.strerror}") from error
         # Whoever looks through the folder removes empty files that nobody has locked: this one perhaps, just now.
         if _locked(file) and os.fstat(file).st_nlink:
             if os.fstat(file).st_size:
