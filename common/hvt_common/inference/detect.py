@@ -147,10 +147,9 @@ def detect_every(given: int | None, *, fps: float) -> int:
     return given or min(5, max(1, round(fps / 3)))
 
 
-def detect_still_every(given: int | None, *, fps: float, lockstep: bool) -> int:
-    """The same while the picture is still (`ByteTracker.still`): one a second, but as given, and in lockstep."""
-    every = detect_every(given, fps=fps)
-    return every if given or lockstep else max(every, round(fps))
+def detect_still_every(given: int | None, *, fps: float) -> int:
+    """The most, while nothing is seen that was not predicted (`ByteTracker.is_due`): a second, or as given."""
+    return given or max(detect_every(None, fps=fps), round(fps))
 
 
 def warm_up(detector: FailingDetector, size: tuple[int, int]) -> None:

@@ -40,6 +40,9 @@ _LONGEST_S: Final = 10.0
 """After so long without a detection the last one tells nothing of the picture now."""
 _LEAST_DETECTIONS: Final = 3
 """Detections that a lost track is remembered for, where they are further apart than the buffer is long."""
+_AS_PREDICTED_IOU: Final = 0.5
+_MOST_SURPRISES: Final = 0.1
+"""Tracks elsewhere than predicted or not found, and what may start new ones, as a share of the tracks."""
 
 # Box lengths; wider, and neighbours in a queue of cars are taken for each other.
 _MOST_GROWTH: Final = 0.75
@@ -160,19 +163,25 @@ class ByteTracker:
         """Frames from one update to the next, of the last ones."""
         self._searched: _Searched | None = None
         self._next_id = 1
+        self._steady = 0
+        """So many updates in a row found nearly all as predicted."""
         self.scene_began = -1
         """The newest frame that another scene began with, where the camera is followed; -1 before any."""
         if self._camera is not None:
             self._camera.reset()
 
-    @property
-    def still(self) -> bool:
-        """Whether the newest frame shows what the last update saw, and that left nothing to be confirmed.
+    def is_due(self, frames: int, *, every: int, most: int) -> bool:
+        """Whether the newest frame, so many after the one searched last, is to be searched.
 
-        False where the camera is not followed.
+        That is each ``every`` frames while something is to be confirmed; else twice or three times as many, up to
+        ``most``, after updates that found nearly all as predicted, and ``most`` while the newest frame shows what the
+        last update saw.
         """
-        confirmed = not (self._table.phase == UNCONFIRMED).any()
-        return self._camera is not None and confirmed and self._camera.still()
+        if (self._table.phase == UNCONFIRMED).any():
+            return frames >= every
+        if frames < max(every, min(most, (1 + min(2, self._steady)) * every)):
+            return False
+        return frames >= most or self._camera is None or not self._camera.still()
 
     def update(self, detections: Detections, *, frame_index: int, image_bgr: Image | None = None) -> Tracks:
         """The tracks at a frame that a detector has searched; boxes in base pixels.
@@ -210,6 +219,7 @@ class ByteTracker:
         self._forget_stale(frame_index)
         self._widen_for(seen)
         match, free = self._match(seen, frame_index, growth=self._growth(frame_index))
+        self._steady = self._steady + 1 if self._as_predicted(seen, match, free) else 0
         self._updated_index = frame_index
         self._correct(seen, match, frame_index, gap=gap)
         retained = self._retire(match, frame_index)
@@ -346,6 +356,14 @@ class ByteTracker:
                 pair(self._fused(wide, seen), match < 0, free, match, limit=limit)
         free &= seen.confidences >= settings.birth_confidence
         return match, free.nonzero()[0]
+
+    def _as_predicted(self, seen: TrackerInput, match: _Indices, free: _Indices) -> bool:
+        tracked = self._table.phase == TRACKED
+        rows = (tracked & (match >= 0)).nonzero()[0]
+        shared = overlaps(kalman.boxes_of(self._table.states[rows]), seen.boxes[match[rows]]).diagonal()
+        count = int(tracked.sum())
+        surprises = count - int((shared >= _AS_PREDICTED_IOU).sum()) + len(free)
+        return count > 0 and surprises <= _MOST_SURPRISES * count
 
     def _held(self, frame_index: int) -> _Floats:
         # The last boxes, moved with the camera alone: meanwhile a vehicle may have stopped.

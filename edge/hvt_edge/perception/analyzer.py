@@ -50,7 +50,7 @@ class Analyzer:
     ``candidates`` says on which pixels the detector runs and the tracker follows the camera. Of the source means
     before it is coded, at the finer of its two sizes: a source that the base enlarges is analyzed enlarged, as by the
     ground's detector, which finds less in fewer pixels. ``detect_every`` source frames are from one detection to the
-    next, see `analyze` for streams that code fewer; ``detect_still_every``, no fewer, while the picture is still.
+    next, see `analyze` for streams that code fewer; up to ``detect_still_every`` while nothing changes.
 
     While the detector gives None the tracks are carried on. ``trust`` is told what it finds. ``search`` finds the
     scale; without it that is as given. A detection that is due waits until ``cpu_budget`` admits it; decoding and
@@ -181,11 +181,11 @@ class Analyzer:
     def _due(self, index: int, *, coded: bool) -> bool:
         # Whether the detector is to run on this frame. By frame counts alone, never by a clock.
         every, last = self.detect_every, self._detected_index
-        rested = last is None or index - last >= every
-        new_scene = last is not None and self._tracker.scene_began > last
-        if rested and last is not None and index - last < self._still_every:
-            rested = not self._tracker.still
-        rested = rested or new_scene
+        rested = (
+            last is None
+            or self._tracker.scene_began > last
+            or self._tracker.is_due(index - last, every=every, most=self._still_every)
+        )
         since_coded = 0 if self._coded_index is None else index - self._coded_index
         sparse = max(self._coded_gap, since_coded) > every
         if coded:

@@ -102,7 +102,7 @@ def make_analyzer(
     cpu_budget: CpuBudget | None = None,
 ) -> Analyzer:
     """Decoder, detector and tracker of the edge's own stream; without ``cpu_budget`` of a trial, unlimited."""
-    steady = cpu_budget is None or config.pace == "lockstep"
+    still_every = detect_still_every(config.detect_every, fps=config.nominal_fps)
     settings = TrackerSettings.starting_at(
         track_confidence(config), camera_motion=cast('Literal["off", "flow"]', config.camera_motion)
     )
@@ -112,7 +112,7 @@ def make_analyzer(
         view=view,
         detect_every=detect_every(config.detect_every, fps=config.nominal_fps),
         candidates=cast('Literal["decoded", "source"]', config.candidates),
-        detect_still_every=detect_still_every(config.detect_every, fps=config.nominal_fps, lockstep=steady),
+        detect_still_every=0 if cpu_budget is None else still_every,
         trust=trust,
         search=_scale_search(config, detector),
         cpu_budget=cpu_budget,

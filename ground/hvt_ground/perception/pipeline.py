@@ -109,7 +109,7 @@ class NothingPerceived:
 class Pipeline:
     """One session's perception. Used by one thread; ``emit`` takes the events.
 
-    Detections are at least ``detect_every`` frames apart, while the picture is still ``detect_still_every``.
+    Detections are at least ``detect_every`` frames apart, up to ``detect_still_every`` while nothing changes.
     """
 
     def __init__(
@@ -338,12 +338,13 @@ class Pipeline:
                 return False
             self._detected_frame = index
             return True
-        frames = None if last is None else index - last
         every = self._detect_every if parts.search is None else parts.search.interval(self._detect_every)
-        due = frames is None or frames >= (_PUT_OFF if hurry else 1) * every
-        if due and frames is not None and frames < self._detect_still_every:
-            due = not parts.tracker.still
-        due = due or (last is not None and parts.tracker.scene_began > last)
+        every *= _PUT_OFF if hurry else 1
+        due = (
+            last is None
+            or parts.tracker.scene_began > last
+            or parts.tracker.is_due(index - last, every=every, most=self._detect_still_every)
+        )
         if due:
             self._detected_frame = index
             self._due_ns = picture.capture_ns

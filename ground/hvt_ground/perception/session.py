@@ -82,9 +82,7 @@ class SessionPerception:
             view=info.view,
             fps=info.fps,
             detect_every=self._detect_every,
-            detect_still_every=detect_still_every(
-                config.detect_every, fps=info.fps, lockstep=info.pace == "lockstep"
-            ),
+            detect_still_every=detect_still_every(config.detect_every, fps=info.fps),
             emit=emit,
         )
 

@@ -453,9 +453,34 @@ def test_what_is_found_late_counts_as_if_it_had_been_found_at_once(late: int) ->
             assert waited.update_late(searched).frame_index == k - late
             for name, column in asdict(at_once.extrapolated(frame_index=k)).items():
                 np.testing.assert_array_equal(getattr(waited.extrapolated(frame_index=k), name), column)
-            assert waited.still == at_once.still
+            for frames in range(4, 16):
+                due = [one.is_due(frames, every=5, most=15) for one in (waited, at_once)]
+                assert due[0] == due[1]
     with pytest.raises(ValueError, match="no frame is being searched"):
         waited.update_late(Detections.none())
+
+
+def test_what_goes_on_as_predicted_is_searched_less_often_until_something_is_new_or_missed() -> None:
+    """Half of the processor would go into what is known; or a car that drives in be listed seconds later."""
+    tracker = ByteTracker(TrackerSettings(), fps=15)
+
+    at = 0
+
+    def first_due(*boxes: tuple[float, ...]) -> int:
+        nonlocal at
+        tracker.update(seen(*boxes), frame_index=at)
+        assert tracker.is_due(5, every=5, most=5), "as given"
+        frames = next(n for n in range(1, 99) if tracker.is_due(n, every=5, most=12))
+        at += frames
+        return frames
+
+    def cars(number: int) -> list[tuple[float, ...]]:
+        return [(2 * at, 60 * k, 2 * at + 40, 60 * k + 40) for k in range(number)]  # they drive on
+
+    assert [first_due(*cars(12)) for _ in range(3)] == [5, 10, 12]
+    assert [first_due(*cars(13)) for _ in range(2)] == [5, 12], "one more is confirmed soon"
+    assert [first_due(*cars(10)) for _ in range(3)] == [5, 10, 12], "three are gone"
+    assert [first_due() for _ in range(2)] == [5, 5], "nothing is known"
 
 
 def test_a_detector_that_hangs_takes_no_more_memory_with_each_frame() -> None:
