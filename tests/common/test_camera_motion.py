@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -115,7 +116,9 @@ def test_a_cut_to_another_scene_is_no_motion() -> None:
     """After a cut, chance matches would be taken for a camera movement."""
     rng, motion = np.random.default_rng(1), CameraMotion()
     for _ in range(4):
-        noise = cv2.GaussianBlur(rng.integers(0, 255, (180, 320, 3)).astype(np.uint8), (0, 0), 2)
+        noise = cv2.GaussianBlur(rng.integers(0, 255, (180, 320, 3)).astype(np.uint8), (0, 0), 2).astype(
+            np.uint8
+        )
         np.testing.assert_array_equal(motion.step(noise), np.eye(2, 3))
 
 
@@ -139,7 +142,7 @@ def test_warp_moves_boxes_as_the_picture_moves() -> None:
     )
 
 
-def follow(ground: np.ndarray, *, camera_motion: str, every: int) -> list[list[int]]:
+def follow(ground: np.ndarray, *, camera_motion: Any, every: int) -> list[list[int]]:
     """The ids listed at each frame for six parked cars under a shaking camera."""
     rng = np.random.default_rng(4)
     world = np.array([[420, 200], [500, 260], [600, 240], [460, 350], [560, 330], [650, 310]], float)
@@ -184,7 +187,7 @@ def test_where_another_scene_begins_all_tracks_end() -> None:
         image = np.clip(3 * (scene.astype(float) - 110) + rng.normal(0, 2, scene.shape), 0, 255).astype(
             np.uint8
         )
-        known = {"frame_index": k, "image_bgr": image}
+        known: dict[str, Any] = {"frame_index": k, "image_bgr": image}
         tracks = tracker.update(seen, **known) if searched else tracker.predict(**known)
         listed.append(tracks.ids.tolist())
     assert listed == [[1]] * 6 + [[]] * 2 + [[2]] * 4

@@ -144,7 +144,7 @@ def send(endpoint: str, device: str, links: str) -> None:
     if device != "lo":
         _segment_in_software(device)
     rows = []
-    with open_session(LinkSettings("edge", connect=(endpoint,), links=int(links))) as session:
+    with open_session(LinkSettings("edge", connect=(endpoint,), links=2 if links == "2" else 1)) as session:
         publisher = declare_publisher(session, Channel.BASE, keys=KEYS)
         while not publisher.matching_status.matching:
             time.sleep(0.01)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -194,7 +195,7 @@ def test_the_real_network_knows_a_flower_and_a_dragonfly(data: Path) -> None:
     classifier = open_classifier(
         str(data / "models/mobilenet_v2_imagenet.onnx"), labels=data / "models/imagenet_labels_1001.txt"
     )
-    crops = [cv2.imread(str(data / f"classify_{name}.bmp")) for name in ("sunflower", "dragonfly")]
+    crops: list[Any] = [cv2.imread(str(data / f"classify_{name}.bmp")) for name in ("sunflower", "dragonfly")]
     flower, dragonfly = classifier.classify(crops)
     assert (flower.class_name, dragonfly.class_name) == ("daisy", "dragonfly")
     assert min(flower.confidence, dragonfly.confidence) > 0.9

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -210,7 +211,7 @@ def test_the_border_is_grey_114() -> None:
     anchor=st.sampled_from(["top-left", "centre"]),
 )
 def test_the_letterbox_holds_the_image_and_maps_back(
-    width: int, height: int, cells_x: int, cells_y: int, anchor: str
+    width: int, height: int, cells_x: int, cells_y: int, anchor: Any
 ) -> None:
     """A panorama or a sliver would crash the detector or lose its boxes."""
     size = (cells_x * 32, cells_y * 32)
@@ -243,13 +244,9 @@ def test_odd_images_do_not_crash(
 
 def test_what_is_no_image_is_a_bug() -> None:
     """An empty crop would be stretched into a phantom."""
-    for wrong in (
-        np.zeros((0, 4, 3), np.uint8),
-        np.zeros((4, 4, 3), np.float32),
-        np.zeros((4, 4, 2), np.uint8),
-    ):
+    for shape, kind in (((0, 4, 3), np.uint8), ((4, 4, 3), np.float32), ((4, 4, 2), np.uint8)):
         with pytest.raises(ValueError, match="image"):
-            as_bgr(wrong)
+            as_bgr(np.zeros(shape, kind))
 
 
 # --- suppression ---------------------------------------------------------------------------------------------------
@@ -398,7 +395,7 @@ def test_what_is_no_detector_is_refused_in_one_sentence(tmp_path: Path) -> None:
         ({"size": (32, 64)}, "32x64 does not fit"),
     ],
 )
-def test_settings_out_of_range_are_refused(tmp_path: Path, setting: dict[str, object], words: str) -> None:
+def test_settings_out_of_range_are_refused(tmp_path: Path, setting: dict[str, Any], words: str) -> None:
     """A mistyped number would silently detect nothing."""
     path = str(colour_detector(tmp_path / "m.onnx", "yolox"))
     with pytest.raises(UserError, match=words):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import cv2
 import numpy as np
@@ -120,7 +121,7 @@ def test_what_is_seen_aslant(data, name):
     detector = open_detector(EMBEDDED_DETECTOR, confidence=default_confidence(EMBEDDED_DETECTOR))
     found = 0
     for frame, _, x, y, width, height in labels[:, :6]:
-        picture = cv2.imread(str(folder / "img1" / f"{int(frame):06d}.jpg"))
+        picture: Any = cv2.imread(str(folder / "img1" / f"{int(frame):06d}.jpg"))
         scale = min(1280 / picture.shape[1], 720 / picture.shape[0])
         boxes = detector.detect(cv2.resize(picture, None, fx=scale, fy=scale)).boxes_xyxy_px / scale
         truth = np.array([[x, y, x + width, y + height]], np.float32)

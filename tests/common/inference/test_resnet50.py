@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -179,7 +180,7 @@ def test_a_batch_of_crops_is_one_call(resnet: Path) -> None:
     shapes: list[tuple[int, ...]] = []
     run = classifier.model.run
     classifier.model.run = lambda feed: shapes.append(feed.shape) or run(feed)  # type: ignore[method-assign, func-returns-value]
-    images = [cv2.resize(one, (40 + 30 * i, 300 - 20 * i)) for i, one in enumerate(crops(6))]
+    images: list[Any] = [cv2.resize(one, (40 + 30 * i, 300 - 20 * i)) for i, one in enumerate(crops(6))]
     together = classifier.classify(images)
     assert shapes == [(6, 3, 224, 224)]
     for image, answer in zip(images, together, strict=True):

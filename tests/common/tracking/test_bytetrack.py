@@ -6,6 +6,7 @@ import json
 import tracemalloc
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -592,7 +593,7 @@ def test_impossible_rates_are_refused(fps: float) -> None:
         ("camera_motion", "magic"),
     ],
 )
-def test_settings_out_of_bounds_are_refused(setting: str, value: object) -> None:
+def test_settings_out_of_bounds_are_refused(setting: str, value: Any) -> None:
     """A typing mistake in a configuration would show only as bad tracks."""
     with pytest.raises(ValueError, match=setting):
         TrackerSettings(**{setting: value})

@@ -15,6 +15,7 @@ import time
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import msgpack
 import pytest
@@ -449,8 +450,8 @@ def test_the_subscriber_of_the_document_writes_the_video(endpoint, tmp_path, way
             session_id=7, accepted=True, reason="", still_request=-1, frame_index=-1, tracks=()
         ).pack()
 
-    other = {"connect": "listen", "listen": "connect"}[way]
-    with open_session(LinkSettings("edge", **{other: (endpoint,)})) as session:
+    other: dict[str, Any] = {{"connect": "listen", "listen": "connect"}[way]: (endpoint,)}
+    with open_session(LinkSettings("edge", **other)) as session:
         publisher = declare_publisher(session, Channel.BASE, keys=KEYS)
         queryable = serve(session, Channel.CONTROL, keys=KEYS, answer=answer)
         reader = start(code, way, endpoint, "uav-1", str(tmp_path / "out.hevc"))
@@ -508,7 +509,7 @@ def test_a_question_that_is_lost_is_asked_once_more(monkeypatch):
             on_answer(b"yes")
 
     monkeypatch.setattr("hvt_common.transport.session.query_later", later)
-    told = {"keys": EdgeKeys("uav-1"), "question": b"", "timeout_s": 0.02}
+    told: dict[str, Any] = {"keys": EdgeKeys("uav-1"), "question": b"", "timeout_s": 0.02}
     assert query(None, Channel.CONTROL, **told) == b"yes"
     assert asked_s == [0.02, 0.01]
     there = False

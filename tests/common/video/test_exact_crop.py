@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -107,7 +108,7 @@ def test_every_pixel_is_as_the_document_states_it(draw):
     width, height = draw.draw(st.integers(1, 70)), draw.draw(st.integers(1, 50))
     rng = np.random.default_rng(draw.draw(st.integers(0, 99)))
     half = -(-height // 2), -(-width // 2)
-    planes = tuple(rng.integers(0, 256, shape, np.uint8) for shape in ((height, width), half, half))
+    planes: Any = tuple(rng.integers(0, 256, shape, np.uint8) for shape in ((height, width), half, half))
     scale = draw.draw(st.floats(0.05, 6))
     x1, y1 = draw.draw(st.integers(0, 300)), draw.draw(st.integers(0, 300))
     wide, high = draw.draw(st.integers(1, 200)), draw.draw(st.integers(1, 200))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from media.crops import textured, washed_out
 CROP = textured(117, 50, seed=2)
 BASE = washed_out(CROP)
 SIZE = (117, 50)
-WHOLE = {"low_pct": 1, "high_pct": 100}
+WHOLE: dict[str, Any] = {"low_pct": 1, "high_pct": 100}
 
 
 @pytest.mark.parametrize("name", ["jpeg", "h264-intra", "residual"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ def check(detector: OnnxDetector, head: str) -> None:
     assert len(detector.detect(np.full((192, 320, 3), 100, np.uint8))) == 0
 
 
-def opened(path: Path, **settings: object) -> OnnxDetector:
+def opened(path: Path, **settings: Any) -> OnnxDetector:
     """As the programs open it."""
     detector = open_detector(str(path), **settings)
     assert isinstance(detector, OnnxDetector)
@@ -216,7 +217,7 @@ def free_network(path: Path, *, stride: int, metadata: dict[str, str] | None = N
         helper.make_node("Add", ["images", "again"], ["whole"]),  # fails where the sides are no multiples
     ]
     weights = np.zeros((7, 3, 1, 1), np.float32)
-    constants = {"w": weights, "flat": np.array([1, 7, -1], np.int64)}
+    constants: dict[str, Any] = {"w": weights, "flat": np.array([1, 7, -1], np.int64)}
     constants["scales"] = np.array([1, 1, stride, stride], np.float32)
     for s in (8, 16, 32):
         nodes += [
@@ -249,7 +250,7 @@ def test_models_of_the_open_model_zoo_find_people(data: Path, name: str, head: s
     frames = sorted((data / "aerial/sequences_dev/otb_Crossing/img1").iterdir())
     import cv2
 
-    image = cv2.imread(str(frames[0]))
+    image: Any = cv2.imread(str(frames[0]))
     truth = np.loadtxt(data / "aerial/sequences_dev/otb_Crossing/gt/gt.txt", delimiter=",")[0, 2:6]
     found = detector.detect(image).boxes_xyxy_px
     x1, y1 = truth[:2] - 1

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import count
+from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives import serialization
@@ -184,7 +185,7 @@ def test_a_proxy_says_who_somebody_is(port):
         assert page.links == ("https://hvt.example.org/",)
         host, origin = "hvt.example.org", "https://hvt.example.org"
         for role in ("viewer", "operator"):
-            headers = {"X-HVT-Role": role, "Host": host}
+            headers: dict[str, Any] = {"X-HVT-Role": role, "Host": host}
             assert asked(port, "/", **headers)[0] == 200
             with connect(
                 f"ws://{host}/ws", sock=reached(port), origin=origin, additional_headers={"X-HVT-Role": role}

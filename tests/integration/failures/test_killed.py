@@ -119,7 +119,7 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight
         again.stop(signal.SIGHUP)
         assert steady.alive, steady.said
         steady.stop(signal.SIGHUP)
-        summaries = {one["edge"]: one for one in again.finish()}
+        summaries: Any = {one["edge"]: one for one in again.finish()}
         return Flight(folder, described, left, {"uav-1": steady.finish(), "uav-2": sent}, summaries)
 
 

@@ -44,7 +44,7 @@ def columns(path: Path, name: str) -> list[str]:
 
 def verified(path: Path) -> bool:
     """Whether Rerun's own tool finds the recording whole, its footer included."""
-    command = [viewer_program(), "rrd", "verify", path]
+    command = [str(viewer_program()), "rrd", "verify", str(path)]
     return subprocess.run(command, check=False, capture_output=True, env=viewer_environment()).returncode == 0
 
 

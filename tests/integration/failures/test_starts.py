@@ -25,7 +25,7 @@ from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_edge.config import EdgeConfig
 from hvt_edge.loop.pose import open_pose
 from hvt_edge.source.contract import SourceSettings
-from hvt_edge.source.live import LiveSource, Shot, SignalLost
+from hvt_edge.source.live import Grabber, LiveSource, Shot, SignalLost
 from hvt_edge.source.opening import open_source
 from hvt_edge.world import World
 from hvt_fleet.health.server import Answer, HealthServer
@@ -166,7 +166,7 @@ def test_a_camera_that_starts_later_is_waited_for(caplog):
     failures, stop = Failures(time.time_ns), threading.Event()
     url = f"rtsp://127.0.0.1:{port}/camera"
     awaited = Awaited(
-        lambda: open_source(url, size=(320, 240), fps=5, fit="stretch"), "source", failures, longest_s=1
+        lambda: open_source(url, size=(320, 240), fps=5, fit="crop"), "source", failures, longest_s=1
     )
     assert awaited.part is None
     assert url in failures.now[0].reason
@@ -182,10 +182,10 @@ def test_a_camera_that_starts_later_is_waited_for(caplog):
     assert not failures.now
 
 
-class Silent:
+class Silent(Grabber):
     """A camera that opens and gives nothing."""
 
-    name = "camera"
+    name, notes = "camera", None
 
     def open(self) -> None:
         """It opens."""

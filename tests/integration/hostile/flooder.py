@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
@@ -67,7 +68,10 @@ def statuses(heard: dict[Channel, list[Message]]) -> Iterator[Said]:
     for number in count(1):
         yield Channel.STATUS, replace(status, sequence=status.sequence + number).pack(), None
         for step in steps:
-            further = {"sequence": step.sequence + number, "frame_index": step.frame_index + number}
+            further: dict[str, Any] = {
+                "sequence": step.sequence + number,
+                "frame_index": step.frame_index + number,
+            }
             yield Channel.TRACKS, replace(step, **further).pack(), None
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -116,8 +117,8 @@ def test_what_is_wrong_is_raised_where_the_program_can_see_it(tmp_path, monkeypa
         hvt_ground.listen(colour="blue")
     edge = hvt_edge.open(connect="tcp/127.0.0.1:9", detector=tmp_path / "absent.onnx")
     with pytest.raises(ValueError, match=r"float64 \(4, 4\) is not accepted"):
-        edge.push(np.zeros((4, 4)))
-    for wrong in (1.5e18, "now", -1, 1 << 63):
+        edge.push(cast("Any", np.zeros((4, 4))))
+    for wrong in cast("tuple[int, ...]", (1.5e18, "now", -1, 1 << 63)):
         with pytest.raises(ValueError, match="whole nanoseconds of Unix time are"):
             edge.push(np.zeros((4, 4, 3), np.uint8), capture_ns=wrong)
     with pytest.raises((UserError, FlightError), match=r"absent\.onnx"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -31,7 +32,7 @@ def write_clip(
     pictures = smooth_pictures(45, size=SIZE) if pictures is None else pictures
     high, wide = pictures[0].shape[:2]
     with av.open(str(path), "w", format=_FORMATS[path.suffix]) as container:
-        stream = container.add_stream(codec, rate=fps)
+        stream: Any = container.add_stream(codec, rate=fps)
         stream.width, stream.height, stream.pix_fmt = wide, high, pixel_format
         if kbps:
             stream.bit_rate = 1000 * kbps

@@ -159,7 +159,7 @@ class LookFlight(World):
             if look.answer is None or header.parameters.get("ask") != look.answer.still_request:
                 continue
             x1, y1, x2, y2 = header.crop_source_px
-            size = header.parameters.get("w", x2 - x1), header.parameters.get("h", y2 - y1)
+            size: Any = header.parameters.get("w", x2 - x1), header.parameters.get("h", y2 - y1)
             look.header, look.size_bytes = header, len(data)
             look.image = still_codec(header.codec).decode(data, size=size, parameters=header.parameters)
             look.source = np.ascontiguousarray(self.sources[header.frame_index][y1:y2, x1:x2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
 
 import cv2
 import numpy as np
@@ -55,7 +56,8 @@ class Rig:
         self.sender = make_transmitter(
             self.out, ledger=self.ledger, budget=self.budget, edge_id="edge-1", session_id=SESSION
         )
-        maker = StillMaker(codec=StandIn(), fallback=JpegCodec()) if codec == "residual" else StillMaker()
+        stand_in: Any = StandIn()
+        maker = StillMaker(codec=stand_in, fallback=JpegCodec()) if codec == "residual" else StillMaker()
         self.outbox = Outbox()
         self.maker = maker
         self.on_demand = OnDemand(
@@ -106,13 +108,14 @@ class Rig:
         for _ in range(frames):
             self.index += 1
             pixels = picture(self.index)
-            base = cv2.blur(cv2.resize(pixels, BASE, interpolation=cv2.INTER_AREA), (31, 31))
+            small = cv2.resize(pixels, BASE, interpolation=cv2.INTER_AREA)
+            base = cv2.blur(small, (31, 31)).astype(np.uint8)
             tracks = tracks_at(self.index, {5: self.box(self.index)})
-            coded = not self.budget.leaves_out(self.now_ns)
+            shown = not self.budget.leaves_out(self.now_ns)
             seen = AnalyzedFrame(
-                Frame(self.index, self.now_ns, pixels, base), base if coded else None, tracks, detected=others
+                Frame(self.index, self.now_ns, pixels, base), base if shown else None, tracks, detected=others
             )
-            if coded:
+            if shown:
                 size, now_ns = int(self.budget.base_step_bytes), self.now_ns
                 self.budget.record_base(size, now_ns=self.budget.earliest_ns(size, now_ns=now_ns, base=True))
             self.chooser.consider(seen, now_ns=self.now_ns, allowance_bytes=1000)

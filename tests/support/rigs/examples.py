@@ -50,7 +50,7 @@ def tracks_of(
 def candidate(track_id: int = 1, box: tuple[float, ...] = (100, 100, 150, 140), **changes: Any) -> Candidate:
     """Of a still: a car in ``box`` of a base picture of 1280x720, which the source shows as large."""
     area_px = (box[2] - box[0]) * (box[3] - box[1])
-    fields = {
+    fields: dict[str, Any] = {
         "frame_index": 300,
         "track_id": track_id,
         "box_base_px": box,
@@ -67,7 +67,7 @@ def candidate(track_id: int = 1, box: tuple[float, ...] = (100, 100, 150, 140), 
 
 def refinement(**changes: Any) -> Refinement:
     """What the ground says of a still of edge track 5: a car, as before."""
-    fields = {
+    fields: dict[str, Any] = {
         "frame_index": 0,
         "capture_ns": 0,
         "still_sequence": 0,
@@ -90,7 +90,7 @@ def overlay(frame_index: int, boxes: Any, *, capture_ns: int = 0, **changes: Any
     """The ground's tracks in ``boxes``: cars, numbered from 1, that no still has shown."""
     boxes = np.asarray(boxes, np.float32).reshape(-1, 4)
     count = len(boxes)
-    fields = {
+    fields: dict[str, Any] = {
         "frame_index": frame_index,
         "capture_ns": capture_ns,
         "track_ids": np.arange(1, count + 1),

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -51,11 +51,12 @@ from rigs.examples import tracks_of
 SIZE = (320, 192)
 CLASSES = ("car", "bus")
 _ids = itertools.count(1000)
+_NO_TIMES: Any = dict.fromkeys(("encode_ms", "detect_ms", "cores_needed", "cores_free"), 0.0)
 _IDLE = replace(
     messages.HEALTH,
     **dict.fromkeys(("frames_dropped", "tracks", "base_queue", "still_queue"), 0),
     **dict.fromkeys(("frames_dropped_cpu", "frames_unanalyzed"), 0),
-    **dict.fromkeys(("encode_ms", "detect_ms", "cores_needed", "cores_free"), 0.0),
+    **_NO_TIMES,
     keyframes=1,
     feedback_age_ms=-1,
 )
@@ -274,7 +275,7 @@ class Flight:
         if data is None:
             pixels = self.pictures[index][crop[1] : crop[3], crop[0] : crop[2]]
             data = cv2.imencode(".jpg", pixels)[1].tobytes()
-        fields = {
+        fields: dict[str, Any] = {
             "session_id": self.session_id,
             "sequence": sequence,
             "frame_index": index,
@@ -305,9 +306,10 @@ class Flight:
     ) -> Received:
         """The edge's report after so many messages."""
         self._statuses += 1
-        counts = dict.fromkeys(
+        counts: dict[str, Any] = dict.fromkeys(
             ("base_bytes", "roi_bytes", "backlog_bytes", "meta_bytes", "overhead_bytes"), 0
         )
+        counts |= {name: {} for name in ("sent", "deferred", "dropped")}
         report = replace(
             messages.STATUS,
             session_id=self.session_id,
@@ -322,7 +324,6 @@ class Flight:
             backlog_messages=backlog,
             meta_messages=meta,
             **counts,
-            **{name: {} for name in ("sent", "deferred", "dropped")},
             health=replace(_IDLE, frames_captured=base, frames_encoded=base),
             failed=(),
             levers="",

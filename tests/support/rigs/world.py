@@ -81,7 +81,7 @@ def make_transmitter(
 
 def make_base_stage(encoder: Any, transmitter: Transmitter, **parts: Any) -> BaseStage:
     """Of this encoder, without a copy and without a store."""
-    plain = {"keyframes": Keyframes(), "local_copy": None, "first_keyframe_bytes": 5000}
+    plain: dict[str, Any] = {"keyframes": Keyframes(), "local_copy": None, "first_keyframe_bytes": 5000}
     plain["failures"] = Failures(time.time_ns)
     return BaseStage(encoder, transmitter=transmitter, **(plain | parts))
 

@@ -24,13 +24,13 @@ _MAIN = (
     "from hvt_study.cli import main; raise SystemExit(main())"
 )
 _HELD = """
-import signal
+import time
 from hvt_study.cache.results import ResultCache
 put = ResultCache.put
 def put_and_hold(cache, key, result):
     put(cache, key, result)
-    while "flights" in cache._folder.parts and cache.count() >= 2:
-        signal.pause()
+    if "flights" in cache._folder.parts and cache.count() >= 2:
+        time.sleep(300)
 ResultCache.put = put_and_hold
 """
 FRAMES = 30
@@ -62,7 +62,7 @@ def detector(uri: str) -> str:
 def study(command: str, *words: str, folder: Path, held: bool = False, **named: Any) -> subprocess.Popen[str]:
     """``hvt-study`` as a process of a group of its own; what it says is in study.out and study.err there.
 
-    ``held`` stands still for ever once two flights are kept, however fast the machine.
+    ``held`` stands still once two flights are kept, for longer than a test may take.
     """
     environment = {**os.environ, "COLUMNS": "200"}
     if held:

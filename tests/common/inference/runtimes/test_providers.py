@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -246,7 +247,7 @@ def test_openvino_gets_no_file_that_onnxruntime_refuses(tmp_path: Path) -> None:
 @needs_openvino
 def test_openvino_costs_at_most_a_point_of_f1_on_a_real_picture(data: Path) -> None:
     """The recommended speed-up would be paid for with objects nobody sees."""
-    picture = cv2.imread(str(data / "visdrone/0000001_02999_d_0000005.jpg"))
+    picture: Any = cv2.imread(str(data / "visdrone/0000001_02999_d_0000005.jpg"))
     path = str(data / "models/yolov5su_visdrone_640.onnx")
     ours, theirs = (open_detector(path, provider=name).detect(picture) for name in ("cpu", "openvino"))
     assert len(ours) > 30
@@ -258,7 +259,7 @@ def test_openvino_costs_at_most_a_point_of_f1_on_a_real_picture(data: Path) -> N
 def test_a_real_classifier_answers_alike_with_openvino(data: Path) -> None:
     """Class and certainty of a still would depend on the machine."""
     path = str(data / "models/mobilenet_v2_imagenet.onnx")
-    crops = [cv2.imread(str(data / f"classify_{name}.bmp")) for name in ("sunflower", "dragonfly")]
+    crops: list[Any] = [cv2.imread(str(data / f"classify_{name}.bmp")) for name in ("sunflower", "dragonfly")]
     ours, theirs = (open_classifier(path, provider=name).classify(crops) for name in ("cpu", "openvino"))
     assert [one.class_name for one in ours] == [one.class_name for one in theirs] == ["daisy", "dragonfly"]
     for one, other in zip(ours, theirs, strict=True):

@@ -9,6 +9,7 @@ import shutil
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -222,13 +223,13 @@ def test_mcap_has_video_boxes_stills_and_events(recording, events, tmp_path):
 def test_what_is_a_guess_has_the_same_word_in_each_picture(field, word, colour, events, tmp_path):
     """A guess of an unknown view bore its class in Foxglove and in the video, and none on the page."""
     settings = RecorderSettings(tmp_path / "unknown.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
-    overlays = [
-        replace(one, **{field: np.ones(len(one.track_ids), np.bool_)})
-        for one in events
-        if isinstance(one, Overlay)
-    ]
+    guesses: list[Overlay] = []
+    for one in (one for one in events if isinstance(one, Overlay)):
+        guess: dict[str, Any] = {field: np.ones(len(one.track_ids), np.bool_)}
+        guesses.append(replace(one, **guess))
+    video: list[Event] = [one for one in events[:8] if isinstance(one, VideoSample)]
     with Recorder(settings) as recorder:
-        for event in [*(one for one in events[:8] if isinstance(one, VideoSample)), *overlays[:8]]:
+        for event in (*video, *guesses[:8]):
             recorder.log(event)
     with export(settings.path, tmp_path / "unknown.mcap").open("rb") as file:
         drawn = [

@@ -7,6 +7,7 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -30,7 +31,7 @@ OVERLAY = overlay(
     confidences=np.array([0.8764], np.float32),
     places=Places(np.array([[52.0, 13.0]]), np.array([[3.0, 2.0, 0.0]])),
 )
-RECORDED = SimpleNamespace(
+RECORDED: Any = SimpleNamespace(
     edge="uav-1",
     session="00ff",
     overlays=lambda: [OVERLAY],

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -25,7 +26,7 @@ NOON_NS = 1_591_012_800 * SECOND_NS
 def row(file: str, edge: str, begin_ns: int, classes: dict[str, int], **changes: object) -> RecordingRow:
     """An hour."""
     end_ns = begin_ns + 3600 * SECOND_NS
-    values = {"size_bytes": 135_000_000, "frames": 54_000, "stills": 31, "whole": True}
+    values: dict[str, Any] = {"size_bytes": 135_000_000, "frames": 54_000, "stills": 31, "whole": True}
     values |= {"written_ns": end_ns, "session": "00ff", "classes": classes}
     return RecordingRow(file=file, edge=edge, begin_ns=begin_ns, end_ns=end_ns, **(values | changes))
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives import serialization
@@ -300,7 +301,7 @@ def test_events_go_over_tls_with_the_certificate_of_the_client(port, fleet):
 def test_the_keystore_of_a_tak_user_works(port, fleet, tmp_path, password):
     """It is what the administrator of a TAK server hands out, with a password of his taste."""
     certificate = load_pem_x509_certificate((fleet.folder / "client.pem").read_bytes())
-    key = serialization.load_pem_private_key((fleet.folder / "client.key").read_bytes(), None)
+    key: Any = serialization.load_pem_private_key((fleet.folder / "client.key").read_bytes(), None)
     store = tmp_path / "client.p12"
     locked = serialization.BestAvailableEncryption(password.encode())
     store.write_bytes(pkcs12.serialize_key_and_certificates(b"client", key, certificate, None, locked))
@@ -408,7 +409,7 @@ def test_keys_that_cannot_be_used_end_the_start(fleet, tmp_path, changes, senten
 
 def test_a_key_that_needs_a_password_is_asked_for_it_once(fleet, tmp_path):
     """OpenSSL would ask at the terminal, and the ground would wait for an answer."""
-    key = serialization.load_pem_private_key((fleet.folder / "client.key").read_bytes(), None)
+    key: Any = serialization.load_pem_private_key((fleet.folder / "client.key").read_bytes(), None)
     locked = key.private_bytes(
         serialization.Encoding.PEM,
         serialization.PrivateFormat.PKCS8,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field, replace
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from hvt_common.geodesy import moved
 from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.messages import Info
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose, View
 from hvt_gateways.cot.event import CotMessage
@@ -39,7 +41,7 @@ LIVE = replace(INFO, edge="uav-1", session_id=0xABCDEF01C0FFEE07, pace="realtime
 class Rig:
     """A reporter at a time that the test sets; the wall clock and the edge's are elsewhere than the ground's."""
 
-    info: object = LIVE
+    info: Info = LIVE
     now_ns: int = 50 * SECOND_NS
     sent: list[CotMessage] = field(default_factory=list)
 
@@ -200,7 +202,7 @@ def test_remarks_say_what_is_known_and_where_the_still_is():
 
 def test_the_remarks_of_a_vague_kind_of_vehicle_name_no_kind():
     """The video of which they speak shows "vehicle" too."""
-    kinds = {"base_classes": ("truck", "van"), "classes": ("truck", "bus")}
+    kinds: dict[str, Any] = {"base_classes": ("truck", "van"), "classes": ("truck", "bus")}
     events = Rig().says(overlay(**kinds, vague=np.array([True, True])))
     assert [one.find("detail/remarks").text for one in events] == ["vehicle 0.87"] * 2
 

@@ -152,7 +152,7 @@ def test_it_begins_at_a_keyframe_and_goes_on_at_one_after_a_gap(events, tmp_path
 
 def test_every_keyframe_has_its_parameter_sets(events, tmp_path):
     """Who tunes in later would see nothing for ever."""
-    bare = []
+    bare: list[Event] = []
     for event in events:
         if isinstance(event, VideoSample) and event.keyframe and event.frame_index:
             rest = [one for one in nal_units(event.data) if one[0] >> 1 not in (32, 33, 34)]
