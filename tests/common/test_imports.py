@@ -8,16 +8,8 @@ import sys
 import pytest
 
 HEAVY = {
-    "av",
-    "onnxruntime",
-    "zenoh",
-    "rich",
-    "rerun",
-    "filelock",
-    "json5",
-    "openvino",
-    "hvt_edge.app",
-    "hvt_ground.app",
+    *("av", "onnxruntime", "zenoh", "rich", "rerun", "filelock", "json5", "openvino"),
+    *("hvt_edge.app", "hvt_ground.app"),
 }
 
 

@@ -52,20 +52,8 @@ def namespaces() -> Iterator[tuple[str, str]]:
         pytest.skip(f"may not make a network namespace: {error.stderr.strip()}")
     try:
         ip("netns", "add", names[1])
-        ip(
-            "link",
-            "add",
-            "veth-a",
-            "netns",
-            names[0],
-            "type",
-            "veth",
-            "peer",
-            "name",
-            "veth-b",
-            "netns",
-            names[1],
-        )
+        pair = ("veth-a", "netns", names[0], "type", "veth", "peer", "name", "veth-b", "netns", names[1])
+        ip("link", "add", *pair)
         for name, end, address in (
             (names[0], "veth-a", "10.99.0.1/30"),
             (names[1], "veth-b", "10.99.0.2/30"),

@@ -157,23 +157,15 @@ def test_ctrl_c_ends_an_edge_with_a_summary_and_its_ground_with_it(late):
     assert count_frames(late.folder / "base.mkv") == late.edge["frames"] + late.edge["frames_stored"]
 
 
-@pytest.mark.parametrize(
-    "sign",
-    [
-        pytest.param(signal.SIGINT, marks=pytest.mark.nightly),
-        signal.SIGTERM,
-        pytest.param(signal.SIGHUP, marks=pytest.mark.nightly),
-    ],
-)
-def test_either_side_stops_before_anybody_came(link, scene, sign):
+def test_either_side_stops_before_anybody_came(link, scene):
     """Who started the wrong side first, or a service manager, would need a kill -9."""
     ground = link.ground(*ANALYSES, "--record", "recordings")
-    ground.stop(sign)
+    ground.stop(signal.SIGTERM)
     assert ground.finish() == []
     assert "no edge was heard" in ground.told
     edge = link.edge(*arguments(scene, "uav-1", "--wait", "600s"))  # longer than is waited for its end
     edge.until("waiting up to")
-    edge.stop(sign)
+    edge.stop(signal.SIGTERM)
     assert edge.finish()["frames"] == 0
 
 

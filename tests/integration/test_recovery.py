@@ -80,7 +80,7 @@ def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
 # Stills that are lost
 
 
-@pytest.mark.realtime
+@pytest.mark.nightly
 def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
     """On a radio that loses datagrams the sharp pictures would have holes; or the gallery show some twice."""
     lossy = Script(

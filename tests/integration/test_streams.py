@@ -38,16 +38,8 @@ def play(module: str, *words: str, folder: Path, output: int, code: int = 0) -> 
 def test_an_edge_flies_on_when_nobody_reads_its_status(scene, tmp_path, free_port, output):
     """The video would end with the terminal, or the log's disk, from which the drone was started."""
     edge = ("--source", str(scene), "--size", "320x180", "--preset", "ultrafast", "--max-frames", "20")
-    link = (
-        "--connect",
-        f"tcp/127.0.0.1:{free_port}",
-        "--wait",
-        "0s",
-        "--pace",
-        "lockstep",
-        "--detector",
-        "motion",
-    )
+    link = ("--connect", f"tcp/127.0.0.1:{free_port}", "--wait", "0s")
+    link += ("--pace", "lockstep", "--detector", "motion")
     summary = play("hvt_edge.cli", *edge, *link, folder=tmp_path, output=output(), code=1)
     assert summary["frame_account"]["nobody_listened"] == summary["frames"] == 20
 

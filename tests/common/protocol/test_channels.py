@@ -114,10 +114,7 @@ def test_stills_yield_to_video_and_video_to_commands():
         "REAL_TIME",
         "INTERACTIVE_HIGH",
         "INTERACTIVE_LOW",
-        "DATA_HIGH",
-        "DATA",
-        "DATA_LOW",
-        "BACKGROUND",
+        *("DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"),
     ]
     rank = {row: order.index(delivery.priority) for row, delivery in DELIVERIES.items()}
     assert rank[Channel.CONTROL] < rank[Channel.STATUS] < rank[Channel.BASE] < rank[Channel.ROI]

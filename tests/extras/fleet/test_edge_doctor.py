@@ -76,12 +76,8 @@ def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
         code, found = examined(
             capsys,
             *("--source", str(tmp_path / "gone.mp4"), *CHEAP, "--detector", str(tmp_path / "gone.onnx")),
-            *(
-                "--metrics",
-                f"127.0.0.1:{taken.getsockname()[1]}",
-                "--record-base",
-                str(tmp_path / "no" / "base.mp4"),
-            ),
+            *("--metrics", f"127.0.0.1:{taken.getsockname()[1]}"),
+            *("--record-base", str(tmp_path / "no" / "base.mp4")),
             *("--connect", f"tcp/127.0.0.1:{free_ports(1)[0]}"),
         )
     assert code == 2

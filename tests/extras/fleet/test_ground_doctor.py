@@ -41,12 +41,8 @@ def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
         code, found = examined(
             capsys,
             *("--detector", str(tmp_path / "gone.onnx"), "--record", str(tmp_path / "file" / "flights")),
-            *(
-                "--web",
-                f"127.0.0.1:{taken.getsockname()[1]}",
-                "--listen",
-                f"tcp/127.0.0.1:{free_ports(1)[0]}",
-            ),
+            *("--web", f"127.0.0.1:{taken.getsockname()[1]}"),
+            *("--listen", f"tcp/127.0.0.1:{free_ports(1)[0]}"),
         )
     assert code == 2
     for name in ("models", "recordings", "page"):

@@ -49,25 +49,22 @@ MOON = "+proj=eqc +R=1737400 +units=m +no_defs"
 PLAN = 'LOCAL_CS["plan",UNIT["metre",1]]'
 
 
+def geotiff(path: Path, heights: np.ndarray, *corner: float, cell: float, **profile: Any) -> Path:
+    """A file of these heights; ``corner`` is its west and north."""
+    high, wide = heights.shape
+    known = {"dtype": "float32", "crs": "EPSG:4326", "transform": from_origin(*corner, cell, cell), **profile}
+    with rasterio.open(path, "w", driver="GTiff", width=wide, height=high, count=1, **known) as file:
+        file.write(heights.astype(known["dtype"]), 1)
+    return path
+
+
 def model(folder: Path, height_m, *, dtype: str = "float32", nodata: float | None = -9999) -> Path:
     """An elevation model of 0.2 degrees around the camera; ``height_m`` of metres north and east of it."""
     rows, columns = np.mgrid[0:720, 0:720]
     north = (0.1 - (rows + 0.5) * CELL) * NORTH_M
     east = ((columns + 0.5) * CELL - 0.1) * EAST_M
-    path = folder / "dem.tif"
-    with rasterio.open(
-        *(path, "w"),
-        driver="GTiff",
-        width=720,
-        height=720,
-        count=1,
-        dtype=dtype,
-        nodata=nodata,
-        crs="EPSG:4326",
-        transform=from_origin(7.9, 47.1, CELL, CELL),
-    ) as file:
-        file.write(np.broadcast_to(height_m(north, east), rows.shape).astype(dtype), 1)
-    return path
+    heights = np.broadcast_to(height_m(north, east), rows.shape)
+    return geotiff(folder / "dem.tif", heights, 7.9, 47.1, cell=CELL, dtype=dtype, nodata=nodata)
 
 
 def terrain_of(path: Path) -> Terrain:
@@ -82,16 +79,7 @@ def surface_of(locator: Locator) -> Surface:
 def flat_file(path: Path, corner: tuple[float, float], *, size=(200, 200), **profile) -> Path:
     """500 m everywhere; ``corner`` is west and north, ``size`` columns and rows, cells 30 m or 0.001 degrees."""
     cell = profile.pop("cell", 0.001 if profile["crs"] == "EPSG:4326" else 30)
-    with rasterio.open(
-        *(path, "w"),
-        driver="GTiff",
-        width=size[0],
-        height=size[1],
-        count=1,
-        **{"dtype": "float32", "transform": from_origin(*corner, cell, cell), **profile},
-    ) as file:
-        file.write(np.full(size[::-1], 500, np.float32), 1)
-    return path
+    return geotiff(path, np.full(size[::-1], 500), *corner, cell=cell, **profile)
 
 
 def ground_m(path: Path, latitude: float, longitude: float) -> float:
@@ -248,19 +236,8 @@ def test_a_model_that_breaks_off_is_refused_before_the_flight(tmp_path):
 
 def test_a_fine_model_is_thinned_out_and_lies_where_it_did(tmp_path):
     """A slope of a fine model would be shifted, and with it all that stands on it."""
-    path = tmp_path / "fine.tif"
-    columns = np.arange(9000)
-    with rasterio.open(
-        *(path, "w"),
-        driver="GTiff",
-        width=9000,
-        height=60,
-        count=1,
-        dtype="float32",
-        crs="EPSG:32632",
-        transform=from_origin(700_000, 5_300_000, 1, 1),
-    ) as file:
-        file.write(np.broadcast_to(columns + 0.5, (60, 9000)).astype(np.float32), 1)
+    slope = np.broadcast_to(np.arange(9000) + 0.5, (60, 9000))
+    path = geotiff(tmp_path / "fine.tif", slope, 700_000, 5_300_000, cell=1, crs="EPSG:32632")
     for east_m in (1000.0, 4500.0, 8000.0):
         (longitude,), (latitude,) = transform("EPSG:32632", "EPSG:4326", [700_000 + east_m], [5_299_970])
         assert ground_m(path, latitude, longitude) == pytest.approx(east_m, abs=5)

@@ -48,7 +48,7 @@ def verified(path: Path) -> bool:
     return subprocess.run(command, check=False, capture_output=True, env=viewer_environment()).returncode == 0
 
 
-@pytest.mark.realtime
+@pytest.mark.nightly
 def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, long_scene, link):
     """It ended the whole ground with the code that keeps systemd from starting it again."""
     ground = link.ground(

@@ -56,16 +56,8 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     port = free_ports(1)[0]
     with Link(folder) as link, sync_playwright() as playwright:
         ground = link.ground(
-            *(
-                "--record",
-                "flight.rrd",
-                "--detector",
-                "motion",
-                "--classifier",
-                "none",
-                "--web",
-                f"127.0.0.1:{port}",
-            )
+            *("--record", "flight.rrd", "--detector", "motion", "--classifier", "none"),
+            *("--web", f"127.0.0.1:{port}"),
         )
         ground.until(f"watch at http://127.0.0.1:{port}/")
         edge = link.edge(
