@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import signal
 import subprocess
 import sys
 import threading
@@ -12,9 +13,35 @@ from unittest.mock import Mock
 import pytest
 
 from hvt_common.runtime import process
-from hvt_common.runtime.process import NewThreads, give_back_holes, limit_malloc_arenas, lower_priority
+from hvt_common.runtime.process import (
+    STOP_SIGNALS,
+    NewThreads,
+    give_back_holes,
+    limit_malloc_arenas,
+    lower_priority,
+    stop_on_signals,
+)
 
 only_with_glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is about glibc's heaps")
+
+
+@pytest.mark.parametrize("one", STOP_SIGNALS)
+def test_each_way_to_stop_a_program_ends_it_in_order(one):
+    """Ctrl-C, a service manager or a closed terminal would cost the summary and the end of the recording."""
+    signal.signal(one, signal.SIG_DFL)
+    stop = stop_on_signals()
+    assert not stop.is_set()
+    signal.raise_signal(one)
+    assert stop.is_set()
+
+
+def test_nohup_is_heeded():
+    """A flight that was started to outlive its terminal would end with it."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    stop = stop_on_signals()
+    signal.raise_signal(signal.SIGHUP)
+    assert not stop.is_set()
+
 
 FRAMES = """
 import threading

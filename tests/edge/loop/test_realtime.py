@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -169,8 +170,8 @@ class TimedOut(Out):
         self.headers.append(BaseHeader.parse(attachment, payload))
 
 
-def play_clip(*, reading_s: float, frames: int, out: TimedOut) -> FrameCounts:
-    """A clip at 15 fps of which each frame takes so long to read, through the loop and x265."""
+def play_clip(*, reading_s: float, frames: int, out: TimedOut, coded: bool = False) -> FrameCounts:
+    """A clip at 15 fps, ``coded`` by a camera or not, each frame of which takes so long to read, and x265."""
     stills, counts, pictures = BlockedStills(), FrameCounts(), smooth_pictures(1, size=SIZE)
     stills.released.set()
     with RealtimePace(
@@ -179,7 +180,7 @@ def play_clip(*, reading_s: float, frames: int, out: TimedOut) -> FrameCounts:
     ) as pace:  # fmt: skip
         for index, frame in enumerate(framed(pictures * frames)):
             out.time.pass_s(reading_s)
-            pace.step(frame)
+            pace.step(replace(frame, camera_unit=unit(index)) if coded else frame)
             assert counts.captured == index + 1
     return counts
 
@@ -203,6 +204,13 @@ def test_a_clip_that_cannot_be_read_in_real_time_is_played_slower(reading_s):
     assert max(new - old for old, new in pairwise(shown_at)) / SECOND_NS <= most_s + 1e-6, (
         "none is left out for long"
     )
+
+
+def test_no_unit_of_a_camera_is_left_out_of_a_clip_that_is_read_too_slowly():
+    """All that builds on it would be smear, up to the next keyframe."""
+    out = TimedOut(SteppedTime())
+    play_clip(reading_s=0.1, frames=60, out=out, coded=True)
+    assert [one.frame_index for one in out.headers] == list(range(60))
 
 
 def test_a_clip_that_can_be_read_in_real_time_keeps_its_time():

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from hvt_common.inference.scale_search import ScaleSearch
+from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures
@@ -57,9 +58,12 @@ def make(*, detector=None, view: View = VIEW, search: ScaleSearch | None = None,
 
 def test_every_frame_is_decoded_and_each_nth_is_searched():
     """Candidates would be of other frames than the stills, or the processor would melt."""
-    analyzer = make(detect_every=5)
+    trust, taken = ViewTrust("motion", hence=""), []
+    trust.take = lambda found: taken.append(len(found))
+    analyzer = make(detect_every=5, trust=trust)
     seen = [analyzer.analyze(frame, unit) for frame, unit in zip(FRAMES, UNITS, strict=True)]
     assert [one.frame.index for one in seen if one.detected] == [0, 5, 10, 15, 20, 25]
+    assert taken == [1] * 6, "or a view that the detector does not know were never noticed"
     for one in seen[10:]:
         assert one.tracks.frame_index == one.frame.index
         assert one.tracks.ids.tolist() == [1]

@@ -284,13 +284,15 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
 
 def test_stored_video_of_an_unknown_view_is_doubted_as_it_is_live(flight):
     """Boxes that were dashed and unnamed before an outage were certain in the middle of it."""
-    trust, found = ViewTrust("motion", hence=""), []
+    trust, found, taken = ViewTrust("motion", hence=""), [], []
+    trust.take = lambda seen: taken.append(len(seen))
     perception, decoder = StoredPerception(flight.info(), trust=trust), BaseDecoder()
     analyze = perception.track(found.append)
     for unit in flight.units[:6]:
         trust.unlike = unit.frame_index >= 3
         analyze(unit.frame_index, unit.capture_ns, decoder.decode(unit.data))
     assert [one.doubted.tolist() for one in found[1:]] == [[False]] * 2 + [[True]] * 3
+    assert taken == [1, 1], "it is told by what is found"
 
 
 def test_a_bus_of_stored_video_is_called_as_it_is_live(flight):

@@ -288,7 +288,8 @@ def test_the_vehicles_that_are_seen_tell_the_tilt(pictures):
 
 def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flight, pictures):
     """A box that is a guess would be drawn and named like one that is right nine times in ten."""
-    trust = ViewTrust("motion", hence="")  # which measures nothing by itself
+    trust, taken = ViewTrust("motion", hence=""), []
+    trust.take = lambda found: taken.append(len(found))
     rig = Rig(trust=trust)
     for picture in pictures[:20]:
         trust.unlike = picture.frame_index >= 10
@@ -301,6 +302,7 @@ def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flig
     assert overlays[19].refined.all()
     assert not overlays[19].doubted.any()
     assert rig.pipeline.doubted == 0
+    assert taken == [1] * 20, "it is told by what is found"
 
 
 def test_what_the_detector_shows_is_counted_without_what_the_edge_tells(pictures):

@@ -63,7 +63,8 @@ def test_the_recording_holds_the_cameras_own_units(link, name, more):
 @pytest.mark.nightly
 def test_a_closer_look_and_a_keyframe_are_refused_with_their_reasons(link):
     """Bits would go to a still of the pixels that the video has; whoever joins would ask for a keyframe for ever."""
-    clip = write_clip(link.folder / "camera.mp4", smooth_pictures(50, size=SIZE), keyint=2, fps=1)
+    pictures = smooth_pictures(10, size=SIZE) * 30  # for longer than anything is waited for
+    clip = write_clip(link.folder / "camera.mp4", pictures, keyint=2, fps=1)
     ground = ground_of(link)
     edge = with_camera(link, clip, "--still-codec", "residual", "--edge-id", "uav-1")
     eventually(lambda: "uav-1" in ground.said and "kbps" in ground.said, what="it is received")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from hvt_common.video.still_codecs import BaseMissingError, CodedCrop
+from hvt_common.video.still_codecs import NO_PARAMETERS, BaseMissingError, CodedCrop
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class StandIn:
         data = cv2.imencode(".webp", half, [cv2.IMWRITE_WEBP_QUALITY, quality_pct])[1].tobytes()
         return CodedCrop(data, {"c": zlib.crc32(base_bgr.tobytes())})
 
-    def decode(self, data, *, size, parameters, base_bgr=None):
+    def decode(self, data, *, size, parameters=NO_PARAMETERS, base_bgr=None):
         """The base with the difference put back."""
         if base_bgr is None or zlib.crc32(base_bgr.tobytes()) != parameters["c"]:
             raise BaseMissingError("another base")
@@ -43,6 +43,6 @@ class Hopeless:
         """All of it."""
         return CodedCrop(crop_bgr.tobytes())
 
-    def decode(self, data, *, size, parameters, base_bgr=None):
+    def decode(self, data, *, size, parameters=NO_PARAMETERS, base_bgr=None):
         """The same."""
         return np.frombuffer(data, np.uint8).reshape(size[1], size[0], 3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
 
 import cv2
 import numpy as np
@@ -56,8 +55,7 @@ class Rig:
         self.sender = make_transmitter(
             self.out, ledger=self.ledger, budget=self.budget, edge_id="edge-1", session_id=SESSION
         )
-        stand_in: Any = StandIn()
-        maker = StillMaker(codec=stand_in, fallback=JpegCodec()) if codec == "residual" else StillMaker()
+        maker = StillMaker(codec=StandIn(), fallback=JpegCodec()) if codec == "residual" else StillMaker()
         self.outbox = Outbox()
         self.maker = maker
         self.on_demand = OnDemand(
