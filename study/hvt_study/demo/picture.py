@@ -61,14 +61,11 @@ def write_picture(path: Path, panels: Sequence[Panel], pairs: Sequence[Pair]) ->
 
     Raises `UserError` where the file cannot be written.
     """
-    columns = [np.vstack((_head(one.title), _panel(one))) for one in panels]
-    picture = _beside(columns)
-    picture = np.vstack((picture, _legend(picture.shape[1])))
-    if pairs:
-        bottom = _beside([_pair(one) for one in pairs])
-        rest = picture.shape[1] - bottom.shape[1]
-        picture = np.vstack((picture, np.pad(bottom, ((0, 0), (0, rest), (0, 0)), constant_values=_PAPER)))
-    if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9]):
+    top = _beside([np.vstack((_head(one.title), _panel(one))) for one in panels])
+    rows = [top, _legend(top.shape[1]), *([_beside([_pair(one) for one in pairs])] if pairs else [])]
+    wide = max(one.shape[1] for one in rows)
+    rows = [np.pad(one, ((0, 0), (0, wide - one.shape[1]), (0, 0)), constant_values=_PAPER) for one in rows]
+    if not cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_PNG_COMPRESSION, 9]):
         raise UserError(f"--picture {path} cannot be written: name another file")
 
 
