@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from av.filter import Graph
 
 from hvt_common.errors import UserError
 from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.video import x265
 from hvt_edge.video.encoder_settings import PRESETS, EncoderSettings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.x265 import MOST_REGIONS, BaseEncoder, Region
 from media.clips import framed, hard_pictures, smooth_pictures
@@ -250,6 +252,15 @@ def test_more_regions_than_are_taken_are_left_out():
     units = encode(pictures, side_data=True, regions=lambda _: wanted)
     few = encode(pictures, side_data=True, regions=lambda _: wanted[:MOST_REGIONS])
     assert [unit.data for unit in units] == [unit.data for unit in few]
+
+
+def test_regions_that_stay_are_not_set_up_again(monkeypatch):
+    """Half a millisecond of each picture's time would go for the same cars on the same car park."""
+    made = []
+    monkeypatch.setattr(x265, "Graph", lambda: made.append(Graph()) or made[-1])
+    pictures, wanted = hard_pictures(6, size=SIZE), [Region(BOX, -0.2)]
+    units = encode(pictures, side_data=True, regions=lambda index: [*wanted] if index > 1 else ())
+    assert (len(units), len(made)) == (6, 2)
 
 
 def test_the_quantiser_is_told():
