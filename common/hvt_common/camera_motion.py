@@ -142,8 +142,13 @@ class CameraMotion:
         full_size = (image_bgr.shape[1], image_bgr.shape[0])
         scale = min(1.0, _WORKING_SIDE_PX / max(full_size)) if self._scale is None else self._scale
         small_size = (max(1, round(full_size[0] * scale)), max(1, round(full_size[1] * scale)))
-        small = cv2.resize(image_bgr, small_size, interpolation=cv2.INTER_AREA)
-        current = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
+        half = (
+            max(1, full_size[0] // 2),
+            max(1, full_size[1] // 2),
+        )  # first: a third of the time of all at once
+        pixels = cv2.resize(image_bgr, half, interpolation=cv2.INTER_AREA) if 2 * scale <= 1 else image_bgr
+        gray = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+        current = np.asarray(cv2.resize(gray, small_size, interpolation=cv2.INTER_AREA), np.uint8)
         previous, self._previous = self._previous, current
         other = self._scene.take(current, capture_ns=0)
         self.new_scene = False
