@@ -86,11 +86,13 @@ export class Boxes {
     this.draw();
   }
 
-  /** The list of this picture, or the newest of those shortly before it, whose tracks go on at their pace. */
+  /** The list of this picture, or the newest of those shortly before it, whose tracks go on at their pace, out of it too. */
   current() {
     const found = this.newest();
     if (!found || this.captured - found.captured >= OLD_MS) return null;
-    return { ...found, tracks: carried(found, this.newest(found.frame - PACE_FRAMES), this.captured) };
+    const tracks = carried(found, this.newest(found.frame - PACE_FRAMES), this.captured);
+    const [wide, high] = this.size;
+    return { ...found, tracks: tracks.filter(({ box: [x, y, right, low] }) => Math.max(0, x) < Math.min(wide, right) && Math.max(0, y) < Math.min(high, low)) };
   }
 
   /** The newest list of a picture or of one before it, however old; null where there is none. */
@@ -256,8 +258,8 @@ export class Boxes {
  * @param {Overlay} list @param {Overlay | null} before @param {number} captured of the later picture, ms
  */
 export function carried(list, before, captured) {
-  const share = before && before.captured < list.captured ? (captured - list.captured) / (list.captured - before.captured) : 0;
-  if (!before || share <= 0 || share > 2) return list.tracks;
+  if (!before || before.captured >= list.captured || captured <= list.captured) return list.tracks;
+  const share = Math.min(2, (captured - list.captured) / (list.captured - before.captured));
   const boxes = new Map(before.tracks.map(({ id, box }) => [id, box]));
   return list.tracks.map((track) => {
     const was = boxes.get(track.id);

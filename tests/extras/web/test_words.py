@@ -127,11 +127,39 @@ def test_boxes_go_on_with_their_objects_until_the_next_list_comes():
       import {{ carried }} from {json.dumps((STATIC / "boxes.js").as_uri())};
       const [found, before] = {json.dumps([found, before])};
       const at = (list, captured) => carried(found, list, captured).map(({{ box }}) => box);
-      console.log(JSON.stringify([at(before, 1500), at(before, 1300), at(null, 1500), at(found, 1500)]));
+      const times = [1500, 2100].map((captured) => at(before, captured));
+      console.log(JSON.stringify([...times, at(before, 1300), at(null, 1500), at(found, 1500)]));
     """
     )
     seen = [[60, 0, 80, 10], parked["box"]]
-    assert boxes == [[[100, 0, 120, 10], parked["box"]], seen, seen, seen]
+    furthest = [[180, 0, 200, 10], parked["box"]]
+    assert boxes == [[[100, 0, 120, 10], parked["box"]], furthest, seen, seen, seen], "it never goes back"
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
+def test_a_box_goes_out_of_the_picture_with_its_object():
+    """Its name would stand at the rim, and a line where a box was turned inside out."""
+    lists = [
+        {
+            "frame": frame,
+            "captured": 40 * frame,
+            "tracks": [{"id": row, "box": box} for row, box in enumerate(boxes)],
+        }
+        for frame, boxes in (
+            (0, [[0, 0, 30, 9], [50, 0, 64, 9], [40, 0, 50, 9]]),
+            (5, [[0, 0, 10, 9], [62, 0, 64, 9], [45, 0, 55, 9]]),
+        )
+    ]
+    drawn = ran(
+        f"""
+      import {{ Boxes }} from {json.dumps((STATIC / "boxes.js").as_uri())};
+      const overlays = new Map({json.dumps([[one["frame"], one] for one in lists])});
+      const about = {{ overlays, frame: 9, captured: 360, size: [64, 36] }};
+      const boxes = Object.assign(Object.create(Boxes.prototype), about);
+      console.log(JSON.stringify(boxes.current().tracks));
+    """
+    )
+    assert drawn == [{"id": 2, "box": [49, 0, 59, 9]}]
 
 
 def texts(found: Any) -> list[str]:
@@ -400,7 +428,7 @@ MORE_ANSWERS = {
 def test_every_answer_to_a_command_is_read():
     """What the edge says to an operator comes from many places too: each text stands here, and was read."""
     found = {text for path in ROOT.joinpath("edge").rglob("*.py") for text in given(path, {"RefusedError"})}
-    found |= set(given(ROOT / "ground/hvt_ground/control.py", {"RefusedError", "UserError"}))
+    found |= set(given(ROOT / "ground/hvt_ground/control.py", {"RefusedError", "UserError", "telling"}))
     assert found == ANSWERS
     for name, said in MORE_ANSWERS.items():
         assert said <= set(sentences(ROOT / name)), name
@@ -441,7 +469,9 @@ def noted(path: Path) -> Iterator[str]:
 def given(path: Path, names: set[str]) -> Iterator[str]:
     """The texts that a module gives to calls of these names."""
     for call in calls(path):
-        if called(call) in names and call.args:
+        if called(call) == "telling" in names:
+            yield "…".join(text for one in call.args for text in spoken(one))
+        elif called(call) in names and call.args:
             yield from spoken(call.args[0])
 
 
