@@ -92,10 +92,10 @@ class Failures:
         with self._lock:
             before = self._parts.get(part)
             count = 1 if before is None else before.count + 1
-            since_ns = now_ns if before is None or before.working else before.since_ns
+            anew = before is None or before.working or before.over
+            since_ns = now_ns if before is None or anew else before.since_ns
             self._parts[part] = Failure(part, reason, count, now_ns, since_ns)
-        fresh = before is None or (before.working and now_ns - before.failed_ns > _STEADY_NS)
-        if fresh or (before is not None and before.working and count.bit_count() == 1):
+        if anew and (before is None or now_ns - before.failed_ns > _STEADY_NS or count.bit_count() == 1):
             self._said.add(part)
             times = "" if count == 1 else f" ({count} failures so far)"
             _log.warning("%s: %s; all else goes on, and it is tried again%s", part, reason, times)

@@ -49,6 +49,17 @@ def test_a_part_that_comes_and_goes_does_not_flood_the_log(caplog):
     assert len(caplog.records) == before + 1, "after an hour without a fault it is news"
 
 
+def test_the_next_of_a_part_that_has_ended_fails_anew(caplog):
+    """A session's recording failed, and is over: that of the next one fails too, and nobody would be told."""
+    clock = Time()
+    failures = Failures(clock)
+    failures.over("recording", failures.failed("recording", "no room"))
+    clock.now_ns += 3600 * SECOND_NS
+    failures.failed("recording", "no folder")
+    assert ["no room" in caplog.messages[0], "no folder" in caplog.messages[-1]] == [True, True]
+    assert [one.since_ns for one in failures.now] == [clock.now_ns]
+
+
 def test_pauses_grow_to_their_limit_and_begin_anew_after_a_steady_time():
     """A broken part would be tried for ever at full speed; or one that failed at breakfast wait a minute at noon."""
     pause, now_ns, pauses = RetryPause(longest_ns=8 * SECOND_NS), 0, []
