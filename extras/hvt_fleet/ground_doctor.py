@@ -67,6 +67,8 @@ def _recordings(config: GroundConfig) -> Finding:
     for name, path, suffix in written(config):
         if is_file(path, suffix):
             check_writable(path, name=name)
+        else:
+            check_folder(path, name=name)
     folder = config.record_folder or (Path() if config.record is None else config.record.absolute().parent)
     free = check_folder(folder, name="--record")
     hours = 8 * free / _USUAL_BPS / 3600

@@ -56,8 +56,11 @@ def test_what_extras_send_and_write_is_checked(tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("PYTAK_TLS_CLIENT_CERT", raising=False)
     link = ("--detector", "motion", "--classifier", "none", "--record", str(tmp_path))
     link += ("--connect", f"tcp/127.0.0.1:{free_ports(1)[0]}")
-    _, found = examined(capsys, *link, "--cot", "udp://239.2.3.1:6969")
-    assert found["reports"]["state"] == "ok"
+    (tmp_path / "notes.txt").touch()
+    told = ("--cot", "udp://239.2.3.1:6969", "--stills", str(tmp_path / "notes.txt"))
+    _, found = examined(capsys, *link, *told)
+    assert (found["reports"]["state"], found["recordings"]["state"]) == ("ok", "wrong")
+    assert "notes.txt is no folder" in found["recordings"]["found"]
     log = tmp_path / "gone" / "flight.hvtlog"
     code, found = examined(capsys, *link, "--cot", "tls://127.0.0.1:8089", "--log", str(log))
     assert found["recordings"]["found"] == f"--log {log} is in a folder that does not exist"
