@@ -85,7 +85,7 @@ class McapFile(SinkWriter[Event]):
         """Write index and footer, and close."""
         if self._file.closed:
             return
-        with self._file, telling(f"MCAP file {self.path} cannot be finished: "):
+        with telling(f"MCAP file {self.path} cannot be finished: "), self._file:
             self._writer.finish()  # type: ignore[no-untyped-call]
 
     def _write(self, topic: str, message: _Message, at: FrameEvent | RecordedStill) -> None:

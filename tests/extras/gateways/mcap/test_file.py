@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from mcap.reader import NonSeekingReader
 
+from hvt_common.errors import UserError
 from hvt_gateways.mcap.file import McapFile
 from hvt_ground.events import Notice
 
@@ -25,3 +27,10 @@ def test_a_ground_that_was_killed_leaves_all_but_the_last_moment(tmp_path: Path)
             pass
     assert 200 - found <= 32
     file.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_a_full_disk_at_its_end_is_a_sentence() -> None:
+    """The last chunk is in a buffer until then: an operator would read an error number."""
+    with pytest.raises(UserError, match="MCAP file /dev/full cannot be finished: No space left on device"):
+        McapFile(Path("/dev/full"), edge="uav-1").close()
