@@ -149,7 +149,8 @@ def write_whole(path: Path, body: bytes) -> None:
         scratch.write_bytes(_checksum(body) + body)
         scratch.replace(path)
     except OSError as error:
-        scratch.unlink(missing_ok=True)
+        with suppress(OSError):
+            scratch.unlink()
         raise CacheError(
             f"cache {path.parent} cannot be written ({error.strerror}): what is in it stays; make room, or name "
             "another with --cache"

@@ -38,6 +38,9 @@ def test_a_folder_that_cannot_be_is_told_in_a_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be made"):
         ResultCache(tmp_path / "file" / "cache")
+    (tmp_path / "ab").write_text("")
+    with pytest.raises(UserError, match="cannot be written"):
+        ResultCache(tmp_path).put("abcdef", {})
 
 
 def test_content_decides_the_name(tmp_path):
