@@ -11,7 +11,8 @@ from pathlib import Path
 
 from rerun.chunk import Chunk
 
-from hvt_common.errors import UserError, check_not_read, exit_with_sentence
+from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.blueprint import comparison
 from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
@@ -26,7 +27,7 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
     Raises:
         UserError: a file is no recording, or two are of the same edge.
     """
-    check_not_read(out, paths, name="--out")
+    check_writable(out, name="--out", reads=paths)
     read = [_read(path) for path in paths]
     edges = [edge for edge, _ in read]
     if len(set(edges)) < len(edges):

@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 from rerun.experimental import ViewerClient
 
-from hvt_common.errors import UserError, check_not_read, exit_with_sentence
+from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.live_view import free_port, started_viewer
 
@@ -34,7 +35,7 @@ def screenshot(recording: Path, *, frame: int, out: Path, size: tuple[int, int] 
     """
     if not recording.is_file():
         raise UserError(f"recording {recording} does not exist: give an .rrd file")
-    check_not_read(out, [recording], name="--out")
+    check_writable(out, name="--out", reads=[recording])
     if shutil.which("ffmpeg") is None:
         raise UserError("ffmpeg is not on the PATH: the viewer needs it to show HEVC")
     port = free_port()

@@ -38,5 +38,7 @@ def test_what_cannot_be_joined_is_said(tmp_path):
     with pytest.raises(UserError, match="same edge"):
         join_recordings([one, one], tmp_path / "all.rrd", base_size=(64, 48), fps=15)
     (tmp_path / "text.rrd").write_text("no recording")
+    with pytest.raises(UserError, match=r"--out .*gone.* is in a folder that does not exist"):
+        join_recordings([one], tmp_path / "gone" / "all.rrd", base_size=(64, 48), fps=15)
     with pytest.raises(UserError, match=r"text\.rrd"):
         join_recordings([one, tmp_path / "text.rrd"], tmp_path / "all.rrd", base_size=(64, 48), fps=15)

@@ -48,3 +48,6 @@ def test_a_missing_recording_is_one_sentence(tmp_path: Path) -> None:
     """A mistyped path must not start a viewer and wait."""
     with pytest.raises(UserError, match="does not exist"):
         screenshot(tmp_path / "none.rrd", frame=0, out=tmp_path / "a.png")
+    (tmp_path / "a.rrd").touch()
+    with pytest.raises(UserError, match=r"--out .*gone.* is in a folder that does not exist"):
+        screenshot(tmp_path / "a.rrd", frame=0, out=tmp_path / "gone" / "a.png")
