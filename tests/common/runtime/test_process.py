@@ -222,21 +222,26 @@ def test_a_library_that_lowers_its_own_workers_gets_them_back():
 
 
 ZENOH_THREADS = """
+from contextlib import suppress
 from pathlib import Path
 from hvt_common.runtime.process import share_zenoh_threads
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
 share_zenoh_threads()
 with open_session(LinkSettings(role="edge", connect=("tcp/127.0.0.1:9",))):
-    print({task.joinpath("comm").read_text().split("-")[0] for task in Path("/proc/self/task").iterdir()})
+    for task in Path("/proc/self/task").iterdir():
+        with suppress(OSError):  # a thread that has ended
+            print(task.joinpath("comm").read_text().split("-")[0])
 """
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it looks at the names of threads")
 def test_zenoh_shares_its_threads() -> None:
+    """Each of three more would take megabytes of a small computer."""
     around = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
     done = subprocess.run(
         [sys.executable, "-c", ZENOH_THREADS], env=around, capture_output=True, text=True, check=True
     )
-    assert "app" in done.stdout
-    assert not any(f"'{one}'" in done.stdout for one in ("net", "acc", "rx"))
+    names = set(done.stdout.split())
+    assert "app" in names
+    assert not names & {"net", "acc", "rx"}

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 import pytest
 
 from programs.processes import PATIENT_S, eventually, free_ports
-from studies.small_study import REGIME, arguments, detector, flights, said, study, table, until
+from studies.small_study import REGIME, arguments, detector, flights, holding, said, study, table, until
 
 pytest.importorskip("distributed")
 pytestmark = pytest.mark.nightly
@@ -18,7 +18,7 @@ WORDS = ("--methods", "M0,R0,M5", "--regimes", REGIME)
 
 
 class Cluster:
-    """Two workers of one thread, without anybody who would start them again."""
+    """Two workers of one thread, that nobody starts again; the first stands still after its flight."""
 
     def __init__(self, folder):
         (port,) = free_ports(1)
@@ -27,16 +27,18 @@ class Cluster:
         self.scheduler = self._start(
             "scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"
         )
-        self.workers = [self._start("worker", self.address, *_WORKER) for _ in range(2)]
+        self.workers = [
+            self._start("worker", self.address, *_WORKER, env=env) for env in (holding(folder, kept=1), None)
+        ]
 
-    def _start(self, what, *words):
+    def _start(self, what, *words, env=None):
         log = self._stack.enter_context((self._folder / f"{what}.log").open("a"))
         code = f"from distributed.cli.dask_{what} import main; main()"
         command = [sys.executable, "-c", code, *words]
         process = subprocess.Popen(
-            command, cwd=self._folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+            command, cwd=self._folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=env
         )
-        self._stack.callback(process.wait, 30)
+        self._stack.callback(process.wait, PATIENT_S)
         self._stack.callback(process.kill)
         return process
 
@@ -45,7 +47,10 @@ class Cluster:
         return (self._folder / "worker.log").read_text().count("Registered to") == 2
 
     def __enter__(self):
-        eventually(self.ready, what="two workers have found their scheduler")
+        with ExitStack() as stack:
+            stack.push(self._stack)  # where they do not
+            eventually(self.ready, what="two workers have found their scheduler")
+            stack.pop_all()
         return self
 
     def __exit__(self, *_):

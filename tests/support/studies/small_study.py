@@ -24,13 +24,14 @@ _MAIN = (
     "from hvt_study.cli import main; raise SystemExit(main())"
 )
 _HELD = """
-import time
+import os, time
 from hvt_study.cache.results import ResultCache
 put = ResultCache.put
 def put_and_hold(cache, key, result):
     put(cache, key, result)
-    if "flights" in cache._folder.parts and cache.count() >= 2:
+    if "flights" in cache._folder.parts and cache.count() >= KEPT:
         time.sleep(300)
+        os._exit(1)  # of a test that has failed
 ResultCache.put = put_and_hold
 """
 FRAMES = 30
@@ -60,15 +61,8 @@ def detector(uri: str) -> str:
 
 
 def study(command: str, *words: str, folder: Path, held: bool = False, **named: Any) -> subprocess.Popen[str]:
-    """``hvt-study`` as a process of a group of its own; what it says is in study.out and study.err there.
-
-    ``held`` stands still once two flights are kept, for longer than a test may take.
-    """
-    environment = {**os.environ, "COLUMNS": "200"}
-    if held:
-        (folder / "held").mkdir()
-        (folder / "held" / "sitecustomize.py").write_text(_HELD)
-        environment["PYTHONPATH"] = str(folder / "held")
+    """``hvt-study`` as a process of a group of its own; what it says is in study.out and study.err there."""
+    environment = holding(folder, kept=2) if held else dict(os.environ)
     with (folder / "study.out").open("w") as out, (folder / "study.err").open("w") as err:
         return subprocess.Popen(
             [sys.executable, "-c", _MAIN, command, *words],
@@ -77,9 +71,16 @@ def study(command: str, *words: str, folder: Path, held: bool = False, **named: 
             stderr=err,
             text=True,
             start_new_session=True,
-            env=environment,
+            env=environment | {"COLUMNS": "200"},
             **named,
         )
+
+
+def holding(folder: Path, *, kept: int) -> dict[str, str]:
+    """Environment of who stands still once so many flights are kept, for longer than a test may take."""
+    (folder / "held").mkdir()
+    (folder / "held" / "sitecustomize.py").write_text(_HELD.replace("KEPT", str(kept)))
+    return {**os.environ, "PYTHONPATH": str(folder / "held")}
 
 
 def table(out: Path) -> list[dict[str, Any]]:
