@@ -14,6 +14,7 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.backlog.entry import worth
 from hvt_edge.backlog.worker import IntakeStill, StoreWorker
 from hvt_edge.config import EdgeConfig, check
+from hvt_edge.wiring.link import channels_of
 from programs.processes import eventually
 from rigs.keeping import STILL, Rig
 from rigs.kept import opened
@@ -178,6 +179,7 @@ def test_only_live_sources_are_stored_unless_requested(settings, live, stored):
     """The next run, of another clip, would send what was left of this one; or the same input give other bytes."""
     config = check(EdgeConfig(source="demo", **settings))
     assert bool(config.store_bytes(live=live)) == stored
+    assert (Channel.BACKLOG in channels_of(config, live=live)) == stored, "grounds are told"
 
 
 def test_asking_for_the_video_of_an_empty_store_is_refused(tmp_path):
