@@ -94,7 +94,7 @@ _SCALE_RANGE: Final = (0.5, 2.0)
 _SCENE_LEVELS: Final = 4.0
 """Two scenes of less difference are a keyframe's sharper picture of the same water or fog."""
 _STILL_SHIFT: Final = 0.03
-"""Of the picture's sides together: what came into view since is no larger."""
+"""The most of `CameraMotion.shift`."""
 _STILL_CHANGED: Final = 0.006
 _CHANGED_LEVELS: Final = 16
 _BLUR_PX: Final = 5
@@ -122,17 +122,19 @@ class CameraMotion:
     def still(self) -> bool:
         """Whether the newest image shows what the marked one did, but for a small motion of the camera. 0.2 ms."""
         then, now = self._marked, self._previous
-        if then is None or now is None or then.shape != now.shape:
+        if then is None or now is None or then.shape != now.shape or self.shift() > _STILL_SHIFT:
             return False
-        height, width = now.shape
-        corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float64)
-        shift = np.abs(corners @ self._since[:2].T - corners[:, :2]).max(axis=0) / (width, height)
-        if shift.sum() > _STILL_SHIFT:
-            return False
-        moved = cv2.warpAffine(then, self._since[:2], (width, height), borderMode=cv2.BORDER_REPLICATE)
+        moved = cv2.warpAffine(then, self._since[:2], now.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
         blurred = (cv2.blur(one, (_BLUR_PX, _BLUR_PX)) for one in (moved, now))
         changed = int(np.count_nonzero(cv2.absdiff(*blurred) > _CHANGED_LEVELS))
         return changed <= _STILL_CHANGED * now.size
+
+    def shift(self) -> float:
+        """How far the newest image lies from the marked one, of the picture's sides together: what came into view."""
+        height, width = (1, 1) if self._previous is None else self._previous.shape
+        corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float64)
+        moved = np.abs(corners @ self._since[:2].T - corners[:, :2]).max(axis=0) / (width, height)
+        return float(moved.sum())
 
     def step(self, image_bgr: Image) -> Affine:
         """The map from the image of the last call to this one, (2, 3) float64 in pixels of the full image.

@@ -230,3 +230,26 @@ def test_before_a_look_and_after_another_size_nothing_is_still(ground: np.ndarra
     assert motion.still()
     motion.step(np.zeros((480, 640, 3), np.uint8))
     assert not motion.still()
+
+
+def test_while_the_camera_turns_what_comes_into_view_is_searched_soon() -> None:
+    """Who turns a camera to look at something would see it for a second without a box."""
+    noise = np.random.default_rng(3).integers(0, 255, (23, 125), np.uint8)
+    ground = cv2.cvtColor(cv2.resize(noise, (1000, 184)), cv2.COLOR_GRAY2BGR)
+
+    def looks(speed_px: int) -> list[int]:
+        tracker = ByteTracker(TrackerSettings(camera_motion="flow"), fps=15)
+        found: list[int] = []
+        for k in range(46):
+            left = speed_px * k
+            known: dict[str, Any] = {"frame_index": k, "image_bgr": ground[:, left : left + 320]}
+            if found and not tracker.is_due(k - found[-1], every=5, most=15):
+                tracker.predict(**known)
+                continue
+            found.append(k)
+            box = np.array([[300 - left, 60, 340 - left, 100]], np.float32)
+            tracker.update(Detections(box, np.full(1, 0.9, np.float32), np.zeros(1, np.int32)), **known)
+        return found
+
+    assert looks(12) == list(range(0, 46, 5))
+    assert looks(0) == [0, 15, 30, 45]

@@ -43,6 +43,8 @@ _LEAST_DETECTIONS: Final = 3
 _AS_PREDICTED_IOU: Final = 0.5
 _MOST_SURPRISES: Final = 0.1
 """Tracks elsewhere than predicted or not found, and what may start new ones, as a share of the tracks."""
+_MOST_SHIFT: Final = 0.1
+"""Of the picture's sides, since the last update: what came into view has no tracks yet (`CameraMotion.shift`)."""
 
 # Box lengths; wider, and neighbours in a queue of cars are taken for each other.
 _MOST_GROWTH: Final = 0.75
@@ -173,15 +175,16 @@ class ByteTracker:
     def is_due(self, frames: int, *, every: int, most: int) -> bool:
         """Whether the newest frame, so many after the one searched last, is to be searched.
 
-        That is each ``every`` frames while something is to be confirmed; else twice or three times as many, up to
-        ``most``, after updates that found nearly all as predicted, and ``most`` while the newest frame shows what the
-        last update saw.
+        That is each ``every`` frames while something is to be confirmed or much has come into view; else twice or
+        three times as many, up to ``most``, after updates that found nearly all as predicted, and ``most`` while the
+        newest frame shows what the last update saw.
         """
-        if (self._table.phase == UNCONFIRMED).any():
+        camera = self._camera
+        if frames < every or frames >= most or (self._table.phase == UNCONFIRMED).any():
             return frames >= every
-        if frames < max(every, min(most, (1 + min(2, self._steady)) * every)):
-            return False
-        return frames >= most or self._camera is None or not self._camera.still()
+        if camera is not None and camera.shift() > _MOST_SHIFT:
+            return True
+        return frames >= (1 + min(2, self._steady)) * every and (camera is None or not camera.still())
 
     def update(self, detections: Detections, *, frame_index: int, image_bgr: Image | None = None) -> Tracks:
         """The tracks at a frame that a detector has searched; boxes in base pixels.
