@@ -85,7 +85,7 @@ class GroundConfig:
         integer(1, 1000, unit=" frames"),
         None,
         "detect on every n-th frame, less when behind",
-        shown_default="5; with few frames a second less; one a second while all is as predicted",
+        shown_default="5; with few frames a second less; up to 15 while all is as predicted",
     )
     confidence: float | None = _MODELS.option(
         number(0.01, 1),
