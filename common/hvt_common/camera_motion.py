@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
 
 _Thumbnail = npt.NDArray[np.float32]
@@ -24,8 +23,8 @@ _EXPOSURE: Final = 16.0
 """Levels. By so much the whole picture may become brighter or darker from one step to the next."""
 _NEWEST: Final = 4
 """So many differences tell what is usual: of a source that repeats pictures some are none."""
-_LONGEST_NS: Final = SECOND_NS
-"""After this time a moving camera may show other ground."""
+_SCENE_LEVELS: Final = 4.0
+"""Two scenes of less mean difference are a keyframe's sharper picture of the same water or fog."""
 
 
 class SceneChange:
@@ -34,30 +33,27 @@ class SceneChange:
     Two pictures are compared as thumbnails. That they do not correlate is not enough: over water, snow and fog or at
     night a thumbnail holds little but noise, and that of two pictures never correlates; nor do pictures of a fast
     flight. So they must also differ by clearly more than the newest pictures of this scene did from each other.
-    ``least_difference`` is in levels, mean over the thumbnail: the default is the rounding of 8 bits in a picture
-    without noise, and some more.
     """
 
-    def __init__(self, *, least_difference: float = 0.15) -> None:
-        self._least_difference = least_difference
-        self._before: tuple[int, _Thumbnail] | None = None
+    def __init__(self) -> None:
+        self._before: _Thumbnail | None = None
         self._usual: deque[float] = deque(maxlen=_NEWEST)
         """Differences of two pictures lately, levels."""
 
-    def take(self, image: Image, *, capture_ns: int) -> bool:
+    def take(self, image: Image) -> bool:
         """Whether this picture, BGR or gray, has nothing to do with the one just before."""
         small = _thumbnail(image)
-        before, self._before = self._before, (capture_ns, small)
-        if before is None or capture_ns - before[0] > _LONGEST_NS:
+        before, self._before = self._before, small
+        if before is None:
             return False
-        brighter = float(small.mean() - before[1].mean())
-        here, there = small - small.mean(), before[1] - before[1].mean()
+        brighter = float(small.mean() - before.mean())
+        here, there = small - small.mean(), before - before.mean()
         difference = float(np.abs(here - there).mean()) + max(0.0, abs(brighter) - _EXPOSURE)
         usual = max(self._usual, default=None)
         self._usual.append(difference)
         if usual is None:
             return False
-        new = difference > max(self._least_difference, _USUAL_TIMES * usual)
+        new = difference > max(_SCENE_LEVELS, _USUAL_TIMES * usual)
         return new and _alike(here, there) < _LEAST_ALIKE
 
 
@@ -91,8 +87,6 @@ _LEAST_INLIERS: Final = 12
 _LEAST_INLIER_SHARE: Final = 0.3
 # No camera zooms or rolls this far between two frames: such an estimate is wrong.
 _SCALE_RANGE: Final = (0.5, 2.0)
-_SCENE_LEVELS: Final = 4.0
-"""Two scenes of less difference are a keyframe's sharper picture of the same water or fog."""
 _STILL_SHIFT: Final = 0.03
 """The most of `CameraMotion.shift`."""
 _STILL_CHANGED: Final = 0.006
@@ -152,7 +146,7 @@ class CameraMotion:
         gray = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
         current = np.asarray(cv2.resize(gray, small_size, interpolation=cv2.INTER_AREA), np.uint8)
         previous, self._previous = self._previous, current
-        other = self._scene.take(current, capture_ns=0)
+        other = self._scene.take(current)
         self.new_scene = False
         if previous is None or previous.shape != current.shape:
             return _identity()
@@ -166,7 +160,7 @@ class CameraMotion:
     def reset(self) -> None:
         """Forget the last image: the next call gives the identity."""
         self._previous = None
-        self._scene = SceneChange(least_difference=_SCENE_LEVELS)
+        self._scene = SceneChange()
         self.new_scene = False
         """Whether the newest image shows another scene than the one before."""
         self.mark()

@@ -32,6 +32,8 @@ class AnalyzedFrame:
     """A decision step: the detector ran on this frame."""
     tracked: bool = True
     """False where nobody used what would be known of it: it was neither decoded nor searched, and has no tracks."""
+    scene_began: int = -1
+    """The newest frame that another scene began with, as the tracker saw; -1 before any."""
     _bgr: list[Image] = field(default_factory=list, compare=False, repr=False)
 
     @property
@@ -163,12 +165,13 @@ class Analyzer:
         if detections is None:
             with self.cpu_budget.spending("track"):
                 tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
-            return AnalyzedFrame(frame, picture, tracks, detected=False, _bgr=bgr)
-        if self._trust is not None:
-            self._trust.take(detections)
-        self._detected_index, self.detected_ns = frame.index, frame.capture_ns
-        tracks = self._tracker.update(detections, frame_index=frame.index, image_bgr=pixels)
-        return AnalyzedFrame(frame, picture, tracks, detected=True, _bgr=bgr)
+        else:
+            if self._trust is not None:
+                self._trust.take(detections)
+            self._detected_index, self.detected_ns = frame.index, frame.capture_ns
+            tracks = self._tracker.update(detections, frame_index=frame.index, image_bgr=pixels)
+        detected, scene_began = detections is not None, self._tracker.scene_began
+        return AnalyzedFrame(frame, picture, tracks, detected=detected, scene_began=scene_began, _bgr=bgr)
 
     def _decode(self, index: int, unit: AccessUnit) -> YuvPicture:
         picture = self._decoder.decode_yuv(unit.data)

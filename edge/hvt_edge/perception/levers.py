@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hvt_common.units import SECOND_NS
 from hvt_edge.operating import Levers, Operating
@@ -42,6 +42,8 @@ class Measured:
     """Share of the shown objects that bear another class there."""
     reported: bool = False
     """The ground's own detector shows even fewer: ``hidden`` are those that it misses."""
+    moved: float = 0.0
+    """By so much the gain changed at the last comparison."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +139,16 @@ class LeverControl:
         if levers != before:
             self._operating.pull(levers)
         return levers
+
+    @property
+    def stable(self) -> bool:
+        """Whether tracks are judged the same were the gain twice as far from here as it moved last."""
+        now, sent = self.measured, self._operating.now.levers.tracks
+        margin = max(self._settings.least_gain, 2 * now.moved)
+        near = (replace(now, gain=now.gain + by, sure_gain=now.sure_gain + by) for by in (-margin, margin))
+        bps = self._operating.now.total_bps
+        judged = [self._settings.tracks_pay(one, total_bps=bps, sent=sent) for one in near]
+        return self.unlike or judged[0] == judged[1]
 
     def _tracks(self, sent: bool) -> bool:  # noqa: FBT001 - the state before
         if self.unlike:

@@ -33,7 +33,6 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.camera_motion import SceneChange
 from hvt_common.tracking.recall import EDGE_ONLY_CONFIDENCE, Recall
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Detections, Image, iou
@@ -50,11 +49,14 @@ _LEAST_MORE = 0.5
 _BASE_NAMES = 1 / 3
 """How often the base's name is right if base and source name an object differently."""
 _REST_NS, _QUICK_REST_NS = SECOND_NS, SECOND_NS // 3
-"""Capture time from one comparison to the next, at least; at first they are made in quick order, …"""
+"""Capture time from one comparison to the next, at least, twice as long while `ShadowGround.stable`; at first they
+are made in quick order, …"""
 _QUICK_COMPARISONS = 2.5
 """… so few, because nothing is known."""
 _MEMORY_S = 8.0
 """Time constant with which former comparisons fade."""
+_SAME_SHARE = 0.75
+"""Of the tracks at the comparison before and now: with fewer of the same it is another view."""
 _MATCH_IOU = 0.3
 """The ground's own limit for one object: boxes of 15 pixels from two pictures seldom overlap more."""
 
@@ -257,9 +259,13 @@ class ShadowGround:
         self._last_ns: int | None = None
         self._shown_ids = np.empty(0, np.int64)
         """Tracks that the base showed at the comparison before."""
-        self._scene_change = SceneChange()
-        self.scene_changes = 0
-        """How often another scene began."""
+        self._compared_ids = self._shown_ids
+        """All tracks of then."""
+        self.stable = False
+        """Nothing would follow from another comparison soon, as its user says."""
+        self.scene_began = -1
+        """The frame that this scene began with."""
+        self._moved = 0.0
         self._recall = Recall()
         """The share of the base's sure objects that the source shows too."""
         self.now = before
@@ -271,10 +277,10 @@ class ShadowGround:
         """The measured gains of tracks, corrected by the ground's reports."""
         more = self._difference.mean
         if more is None:
-            return self.now.measured
+            return replace(self.now.measured, moved=self._moved)
         plain, sure = (self.now.corrected(more, sure=sure) for sure in (False, True))
         reported = plain.hidden > self.now.hidden
-        return replace(plain.measured, sure_gain=sure.sure_gain, reported=reported)
+        return replace(plain.measured, sure_gain=sure.sure_gain, reported=reported, moved=self._moved)
 
     def take_detected(self, report: Detected) -> None:
         self._difference.take(report)
@@ -282,9 +288,12 @@ class ShadowGround:
     def compare(self, seen: AnalyzedFrame) -> bool:
         """Compare, if this is a decision step on a coded frame and one is due; tell whether it was done."""
         capture_ns = seen.frame.capture_ns
-        if seen.detected and self._scene_change.take(seen.frame.source_bgr, capture_ns=capture_ns):
+        if seen.scene_began > self.scene_began:
+            self.scene_began = seen.scene_began
             self._forget()
         if not seen.detected or seen.base is None or capture_ns < self._next_ns:
+            return False
+        if self.stable and capture_ns < self._next_ns + _REST_NS and self._same_view(seen):
             return False
         if not self._next_ns:  # the first picture of a stream is coarser than any other
             self._next_ns = capture_ns + _QUICK_REST_NS
@@ -300,18 +309,23 @@ class ShadowGround:
         self._next_ns = capture_ns + (_QUICK_REST_NS if quick else _REST_NS)
         if found is None:
             return False
-        one = self._compared(seen, found)
+        one, gain = self._compared(seen, found), self.now.gain
         self._take(one, capture_ns)
+        self._moved = abs(self.now.gain - gain)
+        self._compared_ids = seen.tracks.ids
         self._difference.expect(seen.frame.index, one.shown + one.false, capture_ns=capture_ns)
         return True
 
     def _forget(self) -> None:
         # Another scene: measurements of the last one say nothing of it.
-        self.scene_changes += 1
-        self.now, self._last_ns, self._next_ns = UNMEASURED, None, 0
+        self.now, self._last_ns, self._next_ns, self.stable = UNMEASURED, None, 0, False
         self._difference.forget()
         self._recall = Recall()
         self._shown_ids = np.empty(0, np.int64)
+
+    def _same_view(self, seen: AnalyzedFrame) -> bool:
+        then, now = self._compared_ids, seen.tracks.ids
+        return len(np.intersect1d(then, now)) >= _SAME_SHARE * max(len(then), len(now))
 
     def _compared(self, seen: AnalyzedFrame, found: Detections) -> Shadow:
         tracks, least = seen.tracks, self._confidence

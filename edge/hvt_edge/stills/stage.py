@@ -50,7 +50,7 @@ class StillStage:
         self.latest_tracks: Tracks | None = None
         """Those of the frame that `send` took last. In lockstep they change at the same point of the frame loop in
         every run, whatever `analyze` does meanwhile."""
-        self._scene_changes = 0
+        self._scene_began = -1
         self._detected: Detected | None = None
         """Reported since the decision before; in lockstep a frame may be compared at this very moment."""
 
@@ -164,15 +164,18 @@ class StillStage:
         if self.levers is None:
             return _ALL
         if self.shadow is not None:
-            if self.shadow.scene_changes != self._scene_changes:
-                self._scene_changes = self.shadow.scene_changes
+            if self.shadow.scene_began != self._scene_began:
+                self._scene_began = self.shadow.scene_began
                 self.levers.forget()
             if self._detected is not None:
                 self.shadow.take_detected(self._detected)
                 self._detected = None
             self.levers.measured = self.shadow.measured
         self.levers.unlike = self.analyzer.view_unlike
-        return self.levers.decide(now_ns)
+        levers = self.levers.decide(now_ns)
+        if self.shadow is not None:
+            self.shadow.stable = self.levers.stable
+        return levers
 
     def _note_change(self, result: StillResult) -> None:
         # A still may change something where it alone shows the ground another object than the edge names.

@@ -58,6 +58,20 @@ class Rig:
         return self.operating.now.levers
 
 
+@pytest.mark.parametrize(
+    ("gain", "moved", "stable"),
+    [(0.0, 0.0, True), (0.01, 0.0, False), (0.1, 0.01, True), (0.1, 0.06, False), (0.1, 0.5, False)],
+)
+def test_a_judgement_near_its_threshold_is_not_settled(gain, moved, stable):
+    """It would be measured half as often, and tracks would come or go late."""
+    rig = Rig()
+    rig.control.measured = Measured(3.0, gain, gain, moved=moved)
+    rig.second()
+    assert rig.control.stable is stable
+    rig.control.unlike = True
+    assert rig.control.stable
+
+
 def test_in_a_view_that_the_detector_does_not_know_its_tracks_have_no_credit():
     """A tenth of the budget went into guesses, because the ground guessed otherwise."""
     rig = Rig()
