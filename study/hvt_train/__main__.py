@@ -48,8 +48,12 @@ def _parser() -> argparse.ArgumentParser:
         own.add_argument("--batch", type=int, default=8, help="views in a step of the detector")
         own.add_argument("--classifier-steps", type=int, default=5000, help="of 64 crops each")
         own.add_argument("--minutes", type=float, default=None, help="end each network's schedule by then")
-        real = "folder of kit_ais, hit_uav, cats_madison and street"
+        real = "folder of kit_ais, hit_uav, cats_madison, seadronessee, and of street and camera (unlabelled)"
         own.add_argument("--real", type=Path, default=None, metavar="DATA", help=real)
+        named = ("PVB_2003.xml", "YOLOX_NANO.onnx")
+        own.add_argument(
+            "--teachers", type=Path, nargs=2, metavar=named, help="name what is in street and camera"
+        )
         own.add_argument("--start", metavar="embedded|FOLDER|FILE", help="ONNX files to go on from")
     own = commands.add_parser("eval", help="measure", formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     own.add_argument("--drawn", action="store_true", help="on held-out drawn scenes")

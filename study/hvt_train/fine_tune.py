@@ -122,7 +122,7 @@ def fine_tune(
         train_detector(
             pool,
             settings=loop,
-            views=ViewSettings(side=settings.side),
+            views=ViewSettings(side=settings.side, tiled=0.0),
             seed=settings.seed,
             batch=settings.batch,
             workers=0,

@@ -28,6 +28,7 @@ from hvt_train.learning.detector import DetectorNet
 from hvt_train.learning.export import metadata
 from hvt_train.learning.loop import LoopSettings
 from hvt_train.learning.train_detector import export_detector, train_detector
+from hvt_train.pictures.camera import Teachers
 from hvt_train.pictures.crops import (
     CropSource,
     held_out_crops,
@@ -36,6 +37,7 @@ from hvt_train.pictures.crops import (
     real_crops,
     scene_crops,
 )
+from hvt_train.pictures.kinds import CLASSES
 from hvt_train.pictures.pool import PoolPlan, fill_pool
 from hvt_train.pictures.real import HeldOut, fill_real, held_out_pictures
 from hvt_train.pictures.views import ViewSettings
@@ -44,14 +46,16 @@ _VALIDATION = range(100, 104)
 """Held-out scenes by which the best weights are chosen; ``eval`` measures on others."""
 
 _SUMMARY = {
-    DETECTOR: "Vehicles and people seen from above or aslant, in daylight and thermal. Input BGR 0…255, free"
+    DETECTOR: "Vehicles, people and boats seen from above or aslant, in daylight and thermal. Input BGR 0…255, free"
     " multiples of 32, letterboxed top-left with 114; output a raw YOLOX head.",
     CLASSIFIER: "Class of a 96x96 crop (padded by 15 %) of a vehicle or person; other is anything else.",
 }
 _CREDITS = (
     "Begun from YOLOX-nano's COCO weights (Megvii, Apache-2.0); drawn scenes of this project; KIT AIS (CC BY 3.0,"
     " labels by jekhor); HIT-UAV (Suo et al., Sci Data 2023, CC BY 4.0); CATS-Lab Madison drone-view vehicles, with"
-    " our marks of people; four clips of intel-iot-devkit/sample-videos (CC BY 4.0)"
+    " our marks of people; seven clips of intel-iot-devkit/sample-videos (CC BY 4.0); SeaDronesSee (Varga et al.,"
+    " WACV 2022, CC0); contains information from Traffic Images accessed March 2021 from data.gov.sg, made"
+    " available under the terms of the Singapore Open Data Licence version 1.0"
 )
 
 
@@ -64,16 +68,23 @@ def run_recipe(arguments: argparse.Namespace) -> None:
     plan = PoolPlan(scenes=arguments.scenes, places=arguments.places)
     pool = fill_pool(out / "pool", plan, workers=arguments.workers)
     if arguments.real is not None:
-        start = _started(arguments, DETECTOR)
-        teacher = (
-            None if start is None else open_detector(str(start), confidence=0.08, threads=arguments.threads)
-        )
-        knows_streets = teacher is not None and "person" in teacher.class_names
-        pool += fill_real(out / "pool", arguments.real, teacher=teacher if knows_streets else None)
+        pool += fill_real(out / "pool", arguments.real, teachers=_teachers(arguments))
     if arguments.command in ("detector", "all"):
         _detector(arguments, pool)
     if arguments.command in ("classifier", "all"):
         _classifier(arguments, pool)
+
+
+def _teachers(arguments: argparse.Namespace) -> Teachers | None:
+    """``--teachers``: person-vehicle-bike-detection-2003 and YOLOX-nano; the embedded detector is the third."""
+    if arguments.teachers is None:
+        return None
+    names = ("vehicle", "person", "bike")
+    best, nano, own = (
+        open_detector(str(one), confidence=0.08, threads=arguments.threads)
+        for one in (*arguments.teachers, DETECTOR)
+    )
+    return Teachers(best, nano, own, names=names)
 
 
 def _detector(arguments: argparse.Namespace, pool: list[Path]) -> None:
@@ -89,9 +100,13 @@ def _detector(arguments: argparse.Namespace, pool: list[Path]) -> None:
     train_detector(
         pool,
         settings=LoopSettings(
-            steps=arguments.steps, rate=arguments.rate, budget_s=_seconds(arguments), check_every=400
+            steps=arguments.steps,
+            rate=arguments.rate,
+            budget_s=_seconds(arguments),
+            check_every=400,
+            device="cuda" if torch.cuda.is_available() else "cpu",
         ),
-        views=ViewSettings(side=384),
+        views=ViewSettings(side=416),
         seed=arguments.seed,
         batch=arguments.batch,
         workers=arguments.workers,
@@ -106,12 +121,12 @@ def _detector(arguments: argparse.Namespace, pool: list[Path]) -> None:
 def _calibrate(arguments: argparse.Namespace) -> None:
     """Export the best weights again, with scores that say how often a box is right on what was held out."""
     path = (arguments.out / DETECTOR).with_suffix(".onnx")
-    net = DetectorNet(len(CLASS_NAMES))
+    net = DetectorNet(len(CLASSES))
     net.load_state_dict(torch.load(path.with_suffix(".pt")))
     detector = open_detector(str(path), confidence=0.02, threads=arguments.threads)
     drawn = drawn_pictures(_VALIDATION, moments=1, bitrates_bps=(CLEAN, 400_000)).values()
     scenes = (
-        HeldOut(one.image_bgr, one.boxes_px[clear], one.boxes_px[~clear], frozenset(CLASS_NAMES))
+        HeldOut(one.image_bgr, one.boxes_px[clear], one.boxes_px[~clear], frozenset(CLASSES))
         for group in drawn
         for one in group
         for clear in [well_visible(one)]
@@ -209,7 +224,7 @@ class _Best:
 def _properties(name: str, seed: int) -> dict[str, str]:
     return metadata(
         name=name,
-        classes=CLASS_NAMES,
+        classes=CLASSES if name == DETECTOR else CLASS_NAMES,
         seed=seed,
         commit=_commit(),
         date=dt.datetime.now(dt.UTC).date().isoformat(),

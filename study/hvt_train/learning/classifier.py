@@ -89,7 +89,7 @@ def _loss_of(net: nn.Module, batch: tuple[Tensor, Tensor]) -> Loss:
     values = ((images.float() - MEAN) * SCALE).contiguous(memory_format=torch.channels_last)
     logits = net(values).float()
     loss = functional.cross_entropy(logits, kinds, label_smoothing=0.03)
-    return loss, {"top1": (logits.argmax(1) == kinds).float().mean().item()}
+    return loss, {"top1": (logits.argmax(1) == kinds).float().mean()}
 
 
 def train_classifier(

@@ -1,4 +1,8 @@
-"""The network of ``aerial-nano``: YOLOX-nano (Ge et al., 2021), so that training can begin from its COCO weights."""
+"""The network of ``aerial-nano``: YOLOX-nano (Ge et al., 2021) as a processor likes it, begun from its COCO weights.
+
+Half of YOLOX-nano's time on a CPU is its first layer; as one convolution of 6x6 it computes the same in a quarter of
+the time. ReLU instead of SiLU, and more blocks where they cost little.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +15,13 @@ _HEAD = 64
 
 
 class Conv(nn.Sequential):
-    """Convolution, batch norm, SiLU."""
+    """Convolution, batch norm, ReLU."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> None:
         super().__init__(
             nn.Conv2d(inputs, outputs, kernel, stride, (kernel - 1) // 2, groups=groups, bias=False),
             nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.03),
-            nn.SiLU(inplace=True),
+            nn.ReLU(inplace=True),
         )
 
 
@@ -41,14 +45,30 @@ class Block(nn.Module):
         return x + out if self.residual else out
 
 
+class Added(nn.Sequential):
+    """Residual blocks that YOLOX-nano has not; they begin as nearly nothing."""
+
+    def __init__(self, width: int, blocks: int) -> None:
+        super().__init__(*(Block(width, residual=True) for _ in range(blocks)))
+        for block in self:
+            assert isinstance(block, Block)
+            norm = block.spread[1][1]
+            assert isinstance(norm, nn.BatchNorm2d)
+            nn.init.constant_(norm.weight, 0.2)
+
+
 class CrossStage(nn.Module):
     """Half of the channels go through ``blocks``, half past them (CSPNet, Wang et al., 2020)."""
 
-    def __init__(self, inputs: int, outputs: int, blocks: int = 1, *, residual: bool = False) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, blocks: int = 1, *, residual: bool = False, added: int = 0
+    ) -> None:
         super().__init__()
         half = outputs // 2
         self.through, self.bypass = Conv(inputs, half), Conv(inputs, half)
         self.blocks = nn.Sequential(*(Block(half, residual=residual) for _ in range(blocks)))
+        if added:
+            self.blocks.append(Added(half, added))
         self.join = Conv(outputs, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -105,8 +125,8 @@ class DetectorNet(nn.Module):
         self.stages = nn.ModuleList(
             [
                 nn.Sequential(Separable(16, 32, 2), CrossStage(32, 32, 1, residual=True)),
-                nn.Sequential(Separable(32, 64, 2), CrossStage(64, 64, 3, residual=True)),
-                nn.Sequential(Separable(64, 128, 2), CrossStage(128, 128, 3, residual=True)),
+                nn.Sequential(Separable(32, 64, 2), CrossStage(64, 64, 3, residual=True, added=1)),
+                nn.Sequential(Separable(64, 128, 2), CrossStage(128, 128, 3, residual=True, added=3)),
                 nn.Sequential(Separable(128, 256, 2), Pyramid(256), CrossStage(256, 256)),
             ]
         )

@@ -14,7 +14,7 @@ import torch
 from onnx import helper, numpy_helper
 from torch import Tensor, nn
 
-from hvt_train.learning.detector import DetectorNet
+from hvt_train.learning.detector import Added, DetectorNet
 from hvt_train.learning.halve import halve, unfolded
 
 
@@ -26,6 +26,8 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor, *, rows: Sequence[int]
 
     The file's convolutions have absorbed their batch norms, so that a norm's mean and variance are measured on
     ``images`` ((N, 3, H, W) float32 BGR 0…255), and scale and shift are set to undo them.
+
+    Blocks that YOLOX-nano has not keep what they began with where the file has them not either.
 
     Raises `ValueError` where the file is of another architecture.
     """
@@ -57,7 +59,7 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor, *, rows: Sequence[int]
 
     pending: list[Tensor] = []
     named = [head.classes for head in net.heads] if isinstance(net, DetectorNet) else []
-    for module in net.modules():
+    for module in _loaded(net, len(weights)):
         if isinstance(module, (nn.Conv2d, nn.Linear)):
             hooks.append(module.register_forward_pre_hook(take))
         elif isinstance(module, nn.BatchNorm2d):
@@ -66,6 +68,15 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor, *, rows: Sequence[int]
         net.eval()(images)
     for hook in hooks:
         hook.remove()
+
+
+def _loaded(net: nn.Module, layers: int) -> list[nn.Module]:
+    """What a file of so many layers has weights for: all (what was joined comes behind), or YOLOX-nano's."""
+    modules = list(net.modules())
+    if sum(isinstance(module, (nn.Conv2d, nn.Linear)) for module in modules) <= layers:
+        return modules
+    own = {part for one in modules if isinstance(one, Added) for part in one.modules()}
+    return [module for module in modules if module not in own]
 
 
 def _chosen(

@@ -111,9 +111,9 @@ def _stem(graph: onnx.GraphProto, images: str) -> tuple[list[onnx.NodeProto], st
         layers += [node for node in graph.node if node.op_type == "Conv" and out == node.input[0]]
         if not layers:
             break
-        sigmoid, product = (node for node in graph.node if layers[-1].output[0] in node.input)
-        layers += [sigmoid, product]
-        out = product.output[0]
+        activation = [node for node in graph.node if layers[-1].output[0] in node.input]
+        layers += activation
+        out = activation[-1].output[0]
     return layers, out
 
 

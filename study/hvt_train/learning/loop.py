@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-Loss = tuple[Tensor, dict[str, float]]
+Loss = tuple[Tensor, dict[str, Tensor]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +32,8 @@ class LoopSettings:
     bfloat16: bool = True
     budget_s: float | None = None
     """Wall time after which the schedule is shortened so that it ends in time; None: all steps."""
+    device: str = "cpu"
+    """``cuda`` where PyTorch has one."""
 
 
 class Average:
@@ -40,18 +42,19 @@ class Average:
     def __init__(self, net: nn.Module, decay: float) -> None:
         self.net = copy.deepcopy(net).eval()
         self._decay, self._count = decay, 0
+        self._mine = list(self.net.state_dict().values())
 
     def update(self, net: nn.Module) -> None:
         """Take a step towards ``net``; faster in the beginning."""
         self._count += 1
         decay = min(self._decay, (1 + self._count) / (10 + self._count))
+        pairs = list(zip(self._mine, net.state_dict().values(), strict=True))
+        real = [pair for pair in pairs if pair[0].dtype.is_floating_point]
         with torch.no_grad():
-            mine, theirs = self.net.state_dict(), net.state_dict()
-            for name, value in mine.items():
-                if value.dtype.is_floating_point:
-                    value.lerp_(theirs[name], 1 - decay)
-                else:
-                    value.copy_(theirs[name])
+            torch._foreach_lerp_([mine for mine, _ in real], [theirs for _, theirs in real], 1 - decay)
+            for mine, theirs in pairs:
+                if not mine.dtype.is_floating_point:
+                    mine.copy_(theirs)
 
 
 def train(
@@ -68,27 +71,30 @@ def train(
     ``loss_of`` makes of (network, batch) a loss and its parts, ``check`` measures the averaged network at a step. The
     log has one JSON object a line: step, seconds, rate and parts every 50 steps, and what ``check`` returns.
     """
-    optimizer = torch.optim.AdamW(_groups(net, settings.decay), lr=settings.rate, betas=(0.9, 0.99))
+    net.to(settings.device)
+    optimizer = torch.optim.AdamW(
+        _groups(net, settings.decay), lr=settings.rate, betas=(0.9, 0.99), fused=settings.device != "cpu"
+    )
     average = Average(net, settings.average)
     stream, start = iter(batches), time.monotonic()
-    sums: dict[str, float] = {}
+    sums: dict[str, Tensor] = {}
     net.train().to(memory_format=torch.channels_last)
     with log.open("a", encoding="utf-8") as lines:
         for step, share in _progress(settings):
             rate = _rate(settings, step, share)
             for group in optimizer.param_groups:
                 group["lr"] = rate
-            with torch.autocast("cpu", torch.bfloat16, enabled=settings.bfloat16):
+            with torch.autocast(settings.device, torch.bfloat16, enabled=settings.bfloat16):
                 loss, parts = loss_of(net, next(stream))
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             nn.utils.clip_grad_norm_(net.parameters(), settings.clip)
             optimizer.step()
             average.update(net)
-            for name, value in {"loss": loss.detach().item(), **parts}.items():
-                sums[name] = sums.get(name, 0.0) + value
+            for name, value in {"loss": loss.detach(), **parts}.items():
+                sums[name] = sums[name] + value if name in sums else torch.as_tensor(value)
             if step % 50 == 0:
-                means = {name: round(value / 50, 4) for name, value in sums.items()}
+                means = {name: round(float(value) / 50, 4) for name, value in sums.items()}
                 sums.clear()
                 _write(
                     lines, {"step": step, "seconds": round(time.monotonic() - start), "rate": rate, **means}

@@ -23,14 +23,12 @@ from hvt_train.learning.calibration import NONE, Calibration
 from hvt_train.learning.detector import STRIDES, DetectorNet, ExportedDetector
 from hvt_train.learning.export import export_onnx, load_onnx
 from hvt_train.learning.loop import LoopSettings, Loss, train
-from hvt_train.pictures.real import LARGE_VEHICLE
+from hvt_train.pictures.kinds import AMONG
 from hvt_train.pictures.views import View, ViewSettings, ViewSource
 
 _RANGES = ((0.0, 110.0), (22.0, 240.0), (70.0, 1e6))
 """Longer sides in pixels for which a stride may answer."""
 _FAR = 1e4
-_PRIOR = {"van": 0.0, "truck": 0.5, "bus": 0.5}
-"""What a `LARGE_VEHICLE` may be, and how much (in logits) each is favoured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +40,16 @@ class Targets:
     boxes_px: Tensor
     """(M, 4) float32 x1 y1 x2 y2."""
     class_ids: Tensor
-    """(M,) int64; -1 is ignored, `LARGE_VEHICLE` a van, truck or bus."""
+    """(M,) int64; -1 is ignored; below it the set does not tell which of `AMONG` it is."""
+
+    def to(self, device: torch.device) -> Targets:
+        """The same there."""
+        return Targets(
+            *(rows.to(device, non_blocking=True) for rows in (self.pictures, self.boxes_px, self.class_ids))
+        )
 
 
-def detector_loss(maps: list[Tensor], targets: Targets) -> tuple[Tensor, dict[str, float]]:
+def detector_loss(maps: list[Tensor], targets: Targets) -> tuple[Tensor, dict[str, Tensor]]:
     """Weighted sum of overlap, objectness and class losses, and its parts for the log."""
     rows, grid, stride, shapes = _flat(maps)
     targets = Targets(targets.pictures, targets.boxes_px, _named(rows.detach(), shapes, targets))
@@ -53,10 +57,9 @@ def detector_loss(maps: list[Tensor], targets: Targets) -> tuple[Tensor, dict[st
     real = targets.class_ids >= 0
     with torch.no_grad():
         cells, owners = _assign(rows, boxes, shapes, targets)
-        weights = torch.ones(rows.shape[:2])
-        _forgive(weights, grid, stride, targets.pictures[~real], targets.boxes_px[~real])
+        weights = _forgiving(len(rows), grid, stride, targets.pictures[~real], targets.boxes_px[~real])
     count = max(len(cells), 1)
-    wanted = torch.zeros(rows.shape[:2])
+    wanted = torch.zeros_like(weights)
     pictures = targets.pictures[owners]
     wanted[pictures, cells] = 1.0
     weights[pictures, cells] = 1.0
@@ -73,24 +76,27 @@ def detector_loss(maps: list[Tensor], targets: Targets) -> tuple[Tensor, dict[st
     )
     total = 4.0 * shape + objectness + naming
     parts = {
-        "box": shape.detach().item(),
-        "objectness": objectness.detach().item(),
-        "class": naming.detach().item(),
-        "cells": float(len(cells)),
+        "box": shape.detach(),
+        "objectness": objectness.detach(),
+        "class": naming.detach(),
+        "cells": torch.tensor(float(len(cells))),
     }
     return total, parts
 
 
 def _named(rows: Tensor, shapes: list[tuple[int, int]], targets: Targets) -> Tensor:
-    """Class ids in which a vehicle of unknown kind has the likeliest kind by what the network says of it now."""
+    """Class ids in which what a set does not tell has the likeliest of `AMONG` by what the network says of it now."""
     kinds = targets.class_ids.clone()
-    which = torch.nonzero(kinds == LARGE_VEHICLE)[:, 0]
+    which = torch.nonzero(kinds < -1)[:, 0]
     if len(which):
         numbers, allowed = _candidates(shapes, targets.boxes_px[which])
         said = rows[targets.pictures[which][:, None], numbers, 5:]
         mean = (said * allowed[..., None]).sum(1) / allowed.sum(1).clamp(min=1)[:, None]
-        prior = torch.tensor([_PRIOR.get(name, -1e9) for name in CLASS_NAMES])
-        kinds[which] = (mean + prior).argmax(1)
+        table = torch.full((2 + len(AMONG), rows.shape[2] - 5), -1e9)
+        for code, favoured in AMONG.items():
+            for kind, logits in favoured.items():
+                table[-code, kind] = logits
+        kinds[which] = (mean + table.to(rows.device)[-kinds[which]]).argmax(1)
     return kinds
 
 
@@ -100,9 +106,10 @@ def _flat(maps: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, list[tuple[int, i
     grids, strides, shapes = [], [], []
     for level, stride in zip(maps, STRIDES, strict=True):
         high, wide = level.shape[2:]
-        y, x = torch.meshgrid(torch.arange(high), torch.arange(wide), indexing="ij")
+        axes = (torch.arange(side, device=rows.device) for side in (high, wide))
+        y, x = torch.meshgrid(*axes, indexing="ij")
         grids.append(torch.stack([x.flatten(), y.flatten()], 1).float())
-        strides.append(torch.full((high * wide, 1), float(stride)))
+        strides.append(torch.full((high * wide, 1), float(stride), device=rows.device))
         shapes.append((high, wide))
     return rows, torch.cat(grids), torch.cat(strides), shapes
 
@@ -132,7 +139,7 @@ def _overlaps(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 def _candidates(shapes: list[tuple[int, int]], boxes: Tensor) -> tuple[Tensor, Tensor]:
     """(M, 27) cell numbers and whether each may answer: in the picture, and of a stride that suits the size."""
     centre, longest = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]).amax(1)
-    step = torch.tensor([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)])
+    step = torch.tensor([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)], device=boxes.device)
     numbers, allowed, start = [], [], 0
     for (high, wide), stride, (low, most) in zip(shapes, STRIDES, _RANGES, strict=True):
         cell = (centre / stride).floor().long()[:, None] + step
@@ -178,20 +185,22 @@ def _resolved(
 ) -> tuple[Tensor, Tensor]:
     """A cell that several objects want goes to the cheapest."""
     key = pictures[owner] * total + cells
-    order = cost.argsort(descending=True)
-    winner = torch.full((int(key.max()) + 1 if len(key) else 1,), -1, dtype=torch.long)
-    winner[key[order]] = order  # the last write, which is the cheapest, stays
-    won = winner[key] == torch.arange(len(key))
+    order = cost.argsort().argsort()
+    size = int(key.max()) + 1 if len(key) else 1
+    least = torch.full((size,), len(key), device=key.device).scatter_reduce(0, key, order, "amin")
+    won = least[key] == order
     return cells[won], real[owner[won]]
 
 
-def _forgive(weights: Tensor, grid: Tensor, stride: Tensor, pictures: Tensor, boxes: Tensor) -> None:
-    """Cells whose middle lies in an ignored box do not count as background."""
+def _forgiving(count: int, grid: Tensor, stride: Tensor, pictures: Tensor, boxes: Tensor) -> Tensor:
+    """(N, A) 1, but 0 for cells whose middle lies in an ignored box: they do not count as background."""
     middle = (grid + 0.5) * stride
-    for picture in pictures.unique().tolist():
-        mine = boxes[pictures == picture]
-        inside = ((middle[:, None] > mine[:, :2] - 2) & (middle[:, None] < mine[:, 2:] + 2)).all(2).any(1)
-        weights[picture, inside] = 0.0
+    weights = torch.ones(count, len(grid), device=grid.device)
+    if len(boxes):
+        inside = ((middle > boxes[:, None, :2] - 2) & (middle < boxes[:, None, 2:] + 2)).all(2)
+        hidden = torch.zeros_like(weights).index_add_(0, pictures, inside.float())
+        weights[hidden > 0] = 0.0
+    return weights
 
 
 _LIKE = {"van": "car", "motor": "motorcycle", "pedestrian": "person"}
@@ -232,10 +241,11 @@ def batch_of(views: list[View]) -> Batch:
 
 def loss_of(net: nn.Module, batch: Batch) -> Loss:
     """The loss of a batch."""
-    images = batch.images.float().contiguous(memory_format=torch.channels_last)
+    device = next(net.parameters()).device
+    images = batch.images.to(device, non_blocking=True).float().contiguous(memory_format=torch.channels_last)
     maps = net(images)
-    with torch.autocast("cpu", enabled=False):
-        return detector_loss(maps, batch.targets)
+    with torch.autocast(device.type, enabled=False):
+        return detector_loss(maps, batch.targets.to(device))
 
 
 def train_detector(
@@ -266,6 +276,7 @@ def train_detector(
         collate_fn=batch_of,
         num_workers=workers,
         prefetch_factor=4 if workers else None,
+        pin_memory=settings.device != "cpu",
     )
     trained = train(net, loader, loss_of=loss_of, settings=settings, log=log, check=check)
     assert isinstance(trained, DetectorNet)

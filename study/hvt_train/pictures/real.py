@@ -1,4 +1,4 @@
-"""Real labelled pictures for the pool: three public sets, each with what it labels and what it leaves out.
+"""Real labelled pictures for the pool: four public sets, each with what it labels and what it leaves out.
 
 Every picture goes through x265 at 80 to 1400 kbps (of a 1280x720 base) or stays clean, and is kept as one file of the
 pool. ``class_ids`` beyond the classes: -1 is neither object nor background, `LARGE_VEHICLE` is a van,
@@ -14,24 +14,24 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.inference.detect import Detector
-from hvt_common.values import Image, iou
-from hvt_scene.drawing.vehicles import CLASS_NAMES
+from hvt_common.values import Image
+from hvt_train.pictures.camera import Teachers, unlabelled
+from hvt_train.pictures.kinds import ID as _ID
+from hvt_train.pictures.kinds import LARGE_VEHICLE
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import BASE_SIZE, in_flight, save_picture, thin_kbps
 
-LARGE_VEHICLE = -2
-_ID = {name: number for number, name in enumerate(CLASS_NAMES)}
 _KIT = (_ID["car"], _ID["truck"], _ID["bus"], _ID["van"])
-_HIT = (_ID["pedestrian"], _ID["car"], _ID["motor"], LARGE_VEHICLE, -1)
+_HIT = (_ID["pedestrian"], _ID["car"], _ID["bicycle"], LARGE_VEHICLE, -1)
+_WATER = (_ID["pedestrian"], _ID["boat"], _ID["boat"], -1, -1)
 _HIT_JUDGES = {"20210115", "20210123"}
 _HIT_HELD_OUT = {"20210114", "20210119"}
 _KIT_HELD_OUT = "MunichStreet02"
+_WATER_HELD_OUT_FROM = {"seq00": 300, "seq03": 14010}
 _CODED_SHARE = 0.65
 _BORDER_PX = 26  # Madison leaves out vehicles that the border cuts
 _LARGE_PX = 128  # a car is 96 pixels long there, one in twenty vehicles longer than 118
@@ -52,11 +52,11 @@ class HeldOut:
 _Labelled = tuple[Path, npt.NDArray[np.float32], npt.NDArray[np.int32]]
 
 
-def fill_real(folder: Path, data: Path, *, seed: int = 1, teacher: Detector | None = None) -> list[Path]:
-    """Put the sets that lie under ``data`` (``kit_ais``, ``hit_uav``, ``cats_madison``) into the pool ``folder``.
+def fill_real(folder: Path, data: Path, *, seed: int = 1, teachers: Teachers | None = None) -> list[Path]:
+    """Put the sets that lie under ``data`` (``kit_ais``, ``hit_uav``, ``cats_madison`` …) into the pool ``folder``.
 
-    Flights and sequences that are held out for measuring are left out. What is there already stays. With a
-    ``teacher`` the clips of ``street`` too: see `street_pictures`.
+    Flights and sequences that are held out for measuring are left out. What is there already stays. With
+    ``teachers`` the clips of ``street`` and the pictures of ``camera`` too.
     """
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -74,10 +74,14 @@ def fill_real(folder: Path, data: Path, *, seed: int = 1, teacher: Detector | No
                 high, wide = image.shape[:2]
                 inside = boxes.clip(0, (wide, high, wide, high)).astype(np.float32)
                 save_picture(target, Picture(image, inside, kinds, np.ones(len(kinds), np.float32)))
-    if teacher is not None:
-        for number, picture in enumerate(street_pictures(data / "street", teacher)):
-            written.append(folder / f"street-{number:05d}.npz")
-            save_picture(written[-1], picture)
+    if teachers is not None:
+        for name in ("street", "camera"):
+            for number, image in enumerate(unlabelled(data / name)):
+                target = folder / f"{name}-{number:05d}.npz"
+                written.append(target)
+                if not target.exists():
+                    boxes, kinds = teachers.name(image)
+                    save_picture(target, Picture(image, boxes, kinds, np.ones(len(kinds), np.float32)))
     return written
 
 
@@ -153,6 +157,18 @@ def _road(data: Path) -> Iterator[_Labelled]:
         yield path, boxes, np.array([*kinds, *[kind for kind, _ in people], -1, -1, -1, -1], np.int32)
 
 
+def _water(data: Path, *, held_out: bool = False) -> Iterator[_Labelled]:
+    """SeaDronesSee: people and boats, jet skis among them; buoys are neither. The end of a flight is held out."""
+    for path, rows in _pairs(data / "seadronessee"):
+        flight, number = path.stem.split("_")
+        if (int(number) >= _WATER_HELD_OUT_FROM.get(flight, 1 << 30)) == held_out:
+            yield (
+                path,
+                rows[:, 1:].astype(np.float32),
+                np.array([_WATER[int(k)] for k in rows[:, 0]], np.int32),
+            )
+
+
 def held_out_labelled(data: Path, *, every: int = 4) -> Iterator[Picture]:
     """Every n-th picture that training never sees, as it is, with classes as in the pool."""
     for read in (_kit, _thermal):
@@ -165,7 +181,7 @@ def held_out_labelled(data: Path, *, every: int = 4) -> Iterator[Picture]:
 def held_out_pictures(data: Path) -> Iterator[HeldOut]:
     """Flights and sequences that training never sees, as the base stream would show them."""
     vehicles = frozenset({"car", "van", "truck", "bus"})
-    sets = ((_kit, vehicles, 3), (_thermal, vehicles | {"pedestrian", "motor"}, 4))
+    sets = ((_kit, vehicles, 3), (_thermal, vehicles | {"pedestrian", "bicycle"}, 4))
     for read, judged, every in sets:
         for path, boxes, kinds in list(read(data, held_out=True))[::every]:
             image = cv2.imread(str(path))
@@ -176,50 +192,9 @@ def held_out_pictures(data: Path) -> Iterator[HeldOut]:
             yield HeldOut(base, boxes[kinds != -1] * scale, boxes[kinds == -1] * scale, judged)
 
 
-SETS: dict[str, Callable[[Path], Iterator[_Labelled]]] = {"kit": _kit, "thermal": _thermal, "road": _road}
-
-
-_NAMES = {
-    "person": "pedestrian",
-    "car": "car",
-    "truck": "truck",
-    "bus": "bus",
-    "motorcycle": "motor",
-    "bicycle": "motor",
+SETS: dict[str, Callable[[Path], Iterator[_Labelled]]] = {
+    "kit": _kit,
+    "thermal": _thermal,
+    "road": _road,
+    "water": _water,
 }
-_SURE, _SAME = 0.5, 0.6
-_ENLARGED = (1.0, 1.75)
-
-
-def street_pictures(folder: Path, teacher: Detector, *, every: int = 2) -> Iterator[Picture]:
-    """Every n-th picture of the clips in ``folder`` with what ``teacher`` names there.
-
-    The teacher should show what it finds from a low confidence on (0.08): below 0.5 it counts neither way.
-    """
-    for clip in sorted(path for path in folder.iterdir() if path.suffix in {".gif", ".mp4"}):
-        with av.open(str(clip)) as container:
-            for number, frame in enumerate(container.decode(video=0)):
-                if number % every == 0:
-                    image = np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
-                    boxes, kinds = _named(image, teacher)
-                    yield Picture(image, boxes, kinds, np.ones(len(kinds), np.float32))
-
-
-def _named(image: Image, teacher: Detector) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-    """(N, 4) boxes and (N,) classes, -1 where the teacher is unsure, of the picture as it is and enlarged."""
-    rows: list[tuple[float, str, npt.NDArray[np.float32]]] = []
-    for scale in _ENLARGED:
-        how = cv2.INTER_CUBIC
-        found = teacher.detect(
-            np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=how), np.uint8)
-        )
-        for box, score, kind in zip(found.boxes_xyxy_px, found.confidences, found.class_ids, strict=True):
-            if teacher.class_names[kind] in _NAMES:
-                rows.append((float(score), teacher.class_names[kind], box / scale))
-    boxes = np.empty((0, 4), np.float32)
-    kinds: list[int] = []
-    for score, name, box in sorted(rows, key=lambda row: -row[0]):
-        if not len(boxes) or iou(box[None], boxes).max() < _SAME:
-            boxes = np.vstack([boxes, box[None]]).astype(np.float32)
-            kinds.append(CLASS_NAMES.index(_NAMES[name]) if score >= _SURE else -1)
-    return boxes, np.array(kinds, np.int32)

@@ -16,18 +16,21 @@ from hvt_train.pictures.places import Picture
 _Rng = np.random.Generator
 _FILL = 114
 _KINDS = {
-    "demo": (0.6, 0.3, 0.3, 2.6),
-    "base": (0.4, 0.1, 0.35, 1.3),
-    "place": (1.0, 0.6, 0.26, 2.2),
-    "kit": (0.6, 0.15, 0.6, 2.6),
-    "road": (0.7, 0.2, 0.25, 3.8),
-    "thermal": (0.5, 0.15, 0.6, 1.9),
-    "street": (0.5, 0.2, 0.3, 3.0),
+    "demo": (0.6, 0.3, 0.2, 2.6),
+    "base": (0.4, 0.1, 0.25, 1.3),
+    "place": (1.0, 0.6, 0.16, 2.2),
+    "kit": (0.6, 0.15, 0.25, 2.6),
+    "road": (0.7, 0.2, 0.11, 3.8),
+    "thermal": (0.5, 0.15, 0.5, 1.9),
+    "street": (0.5, 0.2, 0.3, 3.5),
+    "camera": (0.5, 0.15, 0.5, 4.0),
+    "water": (0.8, 0.2, 0.3, 2.2),
 }
 """Strength of the damage and how often the codec is bad (base pictures have been through x265 already); least and
 greatest scale."""
-_STRAIGHT_DOWN = frozenset({"kit", "road"})
+_STRAIGHT_DOWN = frozenset({"kit", "road", "water"})
 """Have no up; the others are aslant, at least in part, and mostly left upright."""
+_UPRIGHT = frozenset({"street", "camera"})
 _SPECKLED = 0.4
 """How often small blobs lie about: stones, litter, chipped paint, which are no people."""
 
@@ -48,10 +51,12 @@ class ViewSettings:
 
     side: int = 416
     shares: tuple[tuple[str, float], ...] = (
-        *(("demo", 0.1), ("base", 0.22), ("place", 0.14)),
-        *(("kit", 0.09), ("road", 0.15), ("thermal", 0.2), ("street", 0.1)),
+        *(("demo", 0.08), ("base", 0.16), ("place", 0.11), ("kit", 0.1), ("road", 0.12)),
+        *(("thermal", 0.17), ("street", 0.08), ("camera", 0.11), ("water", 0.07)),
     )
     """How often each kind of picture is taken."""
+    tiled: float = 0.3
+    """How often a view is put together of four or nine smaller ones: what is small stands among others."""
     least_visible: float = 0.3
     least_side_px: float = 4.0
     """Of the longer side of a box, in pixels of the view."""
@@ -70,18 +75,34 @@ class ViewSource:
 
     def next(self) -> View:
         """The next view."""
+        side = self._settings.side
+        if self._rng.random() >= self._settings.tiled:
+            return self._view(side, 1.0)
+        count = 2 if self._rng.random() < 0.7 else 3
+        part = side // count
+        image = np.full((side, side, 3), _FILL, np.uint8)
+        boxes, kinds = [], []
+        for number in range(count * count):
+            view = self._view(part, float(self._rng.uniform(0.4, 1.0)))
+            y, x = (part * place for place in divmod(number, count))
+            image[y : y + part, x : x + part] = view.image_bgr
+            boxes.append(view.boxes_px + np.array([x, y, x, y], np.float32))
+            kinds.append(view.class_ids)
+        return View(image, np.concatenate(boxes).astype(np.float32), np.concatenate(kinds))
+
+    def _view(self, side: int, smaller: float) -> View:
+        """One window of ``side`` pixels; what is in it is shown ``smaller`` than alone."""
         rng = self._rng
         kind = str(rng.choice(self._kinds, p=self._shares))
         files = self._files[kind]
         picture = read_picture(files[int(rng.integers(len(files)))])
-        scale = _scale(kind, rng)
-        view = self._cropped(picture, scale)
+        view = self._cropped(picture, _scale(kind, rng) * smaller, side)
         view = _turned(
-            view, rng, upright=kind == "street" or (kind not in _STRAIGHT_DOWN and rng.random() < 0.6)
+            view, rng, upright=kind in _UPRIGHT or (kind not in _STRAIGHT_DOWN and rng.random() < 0.6)
         )
         if kind == "thermal" and rng.random() < 0.4:  # cameras show heat black or white
             view = View(255 - view.image_bgr, view.boxes_px, view.class_ids)
-        if kind not in {"thermal", "street"} and rng.random() < _SPECKLED:
+        if kind not in {"thermal", "street", "camera"} and rng.random() < _SPECKLED:
             view = View(_speckled(view.image_bgr, rng), view.boxes_px, view.class_ids)
         strength, compress, *_ = _KINDS[kind]
         image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
@@ -89,12 +110,12 @@ class ViewSource:
             image = np.repeat(image[..., 1:2], 3, axis=2)
         return View(image, view.boxes_px, view.class_ids)
 
-    def _cropped(self, picture: Picture, scale: float) -> View:
+    def _cropped(self, picture: Picture, scale: float, side: int) -> View:
         """A square window, usually around an object, every class that is there as often."""
-        side, rng = self._settings.side, self._rng
+        rng = self._rng
         high, wide = picture.image_bgr.shape[:2]
         window = side / scale
-        if len(picture.boxes_px) and rng.random() < 0.75:
+        if len(picture.boxes_px) and rng.random() < 0.7:
             _, which, counts = np.unique(picture.class_ids, return_inverse=True, return_counts=True)
             weights = 1.0 / counts[which] * np.where(picture.class_ids == -1, 0.2, 1.0)
             box = picture.boxes_px[rng.choice(len(weights), p=weights / weights.sum())]
@@ -104,10 +125,10 @@ class ViewSource:
         slack = np.array([wide, high]) - window  # negative where the picture is smaller than the window
         margin = rng.uniform(0, 0.06, 2) * window
         low = np.clip(middle - window / 2, np.minimum(slack, 0) - margin, np.maximum(slack, 0) + margin)
-        return self._window(picture, low, scale)
+        return self._window(picture, low, scale, side)
 
-    def _window(self, picture: Picture, low: npt.NDArray[np.float64], scale: float) -> View:
-        side, settings = self._settings.side, self._settings
+    def _window(self, picture: Picture, low: npt.NDArray[np.float64], scale: float, side: int) -> View:
+        settings = self._settings
         x0, y0 = (round(float(v)) for v in low)
         reach = max(1, round(side / scale))
         image = np.full((reach, reach, 3), _FILL, np.uint8)

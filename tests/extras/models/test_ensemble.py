@@ -137,7 +137,7 @@ def test_the_embedded_model_flies_with_one_of_the_open_model_zoo(
     detector = open_detector("aerial-nano+pvb-2003", confidence=0.4)
     assert detector.class_names == (
         *("car", "van", "truck", "bus", "motor", "pedestrian", "other"),
-        *("vehicle", "bike"),
+        *("boat", "bicycle", "vehicle"),
     )
     folder = data / "aerial/sequences_dev/otb_Crossing"
     image = cv2.imread(str(min((folder / "img1").iterdir())))

@@ -10,6 +10,7 @@ import pytest
 
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.runtimes.model import open_model
+from hvt_common.inference.store import EMBEDDED_DETECTOR, embedded_models
 from hvt_common.values import iou
 from hvt_study.cli import main
 
@@ -68,8 +69,7 @@ def start(tmp_path):
     return path
 
 
-@pytest.mark.realdata
-def test_a_network_learns_what_it_never_knew(tmp_path, data):
+def test_a_network_learns_what_it_never_knew(tmp_path):
     """An hour of training would end in a file that finds nothing."""
     pytest.importorskip("torch")
     pytest.importorskip("onnx")
@@ -106,7 +106,7 @@ def test_a_network_learns_what_it_never_knew(tmp_path, data):
         fill_own(tmp_path / "pool", pictures(10), seed=1),
         held_out,
         classes=NAMES,
-        start=data / "models" / "yolox_nano.onnx",
+        start=embedded_models()[EMBEDDED_DETECTOR],
         out=out,
         settings=FineTuneSettings(
             steps=100, budget_s=600, check_every=20, batch=4, side=128, rate=2e-3, threads=1

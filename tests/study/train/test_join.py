@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import onnx
 import pytest
@@ -35,7 +37,8 @@ def test_no_layer_of_the_embedded_file_takes_a_whole_picture():
 
 
 @pytest.mark.parametrize("height", [32, 96])
-def test_stripes_give_the_same_numbers(height, tmp_path):
+@pytest.mark.parametrize("activation", ["SiLU", "ReLU"])
+def test_stripes_give_the_same_numbers(activation, height, tmp_path):
     """Each of them sees what lies beyond its edges, and only the picture's own edges are filled up."""
     rng = np.random.default_rng(1)
     shapes = {"first": (4, 3, 6, 6), "second": (4, 1, 3, 3), "third": (5, 4, 1, 1)}
@@ -43,7 +46,7 @@ def test_stripes_give_the_same_numbers(height, tmp_path):
         numpy_helper.from_array(rng.normal(size=shape).astype(np.float32), name)
         for name, shape in shapes.items()
     ]
-    whole = parser.parse_graph("""
+    text = """
       stem (float[1, 3, height, width] images) => (float[1, 5, h, w] out) {
         a = Conv <strides = [2, 2], pads = [2, 2, 2, 2]> (images, first)
         b = Sigmoid (a)
@@ -56,7 +59,10 @@ def test_stripes_give_the_same_numbers(height, tmp_path):
         j = Mul (g, i)
         out = Identity (j)
       }
-    """)
+    """
+    if activation == "ReLU":
+        text = re.sub(r"\w = Sigmoid \((\w)\)\s+(\w) = Mul \(.*\)", r"\2 = Relu (\1)", text)
+    whole = parser.parse_graph(text)
     whole.initializer.extend(weights)
     striped = onnx.GraphProto()
     striped.CopyFrom(whole)
@@ -76,9 +82,9 @@ def test_stripes_give_the_same_numbers(height, tmp_path):
 @pytest.mark.parametrize("size", [(32, 32), (64, 96), (416, 416), (672, 384)])
 def test_both_parts_give_one_row_a_cell_for_every_size(size):
     """A row too few, and boxes of the second part would stand in the wrong places."""
-    ours, theirs = anchor_count(size, (8, 16, 32)), anchor_count(size, (12, 24, 48))
+    ours, theirs = anchor_count(size, (8, 16, 32)), anchor_count(size, (16, 32, 64))
     rows = _rows(np.random.default_rng(1).integers(0, 255, (1, 3, *size[::-1])))
-    assert rows.shape == (ours + theirs, 12)
+    assert rows.shape == (ours + theirs, 14)
     assert np.isfinite(rows).all()
 
 

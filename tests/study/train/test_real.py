@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from hvt_common.values import Detections
-from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.learning.calibration import fit_calibration
-from hvt_train.pictures.real import LARGE_VEHICLE, HeldOut, fill_real, held_out_pictures
+from hvt_train.pictures.kinds import ID, LARGE_VEHICLE
+from hvt_train.pictures.real import HeldOut, fill_real, held_out_pictures
 from hvt_train.pictures.views import ViewSettings, ViewSource, read_picture
 from studies.real_sets import write_hit, write_yolo
 
 JUDGED = ("20210115", "20210123")
 KEPT = ("20210114", "20210119")
 TRAINED = ("20210112", "20210120")
-ID = {name: number for number, name in enumerate(CLASS_NAMES)}
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +26,8 @@ def data(tmp_path_factory):
     write_hit(folder / "hit_uav", [*JUDGED, *KEPT, *TRAINED])
     vehicles = [(0, 100, 100, 158, 152), (0, 300, 300, 450, 360)]  # a car, and one of 150 pixels
     write_yolo(folder / "cats_madison", {"0_13": vehicles, "0_20": vehicles, "99_99": vehicles})
+    afloat = [(0, 20, 20, 40, 40), (1, 60, 60, 90, 80), (2, 100, 20, 120, 40), (4, 100, 100, 110, 110)]
+    write_yolo(folder / "seadronessee", {"seq00_10": afloat, "seq00_300": afloat, "seq02_900": afloat})
     return folder
 
 
@@ -52,6 +53,14 @@ def test_what_judges_is_never_trained_on(pool, data):
     assert kept[1].image_bgr.shape == (720, 900, 3)
 
 
+def test_who_swims_is_a_person_and_what_floats_is_a_boat_or_nothing(pool):
+    """Buoys would be boats, and the flight that is measured would be known by heart."""
+    water = of_kind(pool, "water")
+    assert [picture.class_ids.tolist() for picture in water] == [
+        [ID["pedestrian"], ID["boat"], ID["boat"], -1]
+    ] * 2
+
+
 @pytest.mark.parametrize("date", JUDGED)
 def test_the_flights_that_judge_are_in_no_part(tmp_path, data, date):
     """Two dates are kept apart for judging, in training and in calibration alike."""
@@ -68,7 +77,7 @@ def test_classes_become_those_of_the_network(pool):
     assert whole.class_ids.tolist() == [ID["car"], ID["truck"], ID["bus"], ID["van"]]
     assert whole.boxes_px[2] == pytest.approx([300, 200, 340, 220], abs=0.01)
     for picture in of_kind(pool, "thermal"):
-        assert picture.class_ids.tolist() == [ID["pedestrian"], ID["car"], ID["motor"], LARGE_VEHICLE, -1]
+        assert picture.class_ids.tolist() == [ID["pedestrian"], ID["car"], ID["bicycle"], LARGE_VEHICLE, -1]
         assert picture.boxes_px[1].tolist() == [140, 100, 180, 124]
         assert (picture.visible == 1).all()
 
@@ -79,7 +88,7 @@ def test_held_out_pictures_are_enlarged_to_the_base_with_their_boxes(data):
     scale = 720 / 512
     assert thermal.boxes_px[0] == pytest.approx(np.array([20, 100, 60, 124]) * scale)
     assert thermal.ignored_px == pytest.approx(np.array([[500, 100, 540, 124]]) * scale)
-    assert thermal.judged == {"car", "van", "truck", "bus", "pedestrian", "motor"}
+    assert thermal.judged == {"car", "van", "truck", "bus", "pedestrian", "bicycle"}
     assert np.all(thermal.image_bgr[round(112 * scale), round(40 * scale)] > 200)
 
 

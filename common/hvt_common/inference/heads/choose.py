@@ -132,7 +132,11 @@ def are_whole(numbers: Array) -> bool:
 
 
 STRIDES: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32), (16, 32))
-YOLOX_STRIDES: tuple[tuple[int, ...], ...] = (*STRIDES[:2], (8, 16, 32, 12, 24, 48))
+YOLOX_STRIDES: tuple[tuple[int, ...], ...] = (
+    *STRIDES[:2],
+    (8, 16, 32, 12, 24, 48),
+    (8, 16, 32, 16, 32, 64),
+)
 LEAST_COLUMNS = 5
 BGR_255 = Preparation(mean=(0.0,) * 3, scale=(1.0,) * 3, rgb=False)
 

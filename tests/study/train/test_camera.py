@@ -1,0 +1,47 @@
+"""What three detectors say of a picture that nobody labelled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hvt_train.pictures.camera import Said, agreed
+from hvt_train.pictures.kinds import BIKE, ID, LARGE_VEHICLE, VEHICLE
+
+AREA_PX = 640 * 360
+
+
+def said(teacher, name, score, x, *, side=30):
+    """A square at ``x``."""
+    return Said(teacher, name, score, np.array([x, 50, x + side, 50 + side], np.float32))
+
+
+def test_two_that_are_sure_make_a_label_and_one_that_is_not_makes_no_ground():
+    """A car that one detector overlooks would be taught as road, or a shadow that one of them shouts at as a car."""
+    boxes, kinds = agreed(
+        [
+            *(said(0, "vehicle", 0.3, 100), said(1, "car", 0.6, 103), said(2, "truck", 0.2, 99)),
+            *(said(0, "vehicle", 0.3, 200), said(2, "car", 0.3, 200)),
+            said(2, "car", 0.9, 300),
+            said(0, "person", 0.6, 400),
+            *(said(1, "truck", 0.7, 500), said(2, "bus", 0.5, 500)),
+            *(said(0, "bike", 0.5, 560), said(1, "bench", 0.9, 20)),
+        ],
+        area_px=AREA_PX,
+    )
+    found = dict(zip(boxes[:, 0].astype(int).tolist(), kinds.tolist(), strict=True))
+    assert found == {
+        100: ID["car"],
+        200: VEHICLE,
+        300: -1,
+        400: ID["pedestrian"],
+        500: LARGE_VEHICLE,
+        560: BIKE,
+    }
+
+
+def test_half_a_picture_is_not_left_out_for_a_guess():
+    """A weak box around the whole road would take all of its ground from training."""
+    boxes, _ = agreed(
+        [said(0, "vehicle", 0.2, 0, side=300), said(1, "car", 0.12, 0, side=40)], area_px=AREA_PX
+    )
+    assert boxes[:, 2].tolist() == [40]
