@@ -33,6 +33,8 @@ _STRAIGHT_DOWN = frozenset({"kit", "road", "water"})
 _UPRIGHT = frozenset({"street", "camera"})
 _SPECKLED = 0.4
 """How often small blobs lie about: stones, litter, chipped paint, which are no people."""
+_PITTED = {"kit": 0.5, "road": 0.5, "place": 0.5, "demo": 0.2, "base": 0.2}
+"""How often there are bollards, plants and the pits of young trees, which from above are as large as people."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +106,8 @@ class ViewSource:
             view = View(255 - view.image_bgr, view.boxes_px, view.class_ids)
         if kind not in {"thermal", "street", "camera"} and rng.random() < _SPECKLED:
             view = View(_speckled(view.image_bgr, rng), view.boxes_px, view.class_ids)
+        if rng.random() < _PITTED.get(kind, 0.0):
+            view = View(_pitted(view.image_bgr, rng), view.boxes_px, view.class_ids)
         strength, compress, *_ = _KINDS[kind]
         image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
         if kind == "thermal":  # alone without colour: a white blob is a person there, a stone elsewhere
@@ -264,6 +268,27 @@ def _speckled(image: Image, rng: _Rng) -> Image:
         cv2.ellipse(layer, middle, axes, float(rng.uniform(0, 180)), 0, 360, depth, -1)
     soft = np.asarray(cv2.GaussianBlur(layer, (0, 0), float(rng.uniform(0.4, 1.0))), np.float32)
     return np.asarray((image + soft[..., None]).clip(0, 255), np.uint8)
+
+
+def _pitted(image: Image, rng: _Rng) -> Image:
+    """Ragged spots of up to 16 pixels, mostly darker and browner than the ground, some with a tree's thin shadow."""
+    side, spots, lines = len(image), np.zeros(image.shape[:2], np.float32), np.zeros(image.shape[:2], np.float32)
+    size, light = float(np.exp(rng.uniform(0.4, 1.9))), rng.uniform(0, 2 * np.pi)
+    ways = np.linspace(0, 2 * np.pi, 9)[:-1]
+    for _ in range(int(rng.integers(2, 24))):
+        middle, radii = rng.uniform(0, side, 2), size * rng.uniform(0.5, 1.2) * rng.uniform(0.5, 1.2, 8)
+        ring = middle + radii[:, None] * np.stack([np.cos(ways), np.sin(ways)], 1)
+        cv2.fillPoly(spots, [ring.round().astype(np.int32)], float(rng.uniform(0.4, 1.0)))
+        if rng.random() < 0.3:
+            way = light + rng.normal(0, 0.1)
+            end = middle + size * rng.uniform(3, 14) * np.array([np.cos(way), np.sin(way)])
+            first, last = ((int(x), int(y)) for x, y in (middle, end))
+            cv2.line(lines, first, last, float(rng.uniform(0.2, 0.7)), 1, cv2.LINE_AA)
+    spots *= 1 + rng.normal(0, 0.3, spots.shape).astype(np.float32)
+    soft = [cv2.GaussianBlur(one, (0, 0), float(rng.uniform(0.5, 1.2))) for one in (spots, lines)]
+    tint = rng.uniform(30, 130) * np.array([1.0, 0.95, rng.uniform(0.6, 1.0)]) * rng.choice([1, -0.7], p=[0.8, 0.2])
+    shaded = image - soft[0][..., None] * tint - soft[1][..., None] * 60
+    return np.asarray(shaded.clip(0, 255), np.uint8)
 
 
 def _lettered(image: Image, rng: _Rng) -> Image:
