@@ -1,8 +1,8 @@
 """The pool of drawn pictures that training cuts its views from, one file each, made by seeds alone.
 
-Three kinds: ``demo`` (the demo's scene, clean), ``base`` (the same after x265 as the base stream carries it) and
-``place`` (`draw_place`). Seeds of training lie from `TRAIN_SEED` on; those of `held_out` and the demo's own seed 0
-never occur among them.
+Four kinds: ``demo`` (the demo's scene, clean), ``base`` (the same after x265 as the base stream carries it), ``thin``
+(as a base of 640x360 carries it, enlarged as the detector does) and ``place`` (`draw_place`). Seeds of training lie
+from `TRAIN_SEED` on; those of `held_out` and the demo's own seed 0 never occur among them.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ TRAIN_SEED = 1000
 HELD_OUT_SEED = 900_000
 SOURCE_SIZE = (1920, 1080)
 BASE_SIZE = (1280, 720)
+_THIN_SIZE = (640, 360)
 _FPS = 15.0
 _CODED_FRAMES = 6
 
@@ -61,10 +62,12 @@ def shoot(seed: int, *, demo_appearance: bool) -> Scene:
     return Scene(seed, size=SOURCE_SIZE, appearance=None if demo_appearance else Appearance.random(seed))
 
 
-def coded(shot: Shot, *, bitrates_bps: Sequence[int], frames: int = _CODED_FRAMES) -> list[Image]:
+def coded(
+    shot: Shot, *, bitrates_bps: Sequence[int], frames: int = _CODED_FRAMES, size: tuple[int, int] = BASE_SIZE
+) -> list[Image]:
     """The base picture of a moment as the ground decodes it, ``frames`` after a keyframe, at each bitrate."""
     images = [
-        _shrunk(shot.scene.image(max(0.0, shot.t_s - (frames - 1 - index) / _FPS)), BASE_SIZE)
+        _shrunk(shot.scene.image(max(0.0, shot.t_s - (frames - 1 - index) / _FPS)), size)
         for index in range(frames)
     ]
     return [through_x265(images, bitrate_bps) for bitrate_bps in bitrates_bps]
@@ -119,7 +122,7 @@ def _draw(job: tuple[Path, str, int, int]) -> list[Path]:
         if not path.exists():
             save_picture(path, draw_place(np.random.default_rng([TRAIN_SEED, number])))
         return [path]
-    paths = [folder / f"{name}-{number:05d}-{m}.npz" for name in ("demo", "base") for m in range(moments)]
+    paths = [folder / f"{name}-{number:05d}-{m}.npz" for name in ("demo", "base", "thin") for m in range(moments)]
     if not all(path.exists() for path in paths):
         for path, picture in zip(paths, _pictures(number, moments), strict=True):
             save_picture(path, picture)
@@ -127,19 +130,21 @@ def _draw(job: tuple[Path, str, int, int]) -> list[Path]:
 
 
 def _pictures(number: int, moments: int) -> Iterator[Picture]:
-    """First the clean pictures of all moments, then the coded ones."""
+    """First the clean pictures of all moments, then the coded ones, large and small."""
     rng = np.random.default_rng([TRAIN_SEED, 1, number])
     scene = shoot(TRAIN_SEED + number, demo_appearance=number % 4 == 0)
     clean = [
         Shot(scene, float(t_s)).picture(BASE_SIZE) for t_s in rng.uniform(0.4, scene.duration_s, moments)
     ]
     yield from clean
-    for t_s in rng.uniform(0.4, scene.duration_s, moments):
-        shot = Shot(scene, float(t_s))
-        bitrate = round(math.exp(rng.uniform(math.log(300_000), math.log(2_500_000))))
-        truth = shot.picture(BASE_SIZE)
-        picture = coded(shot, bitrates_bps=[bitrate])[0]
-        yield Picture(picture, truth.boxes_px, truth.class_ids, truth.visible)
+    for size, low, high in ((BASE_SIZE, 300_000, 2_500_000), (_THIN_SIZE, 100_000, 500_000)):
+        for t_s in rng.uniform(0.4, scene.duration_s, moments):
+            shot = Shot(scene, float(t_s))
+            bitrate = round(math.exp(rng.uniform(math.log(low), math.log(high))))
+            truth = shot.picture(BASE_SIZE)
+            image = coded(shot, bitrates_bps=[bitrate], size=size)[0]
+            picture = np.asarray(cv2.resize(image, BASE_SIZE, interpolation=cv2.INTER_LINEAR), np.uint8)
+            yield Picture(picture, truth.boxes_px, truth.class_ids, truth.visible)
 
 
 def save_picture(path: Path, picture: Picture) -> None:

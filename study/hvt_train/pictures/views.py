@@ -18,6 +18,7 @@ _FILL = 114
 _KINDS = {
     "demo": (0.6, 0.3, 0.2, 2.6),
     "base": (0.4, 0.1, 0.25, 1.3),
+    "thin": (0.2, 0.0, 0.8, 1.3),
     "place": (1.0, 0.6, 0.16, 2.2),
     "kit": (0.6, 0.15, 0.25, 2.6),
     "road": (0.7, 0.2, 0.11, 3.8),
@@ -26,7 +27,7 @@ _KINDS = {
     "camera": (0.5, 0.15, 0.5, 4.0),
     "water": (0.8, 0.2, 0.3, 2.2),
 }
-"""Strength of the damage and how often the codec is bad (base pictures have been through x265 already); least and
+"""Strength of the damage and how often the codec is bad (base and thin pictures have been through x265); least and
 greatest scale."""
 _STRAIGHT_DOWN = frozenset({"kit", "road", "water"})
 """Have no up; the others are aslant, at least in part, and mostly left upright."""
@@ -53,8 +54,8 @@ class ViewSettings:
 
     side: int = 416
     shares: tuple[tuple[str, float], ...] = (
-        *(("demo", 0.08), ("base", 0.16), ("place", 0.11), ("kit", 0.1), ("road", 0.12)),
-        *(("thermal", 0.17), ("street", 0.08), ("camera", 0.11), ("water", 0.07)),
+        *(("demo", 0.1), ("base", 0.14), ("thin", 0.12), ("place", 0.05), ("kit", 0.09), ("road", 0.07)),
+        *(("thermal", 0.2), ("street", 0.08), ("camera", 0.08), ("water", 0.07)),
     )
     """How often each kind of picture is taken."""
     tiled: float = 0.3
