@@ -65,7 +65,7 @@ def run_recipe(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(arguments.threads)
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
-    plan = PoolPlan(scenes=arguments.scenes, places=arguments.places)
+    plan = PoolPlan(scenes=arguments.scenes, codes=arguments.codes, places=arguments.places)
     pool = fill_pool(out / "pool", plan, workers=arguments.workers)
     if arguments.real is not None:
         pool += fill_real(out / "pool", arguments.real, teachers=_teachers(arguments))

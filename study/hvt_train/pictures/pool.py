@@ -1,8 +1,9 @@
 """The pool of drawn pictures that training cuts its views from, one file each, made by seeds alone.
 
-Four kinds: ``demo`` (the demo's scene, clean), ``base`` (the same after x265 as the base stream carries it), ``thin``
-(as a base of 640x360 carries it, enlarged as the detector does) and ``place`` (`draw_place`). Seeds of training lie
-from `TRAIN_SEED` on; those of `held_out` and the demo's own seed 0 never occur among them.
+Five kinds: ``demo`` (the demo's scene, clean), ``base`` (the same after x265 as the base stream carries it), ``thin``
+(as a base of 640x360 carries it, enlarged as the detector does), ``codes`` (all three, with codes on roofs) and
+``place`` (`draw_place`). Seeds of training lie from `TRAIN_SEED` on; those of `held_out` and the demo's own seed 0
+never occur among them.
 """
 
 from __future__ import annotations
@@ -34,10 +35,11 @@ _CODED_FRAMES = 6
 
 @dataclass(frozen=True, slots=True)
 class PoolPlan:
-    """How many pictures: ``scenes`` worlds with ``moments`` each (clean and coded), and ``places``."""
+    """How many: ``scenes`` worlds with ``moments`` each, ``codes`` with one (clean and coded), and ``places``."""
 
     scenes: int = 220
     moments: int = 3
+    codes: int = 120
     places: int = 700
 
 
@@ -57,9 +59,10 @@ class Shot:
         return Picture(image, boxes, truth.class_ids.astype(np.int32), truth.visible.astype(np.float32))
 
 
-def shoot(seed: int, *, demo_appearance: bool) -> Scene:
-    """The demo's scene of a seed, in the demo's look or in a random one."""
-    return Scene(seed, size=SOURCE_SIZE, appearance=None if demo_appearance else Appearance.random(seed))
+def shoot(seed: int, *, demo_appearance: bool, codes: bool = False) -> Scene:
+    """The demo's scene of a seed, in the demo's look or in a random one; with ``codes`` on roofs."""
+    appearance = None if demo_appearance else Appearance.random(seed)
+    return Scene(seed, size=SOURCE_SIZE, appearance=appearance, codes=codes)
 
 
 def coded(
@@ -105,10 +108,14 @@ def thin_kbps(rng: np.random.Generator) -> float:
 def fill_pool(folder: Path, plan: PoolPlan, *, workers: int = 1) -> list[Path]:
     """Draw what is missing in ``folder`` and return all files of the plan, in the order of their names."""
     folder.mkdir(parents=True, exist_ok=True)
-    jobs = [("demo", number, plan.moments) for number in range(plan.scenes)]
-    jobs += [("place", number, 1) for number in range(plan.places)]
+    counts = {"demo": plan.scenes, "codes": plan.codes, "place": plan.places}
+    jobs = [
+        (kind, number, plan.moments if kind == "demo" else 1)
+        for kind, count in counts.items()
+        for number in range(count)
+    ]
     # Kinds are spread evenly, so that a pool that is cut short is a smaller pool of the same mixture.
-    jobs.sort(key=lambda job: (job[1] / (plan.scenes if job[0] == "demo" else plan.places), job[0]))
+    jobs.sort(key=lambda job: (job[1] / counts[job[0]], job[0]))
     with ProcessPoolExecutor(workers) as executor:
         names = executor.map(_draw, [(folder, *job) for job in jobs], chunksize=1)
         return sorted(path for group in names for path in group)
@@ -122,17 +129,19 @@ def _draw(job: tuple[Path, str, int, int]) -> list[Path]:
         if not path.exists():
             save_picture(path, draw_place(np.random.default_rng([TRAIN_SEED, number])))
         return [path]
-    paths = [folder / f"{name}-{number:05d}-{m}.npz" for name in ("demo", "base", "thin") for m in range(moments)]
+    names = ("demo", "base", "thin") if kind == "demo" else ("codes-demo", "codes-base", "codes-thin")
+    paths = [folder / f"{name}-{number:05d}-{m}.npz" for name in names for m in range(moments)]
     if not all(path.exists() for path in paths):
-        for path, picture in zip(paths, _pictures(number, moments), strict=True):
+        for path, picture in zip(paths, _pictures(number, moments, codes=kind == "codes"), strict=True):
             save_picture(path, picture)
     return paths
 
 
-def _pictures(number: int, moments: int) -> Iterator[Picture]:
+def _pictures(number: int, moments: int, *, codes: bool) -> Iterator[Picture]:
     """First the clean pictures of all moments, then the coded ones, large and small."""
-    rng = np.random.default_rng([TRAIN_SEED, 1, number])
-    scene = shoot(TRAIN_SEED + number, demo_appearance=number % 4 == 0)
+    rng = np.random.default_rng([TRAIN_SEED, 1 + codes, number])
+    seed = TRAIN_SEED + number + 100_000 * codes
+    scene = shoot(seed, demo_appearance=number % 3 > 0 if codes else number % 4 == 0, codes=codes)
     clean = [
         Shot(scene, float(t_s)).picture(BASE_SIZE) for t_s in rng.uniform(0.4, scene.duration_s, moments)
     ]

@@ -19,6 +19,7 @@ _KINDS = {
     "demo": (0.6, 0.3, 0.2, 2.6),
     "base": (0.4, 0.1, 0.25, 1.3),
     "thin": (0.2, 0.0, 0.8, 1.3),
+    "codes": (0.2, 0.0, 0.6, 1.4),
     "place": (1.0, 0.6, 0.16, 2.2),
     "kit": (0.6, 0.15, 0.25, 2.6),
     "road": (0.7, 0.2, 0.11, 3.8),
@@ -27,14 +28,14 @@ _KINDS = {
     "camera": (0.5, 0.15, 0.5, 4.0),
     "water": (0.8, 0.2, 0.3, 2.2),
 }
-"""Strength of the damage and how often the codec is bad (base and thin pictures have been through x265); least and
-greatest scale."""
+"""Strength of the damage and how often the codec is bad (base, thin and most codes pictures have been through
+x265); least and greatest scale."""
 _STRAIGHT_DOWN = frozenset({"kit", "road", "water"})
 """Have no up; the others are aslant, at least in part, and mostly left upright."""
 _UPRIGHT = frozenset({"street", "camera"})
 _SPECKLED = 0.4
 """How often small blobs lie about: stones, litter, chipped paint, which are no people."""
-_PITTED = {"kit": 0.5, "road": 0.5, "place": 0.5, "demo": 0.2, "base": 0.2}
+_PITTED = {"kit": 0.9, "road": 0.9, "place": 0.9, "demo": 0.5, "base": 0.5, "thin": 0.5, "codes": 0.4}
 """How often there are bollards, plants and the pits of young trees, which from above are as large as people."""
 
 
@@ -54,8 +55,8 @@ class ViewSettings:
 
     side: int = 416
     shares: tuple[tuple[str, float], ...] = (
-        *(("demo", 0.1), ("base", 0.14), ("thin", 0.12), ("place", 0.05), ("kit", 0.09), ("road", 0.07)),
-        *(("thermal", 0.2), ("street", 0.08), ("camera", 0.08), ("water", 0.07)),
+        *(("demo", 0.04), ("base", 0.09), ("thin", 0.07), ("codes", 0.2), ("place", 0.06), ("kit", 0.09)),
+        *(("road", 0.08), ("thermal", 0.19), ("street", 0.08), ("camera", 0.05), ("water", 0.05)),
     )
     """How often each kind of picture is taken."""
     tiled: float = 0.3
@@ -273,7 +274,11 @@ def _speckled(image: Image, rng: _Rng) -> Image:
 
 def _pitted(image: Image, rng: _Rng) -> Image:
     """Ragged spots of up to 16 pixels, mostly darker and browner than the ground, some with a tree's thin shadow."""
-    side, spots, lines = len(image), np.zeros(image.shape[:2], np.float32), np.zeros(image.shape[:2], np.float32)
+    side, spots, lines = (
+        len(image),
+        np.zeros(image.shape[:2], np.float32),
+        np.zeros(image.shape[:2], np.float32),
+    )
     size, light = float(np.exp(rng.uniform(0.4, 1.9))), rng.uniform(0, 2 * np.pi)
     ways = np.linspace(0, 2 * np.pi, 9)[:-1]
     for _ in range(int(rng.integers(2, 24))):
@@ -287,7 +292,11 @@ def _pitted(image: Image, rng: _Rng) -> Image:
             cv2.line(lines, first, last, float(rng.uniform(0.2, 0.7)), 1, cv2.LINE_AA)
     spots *= 1 + rng.normal(0, 0.3, spots.shape).astype(np.float32)
     soft = [cv2.GaussianBlur(one, (0, 0), float(rng.uniform(0.5, 1.2))) for one in (spots, lines)]
-    tint = rng.uniform(30, 130) * np.array([1.0, 0.95, rng.uniform(0.6, 1.0)]) * rng.choice([1, -0.7], p=[0.8, 0.2])
+    tint = (
+        rng.uniform(30, 130)
+        * np.array([1.0, 0.95, rng.uniform(0.6, 1.0)])
+        * rng.choice([1, -0.7], p=[0.8, 0.2])
+    )
     shaded = image - soft[0][..., None] * tint - soft[1][..., None] * 60
     return np.asarray(shaded.clip(0, 255), np.uint8)
 

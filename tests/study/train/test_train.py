@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from hvt_common.values import Detections
 from hvt_train.evaluate import average_precision, evaluate_drawn, evaluate_real
 from hvt_train.pictures.fleet import make_solid
 from hvt_train.pictures.places import Picture, draw_place
+from hvt_train.pictures.pool import PoolPlan, fill_pool, shoot
 from hvt_train.pictures.views import ViewSettings, ViewSource, degrade
 
 CLASSES = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
@@ -87,6 +90,22 @@ def test_a_view_keeps_boxes_on_their_objects(tmp_path):
             assert inner > ring + 15
             checked += 1
     assert checked > 5
+
+
+def test_roofs_with_codes_are_a_kind_of_their_own(tmp_path, monkeypatch):
+    """The demo's vans, which carry codes, would be cars to a detector that only saw bare roofs."""
+    shown = []
+
+    def shot(seed, **how):
+        shown.append(shoot(seed, **how))
+        return shown[-1]
+
+    monkeypatch.setattr("hvt_train.pictures.pool.shoot", shot)
+    monkeypatch.setattr("hvt_train.pictures.pool.ProcessPoolExecutor", lambda _: ThreadPoolExecutor(1))
+    files = fill_pool(tmp_path, PoolPlan(scenes=0, codes=1, places=0))
+    assert [file.name for file in files] == [f"codes-{how}-00000-0.npz" for how in ("base", "demo", "thin")]
+    assert shown[0].codes(1.0)
+    assert len(ViewSource(files, seed=1, settings=ViewSettings(side=64)).next().image_bgr) == 64
 
 
 def test_what_is_hidden_is_neither_object_nor_background(tmp_path, place):
