@@ -92,7 +92,7 @@ def _chosen(
 
 
 def _weights(graph: onnx.GraphProto) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Weight and bias of each layer that has some, as float32, in the order in which the file computes them."""
+    """Weight and bias of each layer, as float32, in the order of the file, which computes some in several stripes."""
     values = {item.name: numpy_helper.to_array(item).astype(np.float32) for item in graph.initializer}
     for node in graph.node:
         if node.op_type == "Cast" and node.input[0] in values:
@@ -100,11 +100,8 @@ def _weights(graph: onnx.GraphProto) -> list[tuple[np.ndarray, np.ndarray]]:
     for name, value in values.items():
         if value.shape[1:] == (12, 3, 3):
             values[name] = unfolded(value)
-    return [
-        (values[node.input[1]], values[node.input[2]])
-        for node in graph.node
-        if node.op_type in {"Conv", "Gemm"}
-    ]
+    layers = (tuple(node.input[1:3]) for node in graph.node if node.op_type in {"Conv", "Gemm"})
+    return [(values[weight], values[bias]) for weight, bias in dict.fromkeys(layers)]
 
 
 _OPSET = 17
