@@ -15,7 +15,7 @@ from pathlib import Path
 
 from hvt_common.protocol.messages import Info
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice
+from hvt_ground.events import Event, Notice, Refinement
 from hvt_ground.perception.session import SessionPerception
 from hvt_ground.sinks import QueuedSink
 
@@ -51,7 +51,8 @@ class BacklogRecording:
         self.sink.close()
 
     def _emit(self, event: Event) -> None:
-        self.backlog.note(event)
+        if isinstance(event, Refinement):
+            self.backlog.note(event)
         self.sink.log(event)
 
 

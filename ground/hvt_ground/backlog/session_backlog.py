@@ -177,10 +177,9 @@ class SessionBacklog:
                 self._frames.discard(frame_index)
         self._count(frames=-len(lengths_s), video_s=-sum(lengths_s.values()))
 
-    def note(self, event: Event) -> None:
-        """Note the outcome of a still, for the boxes of its frame should it be a stored one; others pass by."""
-        if isinstance(event, Refinement):
-            self._late.take(event)
+    def note(self, still: Refinement) -> None:
+        """Note the outcome of a still, for the boxes of its frame should it be a stored one."""
+        self._late.take(still)
 
     def log_boxes(self, event: Event) -> None:
         """Log boxes of stored video, named by the stills."""

@@ -34,7 +34,7 @@ from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, StillsRead, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Overlay, PoseUpdate, Refinement, StillsRead, Traffic, VideoSample
 from hvt_ground.link.reassemble import Arrival
 from hvt_ground.link.reception import ReceptionStatistics
 from hvt_ground.perception.models import NotOpenError
@@ -465,7 +465,8 @@ class GroundSession:
     # Events
 
     def _emit(self, event: Event) -> None:
-        self.backlog.note(event)
+        if isinstance(event, Refinement):
+            self.backlog.note(event)
         if self.poses.has_pose and isinstance(event, Overlay) and not event.stored:
             event = self.poses.located(event)
         for sink in self.sinks:

@@ -34,11 +34,10 @@ EMITTED = (
 
 PARTS = (
     ("edge/hvt_edge", r"^\w*PART(?:: Final)?(?:, \w+)? = (.*)$"),
-    ("edge/hvt_edge", r"(?:Awaited|Retried)\([^\"]*?\"([\w ]+)\""),
+    ("edge/hvt_edge", r"(?:Awaited|Retried\w*)\([^\"]*?\"([\w ]+)\""),
     ("common/hvt_common", r"(?:Awaited|Retried)\([^\"]*?\"([\w ]+)\""),
     ("extras/hvt_archive/local_copy.py", r"^_PART = (.*)$"),
     ("extras/hvt_fleet/health/server.py", r"Awaited\([^\"]*?\"([\w ]+)\""),
-    ("common/hvt_common/inference/retried.py", r"super\(\).__init__\([^\"]*?\"([\w ]+)\""),
     ("edge/hvt_edge/link/publisher.py", r"self\._answered\(Channel\.(\w+)"),
 )
 """Where a part of the edge that fails has its name from."""
