@@ -123,7 +123,12 @@ def test_boxes_are_drawn_on_the_frame_that_is_shown(page):
 
 def test_a_click_brings_a_still_of_that_place(page):
     """The operator could look, and not look closer."""
-    shows(page)
+    title = page.locator("#objects-title")
+    eventually(
+        lambda: re.search(r"\d", title.inner_text()),
+        what="a list has come: its clock tells when a still was taken",
+    )
+    shows(page, after=shows(page) + 10)
     page.locator("#boxes").click(position={"x": 300, "y": 150})
     image = page.locator("#answer-picture")
     image.wait_for(state="visible")
