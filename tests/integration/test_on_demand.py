@@ -56,6 +56,18 @@ def command(*words: str) -> tuple[int, str, str]:
     return code, out.getvalue(), err.getvalue()
 
 
+def held(*words: str) -> tuple[int, str, str]:
+    """The same, given again where the edge has analyzed nothing for the seconds that it remembers."""
+    found = []
+
+    def asked() -> bool:
+        found.append(command(*words))
+        return "frames go back" not in found[-1][2]
+
+    eventually(asked, what="the edge holds the frame that is asked for")
+    return found[-1]
+
+
 def patiently(edge):
     """Its tracks, asked for ten times a second: more than 32 questions a second are refused."""
     time.sleep(0.1)
@@ -129,7 +141,7 @@ def flight(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
             after = one.info().budget_bps
         connect = ("--connect", link.ground_endpoint)
         out = ("--out", str(folder / "a.png"))
-        told = command("still", *connect, "--box", "300,100,200,150", "--at", "-1s", *out)
+        told = held("still", *connect, "--box", "300,100,200,150", "--at", "-1s", *out)
         nobody = command("keyframe", *connect, "--edge", "uav-2")
         edge.stop()
         return Flight(
