@@ -25,6 +25,8 @@ _MOST_RETAINED_BYTES = 16 * 2**20
 _MOST_RETAINED = 2000
 """Fragments since the last keyframe."""
 _MOST_STILLS = 60
+_MOST_PICTURES = 4 * _MOST_STILLS
+"""A still has two; those of the list are there while as many newer stills come, for a slow browser asks late."""
 _MOST_STILL_BYTES = 24 * 2**20
 _MOST_NOTICES = 100
 _MOST_LOADS = 240
@@ -176,7 +178,7 @@ class StillPictures:
         self._bytes -= 0 if before is None else len(before[0])
         self._pictures[still, which] = (picture, media_type)
         self._bytes += len(picture)
-        while self._bytes > _MOST_STILL_BYTES or len(self._pictures) > 2 * _MOST_STILLS:
+        while self._bytes > _MOST_STILL_BYTES or len(self._pictures) > _MOST_PICTURES:
             self._bytes -= len(self._pictures.popitem(last=False)[1][0])
 
     def get(self, still: str, which: str) -> tuple[bytes, str] | None:

@@ -146,6 +146,16 @@ def test_a_still_that_comes_again_takes_its_own_place():
     assert len(there) > 100
 
 
+def test_the_pictures_of_a_list_are_there_while_newer_stills_come():
+    """A browser asks for a picture when it has read the list: it got 404 for the oldest eight of them."""
+    pictures = StillPictures()
+    for number in range(120):
+        for which in ("still", "base"):
+            pictures.add(str(number), which, bytes(3_000), "image/jpeg")
+    for number in range(60):
+        assert pictures.get(str(number), "still") is not None, "it was in the list sixty stills ago"
+
+
 def test_who_takes_nothing_at_all_is_given_up():
     """A browser that hangs would hold what is not dropped for ever."""
     viewer = Viewer()

@@ -218,8 +218,8 @@ def test_a_camera_whose_clock_is_wrong_is_as_old_as_its_arrival(tmp_path):
 
 def test_what_could_not_be_written_is_named_of_the_edge_it_concerns(ground):
     """Whoever looks for a recording after the flight would learn only then that there is none, and never why."""
-    ground.sessions.close()
     eventually(lambda: "second recording of uav-1 FAILED at " in ground.line(), what="it failed")
+    ground.sessions.close()
     ground.outputs.close()
     content = completed(
         summary(ground.ended[0]), ground.sessions, sinks=ground.ended[0].sinks, failures=ground.failures
