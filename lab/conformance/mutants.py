@@ -46,14 +46,25 @@ MUTANTS: tuple[Mutant, ...] = (
         "crc32(data.subarray(0, -5))",
     ),
     Mutant("the checksum may be coded in another way", "data[data.length - 5] === 0xce", "data.length > 5"),
-    Mutant(
-        "a later version is read", "!SCHEMA.reads.includes(Number(values[0]))", "values[0] < SCHEMA.reads[0]"
-    ),
-    Mutant("another version counts as damage", "`version ${values[0]}`, true", "`version ${values[0]}`"),
+    Mutant("a later version is read", "!SCHEMA.reads.includes(Number(version))", "version < SCHEMA.reads[0]"),
+    Mutant("another version counts as damage", "`version ${version}`, true", "`version ${version}`"),
     Mutant(
         "the checksum is looked at before the version",
         "if (!SCHEMA.reads",
-        "if (values[values.length - 1] === BigInt(crc32(payload, data.subarray(0, -5))) && !SCHEMA.reads",
+        "if (unpack(data).at(-1) === BigInt(crc32(payload, data.subarray(0, -5))) && !SCHEMA.reads",
+    ),
+    Mutant("all is read before the version", "unpack(data, 1)", "unpack(data)"),
+    Mutant(
+        "the length is looked at before the version",
+        "const [version] =",
+        'need(data.length <= SCHEMA.messages[name].most_bytes, "it is long");\n    const [version] =',
+    ),
+    Mutant("a sender may speak later versions alone", "fields[0] > version || ", ""),
+    Mutant("a sender may speak earlier versions alone", " || fields[1] < version", ""),
+    Mutant(
+        "who speaks other versions is damaged",
+        '"its sender speaks others", true',
+        '"its sender speaks others"',
     ),
     Mutant("a message may be of any length", "data.length <= table.most_bytes", "data.length <= 1e9"),
     Mutant(
@@ -64,7 +75,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(
         "a payload may be of any length", "payload.length <= table.payload_bytes", "payload.length <= 1e9"
     ),
-    Mutant("bytes may follow", "if (at < data.length)", "if (at < 0)"),
+    Mutant("bytes may follow", "if (at < data.length &&", "if (at < 0 &&"),
     Mutant("a key may come twice", " || found.has(key)", ""),
     Mutant("a key may be a number", 'typeof key !== "string" || ', ""),
     Mutant(
@@ -235,6 +246,8 @@ MUTANTS: tuple[Mutant, ...] = (
         "row[0] > before[0] && row[1] > before[1]",
         "row[0] > before[0] && row[1] >= before[1]",
     ),
+    Mutant("a stored still need not say so", "& 8n) !== 0n", "& 8n) >= 0n"),
+    Mutant("a stored still need not say when it was captured", '"capture_ns") >= 0n', '"capture_ns") >= -1n'),
     Mutant("stored video may be empty", "list(1, 2400,", "list(0, 2400,"),
     Mutant("stored video may be of any length", "list(1, 2400,", "list(1, 1e6,"),
     # Coded tracks

@@ -41,7 +41,8 @@ const hex = (bytes: Uint8Array): string => Array.from(bytes, (byte) => byte.toSt
 // Whole numbers are bigint and fractions number, so that the two cannot be taken for one another.
 type Value = null | boolean | bigint | number | string | Uint8Array | Value[] | Map<string, Value>;
 
-function unpack(data: Uint8Array): Value {
+// Of an array no more than its first values, where that is asked for.
+function unpack(data: Uint8Array, first = Infinity): Value {
   const view = new DataView(data.buffer, data.byteOffset, data.byteLength);
   let at = 0;
   const take = (length: number): number => {
@@ -64,7 +65,9 @@ function unpack(data: Uint8Array): Value {
   const array = (length: number, depth: number): Value[] => {
     if (depth > SCHEMA.limits.depth) throw new Refused("it is nested too deep");
     if (length > data.length) throw new Refused("an array is longer than the message");
-    return Array.from({ length }, () => next(depth));
+    const values: Value[] = [];
+    while (values.length < length && values.length < first) values.push(next(depth));
+    return values;
   };
   const map = (length: number, depth: number): Map<string, Value> => {
     if (depth > SCHEMA.limits.depth) throw new Refused("it is nested too deep");
@@ -111,7 +114,7 @@ function unpack(data: Uint8Array): Value {
     }
   };
   const value = next(0);
-  if (at < data.length) throw new Refused("bytes follow");
+  if (at < data.length && first === Infinity) throw new Refused("bytes follow");
   return value;
 }
 
@@ -213,14 +216,16 @@ function checkFields(fields: Fields, values: Value[]): Value[] {
 
 function read(name: string, data: Uint8Array, payload: Uint8Array): Value[] {
   const table = SCHEMA.messages[name];
+  const [version] = unpack(data, 1) as Value[];
+  need(typeof version === "bigint", "no array that begins with a version");
+  if (!SCHEMA.reads.includes(Number(version))) throw new Refused(`version ${version}`, true);
   need(data.length <= table.most_bytes, "it is too long");
   need(payload.length <= table.payload_bytes, "its payload is too long");
-  const values = unpack(data);
-  need(Array.isArray(values) && typeof values[0] === "bigint", "no array that begins with a version");
-  if (!SCHEMA.reads.includes(Number(values[0]))) throw new Refused(`version ${values[0]}`, true);
+  const values = unpack(data) as Value[];
   need(data[data.length - 5] === 0xce, "no checksum at its end");
   need(values[values.length - 1] === BigInt(crc32(payload, data.subarray(0, -5))), "another checksum");
   const fields = checkFields(fieldsOf(table), values.slice(1, -1));
+  if (table.fields[0].name === "lowest_version" && (fields[0]! > version || fields[1]! < version)) throw new Refused("its sender speaks others", true);
   if (name === "RoiHeader") {
     checkPlace((field(name, fields, "place") as bigint[]).map(Number));
     const parameters = field(name, fields, "parameters");
@@ -248,7 +253,13 @@ const field = (name: string, values: Value[], wanted: string): Value =>
 function readObject(kind: string, data: Uint8Array): Value {
   need(data.length <= SCHEMA.limits.object_bytes, "it is too long");
   const values = unpack(data);
-  if (kind === "still") return row(fieldsOf(SCHEMA.objects.BacklogStill))(values)!;
+  if (kind === "still") {
+    const [attachment, encoding, still] = row(fieldsOf(SCHEMA.objects.BacklogStill))(values) as [Uint8Array, string, Uint8Array];
+    const header = read("RoiHeader", attachment, still);
+    need((BigInt(field("RoiHeader", header, "flags") as bigint) & 8n) !== 0n, "it does not say that it was stored");
+    need((field("RoiHeader", header, "capture_ns") as bigint) >= 0n, "it does not say when it was captured");
+    return [attachment, encoding, still];
+  }
   list(1, 2400, row(fieldsOf(SCHEMA.objects.BacklogUnit)))(values);
   let before: Value[] | undefined;
   for (const row of values as Value[][]) {

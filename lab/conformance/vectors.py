@@ -25,14 +25,14 @@ from hvt_common.protocol.messages import (
     Message,
     PackedMessage,
     StillWire,
+    UnknownVersionError,
     WireError,
     kinds,
     pack_backlog_still,
     pack_backlog_units,
-    parse_backlog_still,
-    parse_backlog_units,
 )
 from hvt_common.protocol.messages.envelope import DEEPEST, MOST_UNKNOWN_FIELDS, WIRE_VERSION
+from hvt_ground.backlog.assembly import backlog_content
 from lab.conformance.dialogues import backlog_dialogues, report_traces, still_sizes
 from lab.conformance.schema import PATH, name_of, schema
 from lab.conformance.sessions import poses, track_steps
@@ -245,14 +245,18 @@ def _of_other_minors(message: Message) -> Iterator[dict[str, Any]]:
             yield _vector(message, what, _packed([*values, *unknown], payload))
     if name_of(type(message)) in _WITH_NESTED:
         name, place = _WITH_NESTED[name_of(type(message))]
-        nested = [[*one, 7] for one in values[place]]
-        longer = [*values[:place], nested, *values[place + 1 :]]
-        yield _vector(message, f"an unknown field in each of {name}", _packed(longer, payload))
+        for what, raw in (("an unknown field", 7), ("one as deep as may be", _nested(DEEPEST - 3))):
+            longer = _with_nested(values, place, raw)
+            yield _vector(message, f"{what} in each of {name}", _packed(longer, payload))
     table = fields(type(message))
     optional = {one.name: one.metadata["default"] for one in table if one.metadata["optional"]}
     if optional:
         fewer = _packed(values[: len(table) + 1 - len(optional)], payload)
         yield _vector(replace(message, **optional), "without what was added since", fewer)
+
+
+def _with_nested(values: list[Any], place: int, raw: Any) -> list[Any]:
+    return [*values[:place], [[*one, raw] for one in values[place]], *values[place + 1 :]]
 
 
 def _vector(message: Message, what: str, data: bytes | None = None) -> dict[str, Any]:
@@ -338,6 +342,7 @@ def _bad_envelopes() -> Iterator[dict[str, Any]]:
         ("maps too deep", _nested(DEEPEST, map_of=True)),
         ("an unknown map whose key is a number", {1: 2}),
         ("an unknown field of a type of its own", msgpack.ExtType(5, b"x")),
+        ("an unknown field of a type of its own without bytes", msgpack.ExtType(5, b"")),
     ):
         yield _bad(BASE, what, _packed([*values, unknown], payload), payload)
     for what, coded in (
@@ -356,8 +361,13 @@ def _bad_envelopes() -> Iterator[dict[str, Any]]:
         yield _bad(ROI.on_wire(), what, _packed([WIRE_VERSION, *sent], b"a still"), b"a still")
     whole = BASE.pack(payload)
     other = whole[:1] + bytes((WIRE_VERSION + 1,)) + whole[2:]
-    yield _bad(BASE, "another version whose checksum is wrong", other, payload, version=True)
-    yield _bad(BASE, "another version without a checksum", b"\x92\x07\xa1x", payload, version=True)
+    for what, data in (
+        ("whose checksum is wrong", other),
+        ("without a checksum", b"\x92\x07\xa1x"),
+        ("with a type of its own", b"\x93\x07\xc7\0\5\xc1"),
+        ("longer than a message may be", b"\x92\x07\xc4\x64" + bytes(100)),
+    ):
+        yield _bad(BASE, f"another version {what}", data, payload)
     body = bytes((whole[0], *whole[1:-5], 0xCF, 0, 0, 0))
     checksum = zlib.crc32(body, zlib.crc32(payload)).to_bytes(4, "big")
     yield _bad(BASE, "the checksum in eight bytes", body + b"\0" + checksum, payload)
@@ -405,20 +415,12 @@ def _refused() -> Iterator[dict[str, Any]]:
         yield _bad(message, "its end is missing", good[:-1], payload)
         yield _bad(message, "a byte follows", good + b"\0", payload)
         yield _bad(message, "the checksum is of another payload", good, payload + b"!")
-        yield _bad(
-            message,
-            "an older version",
-            _packed([WIRE_VERSION - 1, *values[1:]], payload),
-            payload,
-            version=True,
-        )
-        yield _bad(
-            message,
-            "a newer version",
-            _packed([WIRE_VERSION + 1, *values[1:]], payload),
-            payload,
-            version=True,
-        )
+        for what, version in (("an older", WIRE_VERSION - 1), ("a newer", WIRE_VERSION + 1)):
+            yield _bad(message, f"{what} version", _packed([version, *values[1:]], payload), payload)
+        if name_of(type(message)) in _WITH_NESTED:
+            name, place = _WITH_NESTED[name_of(type(message))]
+            deeper = _packed(_with_nested(values, place, _nested(DEEPEST - 2)), payload)
+            yield _bad(message, f"an unknown field too deep in each of {name}", deeper, payload)
         unknown = [0] * (MOST_UNKNOWN_FIELDS + 1)
         yield _bad(
             message, "more unknown fields than are skipped", _packed([*values, *unknown], payload), payload
@@ -444,13 +446,15 @@ def _values(message: Message) -> list[Any]:
 
 def _edges(message: Message, *, good: bool) -> Iterator[tuple[int, Any, str]]:
     """Values at the edges of what each field may hold, by its place: those that are read, or those refused."""
-    size = len(message.pack(_PAYLOADS.get(type(message), b"")))
+    payload = _PAYLOADS.get(type(message), b"")
+    size = len(message.pack(payload))
     values = _values(message)
     for place, (name, kind) in enumerate(kinds(type(message)), 1):
         more = _PLACES if name == "place" else ()
         for raw, what in (*edges(kind.schema()), *_OF_ANY_TYPE, *more):
+            changed = [*values[:place], raw, *values[place + 1 :]]
             try:
-                type(message).of_version(WIRE_VERSION, [*values[1:place], raw, *values[place + 1 :]])
+                type(message).parse(_packed(changed, payload), payload)
             except WireError:
                 read = False
             else:
@@ -460,18 +464,16 @@ def _edges(message: Message, *, good: bool) -> Iterator[tuple[int, Any, str]]:
                 yield place, raw, f"{name} {what}"
 
 
-def _bad(
-    message: Message, what: str, data: bytes, payload: bytes, *, version: bool = False
-) -> dict[str, Any]:
+def _bad(message: Message, what: str, data: bytes, payload: bytes) -> dict[str, Any]:
     try:
         type(message).parse(data, payload)
-    except WireError:
+    except WireError as error:
         return {
             "message": name_of(type(message)),
             "what": what,
             "hex": data.hex(),
             "payload": payload.hex(),
-            "version": version,
+            "version": isinstance(error, UnknownVersionError),
         }
     raise AssertionError(f"{type(message).__name__} is read although {what}")
 
@@ -501,6 +503,12 @@ def _objects() -> Iterator[dict[str, Any]]:
         ):
             yield _bad_object(kind, what, wrong)
     rows = [[7, 1_000, True, b"first"], [9, 1_200, False, b"second"]]
+    for what, wrong_header in (
+        ("it does not say that it was stored", replace(header, flags=0)),
+        ("it does not say when it was captured", replace(header, capture_ns=-1)),
+    ):
+        unsaid = replace(still, attachment=wrong_header.pack(b"a still"))
+        yield _bad_object("still", what, pack_backlog_still(unsaid))
     for what, changed in (
         ("no frame at all", []),
         ("frames are not in order", rows[::-1]),
@@ -528,8 +536,9 @@ def _objects() -> Iterator[dict[str, Any]]:
 
 
 def _bad_object(kind: str, what: str, data: bytes) -> dict[str, Any]:
+    number = ROI.sequence if kind == "still" else 7
     try:
-        (parse_backlog_still if kind == "still" else parse_backlog_units)(data)
+        backlog_content((ROI.session_id, kind, number), data, edge=INFO.edge)
     except WireError:
         return {"kind": kind, "what": what, "hex": data.hex()}
     raise AssertionError(f"the object {kind} is read although {what}")

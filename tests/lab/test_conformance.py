@@ -88,7 +88,7 @@ def test_the_vectors_notice_a_broken_reader(reader):
 
 def test_a_mutant_that_is_none_is_noticed(reader):
     """Faults that are no longer in the reader, or change nothing, would count as caught."""
-    same = Mutant("nothing", "if (at < data.length)", "if (data.length > at)")
+    same = Mutant("nothing", "if (at < data.length &&", "if (data.length > at &&")
     assert survivors(Path(reader[-1]), [same]) == [same]
     with pytest.raises(ValueError, match="0 times"):
         survivors(Path(reader[-1]), [Mutant("gone", "no such text", "")])

@@ -266,7 +266,7 @@ class EdgeListener:
     def _skip(self, channel: str, error: WireError) -> None:
         self.unusable += 1
         if isinstance(error, UnknownVersionError):
-            if not self._version_said:
+            if not (self._version_said or error.in_common):  # the answer says what this edge speaks
                 self._version_said = True
                 _log.warning("%s", error.between("a ground", f"edge {self.keys.edge}"))
             return

@@ -13,7 +13,7 @@ one byte.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from hvt_common.protocol.messages import (
     MAX_BACKLOG_BYTES,
@@ -217,7 +217,9 @@ def _still(session_id: int, number: int, data: bytes) -> ReceivedStill:
     header = RoiHeader.parse(stored.attachment, stored.payload, versions=READ_VERSIONS)
     if header.session_id != session_id or header.sequence != number:
         raise WireError(f"stored still {number} has another number inside")
-    return ReceivedStill(replace(header, flags=header.flags | Flags.STORED), stored.payload)
+    if not header.flags & Flags.STORED or header.capture_ns < 0:
+        raise WireError(f"stored still {number} does not say that it is one, or when it was captured")
+    return ReceivedStill(header, stored.payload)
 
 
 def _check(header: BacklogHeader, payload: bytes) -> None:

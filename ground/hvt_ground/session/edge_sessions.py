@@ -184,8 +184,9 @@ class EdgeSessions:
             self.receiver.skip("info", WireError(f"the edge says that it is {info.edge!r:.40}"))
             return None
         if info.codec not in _BASE_CODECS:
-            text = f"the edge sends video of {info.codec!r:.40}, and this ground reads {BASE_CODEC}"
+            text = f"the edge sends video of {info.codec!r:.40}, and this ground reads {BASE_CODEC}: none is shown"
             self.receiver.skip("info", WireError(text))
+            self._pause.failed(time.monotonic_ns())  # its keyframes are of no use here
             return None
         self._clock_offset.add(
             t0_ns=requested_ns, t1_ns=info.received_ns, t2_ns=info.answered_ns, t3_ns=answered_ns
@@ -276,7 +277,10 @@ class EdgeSessions:
     # Sessions
 
     def _begin_session(self, session_id: int) -> None:
-        info = next((info for _ in range(_INFO_TRIES) if (info := self._query_info(session_id))), None)
+        due, info = self._pause.due, None
+        for _ in range(_INFO_TRIES):
+            if info is None and due(time.monotonic_ns()):
+                info = self._query_info(session_id)
         shown = self.session
         if info is None and shown is not None and self._query_info(shown.info.session_id) is not None:
             self.receiver.stream.disown()
@@ -284,7 +288,8 @@ class EdgeSessions:
             return
         self._end_session()
         if info is None:
-            self.receiver.skip("info", WireError("the edge does not say what its session is"))
+            if due(time.monotonic_ns()):  # else what it said is of no use
+                self.receiver.skip("info", WireError("the edge does not say what its session is"))
             return
         if not self._beginnings.take(self._clock()):
             every_s = _EVERY_NS // SECOND_NS

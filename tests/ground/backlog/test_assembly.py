@@ -309,7 +309,7 @@ def flight() -> Flight:
 def test_objects_are_read(flight):
     """Nothing of an outage could be shown."""
     sid = flight.session_id
-    still = backlog_content((sid, "still", 4), still_object(flight, 6, 4, flags=0), edge="uav-1")
+    still = backlog_content((sid, "still", 4), still_object(flight, 6, 4), edge="uav-1")
     assert isinstance(still, ReceivedStill)
     assert (still.header.sequence, still.header.frame_index) == (4, 6)
     assert still.header.flags & Flags.STORED
@@ -330,6 +330,8 @@ def test_objects_that_are_another_inside_are_refused(flight):
         ((sid, "still", 5), still, "uav-1"),
         ((sid + 1, "still", 4), still, "uav-1"),
         ((sid, "still", 4), damaged, "uav-1"),
+        ((sid, "still", 4), still_object(flight, 6, 4, flags=0), "uav-1"),
+        ((sid, "still", 4), still_object(flight, 6, 4, capture_ns=-1), "uav-1"),
         ((sid, "still", 4), video, "uav-1"),
         ((sid, "base", 21), video, "uav-1"),
         ((sid, "base", 20), still, "uav-1"),

@@ -472,6 +472,23 @@ def test_a_lost_answer_does_not_lose_the_flight(flight):
         assert rig.receiver.session.frames_decoded == 10
 
 
+def test_video_that_this_ground_does_not_read_is_told_of_in_a_sentence(flight, caplog, monkeypatch):
+    """A newer edge would be asked for a keyframe each second, for a picture that nobody here sees."""
+    caplog.set_level(logging.WARNING)
+    with Rig() as rig:
+        rig.port.flight = flight
+        read = flight.info
+        monkeypatch.setattr(flight, "info", lambda: replace(read(), codec="av1"))
+        for index in range(0, 30, 5):
+            rig.put(flight.base(index))
+            rig.settle()
+        assert rig.receiver.idle
+        assert (rig.port.requested, rig.port.keyframe_requests) == (1, 0)
+    said = [one.getMessage() for one in caplog.records]
+    assert len(said) == 1
+    assert "the edge sends video of 'av1', and this ground reads h265: none is shown" in said[0]
+
+
 def test_a_flight_goes_on_after_an_outage(flight):
     """After ten seconds without a link the picture would never come back although the edge flies on."""
     with Rig(patience_s=0.2) as rig:

@@ -124,7 +124,7 @@ def test_edges_that_are_there_or_fly_keep_their_place(link):
 def test_another_version_of_the_wire_is_said_once(link, caplog, version, said):
     """The operator would see no picture, or an edge that obeys nothing, and no reason."""
     ground, outsider = link
-    values = msgpack.unpackb(INFO.pack())[1:-1]
+    values = [version, version, *msgpack.unpackb(INFO.pack())[3:-1]]
     body = msgpack.packb([version, *values, 2**32 - 1])[:-5]
     answer = body + b"\xce" + zlib.crc32(body).to_bytes(4, "big")
     keys = EdgeKeys("uav-1")

@@ -161,7 +161,4 @@ def _exact(kind: type[_T], values: Any) -> _T:
 def _unpack(data: bytes, name: str) -> list[Any]:
     if len(data) > MAX_BACKLOG_BYTES:
         raise WireError(f"{name} of {len(data)} bytes is longer than {MAX_BACKLOG_BYTES}")
-    values = unpacked(data, name)
-    if type(values) is not list:
-        raise WireError(f"{name} is not an array")
-    return values
+    return unpacked(data, name)

@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import ClassVar
 
 from hvt_common.protocol.messages.backlog import MAX_ACKNOWLEDGED_RANGES, AcknowledgedRange
-from hvt_common.protocol.messages.envelope import WIRE_VERSION, Message, Nested
+from hvt_common.protocol.messages.envelope import MOST_VERSION, WIRE_VERSION, Message, Nested
 from hvt_common.protocol.messages.fields import (
     I63,
     U32,
@@ -57,9 +57,11 @@ class Command(StrEnum):
 class InfoRequest(Message):
     """Payload of a question on ``info``. A question without one is answered alike, and says nothing of codecs."""
 
-    lowest_version: int = wire_field(Int(1, 255), default=WIRE_VERSION, since=5, before=4)
+    NEGOTIATES: ClassVar[bool] = True
+
+    lowest_version: int = wire_field(Int(1, MOST_VERSION), default=WIRE_VERSION, since=5, before=4)
     """As in `Info`, of the ground."""
-    highest_version: int = wire_field(Int(1, 255), default=WIRE_VERSION, since=5, before=4)
+    highest_version: int = wire_field(Int(1, MOST_VERSION), default=WIRE_VERSION, since=5, before=4)
     requester_id: int = wire_field(Int(0, U64))
     """Random, new at each start of the ground: a later request of the same number takes the place of this one."""
     still_codecs: tuple[str, ...] = wire_field(ListOf(Text(24), MAX_STILL_CODECS))

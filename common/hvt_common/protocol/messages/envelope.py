@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from itertools import islice
 from typing import Any, ClassVar, Self, TypeVar
 
 import msgpack
@@ -28,6 +30,7 @@ SPOKEN_VERSIONS = (5,)
 """Of messages that come over the link now."""
 READ_VERSIONS = (4, 5)
 """Where they were stored: in logs, recordings, and what an edge kept on its disk."""
+MOST_VERSION = 255
 MOST_UNKNOWN_FIELDS = 16
 """So many fields behind the last known one are skipped, in each array; with more it is no message of ours."""
 DEEPEST = 8
@@ -35,6 +38,8 @@ DEEPEST = 8
 
 _CRC_BYTES = 5
 _CRC_TAG = 0xCE
+_HEAD_BYTES = 32
+"""The array's head, the version, and the two that a message on ``info`` begins with."""
 
 _T = TypeVar("_T")
 
@@ -42,15 +47,22 @@ _T = TypeVar("_T")
 class UnknownVersionError(WireError):
     """The message is of another schema version: count it apart, warn once, skip it."""
 
-    def __init__(self, message: str, version: int, *, read: Sequence[int]) -> None:
-        self.version, self._read = version, " and ".join(map(str, read))
+    def __init__(
+        self, message: str, version: int, *, read: Sequence[int], spoken: tuple[int, int] | None = None
+    ) -> None:
+        self._lowest, self._highest = spoken or (version, version)
+        self.in_common = any(self._lowest <= one <= self._highest for one in read)
+        """The sender also speaks one that is read."""
+        self._read = " and ".join(map(str, read))
         known = f"{self._read} are" if len(read) > 1 else f"{self._read} is"
         super().__init__(f"{message} has schema version {version}, only {known} known here")
 
     def between(self, sender: str, reader: str) -> str:
         """The remedy, as one sentence."""
-        older = reader if self.version > WIRE_VERSION else sender
-        return f"{sender} speaks wire version {self.version}, {reader} reads {self._read}: update {older}"
+        low, high = self._lowest, self._highest
+        older = reader if high > WIRE_VERSION else sender
+        spoken = f"version {low}" if low == high else f"versions {low} to {high}"
+        return f"{sender} speaks wire {spoken}, {reader} reads {self._read}: update {older}"
 
 
 class CorruptError(WireError):
@@ -71,6 +83,8 @@ class Message:
     """Bytes of the payload that it may be attached to."""
     TRIMMED: ClassVar[bool] = False
     """Fields at the end that have their defaults are left out."""
+    NEGOTIATES: ClassVar[bool] = False
+    """From version 5 on it begins with the lowest and the highest version that its sender speaks."""
 
     def on_wire(self) -> Message:
         """The message whose fields are sent."""
@@ -95,18 +109,19 @@ class Message:
         Raises UnknownVersionError, CorruptError or another WireError, and nothing else, for any bytes whatever.
         """
         name = cls.__name__
+        version, spoken = _versions(data, name, negotiates=cls.NEGOTIATES)
+        if version not in versions or not spoken[0] <= version <= spoken[1]:
+            raise UnknownVersionError(name, version, read=versions, spoken=spoken)
         if len(data) > cls.MAX_BYTES:
             raise WireError(f"{name} of {len(data)} bytes is longer than {cls.MAX_BYTES}")
         if len(payload) > cls.MAX_PAYLOAD:
             raise WireError(f"payload of {len(payload)} bytes is longer than {cls.MAX_PAYLOAD}")
-        array = _unpack(data, name)
-        if array[0] not in versions:
-            raise UnknownVersionError(name, array[0], read=versions)
+        array = unpacked(data, name)
         if len(data) <= _CRC_BYTES or data[-_CRC_BYTES] != _CRC_TAG:
             raise WireError(f"{name} does not end with its checksum")
         if array[-1] != _checksum(data[:-_CRC_BYTES], payload):
             raise CorruptError(f"{name} or its payload is not what was sent: checksum differs")
-        return cls.of_version(array[0], array[1:-1])
+        return cls.of_version(version, array[1:-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,21 +203,41 @@ def _packed(value: Any) -> bytes:
     return packed
 
 
-def _unpack(data: bytes, name: str) -> list[Any]:
-    # The array in ``data``, its version not checked. Sizes inside are bounded by the length of ``data`` itself.
-    array = unpacked(data, name)
-    if type(array) is not list or not array or type(array[0]) is not int:
+def _versions(data: bytes, name: str, *, negotiates: bool) -> tuple[int, tuple[int, int]]:
+    # Of a message, and of its sender: all else may be other in another version.
+    head = msgpack.Unpacker()
+    head.feed(data[:_HEAD_BYTES])
+    found: list[Any] = []
+    with suppress(ValueError, msgpack.UnpackException):
+        head.read_array_header()
+        found.extend(islice(head, 3))
+    if not found or type(found[0]) is not int:
         raise WireError(f"{name} is not an array that begins with a version")
-    return array
+    version = found[0]
+    bounds = [one for one in found[1:] if type(one) is int and 1 <= one <= MOST_VERSION]
+    if negotiates and version >= WIRE_VERSION and len(bounds) == 2:
+        return version, (bounds[0], bounds[1])
+    return version, (version, version)
 
 
-def unpacked(data: bytes, name: str) -> Any:
-    """MessagePack of one value without extensions, each key of a map once; `WireError` for all else."""
+def unpacked(data: bytes, name: str) -> list[Any]:
+    """MessagePack of one array without extensions, each key of a map once; `WireError` for all else."""
     try:
-        return msgpack.unpackb(data, strict_map_key=True, max_ext_len=0, object_pairs_hook=_once)
+        array = msgpack.unpackb(
+            data, strict_map_key=True, max_ext_len=0, ext_hook=_extension, object_pairs_hook=_once
+        )
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         reason = str(error).strip() or type(error).__name__
         raise WireError(f"{name} is not MessagePack: {reason:.80}") from None
+    if type(array) is not list:
+        raise WireError(f"{name} is not an array")
+    if _too_deep(array, DEEPEST):
+        raise WireError(f"{name} is nested more than {DEEPEST} deep")
+    return array
+
+
+def _extension(code: int, _data: bytes) -> None:
+    raise ValueError(f"an extension of type {code}")
 
 
 def _once(pairs: list[tuple[str | bytes, Any]]) -> dict[str, Any]:
@@ -227,17 +262,14 @@ def from_values(message: type[_T], values: list[Any], version: int = WIRE_VERSIO
             decoded[name] = kind.decode(raw)
         except WireError as error:
             raise WireError(f"{message.__name__}.{name}: {error}") from None
-    if _too_deep(values[len(table) :], DEEPEST - 1):
-        raise WireError(f"{message.__name__} has a field that is nested too deep")
     return message(**decoded)
 
 
 def _too_deep(value: Any, levels: int) -> bool:
     if type(value) not in (list, dict):
         return False
-    return levels < 0 or any(
-        _too_deep(one, levels - 1) for one in (value if type(value) is list else value.values())
-    )
+    within = value if type(value) is list else value.values()
+    return levels == 0 or any(_too_deep(one, levels - 1) for one in within)
 
 
 @cache

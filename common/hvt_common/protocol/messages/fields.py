@@ -125,9 +125,7 @@ class Real(Kind):
 
     def decode(self, raw: Any) -> Any:
         if type(raw) is not float or not math.isfinite(raw):
-            found = (
-                raw if type(raw) is float else type(raw).__name__
-            )  # what is nested too deep cannot be shown
+            found = raw if type(raw) is float else type(raw).__name__
             raise WireError(f"{found} in place of a finite float")
         if not self.low <= raw <= self.high:
             raise WireError(f"{raw:g} is outside {self.low:g}…{self.high:g}")

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from hvt_common.protocol.edge_words import FrameAccount
 from hvt_common.protocol.ledger import MOST_WINDOW_NS
-from hvt_common.protocol.messages.envelope import WIRE_VERSION, Message, Nested
+from hvt_common.protocol.messages.envelope import MOST_VERSION, WIRE_VERSION, Message, Nested
 from hvt_common.protocol.messages.fields import (
     I63,
     U32,
@@ -57,10 +57,11 @@ class Info(Message):
     """Payload of the answer to ``info``: everything about the session that does not change while it runs."""
 
     MAX_BYTES: ClassVar[int] = 65536
+    NEGOTIATES: ClassVar[bool] = True
 
-    lowest_version: int = wire_field(Int(1, 255), default=WIRE_VERSION, since=5, before=4)
+    lowest_version: int = wire_field(Int(1, MOST_VERSION), default=WIRE_VERSION, since=5, before=4)
     """Versions of the wire that the edge speaks: both sides use the highest that they have in common."""
-    highest_version: int = wire_field(Int(1, 255), default=WIRE_VERSION, since=5, before=4)
+    highest_version: int = wire_field(Int(1, MOST_VERSION), default=WIRE_VERSION, since=5, before=4)
     session_id: int = wire_field(Int(0, U64))
     edge: str = wire_field(Text(32))
     software: str = wire_field(Text(32))

@@ -74,7 +74,7 @@ from hvt_common.protocol.messages.fields import (
 from hvt_common.units import shown_text
 from hvt_common.values import View
 from lab.conformance.schema import described
-from rigs.messages import BASE, EXAMPLES, FEEDBACK, INFO, REQUEST, ROI, STATUS, STEP
+from rigs.messages import BASE, EXAMPLES, FEEDBACK, INFO, INFO_REQUEST, REQUEST, ROI, STATUS, STEP
 
 DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "wire-messages.md"
 V4 = WIRE_VERSION - 1
@@ -130,7 +130,11 @@ def value_of(kind: Kind) -> SearchStrategy:  # noqa: C901, PLR0911, PLR0912 - on
 
 def message_of(message: type[Message]) -> SearchStrategy:
     """Any value of a message type."""
-    return st.builds(message, **{name: value_of(kind) for name, kind in kinds(message)})
+    values = {name: value_of(kind) for name, kind in kinds(message)}
+    if message.NEGOTIATES:
+        values |= {"lowest_version": st.integers(1, WIRE_VERSION)}
+        values |= {"highest_version": st.integers(WIRE_VERSION, 255)}
+    return st.builds(message, **values)
 
 
 any_message = st.sampled_from(MESSAGES).flatmap(message_of)
@@ -328,6 +332,35 @@ def test_another_version_is_told_apart():
         BaseHeader.parse(sealed([True, 1, 2, 3, 4, 5, 6]))
 
 
+@pytest.mark.parametrize("data", [b"\x92\x07\xc7\0\5\xc1", b"\xc4".join((b"\x92\x07", b"\x64" + bytes(100)))])
+def test_another_version_is_told_apart_whatever_else_it_holds(data):
+    """A newer edge would be called damaged, because its messages are longer or hold what ours do not."""
+    with pytest.raises(UnknownVersionError, match="version 7"):
+        BaseHeader.parse(data)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "said", "in_common"),
+    [
+        ((6, 7), "a ground speaks wire versions 6 to 7, edge uav-1 reads 5: update edge uav-1", False),
+        ((3, 4), "a ground speaks wire versions 3 to 4, edge uav-1 reads 5: update a ground", False),
+        ((7, 6), "a ground speaks wire versions 7 to 6, edge uav-1 reads 5: update edge uav-1", False),
+        ((4, 6), "", True),
+    ],
+)
+@pytest.mark.parametrize("version", [WIRE_VERSION, 6])
+def test_the_versions_that_a_sender_speaks_are_read_in_every_version(bounds, said, in_common, version):
+    """Two sides without a version in common would show nothing, and no reason."""
+    values = [version, *bounds, *msgpack.unpackb(INFO_REQUEST.pack())[3:-1]]
+    if in_common and version == WIRE_VERSION:
+        assert InfoRequest.parse(sealed(values)).highest_version == 6
+        return
+    with pytest.raises(UnknownVersionError) as other:
+        InfoRequest.parse(sealed(values))
+    assert other.value.in_common is in_common
+    assert in_common or other.value.between("a ground", "edge uav-1") == said
+
+
 @pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
 def test_fields_of_a_later_minor_version_are_skipped(message):
     """Every new field would need every ground and every edge to be updated on one day."""
@@ -346,8 +379,19 @@ def test_fields_of_a_later_minor_version_are_skipped(message):
 def test_fields_of_a_later_minor_version_are_skipped_in_nested_arrays_too():
     """A new field of a track in a still would make the whole still unusable."""
     values = msgpack.unpackb(ROI.pack())[:-1]
-    values[-1] = [[*one, "new"] for one in values[-1]]
-    assert RoiHeader.parse(sealed(values)) == ROI
+    also, deep = values[-1], [[[[[0]]]]]
+    for one in ("new", deep):
+        values[-1] = [[*row, one] for row in also]
+        assert RoiHeader.parse(sealed(values)) == ROI
+    values[-1] = [[*row, [deep]] for row in also]
+    with pytest.raises(WireError, match="nested more than 8 deep"):
+        RoiHeader.parse(sealed(values))
+
+
+def test_an_extension_is_refused_even_without_bytes():
+    """Other readers refuse it, and two would not agree on what a message is."""
+    with pytest.raises(WireError, match="an extension of type 5"):
+        BaseHeader.parse(sealed([*msgpack.unpackb(BASE.pack())[:-1], msgpack.ExtType(5, b"")]))
 
 
 def test_the_version_before_is_read():
@@ -373,14 +417,14 @@ def test_arrays_in_arrays_in_place_of_a_number_are_refused_in_a_sentence():
     head = msgpack.Packer().pack_array_header(len(packed) + 2)
     body = b"".join((head, bytes((WIRE_VERSION,)), *packed.values()))
     data = body + b"\xce" + zlib.crc32(body).to_bytes(4, "big")
-    with pytest.raises(WireError, match=r"Info.fps: list in place of a finite float"):
+    with pytest.raises(WireError, match=r"Info is nested more than 8 deep"):
         Info.parse(data)
 
 
 def test_oversized_messages_are_not_looked_at():
     """Memory would follow whatever a stranger sends."""
     with pytest.raises(WireError, match="longer than 80"):
-        BaseHeader.parse(bytes(81))
+        BaseHeader.parse(BASE.pack() + bytes(81))
     with pytest.raises(WireError, match="payload of"):
         BaseHeader.parse(BASE.pack(), bytes(MAX_PAYLOAD_BYTES + 1))
 
