@@ -20,8 +20,8 @@ from hvt_common.runtime.process import STOP_SIGNALS
 from hvt_common.video.still_codecs import still_codec
 from media.pictures import write_scene
 from media.third_party import install
-from programs.golden import once
-from programs.processes import free_ports
+from programs.golden import FLIGHTS, once
+from programs.processes import Link, free_ports
 from rigs.drawn_flight import DrawnFlight, fly_into_all_sinks
 from rigs.watched_flight import WatchedFlight, fly_watched
 
@@ -51,6 +51,11 @@ if 0 <= files < (wanted := 4096 if most_files < 0 else min(4096, most_files)):
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--nightly``."""
     parser.addoption("--nightly", action="store_true", help="run the tests marked nightly or realtime, too")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """By day the golden flights alone."""
+    Link.flights = None if config.getoption("nightly") else FLIGHTS
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

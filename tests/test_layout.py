@@ -12,6 +12,8 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
+from programs.golden import FLIGHTS
+
 ROOT = Path(__file__).resolve().parents[1]
 BUILD = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]
 PACKAGES = tuple(BUILD["targets"]["wheel"]["packages"])
@@ -47,6 +49,14 @@ def test_no_folder_is_a_corridor():
     count = Counter(str(one.parent) for one in modules() if one.name != "__init__.py")
     assert {place: number for place, number in count.items() if number > MOST_IN_A_FOLDER} == {}
     assert {place: count[place] for place in PACKAGES if count[place] > MOST_AT_THE_TOP} == {}
+
+
+def test_each_golden_flight_is_flown_in_one_place():
+    """Who looks for a flight by its name would find none, or several that are not the same."""
+    flown = re.compile(r'(?<!def )\bLink\(\w+, name="([\w-]+)"\)|^FLIGHT = "([\w-]+)"$', re.MULTILINE)
+    files = [one for one in modules() if one.parts[0] == "tests"]
+    named = {(one, *found) for one in files for found in flown.findall((ROOT / one).read_text("utf-8"))}
+    assert sorted("".join(found) for _, *found in named) == sorted(FLIGHTS)
 
 
 def test_every_folder_of_a_package_says_what_happens_there():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,23 +41,28 @@ def test_a_socket_may_have_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_ground_is_ready_and_goes_on_telling_that_it_lives(systemd: socket.socket, tmp_path: Path) -> None:
-    """A start would never end; or the watchdog would kill a ground that works, every 30 s."""
-    with Link(tmp_path) as link:
+    """A start would never end; or the watchdog would kill a ground that works, every 30 s; or it would not stop."""
+    with Link(tmp_path, name="alone") as link:
         ground = link.ground("--detector", "motion", "--classifier", "none")
         assert systemd.recv(64) == b"READY=1"
         assert [systemd.recv(64) for _ in range(3)] == [b"WATCHDOG=1"] * 3
-        ground.stop()
+        ground.stop(signal.SIGTERM)
+        assert ground.finish() == []
+        assert "no edge was heard" in ground.told
 
 
 def test_an_edge_is_ready_before_any_ground_is_there(
     systemd: socket.socket, tmp_path: Path, scene: Path
 ) -> None:
-    """A drone that boots before its ground would hang in its start."""
-    with Link(tmp_path) as link:
-        edge = link.edge("--source", str(scene), "--method", "M0")
+    """A drone that boots before its ground would hang in its start, or end by kill -9 alone."""
+    with Link(tmp_path, name="alone") as link:
+        edge = link.edge(
+            "--source", str(scene), "--method", "M0", "--wait", "600s"
+        )  # longer than for its end
         assert systemd.recv(64) == b"READY=1"
         assert [systemd.recv(64) for _ in range(3)] == [b"WATCHDOG=1"] * 3, "it waits for a ground"
-        edge.stop()
+        edge.stop(signal.SIGTERM)
+        assert edge.finish()["frames"] == 0
 
 
 def test_a_socket_that_is_gone_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

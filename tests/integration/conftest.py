@@ -12,9 +12,9 @@ from programs.processes import Link
 
 
 @pytest.fixture
-def link(tmp_path: Path) -> Iterator[Link]:
-    """A ground and its edges on free ports, killed at the end of the test."""
-    with Link(tmp_path) as link:
+def link(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Link]:
+    """A ground and its edges on free ports, killed at the end of the test; of the golden flight of its module."""
+    with Link(tmp_path, name=getattr(request.module, "FLIGHT", "")) as link:
         yield link
 
 

@@ -24,7 +24,7 @@ LIGHT = LinkState(rate_bps=1_500_000, delay_s=0.02)
 DARK = LinkState(rate_bps=1_500_000, delay_s=0.02, dark=True)
 EDGE = (
     "--source-fps", "10", "--fps", "10", "--size", "320x192", "--budget", "800kbps", "--detector", "motion",
-    "--preset", "ultrafast", "--detect-every", "5", "--cooldown", "0", "--wait", "60s", "--method", "M5",
+    "--preset", "ultrafast", "--detect-every", "5", "--cooldown", "0", "--wait", "60s", "--profile", "paper",
 )  # fmt: skip
 
 
@@ -76,7 +76,7 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
     """The operator would never see what the drone saw while the link was away."""
     timing, own = tmp_path / "timing.csv", tmp_path / "own.mkv"
     script = outage(begins_s=2.0, lasts_s=dark_s)
-    with Link(tmp_path) as link, Relay(script, target_port=link.port) as relay:
+    with Link(tmp_path, name="outage") as link, Relay(script, target_port=link.port) as relay:
         ground = link.ground(
             "--detector", "motion", "--classifier", "none",
             "--record", str(tmp_path / "run.rrd"), "--timing", str(timing),
@@ -120,7 +120,7 @@ def test_an_edge_that_is_stopped_counts_what_the_ground_has(tmp_path, scene):
             folder.add_still(number, data, utility=1.0, capture_ns=time.time_ns())
     slow = LinkState(rate_bps=600_000, delay_s=0.15)
     script = Script(phases=(Phase(0.0, slow),), lasts_s=200.0, queue_bytes=64_000)
-    with Link(tmp_path) as link, Relay(script, target_port=link.port) as relay:
+    with Link(tmp_path, name="backlog") as link, Relay(script, target_port=link.port) as relay:
         ground = link.ground(
             "--detector", "motion", "--classifier", "none",
             "--record", str(tmp_path / "run.rrd"), "--timing", str(timing),

@@ -34,7 +34,7 @@ def play(module: str, *words: str, folder: Path, output: int, code: int = 0) -> 
     return json.loads((folder / "s.json").read_text())
 
 
-@pytest.mark.parametrize("output", [dead_pipe, full_disk])
+@pytest.mark.parametrize("output", [pytest.param(dead_pipe, marks=pytest.mark.nightly), full_disk])
 def test_an_edge_flies_on_when_nobody_reads_its_status(scene, tmp_path, free_port, output):
     """The video would end with the terminal, or the log's disk, from which the drone was started."""
     edge = ("--source", str(scene), "--size", "320x180", "--preset", "ultrafast", "--max-frames", "20")

@@ -14,6 +14,7 @@ from programs.processes import Link
 from programs.rrd import Recording
 
 pytestmark = pytest.mark.integration
+FLIGHT = "plug-ins"
 
 FRAMES = 60
 

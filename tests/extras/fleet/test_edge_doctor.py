@@ -11,10 +11,13 @@ from types import SimpleNamespace
 
 import pytest
 
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_edge.cli import main
+from hvt_ground.session.subscribe import GroundLink
 from media.pictures import write_scene
 from programs.fleet_keys import Fleet
-from programs.processes import Link, free_ports
+from programs.processes import free_ports
 from programs.rtsp_camera import RtspCamera
 
 CHEAP = ("--size", "320x192", "--detector", "motion", "--preset", "ultrafast")
@@ -41,11 +44,11 @@ def with_keys(folder: Path) -> tuple[Fleet, tuple[str, ...]]:
     return fleet, ("--zenoh-config", str(fleet.file("uav-1")), "--connect", "tls/127.0.0.1:7447")
 
 
-def test_all_is_well_where_a_ground_listens(tmp_path, capsys, scene):
+def test_all_is_well_where_a_ground_listens(capsys, scene):
     """The engineer would look for a fault that is not there."""
-    with Link(tmp_path) as link:
-        link.ground("--detector", "motion", "--classifier", "none")
-        code, found = examined(capsys, "--source", str(scene), *CHEAP, "--connect", link.ground_endpoint)
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    with open_session(LinkSettings("ground", listen=(endpoint,))) as ground, GroundLink(ground, edges="*"):
+        code, found = examined(capsys, "--source", str(scene), *CHEAP, "--connect", endpoint)
     assert code == 0
     assert found["link"]["found"] == "a ground listens"
     assert {one["state"] for name, one in found.items() if name not in ("clock", "processor")} == {"ok"}

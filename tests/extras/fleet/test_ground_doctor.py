@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import socket
 
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_ground.cli import main
-from programs.processes import Link, free_ports
+from programs.processes import free_ports
 
 
 def examined(capsys, *words: str) -> tuple[int, dict[str, dict[str, str]]]:
@@ -15,17 +17,14 @@ def examined(capsys, *words: str) -> tuple[int, dict[str, dict[str, str]]]:
     return code, {row["check"]: row for row in json.loads(capsys.readouterr().out)}
 
 
-def test_it_names_the_edges_that_are_there(tmp_path, capsys, long_scene):
+def test_it_names_the_edges_that_are_there(tmp_path, capsys):
     """A ground that hears nobody would be searched for a fault of its own."""
-    with Link(tmp_path) as link:
-        cheap = ("--source", str(long_scene), "--size", "640x360", "--fps", "5", "--detector", "motion")
-        link.edge(*cheap, "--edge-id", "uav-7", listens=True).until("ground")
-        words = (
-            *("--connect", link.edge_endpoint, "--record", str(tmp_path / "flights"), "--classifier", "none"),
-        )
-        code, found = examined(
-            capsys, *words, "--detector", "motion", "--web", f"127.0.0.1:{free_ports(1)[0]}"
-        )
+    port, page = free_ports(2)
+    words = ("--connect", f"tcp/127.0.0.1:{port}", "--record", str(tmp_path / "flights"))
+    words += ("--classifier", "none", "--detector", "motion", "--web", f"127.0.0.1:{page}")
+    settings = LinkSettings("edge", listen=(f"tcp/127.0.0.1:{port}",))
+    with open_session(settings) as edge, edge.liveliness().declare_token("hvt/uav-7/alive"):
+        code, found = examined(capsys, *words)
     assert found["link"] == {"check": "link", "state": "ok", "found": "edges: uav-7", "todo": ""}
     assert "GB are free" in found["recordings"]["found"]
     assert not (tmp_path / "flights").exists(), "it changes nothing"

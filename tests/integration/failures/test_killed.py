@@ -91,7 +91,7 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight
     def flown(count: int) -> None:
         eventually(lambda: len(files()) >= count, what=f"there are {count} files")
 
-    with Link(folder) as link:
+    with Link(folder, name="killed") as link:
         first = link.ground(*GROUND)
         doomed = link.edge(*edge, "--edge-id", "uav-1", "--record-base", "killed.mkv", name="doomed")
         flown(2)

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
@@ -22,7 +23,8 @@ from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
-from hvt_edge.config import EdgeConfig
+from hvt_edge.app import Edge
+from hvt_edge.config import EdgeConfig, check
 from hvt_edge.loop.pose import open_pose
 from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.live import Grabber, LiveSource, Shot, SignalLost
@@ -328,10 +330,18 @@ def test_a_whole_ground_waits_and_serves(link, scene):
     ground.kill()
 
 
-def test_an_edge_waits_for_its_camera_and_can_be_stopped(link):
+def test_an_edge_waits_for_its_camera_and_can_be_stopped(caplog):
     """Nobody would start it again; or only kill -9 ends it."""
-    edge = link.edge("--source", "/dev/video97", "--detector", "motion")
-    edge.until("/dev/video97 does not exist")
-    edge.stop()
-    assert edge.wait() == 1
-    assert "stopped before the source was there" in edge.said
+    config = EdgeConfig(source="/dev/video97", detector="motion", connect=("tcp/127.0.0.1:9",), quiet=True)
+    stop = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        flight = pool.submit(Edge(check(config), stop=stop).run)
+        try:
+            eventually(
+                lambda: "/dev/video97 does not exist" in caplog.text, what="it waits, and says for what"
+            )
+            assert not flight.done()
+        finally:
+            stop.set()
+        with pytest.raises(FlightError, match="stopped before the source was there"):
+            flight.result()

@@ -206,16 +206,20 @@ def test_watching_commanding_and_being_a_stranger(
             )
         publisher = declare_publisher(edge, Channel.STATUS, keys=UAV1)
         eventually(_linked(*grounds.values()), what="all three are linked")
-        info = {
-            name: query(ground, Channel.INFO, keys=UAV1, question=b"", timeout_s=2)
-            for name, ground in grounds.items()
-        }
-        assert info == {"base": b"info", "guest": b"info", "stranger": None}
-        control = {
-            name: query(ground, Channel.CONTROL, keys=UAV1, question=b"do", timeout_s=2)
-            for name, ground in grounds.items()
-        }
-        assert control == {"base": b"done", "guest": None, "stranger": None}
+
+        def answers(row: Channel, expected: dict[str, bytes | None]) -> bool:
+            """Who may ask is answered, on a busy machine at another try; who may not, at none."""
+            found = {
+                name: query(ground, row, keys=UAV1, question=b"do", timeout_s=2)
+                for name, ground in grounds.items()
+            }
+            assert not any(found[name] for name, answer in expected.items() if answer is None), found
+            return found == expected
+
+        info = {"base": b"info", "guest": b"info", "stranger": None}
+        eventually(lambda: answers(Channel.INFO, info), what="who may watch is answered")
+        control = {"base": b"done", "guest": None, "stranger": None}
+        eventually(lambda: answers(Channel.CONTROL, control), what="who may command is answered")
         publisher.put(b"picture")
         eventually(lambda: came["base"] and came["guest"], what="the two that may watch receive")
         assert came["stranger"] == []

@@ -54,7 +54,7 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
     folder = tmp_path_factory.mktemp("page")
     port = free_ports(1)[0]
-    with Link(folder) as link, sync_playwright() as playwright:
+    with Link(folder, name="page") as link, sync_playwright() as playwright:
         ground = link.ground(
             *("--record", "flight.rrd", "--detector", "motion", "--classifier", "none"),
             *("--web", f"127.0.0.1:{port}"),

@@ -13,6 +13,7 @@ from programs.processes import Link, Running, eventually
 from programs.rrd import Recording
 
 pytestmark = pytest.mark.integration
+FLIGHT = "passthrough"
 
 
 def camera(clip: object) -> tuple[str, ...]:

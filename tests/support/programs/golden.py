@@ -1,4 +1,4 @@
-"""What is flown once in a run of all tests, by whichever of its processes comes first; the others read it."""
+"""The golden flights, of real processes, and what is flown once in a run of all tests, whoever comes first."""
 
 from __future__ import annotations
 
@@ -13,6 +13,22 @@ from typing import TypeVar
 import pytest
 
 _Left = TypeVar("_Left")
+
+FLIGHTS = {
+    "drawn": "auto, with a pose, into every sink: recorded, exported, placed on maps, replayed",
+    "outage": "the paper's method over a link that goes away: what was stored comes afterwards",
+    "backlog": "an edge that is stopped while it sends what was stored before",
+    "passthrough": "a camera that makes HEVC itself",
+    "late": "grounds that come and go in mid-flight, and a program that is none",
+    "killed": "two edges; one of them is killed, and then the ground",
+    "alone": "a ground and an edge, each under systemd, that meet nobody",
+    "asked": "stills, keyframes and budgets on request",
+    "keys": "TLS: who may watch, who may command, who may not",
+    "page": "a browser that watches and commands",
+    "watched": "Prometheus, a probe and a collector of logs",
+    "plug-ins": "a codec and a detector of others, installed beside HVT",
+}
+"""Those of `make test`, each flown once in the file of its name or in `tests/conftest.py`; all others are nightly."""
 
 
 def once(factory: pytest.TempPathFactory, name: str, fly: Callable[[Path], _Left]) -> _Left:

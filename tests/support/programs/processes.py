@@ -11,9 +11,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from hvt_common.protocol.edge_words import FRAME_GROUPS, FrameAccount
 
@@ -168,10 +168,27 @@ class Running:
         return content
 
 
+def agree(sent: dict[str, Any], received: dict[str, Any]) -> None:
+    """The summaries of an edge and of the ground that had all of its flight."""
+    assert sent["frames"] == received["frames"] > 0
+    assert sent["base_bytes"] == received["base_bytes"] > 0
+    # On a busy machine a report may be late, and a base frame. A still that is sent again counts once; twice where it
+    # has a new number, because it had to do without the base.
+    copies = sent["stills"]["reasons"]["sent"].get("again", 0)
+    assert 0 <= sent["stills"]["sent"] - received["stills"]["received"] <= copies
+    # A copy counts at the ground as well, if it comes before the end.
+    assert received["roi_bytes"] <= sent["roi_bytes"]
+    assert copies or received["roi_bytes"] == sent["roi_bytes"]
+
+
 class Link:
     """A ground and its edges on ports of their own. A context manager that leaves no process behind."""
 
-    def __init__(self, folder: Path) -> None:
+    flights: ClassVar[Collection[str] | None] = None
+    """Names of all that may be flown; None: any."""
+
+    def __init__(self, folder: Path, *, name: str = "") -> None:
+        assert self.flights is None or name in self.flights, "it is no golden flight: mark its test nightly"
         self.folder = folder
         self.port, self.edge_port = free_ports(2)
         self._started: list[Running] = []

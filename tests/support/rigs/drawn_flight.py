@@ -106,7 +106,7 @@ def fly_into_all_sinks(folder: Path) -> DrawnFlight:
     (folder / "stills").mkdir()
     gateways = ("--cot", f"udp://127.0.0.1:{port}", "--cot-types", "types.toml", "--ts", "flight.ts")
     sinks = ("--stills", "stills", "--log", "flight.hvtlog", *(gateways if find_spec("hvt_gateways") else ()))
-    with receiving(port) as events, Link(folder) as link:
+    with receiving(port) as events, Link(folder, name="drawn") as link:
         edge, ground, _ = fly(link, *sinks, edge=("--pose", "demo", "--pace", "lockstep"))
     return DrawnFlight(folder, events, edge, ground)
 

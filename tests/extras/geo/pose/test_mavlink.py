@@ -16,8 +16,9 @@ from hvt_edge.loop.pose import open_pose
 
 @pytest.fixture
 def source(port):
-    """What listens."""
-    opened = open_pose(f"mavlink:udpin:127.0.0.1:{port}", hfov_deg=65.0, clock=time.time_ns)
+    """What listens. Its clock stands: what was said once is not old, however long this machine takes to look."""
+    now_ns = time.time_ns()
+    opened = open_pose(f"mavlink:udpin:127.0.0.1:{port}", hfov_deg=65.0, clock=lambda: now_ns)
     yield opened
     opened.close()
 
