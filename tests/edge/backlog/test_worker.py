@@ -294,12 +294,12 @@ def test_a_full_disk_stops_storing_alone_until_there_is_space(small_disk, caplog
     link = Link()
     link.open = False
     worker = worker_of(small_disk / "store", link)
-    units = [shifted(unit, 4 * part) for part in range(30) for unit in UNITS]
     with caplog.at_level(logging.WARNING):
-        for unit in units:
-            if not worker.offer(unit):
+        for part in range(30):
+            taken = [worker.offer(shifted(unit, 4 * part)) for unit in UNITS]
+            eventually(lambda: worker.intake.idle, what="they are taken")
+            if not all(taken):
                 break
-            eventually(lambda: worker.intake.idle, what="it is taken")
         eventually(lambda: worker.failed, what="the disk is full")
         stored = worker.numbers
         assert stored.segments >= 2

@@ -350,7 +350,7 @@ def test_who_changes_what_is_shown_all_the_time_gets_a_few(local, monkeypatch, d
     done: list[str] = []
     monkeypatch.setattr(site, "WATCH_PAUSE_S", 60.0)
     monkeypatch.setattr(Hub, does, lambda *_, **__: done.append(does))
-    with joined(local) as viewer:
+    with joined(local, close_timeout=0.1) as viewer:  # nobody answers before the pause is over
         for message in messages:
             viewer.send(json.dumps(message))
         eventually(lambda: done, what="the first is done")

@@ -107,7 +107,9 @@ def fly_into_all_sinks(folder: Path) -> DrawnFlight:
     gateways = ("--cot", f"udp://127.0.0.1:{port}", "--cot-types", "types.toml", "--ts", "flight.ts")
     sinks = ("--stills", "stills", "--log", "flight.hvtlog", *(gateways if find_spec("hvt_gateways") else ()))
     with receiving(port) as events, Link(folder, name="drawn") as link:
-        edge, ground, _ = fly(link, *sinks, edge=("--pose", "demo", "--pace", "lockstep"))
+        edge, ground, _ = fly(
+            link, *sinks, edge=("--pose", "demo", "--pace", "lockstep", "--provider", "cpu")
+        )
     return DrawnFlight(folder, events, edge, ground)
 
 

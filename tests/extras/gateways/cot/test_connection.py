@@ -72,6 +72,8 @@ class Server:
             self.connections.append(made)
             while self._reads and (data := made.recv(65536)):
                 self.received += data
+            if isinstance(made, ssl.SSLSocket) and self._reads:
+                made.unwrap()  # else a client waits half a minute for the answer to its goodbye
 
     def close(self) -> None:
         """As a process ends: the port is free, the connections are cut."""
