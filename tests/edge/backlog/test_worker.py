@@ -295,8 +295,8 @@ def test_a_full_disk_stops_storing_alone_until_there_is_space(small_disk, caplog
     link.open = False
     worker = worker_of(small_disk / "store", link)
     with caplog.at_level(logging.WARNING):
-        for part in range(30):
-            taken = [worker.offer(shifted(unit, 4 * part)) for unit in UNITS]
+        for stretch in range(30):
+            taken = [worker.offer(shifted(unit, 4 * stretch)) for unit in UNITS]
             eventually(lambda: worker.intake.idle, what="they are taken")
             if not all(taken):
                 break
