@@ -93,6 +93,19 @@ MUTANTS: tuple[Mutant, ...] = (
         "const array = (length, depth) => {\n        if (depth > SCHEMA.limits.depth)",
         "const array = (length, depth) => {\n        if (depth >= SCHEMA.limits.depth)",
     ),
+    *(
+        Mutant(
+            f"{what} may be nested deeper",
+            f"return {of}(size({size}), depth + 1);",
+            f"return {of}(size({size}), 0);",
+        )
+        for what, of, size in (
+            ("arrays of 16 bits", "array", 2),
+            ("arrays of 32 bits", "array", 4),
+            ("maps of 16 bits", "map", 2),
+            ("maps of 32 bits", "map", 4),
+        )
+    ),
     Mutant("a float of 32 bits is unknown", "case 0xca: return view.getFloat32(take(4));", ""),
     Mutant("a map of 16 bits is unknown", "case 0xde: return map(size(2), depth + 1);", ""),
     Mutant("an array of 32 bits is unknown", "case 0xdd: return array(size(4), depth + 1);", ""),
@@ -253,6 +266,12 @@ MUTANTS: tuple[Mutant, ...] = (
     # Coded tracks
     Mutant("contexts learn for ever", "Math.min(30, context.n + 1)", "context.n + 1"),
     Mutant("contexts learn a step less", "Math.min(30, context.n + 1)", "Math.min(29, context.n + 1)"),
+    Mutant("a step of any coding is read", "coding !== 1 || sequence", "sequence"),
+    Mutant("a pose of any coding is read", '"coding") !== 1n', '"coding") < 1n'),
+    Mutant("a number is a bit shorter at most", "need(length < 33,", "need(length < 32,"),
+    Mutant("a half is rounded down", "old.vx * frames + 128", "old.vx * frames + 127"),
+    Mutant("a little less than a half is rounded up", "old.vy * frames + 128", "old.vy * frames + 129"),
+    Mutant("the median of none is not 0", ">> 1] : 0", ">> 1] : 1"),
     Mutant("a number may be of any length", "need(length < 33,", "need(length < 34,"),
     Mutant("bytes may be left over", "need(this.next >= this.data.length,", "need(true,"),
     Mutant(
@@ -312,9 +331,8 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(
         "a step's frame is looked at before its reference",
-        "if (sequence <= this.sequence ||",
-        'if (frame <= this.frame && sequence > this.sequence) return "damaged";\n'
-        "        if (sequence <= this.sequence ||",
+        "if (coding !== 1 ||",
+        'if (frame <= this.frame && sequence > this.sequence) return "damaged";\n        if (coding !== 1 ||',
     ),
     Mutant("a step may stand still", "need(frame > this.frame,", "need(frame >= this.frame,"),
     Mutant("a step is not sorted", "return found.sort((a, b) => a.id - b.id);", "return found;"),
@@ -327,6 +345,8 @@ MUTANTS: tuple[Mutant, ...] = (
         "a pose may have bytes behind it", 'rest.length < 8 && !rest.includes("1")', '!rest.includes("1")'
     ),
     Mutant("a pose's numbers have no bounds", "value >= kinds[index][0] && value <= kinds[index][1]", "true"),
+    Mutant("a roll may be half a turn", "[-1800, 1799, 12, 3, true]", "[-1800, 1800, 12, 3, true]"),
+    Mutant("a pose may have a byte behind it", "rest.length < 8", "rest.length < 9"),
     Mutant("a pose may go back in time", "time > this.time && ", ""),
     Mutant("a pose's number does not begin again at 16", "(this.number + 1) % 16", "this.number + 1"),
     # Where a still is
@@ -342,6 +362,14 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("a crop may end too far to the right", "x + width <= 32767 && ", ""),
     Mutant("a crop may end too far below", " && y + height <= 32767", ""),
     Mutant("a box may be inside out", " && box[0] <= box[2] && box[1] <= box[3]", ""),
+    Mutant("a box may be upside down", " && box[1] <= box[3]", ""),
+    Mutant("a box at its bound is refused", "Math.abs(side) <= 8", "Math.abs(side) < 8"),
+    Mutant("a coded size of 1 is refused", "side >= 1 && side <= 32767", "side > 1 && side <= 32767"),
+    Mutant("the largest coded size is refused", "side >= 1 && side <= 32767", "side >= 1 && side < 32767"),
+    Mutant("any flag says that a still was stored", "& 8n) !== 0n", "& 255n) !== 0n"),
+    Mutant("a stored still was never captured at 0", '"capture_ns") >= 0n', '"capture_ns") > 0n'),
+    Mutant("stored video is more than a frame", "list(1, 2400,", "list(2, 2400,"),
+    Mutant("stored video ends a frame early", "list(1, 2400,", "list(1, 2399,"),
     Mutant("a box has no bound", "Math.abs(side) <= 8 * 32767", "true"),
     Mutant("a coded size may be nothing", "side >= 1 && side <= 32767", "side <= 32767"),
     Mutant("a coded size has no bound", "side >= 1 && side <= 32767", "side >= 1"),

@@ -439,8 +439,8 @@ class TrackReader {
   take(data: Uint8Array): string {
     const values = read("TrackStep", data, new Uint8Array());
     const of = (name: string): Value => field("TrackStep", values, name);
-    const [sequence, frame, reference] = [of("sequence"), of("frame_index"), of("reference")].map(Number);
-    if (sequence <= this.sequence || (reference !== -1 && reference !== this.sequence)) return "skipped";
+    const [sequence, frame, reference, coding] = [of("sequence"), of("frame_index"), of("reference"), of("coding")].map(Number);
+    if (coding !== 1 || sequence <= this.sequence || (reference !== -1 && reference !== this.sequence)) return "skipped";
     try {
       need(frame > this.frame, "it does not lie ahead");
       const before = reference === -1 ? [] : this.tracks;
@@ -508,6 +508,7 @@ class PoseReader {
   take(data: Uint8Array): unknown {
     try {
       const values = read("PoseReport", data, new Uint8Array());
+      if (field("PoseReport", values, "coding") !== 1n) return "skipped";
       return this.decode(new Bits(field("PoseReport", values, "coded") as Uint8Array));
     } catch (error) {
       if (error instanceof Refused) return "damaged";

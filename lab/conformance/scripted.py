@@ -116,6 +116,21 @@ def track_sessions() -> Iterator[tuple[str, list[Step]]]:
             (9, False, [0, 0, 1024]),
         ],
     )
+    still = [1, 1, 0, 0]
+    yield (
+        "halves, nobody there, and a number as long as may be",
+        [
+            (
+                0,
+                False,
+                [0, 0, 2, *(0, 0, 0, -5, 0, -5, 0, 50, 60, 1, 1), *(0, 0, 0, 0, 0, 0, 0, 500, 600, 0, 0)],
+            ),
+            (1, True, still),
+            (4, True, [*still, *(0, 0, 0, 0, 0), *(2, 2, 0, 0, 0)]),
+            (135, True, still),
+            (136, True, [0, 0, 1, *(6, 0, 0, 0, 0, 0, 0, 2**32 + 5, -(2**32) - 5)]),
+        ],
+    )
     for what, born in (
         ("a class", [0, 1, 2048, *plain[2:], 0, 0]),
         ("an id", [2**32 - 1, *plain[1:], 0, 0]),
@@ -128,13 +143,23 @@ def track_sessions() -> Iterator[tuple[str, list[Step]]]:
 
 
 def whole_pose(
-    number: int, time_ms: int, place: Sequence[int], *, yaw: int | None = None, pitch: int = 0
+    number: int,
+    time_ms: int,
+    place: Sequence[int],
+    *,
+    yaw: int | None = None,
+    pitch: int = 0,
+    roll: int = 0,
+    field: int | None = None,
 ) -> BitWriter:
-    """A report that stands by itself: place, the camera where it has a yaw, and errors of 4."""
-    out = BitWriter().u(1, 1).u(number, 4).u(time_ms, 42).u(0b00100 if yaw is not None else 0, 5)
+    """A report that stands by itself: place, the camera where it has a yaw, field of view, and errors of 4."""
+    there = (yaw is not None) << 2 | (field is not None)
+    out = BitWriter().u(1, 1).u(number, 4).u(time_ms, 42).u(there, 5)
     out.u(place[0] + 900_000_000, 31).u(place[1] + 1_800_000_000, 32)
     if yaw is not None:
-        out.u(yaw, 12).u(pitch + 900, 11).u(1800, 12)
+        out.u(yaw, 12).u(pitch + 900, 11).u(roll + 1800, 12)
+    if field is not None:
+        out.u(field - 1, 11)
     return out.u(4, 5).u(4, 5).u(4, 5)
 
 

@@ -121,7 +121,8 @@ def _damaged() -> Iterator[dict[str, Any]]:
     for frame_index in (second.frame_index, 0):
         lost = replace(second, sequence=9, reference=8, frame_index=frame_index)
         yield {"hex": lost.pack().hex(), "skipped": True}
-    yield {"hex": first.pack().hex(), "skipped": True}
+    for skipped in (first, replace(second, coding=2)):
+        yield {"hex": skipped.pack().hex(), "skipped": True}
     yield {"hex": second.pack().hex(), "tracks": _rows(_read(second, state, before=first.frame_index))}
 
 
@@ -177,7 +178,8 @@ def poses() -> Iterator[dict[str, Any]]:
         replace(reports[1], coded=reports[1].coded + b"\0"),
         replace(reports[1], coded=b""),
     ]
-    holes = [reports[1], reports[0], *damaged, reports[1], reports[1], *reports[3:]]
+    other = replace(reports[1], coding=2)
+    holes = [reports[1], reports[0], *damaged, other, reports[1], reports[1], *reports[3:]]
     yield {"session": "holes, damage, and one that stands by itself", "reports": list(_read_poses(holes))}
     for name, scripts in _pose_scripts().items():
         made = [PoseReport(session=9, send_ns=7, coded=one.ended(stop="")) for one in scripts]
@@ -188,6 +190,7 @@ def _pose_scripts() -> dict[str, list[BitWriter]]:
     place = (481_370_000, -1_799_999_990)
     filled = whole_pose(0, 1000, place)
     filled.u(1, 3)  # in the bits that fill the last byte
+    whole = whole_pose(1, 2000, place, yaw=0, field=650)  # it fills its last byte
     steep = [
         whole_pose(number, 1000 * number, place, yaw=0, pitch=pitch) for number, pitch in ((1, 900), (2, 901))
     ]
@@ -203,13 +206,16 @@ def _pose_scripts() -> dict[str, list[BitWriter]]:
             pose_changes(2, camera=(0, 0, 0), errors=-31),
             pose_changes(3, camera=(0, 0, 0), errors=-1),
         ],
-        "bits where zeros have to be": [filled, whole_pose(0, 1000, place)],
+        "bits where zeros have to be": [filled, whole_pose(0, 1000, place), whole.u(0, 8)],
         "bounds": [
             *(whole_pose(0, 1000, (north, 5)) for north in (900_000_000, 900_000_001, -900_000_000)),
             *(whole_pose(0, 1000, (7, east)) for east in (-1_800_000_000, 1_799_999_999, 1_800_000_000)),
-            whole_pose(0, 1000, place, yaw=3599),
-            whole_pose(0, 1000, place, yaw=3600),
+            *(whole_pose(0, 1000, place, yaw=yaw) for yaw in (3599, 3600)),
+            *(whole_pose(0, 1000, place, field=field) for field in (1, 1799, 1800)),
+            whole_pose(0, 1000, place),
+            *(pose_changes(1, errors=more) for more in (28, 27)),
             *steep,
+            *(whole_pose(3, 3000, place, yaw=0, roll=roll) for roll in (-1800, 1799, 1800)),
         ],
         "time goes on": [
             whole_pose(3, 5000, place),
@@ -228,6 +234,9 @@ def _read_poses(reports: list[PoseReport]) -> Iterator[dict[str, Any]]:
     decoder = PoseDecoder()
     for report in reports:
         found: dict[str, Any] = {"hex": report.pack().hex()}
+        if report.coding != 1:
+            yield found | {"skipped": True}
+            continue
         try:
             pose = decoder.decode(report)
         except WireError:

@@ -74,24 +74,27 @@ def still_cases() -> Iterator[dict[str, Any]]:
         }
     for what, payload in (("a QP of 52", "3401"), ("no data", "20"), ("nothing", "")):
         yield {"what": what, "size": (16, 16), "payload": payload, "becomes": "refused"}
-    planes = _base_planes()
-    for what, side, change, becomes in (
-        ("the base that it was coded on", 64, 0, "read"),
-        ("another base", 64, 1, "again"),
-        ("32 samples a pixel", 32 * 16, 0, "read"),
-        ("33 samples a pixel", 33 * 16, 0, "refused"),
+    planes, noise = _base_planes(), _noise_planes()
+    for what, base_planes, crop, size, scale, offset, change, becomes in (
+        ("the base that it was coded on", planes, (0, 0, 64, 64), (16, 16), 1.0, (0.0, 0.0), 0, "read"),
+        ("another base", planes, (0, 0, 64, 64), (16, 16), 1.0, (0.0, 0.0), 1, "again"),
+        ("32 samples a pixel", planes, (0, 0, 512, 512), (16, 16), 1.0, (0.0, 0.0), 0, "read"),
+        ("33 samples a pixel", planes, (0, 0, 528, 528), (16, 16), 1.0, (0.0, 0.0), 0, "refused"),
+        ("any colours, up to the far corner", noise, (36, 24, 64, 48), (28, 24), 1.0, (0.0, 0.0), 0, "read"),
+        ("enlarged beyond all sides", noise, (0, 0, 190, 150), (190, 150), 0.37, (-1.5, 2.25), 0, "read"),
+        ("shrunk to odd sides", noise, (5, 3, 64, 46), (41, 29), 1.0, (0.5, 0.25), 0, "read"),
     ):
-        crop, view = (0, 0, side, side), View((side, side), _BASE, 1.0, (0.0, 0.0))
-        base = exact_base_crop(planes, view=view, crop_source_px=crop, size=(16, 16))
+        view = View(crop[2:], _BASE, scale, offset)
+        base = exact_base_crop(base_planes, view=view, crop_source_px=crop, size=size)
         yield {
             "what": what,
-            "size": (16, 16),
+            "size": size,
             "parameters": {"b": zlib.crc32(to_planar(base).tobytes()) ^ change},
             "crop_source_px": crop,
-            "view_scale": 1.0,
-            "view_offset_px": (0.0, 0.0),
+            "view_scale": scale,
+            "view_offset_px": offset,
             "base_size": _BASE,
-            "base_planes": [plane.tobytes().hex() for plane in planes],
+            "base_planes": [plane.tobytes().hex() for plane in base_planes],
             "becomes": becomes,
         }
 
@@ -162,6 +165,15 @@ def _vector(
         "payload": data.hex(),
         "pixels": pixels.tobytes().hex(),
     }
+
+
+def _noise_planes() -> tuple[Planar, Planar, Planar]:
+    """Of a base picture: every level beside every other, and one half of it black and white."""
+    rng, (width, height) = np.random.default_rng(11), _BASE
+    luma = rng.integers(0, 256, (height, width), np.uint8)
+    blue, red = (rng.integers(0, 256, (height // 2, width // 2), np.uint8) for _ in range(2))
+    luma[:, ::3] = np.where(luma[:, ::3] > 127, 255, 0)
+    return luma, blue, red
 
 
 def _base_planes() -> tuple[Planar, Planar, Planar]:

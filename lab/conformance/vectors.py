@@ -48,6 +48,10 @@ _EXACT = 2**53 - 1
 """Beyond it a number of JSON is not exact everywhere, and stands as text."""
 
 
+class _Coded(bytes):
+    """A value of a message, packed already."""
+
+
 def files() -> dict[str, str]:
     """The text of each file, by name."""
     content = {
@@ -214,7 +218,11 @@ _PLACES: tuple[tuple[list[int], str], ...] = (
     ([9, 9, 40, 30, 0, 0, 0, 0, 32768, 15], "has a coded size that is too wide"),
     ([9, 9, 40, 30, 161, 0, 160, 0], "has a box that is inside out"),
     ([9, 9, 40, 30, 160, 120, 160, 120], "has a box without an inside"),
+    ([9, 9, 40, 30, 0, 161, 0, 100], "has a box that is upside down"),
     ([9, 9, 40, 30, -262209, 0, 0, 0], "has a box too far to the left"),
+    ([0, 0, 32767, 32767, -262136, -262136, 0, 0], "has a box as far out as may be"),
+    ([9, 9, 40, 30, 0, 0, 0, 0, 1, 1], "has the smallest coded size"),
+    ([9, 9, 40, 30, 0, 0, 0, 0, 32767, 32767], "has the largest coded size"),
 )
 
 
@@ -303,6 +311,8 @@ def _good_envelopes() -> Iterator[dict[str, Any]]:
     yield _vector(BASE, "an unknown field as deep as may be", _packed([*values, deepest], payload))
     maps = _nested(DEEPEST - 1, map_of=True)
     yield _vector(BASE, "maps as deep as may be", _packed([*values, maps], payload))
+    for what, nested in _long_heads(DEEPEST - 1):
+        yield _vector(REQUEST, f"{what} as deep as may be", _packed([*_values(REQUEST), nested], b""))
     numbers: list[Any] = [math.nan, math.inf, 2**64 - 1, -(2**63), "\x07"]
     yield _vector(BASE, "unknown fields that no known one may hold", _packed([*values, *numbers], payload))
     for length, what in enumerate(("8 bits", "16 bits", "32 bits", "64 bits")):
@@ -345,6 +355,8 @@ def _bad_envelopes() -> Iterator[dict[str, Any]]:
         ("an unknown field of a type of its own without bytes", msgpack.ExtType(5, b"")),
     ):
         yield _bad(BASE, what, _packed([*values, unknown], payload), payload)
+    for what, nested in _long_heads(DEEPEST):
+        yield _bad(REQUEST, f"{what} too deep", _packed([*_values(REQUEST), nested], b""), b"")
     for what, coded in (
         ("a key twice", b"\x82\xa1a\x01\xa1a\x02"),
         ("a key that is a number", b"\x81\x01\x02"),
@@ -387,6 +399,17 @@ def _nested(levels: int, *, map_of: bool = False) -> Any:
     for _ in range(levels - 1):
         value = {"a": value} if map_of else [value]
     return value
+
+
+def _long_heads(levels: int) -> Iterator[tuple[str, _Coded]]:
+    """Nested so deep, with lengths of more bits than they need."""
+    for what, head in (
+        ("arrays of 16 bits", b"\xdc\0\1"),
+        ("arrays of 32 bits", b"\xdd\0\0\0\1"),
+        ("maps of 16 bits", b"\xde\0\1\xa1a"),
+        ("maps of 32 bits", b"\xdf\0\0\0\1\xa1a"),
+    ):
+        yield what, _Coded(head * (levels - 1) + b"\x90")
 
 
 def _coded(message: Message, changed: Mapping[str, bytes]) -> bytes:
@@ -480,7 +503,8 @@ def _bad(message: Message, what: str, data: bytes, payload: bytes) -> dict[str, 
 
 def _packed(values: list[Any], payload: bytes) -> bytes:
     """The array with a checksum that fits."""
-    body = msgpack.Packer().pack_array_header(len(values) + 1) + b"".join(map(msgpack.packb, values))
+    packed = (one if isinstance(one, _Coded) else msgpack.packb(one) for one in values)
+    body = msgpack.Packer().pack_array_header(len(values) + 1) + b"".join(packed)
     return bytes(body) + b"\xce" + zlib.crc32(body, zlib.crc32(payload)).to_bytes(4, "big")
 
 
@@ -495,16 +519,21 @@ def _objects() -> Iterator[dict[str, Any]]:
         BacklogUnit(9, 1_200, keyframe=False, data=b"second"),
     ]
     for kind, data in (("still", pack_backlog_still(still)), ("base", pack_backlog_units(units))):
-        yield {"kind": kind, "what": "an example", "hex": data.hex(), "values": _plain(msgpack.unpackb(data))}
+        yield _good_object(kind, "an example", data)
         for what, wrong in (
             ("its end is missing", data[:-1]),
             ("a byte follows", data + b"\0"),
             ("is empty", b""),
         ):
             yield _bad_object(kind, what, wrong)
+    first = replace(still, attachment=replace(header, capture_ns=0).pack(b"a still"))
+    yield _good_object("still", "captured at the very first", pack_backlog_still(first))
+    for count, what in ((1, "one frame"), (2400, "as many frames as may be")):
+        rows = [[7 + frame, frame, False, b"x"] for frame in range(count)]
+        yield _good_object("base", what, msgpack.packb(rows))
     rows = [[7, 1_000, True, b"first"], [9, 1_200, False, b"second"]]
     for what, wrong_header in (
-        ("it does not say that it was stored", replace(header, flags=0)),
+        ("it does not say that it was stored", replace(header, flags=255 - Flags.STORED)),
         ("it does not say when it was captured", replace(header, capture_ns=-1)),
     ):
         unsaid = replace(still, attachment=wrong_header.pack(b"a still"))
@@ -535,10 +564,19 @@ def _objects() -> Iterator[dict[str, Any]]:
     )
 
 
-def _bad_object(kind: str, what: str, data: bytes) -> dict[str, Any]:
+def _good_object(kind: str, what: str, data: bytes) -> dict[str, Any]:
+    _object(kind, data)
+    return {"kind": kind, "what": what, "hex": data.hex(), "values": _plain(msgpack.unpackb(data))}
+
+
+def _object(kind: str, data: bytes) -> None:
     number = ROI.sequence if kind == "still" else 7
+    backlog_content((ROI.session_id, kind, number), data, edge=INFO.edge)
+
+
+def _bad_object(kind: str, what: str, data: bytes) -> dict[str, Any]:
     try:
-        backlog_content((ROI.session_id, kind, number), data, edge=INFO.edge)
+        _object(kind, data)
     except WireError:
         return {"kind": kind, "what": what, "hex": data.hex()}
     raise AssertionError(f"the object {kind} is read although {what}")
