@@ -20,6 +20,12 @@ from hvt_edge.video.stage import BaseStage
 _MOST_GAP_NS = SECOND_NS // 4
 """Of a clip that cannot be read in time so much is left out in a row, and no more, of its own time and of time as it
 passes: else nothing would be shown."""
+_STEADY_NS = 2 * SECOND_NS
+"""Where no frame was lost for so long, one may be late by two frames: a keyframe takes six times as long to code as
+others, on a small board longer than a frame, and would cost those behind it. A machine that is too slow for all gains
+no delay by that."""
+_BEFORE_KEYFRAME_NS = 3 * SECOND_NS // 10
+"""About as long as the detector takes on a small board: it does not begin so shortly before a keyframe."""
 _MOST_LATE_NS = SECOND_NS
 """A clip that is later than that, and not because of the link, is played slower."""
 _MOST_LINK_LATE_NS = 10 * SECOND_NS
@@ -59,6 +65,7 @@ class RealtimePace:
     def __post_init__(self) -> None:
         self._missed: int | None = None
         self._must_code_ns = 0
+        self._lost_ns = -_STEADY_NS
         self._sent_ns = self._link_late_ns = 0
         """When the last frame was sent; how late a clip is because the link took its time, not yet made up."""
         self._bound: FrameGroup = "processor"
@@ -91,6 +98,7 @@ class RealtimePace:
             in_time = self._in_time(frame) or frame.camera_unit is not None
             shown_lately = self.clock() - self._sent_ns < _MOST_GAP_NS
             if not in_time and frame.capture_ns < self._must_code_ns and shown_lately:
+                self._lost_ns = self.clock()
                 self.counts.drop(self._bound)
                 return
             self._must_code_ns = frame.capture_ns + _MOST_GAP_NS
@@ -117,6 +125,7 @@ class RealtimePace:
         # Where nobody uses it, it takes no time.
         used = self.stills.is_used(frame.capture_ns)
         cpu_budget, lost = self.stills.analyzer.cpu_budget, self.counts.dropped_cpu
+        cpu_budget.keyframe_soon = self.base.keyframes.due(self._sent_ns + _BEFORE_KEYFRAME_NS)
         rests = used and not cpu_budget.admits_frame(frame.capture_ns, lost=lost, late=behind)
         taken_up = self._worker.take(frame, unit, late=rests)
         self.counts.unanalyzed += used and not taken_up
@@ -138,7 +147,9 @@ class RealtimePace:
 
     def _in_time(self, frame: Frame) -> bool:
         # Wait until the frame of a clip is due; False where it is so late that the next is due already.
-        early_ns = frame.capture_ns - self.clock()
+        now_ns = self.clock()
+        early_ns = frame.capture_ns - now_ns
         if early_ns > 0:
             self.stop.wait(early_ns / SECOND_NS)
-        return -early_ns < SECOND_NS / self.fps
+        frames = 2 if now_ns - self._lost_ns >= _STEADY_NS else 1
+        return -early_ns < frames * SECOND_NS / self.fps

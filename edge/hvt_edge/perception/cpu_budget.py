@@ -112,6 +112,8 @@ class CpuBudget:
         self._newest_ns = 0
         self.queued = 0
         """Frames behind the one in hand."""
+        self.keyframe_soon = False
+        """The detector waits until it is coded, which takes video longer than any other frame."""
 
     @property
     def plan(self) -> Plan:
@@ -144,7 +146,8 @@ class CpuBudget:
 
     def admits_detection(self, at_ns: int, *, due: bool = True) -> bool:
         """Whether the detector searches the source of that frame, where that is ``due``."""
-        admitted = due and self.queued < _MOST_QUEUED and self._take("detect", self.plan.detect_s, at_ns)
+        free = self.queued < _MOST_QUEUED and not (self.keyframe_soon and math.isfinite(self._processors))
+        admitted = due and free and self._take("detect", self.plan.detect_s, at_ns)
         if admitted or not due:
             self._waits_ns = None
         return admitted

@@ -30,6 +30,8 @@ IDLE_S = 1.0
 LEAST_PATIENCE_S, _MOST_PATIENCE_S = 2.0, 10.0
 _MOST_PENDING = 8
 """Frames of a burst that are kept."""
+_STEADY_NS = 2 * SECOND_NS
+"""Where none was missed for so long, one more may wait than the newest: a keyframe is dear to code."""
 SOURCE_PART = "source"
 """Its name as a failed part."""
 
@@ -130,7 +132,9 @@ class LiveSource(Source):
         self._pause = RetryPause(FIRST_WAIT_NS, _LONGEST_WAIT_NS)
         self._news = threading.Condition()
         self._pending: deque[tuple[int, Image]] = deque()
-        """(when taken, picture), the latest last: of a burst all, else one."""
+        """(when taken, picture), the latest last: of a burst all, else one, or two for once."""
+        self._missed_ns: int | None = None
+        """Capture time of the frame at whose coming another was missed."""
         self._gate = Gate(self.fps)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-source", daemon=True)
@@ -200,8 +204,12 @@ class LiveSource(Source):
         image = shot.image()
         with self._news:
             together = [one for one in self._pending if one[0] >= capture_ns - jitter_ns]
+            if not together and (self._missed_ns is None or capture_ns - self._missed_ns >= _STEADY_NS):
+                together = list(self._pending)[-1:]
             together = together[1 - _MOST_PENDING :]
-            self.missed += len(self._pending) - len(together) + shot.missed
+            missed = len(self._pending) - len(together) + shot.missed
+            if missed:
+                self.missed, self._missed_ns = self.missed + missed, capture_ns
             self._pending = deque([*together, (capture_ns, image)])
             self._news.notify_all()
         self._failures.works(SOURCE_PART)

@@ -170,8 +170,13 @@ class TimedOut(Out):
         self.headers.append(BaseHeader.parse(attachment, payload))
 
 
-def play_clip(*, reading_s: float, frames: int, out: TimedOut, coded: bool = False) -> FrameCounts:
-    """A clip at 15 fps, ``coded`` by a camera or not, each frame of which takes so long to read, and x265."""
+def play_clip(
+    *, reading_s: float, frames: int, out: TimedOut, coded: bool = False, slow: int = 1000
+) -> FrameCounts:
+    """A clip at 15 fps, ``coded`` by a camera or not, each frame of which takes so long to read, and x265.
+
+    One frame in ``slow`` takes two and a half times the time between two.
+    """
     stills, counts, pictures = BlockedStills(), FrameCounts(), smooth_pictures(1, size=SIZE)
     stills.released.set()
     with RealtimePace(
@@ -179,7 +184,7 @@ def play_clip(*, reading_s: float, frames: int, out: TimedOut, coded: bool = Fal
         stop=out.time, failures=Failures(out.time),
     ) as pace:  # fmt: skip
         for index, frame in enumerate(framed(pictures * frames)):
-            out.time.pass_s(reading_s)
+            out.time.pass_s(2.5 / 15 if index % slow == slow - 1 else reading_s)
             pace.step(replace(frame, camera_unit=unit(index)) if coded else frame)
             assert counts.captured == index + 1
     return counts
@@ -219,6 +224,31 @@ def test_a_clip_that_can_be_read_in_real_time_keeps_its_time():
     counts = play_clip(reading_s=0.03, frames=90, out=out)
     assert counts.paused_ns == 0
     assert {one.capture_ns - START_NS for one in out.headers} <= {round(n * 1e9 / 15) for n in range(90)}
+
+
+def test_a_frame_that_is_dear_to_code_now_and_then_costs_no_other():
+    """A keyframe takes six times as long as others: each cost two frames on a board, with half of it idle."""
+    out = TimedOut(SteppedTime())
+    counts = play_clip(reading_s=0.03, frames=120, out=out, slow=40)
+    assert counts.groups == {"sent": 120}
+    often = play_clip(reading_s=0.06, frames=120, out=TimedOut(SteppedTime()), slow=4)
+    assert often.dropped_cpu > 20, "a machine that is too slow would gain delay"
+
+
+def test_the_detector_does_not_begin_just_before_a_keyframe():
+    """Both together take longer than the frames behind them can wait."""
+    out, stills = TimedOut(SteppedTime()), BlockedStills()
+    stills.released.set()
+    cpu_budget, base, soon = stills.analyzer.cpu_budget, base_stage(out), []
+    with RealtimePace(
+        base, stills, inbox=FeedbackInbox(), clock=out.time, fps=15, live=False, counts=FrameCounts(),
+        stop=out.time, failures=Failures(out.time),
+    ) as pace:  # fmt: skip
+        for frame in framed(smooth_pictures(1, size=SIZE) * 160):
+            pace.step(frame)
+            soon.append(cpu_budget.keyframe_soon)
+    keyframe = 150
+    assert [index for index, one in enumerate(soon) if one] == list(range(keyframe - 4, keyframe))
 
 
 def test_a_clip_behind_a_link_that_stood_still_catches_up():

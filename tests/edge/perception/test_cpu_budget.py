@@ -153,6 +153,15 @@ def test_a_machine_is_not_too_slow_for_frames_that_are_far_apart():
         assert budget.admits_detection(at_ns)
 
 
+def test_just_before_a_keyframe_nothing_is_searched_but_in_lockstep():
+    """Video would lose the frames behind it; lockstep has all the time that there is."""
+    for processors, admitted in ((0.5, False), (math.inf, True)):
+        budget = CpuBudget(fps=10, processors=processors)
+        budget.keyframe_soon = True
+        assert budget.admits_frame(0, lost=0, late=False)
+        assert budget.admits_detection(0) is admitted
+
+
 def test_with_frames_that_wait_nothing_is_searched():
     """They would wait as long again, and boxes be seconds old."""
     budget = CpuBudget()

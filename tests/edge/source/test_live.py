@@ -237,11 +237,12 @@ def raising_pictures(grab):
 
 
 class Bursts:
-    """A camera whose frames, 30 a second by its stamps, come three at a time."""
+    """A camera whose frames, 30 a second by its stamps, come so many at a time."""
 
     name, notes = "cam", None
 
-    def __init__(self) -> None:
+    def __init__(self, together: int = 3) -> None:
+        self.together = together
         self.given, self.now_ns = 0, 1_000 * SECOND_NS
         self.come, self.wanted = threading.Semaphore(0), threading.Semaphore(1)
 
@@ -252,12 +253,12 @@ class Bursts:
 
     def grab(self) -> Shot:
         """The next; before the first of a burst, once it is wanted."""
-        if self.given % 3 == 1:  # the source asks for one before it begins
+        if self.given % self.together == 1 % self.together:  # the source asks for one before it begins
             if self.given > 1:
                 self.come.release()
             if not self.wanted.acquire(timeout=60):
                 raise SignalLost("nobody wants more")
-            self.now_ns += SECOND_NS // 10
+            self.now_ns += self.together * SECOND_NS // 30
         self.given += 1
         return Shot(partial(np.zeros, (48, 64, 3), np.uint8), self.given * SECOND_NS // 30)
 
@@ -278,6 +279,19 @@ def test_frames_that_come_in_bursts_are_all_taken_at_the_times_of_their_stamps()
     steady = times[-12:]
     assert len(times) >= 6 * 3 - 3
     assert all(abs(later - earlier - SECOND_NS // 30) < MS for earlier, later in pairwise(steady))
+
+
+def test_one_frame_may_wait_beside_the_newest_and_no_second_one_soon():
+    """A keyframe takes longer to code than two frames are apart; a machine that is too slow gains no delay."""
+    camera, waiting = Bursts(together=1), []
+    settings = SourceSettings(size=lambda size: size, fps=30)
+    with LiveSource(camera, settings, clock=lambda: camera.now_ns) as source:
+        for _ in range(6):
+            camera.wanted.release()
+            assert camera.come.acquire(timeout=60)
+            waiting.append((source.pending, source.missed))
+        camera.wanted.release(100)
+    assert waiting == [(1, 0), (2, 0), (2, 1), (1, 3), (1, 4), (1, 5)]
 
 
 def test_stamps_that_count_another_second_are_not_believed_for_long():

@@ -152,7 +152,8 @@ def test_auto_takes_openvino_only_where_it_is_quicker(
     )
     chosen = open_model(path, settings=ModelSettings(provider="auto")).provider
     (percent,) = map(int, re.findall(r"takes (\d+)% of ", chosen.why))
-    assert chosen.provider == ("openvino" if percent < 80 else "cpu"), chosen.why
+    rounded = percent == 80  # it may be a little less or more
+    assert rounded or chosen.provider == ("openvino" if percent < 80 else "cpu"), chosen.why
 
 
 @needs_bf16
