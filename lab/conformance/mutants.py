@@ -423,6 +423,11 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant("no byte follows zeros at the end", "    if (zeros)\n        out.push(3);\n", ""),
     Mutant("emulation is prevented for 3 alone", "byte <= 3", "byte < 3"),
     Mutant(
+        "chroma below the picture is not that of its last row",
+        "height: height / 2, at: all.slice(luma, luma",
+        "height, at: all.slice(luma, luma",
+    ),
+    Mutant(
         "the picture is not filled up by its last column", "Math.min(x, width - 1)", "Math.min(x, width - 2)"
     ),
     Mutant("a still that shrinks by more than 32 is read", "need(n <= 32,", "need(n <= 1e6,"),

@@ -41,6 +41,7 @@ def vectors() -> Iterator[dict[str, Any]]:
         yield _residual(what, planes, view, crop_px, size)
     crop = _texture(41, 29, seed=3)
     yield _intra("one slice", crop, quality_pct=70)
+    yield _intra("whole blocks", _texture(32, 32, seed=4), quality_pct=70)
     # Found by trying: its data has zeros that look like a start code; without a loop filter.
     noise = np.random.default_rng(5235).integers(-30, 30, (29, 41, 3))
     grain = np.asarray(np.clip(_texture(41, 29, seed=5235) + noise, 0, 255), np.uint8)
