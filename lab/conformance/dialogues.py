@@ -31,6 +31,7 @@ _DIALOGUES: tuple[tuple[str, tuple[_Event, ...]], ...] = (
     ("a chunk before any other", ((7, 15, 30, 40), (7, 0, 15, 40))),
     ("chunks overlap", ((7, 0, 20, 40), (7, 10, 30, 40), (7, 0, 10, 40), (7, 5, 40, 40), True)),
     ("the end comes again while it is processed", ((7, 0, 40, 40), (7, 39, 40, 40), True, (7, 0, 40, 40))),
+    ("the total changes while it is processed", ((7, 0, 40, 40), (7, 0, 20, 30), True, (7, 39, 40, 40))),
     ("an unusable object", ((7, 0, 40, 40), False, (7, 0, 40, 40), True)),
     ("the total changes", ((7, 0, 20, 40), (7, 20, 25, 30), (7, 0, 30, 30), True)),
     ("the total changes after the end", ((7, 0, 30, 30), True, (7, 0, 20, 40), (7, 20, 40, 40), True)),
@@ -107,6 +108,7 @@ _TRACES: tuple[tuple[str, tuple[tuple[str, int, int, float | None], ...]], ...] 
         (
             ("base", 3, 0, None),
             ("base", 5, 10, None),
+            ("base", 5, 15, None),
             ("base", 4, 20, None),
             ("still", 4, 21, None),
             ("still", 3, 22, None),

@@ -381,6 +381,8 @@ MUTANTS: tuple[Mutant, ...] = (
         "all is acknowledged before it is written", "[number, total - 1], object", "[number, total], object"
     ),
     Mutant("all is acknowledged while it is processed", "=== total ? total - 1 : 0", "=== total ? total : 0"),
+    Mutant("another object of its name is busy too", "total - 1 : 0", "total - 1 : 1"),
+    Mutant("the base that comes twice came last", "step.base > this.base", "step.base >= this.base"),
     Mutant("a chunk may be empty", "payload.length > 0 && offset", "offset"),
     Mutant(
         "a chunk may end beyond its object",
