@@ -1,14 +1,15 @@
-"""Tracks that are more likely nothing: weak, never moved, and like nothing around them.
+"""Tracks that are more likely nothing: weak, never moved, and like nothing around them; which kinds are settled.
 
 A post is a pedestrian, a planter a bus: what a detector takes wrongly for an object mostly stands still. Where scores
 are true, a box of .4 is right four times in ten; that it moves over the ground, or that surer ones of its kind and
-size stand around it, as in a row of parked cars, is the better evidence. Without either it is a guess.
+size stand around it, as in a row of parked cars, is the better evidence. Without either it is a guess. People
+move: who stands must be surer. And a kind of vehicle is settled where its detections agree on it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,10 @@ from hvt_common.inference.class_names import group_of
 from hvt_common.values import Tracks
 
 _LIKELY, _LIKELY_ODD = 0.5, 0.65
-"""From this mean confidence on a track is more likely right than not; one much larger than those around it."""
+"""From this mean confidence on a track is more likely right than not; a person's, or one much larger than others."""
+_SETTLED = {"car": 0.6}
+_SETTLED_ELSE = 0.85
+"""From this mean confidence on, 0 where it was called another kind, nine of ten are right (embedded-models.md)."""
 _REACH, _NOISE_PX = 0.5, 4.0
 """It has moved when its middle is so many of its longer sides, and so many pixels, from where it stood."""
 _FORGOTTEN_S = 10.0
@@ -34,8 +38,14 @@ class _Evidence:
     at: _Floats
     moved: bool = False
     seen_frame: int = -1
-    total: float = 0.0
     count: int = 0
+    totals: dict[str, float] = field(default_factory=dict)
+    """The sum of its confidences by class."""
+
+    def mean(self, name: str | None = None) -> float:
+        """Its mean confidence; that of one class."""
+        total = sum(self.totals.values()) if name is None else self.totals.get(name, 0.0)
+        return total / max(1, self.count)
 
 
 class Guesses:
@@ -76,7 +86,8 @@ class Guesses:
             one.at = one.at + off * share
             if tracks.seen_frames[row] > one.seen_frame:
                 one.seen_frame = int(tracks.seen_frames[row])
-                one.total, one.count = one.total + float(scores[row]), one.count + 1
+                one.totals[names[row]] = one.totals.get(names[row], 0.0) + float(scores[row])
+                one.count += 1
             self._seen[track_id] = one
         self._ids = self._guessed(tracks.ids.tolist(), names, sides)
 
@@ -84,15 +95,26 @@ class Guesses:
         """(N,) True for those that were guesses in the newest list."""
         return np.array([one in self._ids for one in ids.tolist()], np.bool_)
 
+    def settled(
+        self, ids: npt.NDArray[np.int64], names: Sequence[str], *, aslant: bool
+    ) -> npt.NDArray[np.bool_]:
+        """(N,) True where the detections so far agree on this class; ``aslant`` on none but a car."""
+        unknown, otherwise = _Evidence(np.zeros(2)), 2.0 if aslant else _SETTLED_ELSE
+        means = [
+            self._seen.get(one, unknown).mean(name) for one, name in zip(ids.tolist(), names, strict=True)
+        ]
+        return np.array(means) >= [_SETTLED.get(name, otherwise) for name in names]
+
     def _guessed(self, ids: Sequence[int], names: Sequence[str], sides: _Floats) -> frozenset[int]:
         groups = np.array([group_of(name) or name for name in names], object)
-        means = np.array([self._seen[one].total / max(1, self._seen[one].count) for one in ids])
+        means = np.array([self._seen[one].mean() for one in ids])
+        likely = np.where(groups == "person", _LIKELY_ODD, _LIKELY)
         found = set()
         for row in np.flatnonzero(means < _LIKELY_ODD).tolist():
-            like = sides[(means >= _LIKELY) & (groups == groups[row])]
+            like = sides[(means >= likely) & (groups == groups[row])]
             larger = sides[row] / np.median(like) if len(like) >= _NEIGHBOURS else np.nan
             usual = 1 / _LARGER < larger < _LARGER
-            weak = means[row] < (_LIKELY_ODD if larger >= _LARGER else _LIKELY)
+            weak = means[row] < (_LIKELY_ODD if larger >= _LARGER else likely[row])
             if weak and not (usual or self._seen[ids[row]].moved):
                 found.add(ids[row])
         return frozenset(found)

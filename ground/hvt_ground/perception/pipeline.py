@@ -424,12 +424,15 @@ class Pipeline:
     def _doubting(self, shown: Overlay) -> Overlay:
         # In a view that our detector does not know all its tracks are guesses, and no class is certain. What the
         # edge's alone sees is its own affair.
-        guesses, sure = self._parts.guesses, shown.sure
-        doubted = np.zeros(len(sure), np.bool_) if guesses is None else guesses.among(shown.track_ids)
+        guesses, sure, vague = self._parts.guesses, shown.sure, shown.vague
+        doubted = np.zeros_like(sure)
+        if guesses is not None:
+            doubted = guesses.among(shown.track_ids)
+            vague = vague & ~guesses.settled(shown.track_ids, shown.classes, aslant=self.tilt.aslant)
         if self.trust.unlike:
             doubted |= np.array([origin == "base" for origin in shown.origins], np.bool_)
             sure = np.zeros_like(sure)
-        return replace(shown, doubted=shown.doubted | doubted & ~shown.refined, sure=sure)
+        return replace(shown, doubted=shown.doubted | doubted & ~shown.refined, sure=sure, vague=vague)
 
     def _inside(self, shown: Overlay) -> Overlay:
         # The tracker lets boxes leave the picture.

@@ -109,9 +109,11 @@ class SessionPerception:
             self._next_id = max(self._next_id, int(ids.max(initial=0)) + 1)
             names = tuple(detector.class_names[class_id] for class_id in tracks.class_ids)
             doubted = np.full(len(tracks), self._trust.unlike)
+            vague = np.array([self.tilt.is_vague(name) for name in names], np.bool_)
             if guesses is not None:
                 guesses.update(tracks, names, tracker.camera_step)
                 doubted |= guesses.among(tracks.ids)
+                vague &= ~guesses.settled(tracks.ids, names, aslant=self.tilt.aslant)
             emit(
                 Overlay(
                     frame_index=frame_index,
@@ -124,7 +126,7 @@ class SessionPerception:
                     refined=np.zeros(len(tracks), np.bool_),
                     stored=True,
                     doubted=doubted,
-                    vague=np.array([self.tilt.is_vague(name) for name in names], np.bool_),
+                    vague=vague,
                 )
             )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from hvt_common.values import Tracks
 from hvt_ground.perception.guesses import Guesses
@@ -46,10 +47,10 @@ def test_a_post_is_no_pedestrian_and_a_walker_is_one():
     post: Thing = ("pedestrian", 0.44, (900.0, 400.0), 12.0)
     assert guessed([*ROW, post]) == [False] * 5 + [True, False]
     assert guessed([*ROW, post], moves_px=1.0) == [False] * 7
-    assert guessed([("pedestrian", 0.55, (900.0, 400.0), 12.0)]) == [False] * 2, (
-        "a surer one may stand and wait"
-    )
-    assert guessed([*[post] * 5]) == [True] * 5 + [False], "five posts do not vouch for each other"
+    pit, waits = (("pedestrian", score, (900.0, 400.0), 12.0) for score in (0.55, 0.7))
+    assert guessed([pit]) == [True, False]
+    assert guessed([waits]) == [False] * 2, "a surer one may stand and wait"
+    assert guessed([*[pit] * 5]) == [True] * 5 + [False], "five pits do not vouch for each other"
 
 
 def test_a_planter_among_cars_is_no_bus_and_a_parked_car_is_kept():
@@ -67,3 +68,22 @@ def test_a_camera_that_is_followed_a_little_wrongly_moves_nothing():
         listed = tracks(frame, [("pedestrian", 0.4, (500.0 + 0.05 * frame, 400.0), 30.0)])
         guesses.update(listed, ["pedestrian"], None)
     assert guesses.among(np.array([1])).tolist() == [True]
+
+
+@pytest.mark.parametrize(
+    ("said", "aslant", "settled"),
+    [
+        (["car"] * 4, True, True),
+        (["truck"] * 4, False, True),
+        (["truck"] * 4, True, False),
+        (["truck", "car"] * 2, False, False),
+        (["car", "car", "truck"], False, False),
+    ],
+)
+def test_a_kind_is_settled_where_detections_agree_on_it(said, aslant, settled):
+    """A parked car was a truck in one second and a car in the next, each as firm as a car that never was another."""
+    guesses = Guesses(fps=10)
+    for frame, name in enumerate(said):
+        guesses.update(tracks(frame, [(name, 0.87, (500.0, 400.0), 30.0)]), [name], None)
+    assert guesses.settled(np.array([1]), said[-1:], aslant=aslant).tolist() == [settled]
+    assert not guesses.settled(np.array([2]), said[-1:], aslant=aslant).any(), "one that was never seen"

@@ -19,8 +19,10 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import still_codec
 from hvt_ground.events import Notice, Overlay, Refinement
 from hvt_ground.perception.detector_thread import DetectorThread
+from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import as_bgr
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
+from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.perception.worker import RealtimeWorker
 from programs.processes import eventually
 from rigs.flight import (
@@ -284,6 +286,25 @@ def test_the_vehicles_that_are_seen_tell_the_tilt(pictures):
     for picture in pictures:
         rig.pipeline.analyze(picture, hurry=False)
     assert taken == [(1, 192)] * 10
+
+
+def test_a_kind_that_detections_do_not_agree_on_is_not_named(pictures):
+    """A parked pickup was a car and a truck by turns for the whole flight."""
+
+    class ByTurns(RedSquares):
+        looks = 0
+
+        def detect(self, image_bgr):
+            self.looks += 1
+            return replace(super().detect(image_bgr), class_ids=np.array([self.looks % 2], np.int32))
+
+    said = []
+    for detector in (RedSquares(), ByTurns()):
+        rig = Rig(detector=detector, tilt=ViewTilt(vague_kinds=True), guesses=Guesses(fps=15))
+        for picture in pictures[:12]:
+            rig.pipeline.analyze(picture, hurry=False)
+        said.append({word for one in rig.of(Overlay)[4:] for word in one.words})
+    assert said == [{"car"}, {"vehicle"}]
 
 
 def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flight, pictures):

@@ -35,6 +35,7 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.perception.detector_thread import Detection, DetectorThread
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.models import ModelFacts, Models
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.session import SessionPerception
@@ -161,6 +162,8 @@ def pipeline_of(
     detect_still_every: int = 0,
     edge_classes: Sequence[str] = CLASSES,
     trust: ViewTrust | None = None,
+    tilt: ViewTilt | None = None,
+    guesses: Guesses | None = None,
     search: ScaleSearch | None = None,
     detector_thread: DetectorThread | None = None,
 ) -> Pipeline:
@@ -175,12 +178,13 @@ def pipeline_of(
             TrackerSettings.starting_at(0.25, camera_motion="flow" if detect_still_every else "off"), fps=15
         ),
         reader=reader,
-        refiner=Refiner("replace", fps=15, vocabulary=vocabulary),
+        refiner=Refiner("replace", fps=15, vocabulary=vocabulary, tilt=tilt),
         vocabulary=vocabulary,
         fusion=Fusion(fps=15, edge_classes=places, path=path),
         path=path,
         detector_thread=detector_thread or DetectsAtOnce(),
         trust=trust or ViewTrust(MOTION, hence=""),
+        guesses=guesses,
         search=search,
     )
     view = View.fitted(SIZE, SIZE, fit="letterbox")
@@ -206,7 +210,7 @@ class StoredPerception(SessionPerception):
         tilt: ViewTilt | None = None,
     ) -> None:
         self._detector_of = detector_of
-        facts = ModelFacts(track_confidence=0.25, calibrated=False, stills_calibrated=False)
+        facts = ModelFacts(track_confidence=0.25, calibrated=tilt is not None, stills_calibrated=False)
         config = GroundConfig(detector=MOTION, detect_every=3, camera_motion="off")
         super().__init__(config, cast("Models", SimpleNamespace(facts=facts)), info)
         self._trust, self.tilt = trust or self._trust, tilt or self.tilt
