@@ -60,6 +60,12 @@ def group_of(name: str) -> str | None:
     return _GROUP_OF_KIND.get(kind_of(name)) or _GROUP_OF_SYNSET.get(_plain(name))
 
 
+def are_apart(name: str, other: str) -> bool:
+    """Whether they mean two groups: a person is no vehicle, but may be what moves."""
+    groups = {group_of(name), group_of(other)}
+    return len(groups) == 2 and None not in groups
+
+
 def is_nothing(name: str) -> bool:
     """Whether a class stands for none of the others: ``other``, ``background`` or ``nothing``."""
     return _plain(name) in _NOTHING

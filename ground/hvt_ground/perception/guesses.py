@@ -1,9 +1,9 @@
-"""Tracks that are more likely nothing: weak, never moved, and like nothing around them; which kinds are settled.
+"""Tracks that are more likely nothing: weak, never moved, and like nothing around them; which kinds are known.
 
 A post is a pedestrian, a planter a bus: what a detector takes wrongly for an object mostly stands still. Where scores
 are true, a box of .4 is right four times in ten; that it moves over the ground, or that surer ones of its kind and
 size stand around it, as in a row of parked cars, is the better evidence. Without either it is a guess. People
-move: who stands must be surer. And a kind of vehicle is settled where its detections agree on it.
+move, and lane marks stand in rows: who stands must be surer. A kind of vehicle is known where its detections agree.
 """
 
 from __future__ import annotations
@@ -19,14 +19,16 @@ from hvt_common.inference.class_names import group_of
 from hvt_common.values import Tracks
 
 _LIKELY, _LIKELY_ODD = 0.5, 0.65
-"""From this mean confidence on a track is more likely right than not; a person's, or one much larger than others."""
-_SETTLED = {"car": 0.6}
-_SETTLED_ELSE = 0.85
+"""From this mean confidence on it is more likely right than not; a person, one much larger than others or on one."""
+_AGREED = {"car": 0.6}
+_AGREED_ELSE = 0.85
 """From this mean confidence on, 0 where it was called another kind, nine of ten are right (embedded-models.md)."""
 _REACH, _NOISE_PX = 0.5, 4.0
 """It has moved when its middle is so many of its longer sides, and so many pixels, from where it stood."""
 _FORGOTTEN_S = 10.0
 """Where it stood follows it so slowly: the estimate of the camera's motion drifts."""
+_ON = 0.7
+"""One that shares so much of the smaller box with a surer one of its group is likely the same object once more."""
 _NEIGHBOURS, _LARGER = 3, 2.0
 """So many surer ones of its group speak for it, unless it is so many times larger or smaller than they mostly are."""
 
@@ -89,23 +91,24 @@ class Guesses:
                 one.totals[names[row]] = one.totals.get(names[row], 0.0) + float(scores[row])
                 one.count += 1
             self._seen[track_id] = one
-        self._ids = self._guessed(tracks.ids.tolist(), names, sides)
+        self._ids = self._guessed(tracks.ids.tolist(), names, boxes)
 
     def among(self, ids: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
         """(N,) True for those that were guesses in the newest list."""
         return np.array([one in self._ids for one in ids.tolist()], np.bool_)
 
-    def settled(
+    def agreed(
         self, ids: npt.NDArray[np.int64], names: Sequence[str], *, aslant: bool
     ) -> npt.NDArray[np.bool_]:
         """(N,) True where the detections so far agree on this class; ``aslant`` on none but a car."""
-        unknown, otherwise = _Evidence(np.zeros(2)), 2.0 if aslant else _SETTLED_ELSE
+        unknown, otherwise = _Evidence(np.zeros(2)), 2.0 if aslant else _AGREED_ELSE
         means = [
             self._seen.get(one, unknown).mean(name) for one, name in zip(ids.tolist(), names, strict=True)
         ]
-        return np.array(means) >= [_SETTLED.get(name, otherwise) for name in names]
+        return np.array(means) >= [_AGREED.get(name, otherwise) for name in names]
 
-    def _guessed(self, ids: Sequence[int], names: Sequence[str], sides: _Floats) -> frozenset[int]:
+    def _guessed(self, ids: Sequence[int], names: Sequence[str], boxes: _Floats) -> frozenset[int]:
+        sides = (boxes[:, 2:] - boxes[:, :2]).max(1, initial=0)
         groups = np.array([group_of(name) or name for name in names], object)
         means = np.array([self._seen[one].mean() for one in ids])
         likely = np.where(groups == "person", _LIKELY_ODD, _LIKELY)
@@ -113,8 +116,16 @@ class Guesses:
         for row in np.flatnonzero(means < _LIKELY_ODD).tolist():
             like = sides[(means >= likely) & (groups == groups[row])]
             larger = sides[row] / np.median(like) if len(like) >= _NEIGHBOURS else np.nan
-            usual = 1 / _LARGER < larger < _LARGER
-            weak = means[row] < (_LIKELY_ODD if larger >= _LARGER else likely[row])
+            surer = boxes[(means > means[row]) & (groups == groups[row])]
+            odd = larger >= _LARGER or _is_on(boxes[row], surer)
+            usual = groups[row] != "person" and not odd and larger > 1 / _LARGER
+            weak = means[row] < (_LIKELY_ODD if odd else likely[row])
             if weak and not (usual or self._seen[ids[row]].moved):
                 found.add(ids[row])
         return frozenset(found)
+
+
+def _is_on(box: _Floats, others: _Floats) -> bool:
+    inner = (np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])).clip(0).prod(1)
+    smaller = np.minimum((box[2:] - box[:2]).prod(), (others[:, 2:] - others[:, :2]).prod(1))
+    return bool((inner > _ON * smaller).any())

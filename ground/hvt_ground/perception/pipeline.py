@@ -28,6 +28,7 @@ from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import History, as_bgr
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.stills.posterior import SURE
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
@@ -425,14 +426,14 @@ class Pipeline:
         # In a view that our detector does not know all its tracks are guesses, and no class is certain. What the
         # edge's alone sees is its own affair.
         guesses, sure, vague = self._parts.guesses, shown.sure, shown.vague
-        doubted = np.zeros_like(sure)
+        doubted = shown.doubted
         if guesses is not None:
-            doubted = guesses.among(shown.track_ids)
-            vague = vague & ~guesses.settled(shown.track_ids, shown.classes, aslant=self.tilt.aslant)
+            doubted = doubted | guesses.among(shown.track_ids) & ~(shown.refined & (shown.confidences > SURE))
+            vague = vague & ~guesses.agreed(shown.track_ids, shown.classes, aslant=self.tilt.aslant)
         if self.trust.unlike:
-            doubted |= np.array([origin == "base" for origin in shown.origins], np.bool_)
+            doubted = doubted | np.array([one == "base" for one in shown.origins], np.bool_) & ~shown.refined
             sure = np.zeros_like(sure)
-        return replace(shown, doubted=shown.doubted | doubted & ~shown.refined, sure=sure, vague=vague)
+        return replace(shown, doubted=doubted, sure=sure, vague=vague)
 
     def _inside(self, shown: Overlay) -> Overlay:
         # The tracker lets boxes leave the picture.

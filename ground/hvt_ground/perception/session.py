@@ -113,7 +113,7 @@ class SessionPerception:
             if guesses is not None:
                 guesses.update(tracks, names, tracker.camera_step)
                 doubted |= guesses.among(tracks.ids)
-                vague &= ~guesses.settled(tracks.ids, names, aslant=self.tilt.aslant)
+                vague &= ~guesses.agreed(tracks.ids, names, aslant=self.tilt.aslant)
             emit(
                 Overlay(
                     frame_index=frame_index,

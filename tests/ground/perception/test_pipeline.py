@@ -307,6 +307,23 @@ def test_a_kind_that_detections_do_not_agree_on_is_not_named(pictures):
     assert said == [{"car"}, {"vehicle"}]
 
 
+@pytest.mark.parametrize(("confidence", "doubted"), [(0.7, True), (0.95, False)])
+def test_a_guess_stays_one_until_a_still_is_sure_of_it(flight, pictures, confidence, doubted):
+    """Stills made firm pedestrians of lane marks, by .6."""
+
+    class Doubts(Guesses):
+        def among(self, ids):
+            return np.ones(len(ids), np.bool_)
+
+    rig = Rig(guesses=Doubts(fps=15), reader=SameAnswer(confidence=confidence))
+    for picture in pictures[:6]:
+        rig.pipeline.analyze(picture, hurry=False)
+        if picture.frame_index == 3:
+            rig.pipeline.read([received(flight, 3, 0)])
+    after = rig.of(Overlay)[-1]
+    assert (after.refined.tolist(), after.doubted.tolist()) == ([True], [doubted])
+
+
 def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flight, pictures):
     """A box that is a guess would be drawn and named like one that is right nine times in ten."""
     trust, taken = ViewTrust("motion", hence=""), []

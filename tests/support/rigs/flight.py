@@ -122,6 +122,7 @@ class SameAnswer:
 
     class_names: tuple[str, ...] = CLASSES
     knows: bool = True
+    confidence: float = 0.9
     wants_base: bool = False
     had_base: list[bool] = field(default_factory=list)
     found: Detections = field(default_factory=Detections.none)
@@ -132,7 +133,8 @@ class SameAnswer:
     def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:
         """The same for each."""
         self.had_base += [base_bgr is not None] * len(stills)
-        answer = Posterior(self.class_names[1], 0.9, 0.3, np.array([0.1, 0.9], np.float32))
+        probabilities = np.array([1 - self.confidence, self.confidence], np.float32)
+        answer = Posterior(self.class_names[1], self.confidence, 0.3, probabilities)
         reading = ObjectReading(answer, self.at) if self.knows else ObjectReading()
         return FrameReadings(tuple((reading,) * len(one.boxes_base_px) for one in stills), self.found)
 

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.inference.class_names import VEHICLE_KINDS, kind_of
+from hvt_common.inference.class_names import VEHICLE_KINDS, are_apart, kind_of
 from hvt_common.values import Tracks
 from hvt_ground.events import Origin, Overlay, Refinement
 from hvt_ground.perception.history import History
@@ -155,7 +155,8 @@ class Refiner:
                 continue
             reading = self._read(class_posterior, tracks, row)
             classes[row], confidences[row], refined[row] = names[reading.class_id], reading.confidence, True
-            doubted[row] = reading.class_id == self._vocabulary.nothing
+            contradicted = not reading.sure and are_apart(base_classes[row], classes[row])
+            doubted[row] = contradicted or reading.class_id == self._vocabulary.nothing
             sure[row] = self._is_sure(reading)
             vague[row] = self.tilt.is_vague(classes[row], known=reading.sure)
         return Overlay(

@@ -213,6 +213,16 @@ def test_a_kind_of_vehicle_that_stills_are_unsure_of_is_left_to_the_detections(n
     assert [one.words[1] for one in events] == ["vehicle" if vague else name] * len(stills)
 
 
+@pytest.mark.parametrize(("share", "doubted"), [(0.8, True), (0.99, False)])
+def test_stills_that_are_unsure_make_no_vehicle_of_a_person(share, doubted):
+    """Who crossed the road was a truck by .41."""
+    words = Vocabulary(AERIAL, AERIAL)
+    stills = votes(words, {"truck": share})
+    shown = flown(words, *stills, base=AERIAL.index("pedestrian"), confidence=0.3)
+    assert (shown.classes, shown.doubted.tolist()) == (("truck",), [doubted])
+    assert flown(words, *stills, base=AERIAL.index("car"), confidence=0.3).doubted.tolist() == [False]
+
+
 def test_a_toss_up_leaves_the_class_as_it_is():
     """A class would flip with every still."""
     words = Vocabulary(AERIAL, AERIAL)
