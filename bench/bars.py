@@ -31,7 +31,7 @@ BARS = {
     "each further edge at the ground, MB": _at_most(15),
     "each further edge at the ground, threads": _at_most(5),
     "capture to overlay p95 over its floor, a core each": _at_most(1.3),
-    "capture to overlay p95 over its floor, unpinned": _at_most(1.8),
+    "capture to overlay p95 over its floor, unpinned": _at_most(1.6),
     "edge, frames a second over its floor's": _at_least(0.95),
     "ground, frames a second over its floor's": _at_least(0.90),
     "a late ground's first picture, in frames": _at_most(15),

@@ -32,6 +32,9 @@ _MOST_DETECTING: Final = 0.85
 _LEAST_CORES: Final = 0.5
 _SHARE: Final = 0.5
 """With fewer looks than three a second nothing is tracked from a camera that moves: with 1.5 a third is (car10)."""
+_IDLE: Final = 0.1
+"""Share of the processors that nobody is given: a process that takes all that its control group allows stands still
+for the rest of each tenth of a second, and its video with it."""
 _LEAST_LEFT: Final = 1 / 16
 """Of the budget, however many frames are lost."""
 _BACK_S: Final = 5.0
@@ -57,7 +60,7 @@ class Plan:
 
 def most_cores(processors: float, *, others: float = 0.0) -> float:
     """Cores, of so many, that perception may take where the rest of this process takes ``others``."""
-    return min(max(_LEAST_CORES, _SHARE * processors), max(0.0, processors - others))
+    return min(max(_LEAST_CORES, _SHARE * processors), max(0.0, (1 - _IDLE) * processors - others))
 
 
 def share_out(cores: float, costs: Mapping[Part, float], *, fps: float) -> Plan:
@@ -99,7 +102,7 @@ class CpuBudget:
         spent_ns: Callable[[], int] = time.thread_time_ns,
     ) -> None:
         self._fps, self._processors = fps, processors
-        self._cores = most_cores(processors)
+        self._cores = most_cores(processors, others=_SHARE * processors if math.isfinite(processors) else 0.0)
         self._spent_ns = spent_ns
         self._costs: dict[Part, float] = {}
         self._had_ns: dict[Part, int] = {}

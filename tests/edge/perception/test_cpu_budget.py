@@ -38,6 +38,14 @@ def test_perception_of_a_large_machine_looks_as_often_as_it_likes():
     assert share_out(most_cores(16), COSTS, fps=FPS).detect_s < 1 / 3
 
 
+@pytest.mark.parametrize(
+    ("processors", "others", "cores"), [(0.5, 0.2, 0.25), (2, 0.5, 1.0), (2, 1.2, 0.6), (2, 2, 0)]
+)
+def test_nobody_is_given_the_last_tenth_of_the_processors(processors, others, cores):
+    """A control group stops the whole process where it takes all; each keyframe cost two frames."""
+    assert most_cores(processors, others=others) == pytest.approx(cores)
+
+
 class Rig:
     """A flight whose parts take the processor time that they are said to; ``video`` cores go to video."""
 
