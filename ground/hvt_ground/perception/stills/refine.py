@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.inference.class_names import VEHICLE_KINDS, are_apart, kind_of
+from hvt_common.inference.class_names import VEHICLE_KINDS, are_apart, is_nothing, kind_of
 from hvt_common.values import Tracks
 from hvt_ground.events import Origin, Overlay, Refinement
 from hvt_ground.perception.history import History
@@ -147,7 +147,8 @@ class Refiner:
         base_classes = tuple(names[class_id] for class_id in tracks.class_ids)
         classes = list(base_classes)
         confidences = tracks.confidences.astype(np.float32)  # a copy
-        refined, doubted, sure = (np.zeros(len(tracks), np.bool_) for _ in range(3))
+        refined, sure = (np.zeros(len(tracks), np.bool_) for _ in range(2))
+        doubted = np.array([is_nothing(name) for name in classes], np.bool_)
         vague = np.array([self.tilt.is_vague(name) for name in classes], np.bool_)
         for row, track_id in enumerate(tracks.ids.tolist()):
             class_posterior = self._track_posteriors.get(track_id)

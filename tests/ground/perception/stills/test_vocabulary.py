@@ -223,6 +223,14 @@ def test_stills_that_are_unsure_make_no_vehicle_of_a_person(share, doubted):
     assert flown(words, *stills, base=AERIAL.index("car"), confidence=0.3).doubted.tolist() == [False]
 
 
+def test_what_the_detector_calls_other_has_no_name():
+    """A roof was "other 67", as firm as the cars beside it."""
+    words = Vocabulary(AERIAL, AERIAL)
+    other = AERIAL.index("other")
+    assert flown(words, base=other, confidence=0.8).words == ("something",)
+    assert flown(words, *votes(words, {"car": 0.97}), base=other, confidence=0.3).words == ("car",)
+
+
 def test_a_toss_up_leaves_the_class_as_it_is():
     """A class would flip with every still."""
     words = Vocabulary(AERIAL, AERIAL)
