@@ -432,6 +432,9 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(
         "the picture is not filled up by its last column", "Math.min(x, width - 1)", "Math.min(x, width - 2)"
     ),
+    Mutant("a half of a tap is rounded down", "(m + 1024)", "(m + 1023)"),
+    Mutant("a little less than a half of a tap is rounded up", "(m + 1024)", "(m + 1025)"),
+    Mutant("a little more than a sample is one", "Math.ceil(step / 65536)", "Math.ceil(step / 65537)"),
     Mutant("a still that shrinks by more than 32 is read", "need(n <= 32,", "need(n <= 1e6,"),
 )
 
