@@ -8,6 +8,7 @@ beside the coding of the one before. At 4K that is 380 MB and 120 ms.
 
 from __future__ import annotations
 
+import io
 import math
 import pickle
 import subprocess
@@ -168,7 +169,9 @@ def _end(drawing: subprocess.Popen[bytes]) -> None:
 def _draw(seed: int, spec: str) -> None:
     (entry,) = entry_points(group="hvt.scenes", name="demo")
     scene: DrawnScene = entry.load()(seed, **demo_scene(spec))
-    requests, answers = sys.stdin.buffer, sys.stdout.buffer
+    # Not `sys.stdout.buffer`: with PYTHONUNBUFFERED it has no buffer, and a signal cuts what it writes short.
+    answers = io.BufferedWriter(io.FileIO(sys.stdout.fileno(), "w", closefd=False))
+    requests = sys.stdin.buffer
     pickle.dump((scene.size, scene.class_names, scene.duration_s), answers)
     answers.flush()
     while True:

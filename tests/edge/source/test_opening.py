@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import io
 import logging
 import os
 import pickle
+import signal
 import socket
 import subprocess
+import sys
 import tempfile
+import termios
 import threading
 import time
 from fractions import Fraction
@@ -21,6 +25,7 @@ from unittest import mock
 import av
 import cv2
 import numpy as np
+import psutil
 import pytest
 from av.video.reformatter import Interpolation
 
@@ -34,6 +39,7 @@ from hvt_edge.source.live import LiveSource
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.stream import StreamGrabber, is_description
 from hvt_scene import Scene
+from programs.processes import eventually
 
 BASE = {"size": (320, 180), "fps": 15.0}
 
@@ -306,13 +312,37 @@ def test_the_demo_begins_anew_for_its_next_reader(tmp_path):
     assert not np.array_equal(whole[0], whole[3])
 
 
-def test_a_demo_that_nobody_draws_any_more_ends_with_a_sentence(monkeypatch):
-    """Where the system had no memory left for it, a traceback would tell of a broken pipe."""
-    drawn_by = []
-    popen = subprocess.Popen
+@pytest.fixture
+def drawn_by(monkeypatch) -> list[subprocess.Popen]:
+    """The processes that draw."""
+    started, popen = [], subprocess.Popen
     monkeypatch.setattr(
-        subprocess, "Popen", lambda *args, **more: drawn_by.append(popen(*args, **more)) or drawn_by[0]
+        subprocess, "Popen", lambda *args, **more: started.append(popen(*args, **more)) or started[-1]
     )
+    return started
+
+
+def test_a_demo_whose_drawing_was_stopped_for_a_moment_goes_on(monkeypatch, drawn_by):
+    """In a container, whose Python has no buffers, half a picture came, and the flight stood still for good."""
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")
+    with open_source("demo", size=(64, 64), fps=5, max_frames=2) as source:
+        frames = source.frames(start_ns=0)
+        next(frames)
+        (drawing,) = drawn_by
+
+        def has_begun() -> bool:
+            waits = fcntl.ioctl(drawing.stdout, termios.FIONREAD, bytes(4))
+            return int.from_bytes(waits, sys.byteorder) >= 4096
+
+        eventually(has_begun, what="a part of the next picture has come")
+        drawing.send_signal(signal.SIGSTOP)
+        eventually(lambda: psutil.Process(drawing.pid).status() == "stopped", what="it is stopped")
+        drawing.send_signal(signal.SIGCONT)
+        assert len(list(frames)) == 1
+
+
+def test_a_demo_that_nobody_draws_any_more_ends_with_a_sentence(drawn_by):
+    """Where the system had no memory left for it, a traceback would tell of a broken pipe."""
     with open_source("demo", size=(64, 64), fps=5) as source:
         assert isinstance(source, DemoSource)
         drawn_by[0].kill()

@@ -173,7 +173,9 @@ def test_a_gap_greys_the_last_picture_and_ends_with_the_next(flight, page):
     flight.edge.process.send_signal(signal.SIGSTOP)
     try:
         page.locator("#stage.old").wait_for()
-        assert page.inner_text("#standing").startswith(("NO NEW PICTURE", "LINK LOST"))
+        # On a busy machine the page may have missed the ground before it misses the edge.
+        missed = ("NO NEW PICTURE", "LINK LOST")
+        eventually(lambda: page.inner_text("#standing").startswith(missed), what="it says so")
         last = frame(page)
         time.sleep(1.5)
     finally:
