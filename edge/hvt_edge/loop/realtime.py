@@ -25,7 +25,8 @@ _STEADY_NS = 2 * SECOND_NS
 others, on a small board longer than a frame, and would cost those behind it. A machine that is too slow for all gains
 no delay by that."""
 _BEFORE_KEYFRAME_NS = 3 * SECOND_NS // 10
-"""About as long as the detector takes on a small board: it does not begin so shortly before a keyframe."""
+"""About as long as the detector takes on a small board: it does not begin so shortly before a keyframe. That may wait
+longer for its room in the budget."""
 _MOST_LATE_NS = SECOND_NS
 """A clip that is later than that, and not because of the link, is played slower."""
 _MOST_LINK_LATE_NS = 10 * SECOND_NS
@@ -66,6 +67,8 @@ class RealtimePace:
         self._missed: int | None = None
         self._must_code_ns = 0
         self._lost_ns = -_STEADY_NS
+        self._none_due_ns = 0
+        """When no keyframe was due, last."""
         self._sent_ns = self._link_late_ns = 0
         """When the last frame was sent; how late a clip is because the link took its time, not yet made up."""
         self._bound: FrameGroup = "processor"
@@ -125,7 +128,11 @@ class RealtimePace:
         # Where nobody uses it, it takes no time.
         used = self.stills.is_used(frame.capture_ns)
         cpu_budget, lost = self.stills.analyzer.cpu_budget, self.counts.dropped_cpu
-        cpu_budget.keyframe_soon = self.base.keyframes.due(self._sent_ns + _BEFORE_KEYFRAME_NS)
+        keyframe_due = self.base.keyframes.due(self._sent_ns + _BEFORE_KEYFRAME_NS)
+        self._none_due_ns = self._none_due_ns if keyframe_due else self._sent_ns
+        cpu_budget.keyframe_soon = (
+            keyframe_due and self._sent_ns - self._none_due_ns < 2 * _BEFORE_KEYFRAME_NS
+        )
         rests = used and not cpu_budget.admits_frame(frame.capture_ns, lost=lost, late=behind)
         taken_up = self._worker.take(frame, unit, late=rests)
         self.counts.unanalyzed += used and not taken_up

@@ -102,7 +102,8 @@ class CpuBudget:
         spent_ns: Callable[[], int] = time.thread_time_ns,
     ) -> None:
         self._fps, self._processors = fps, processors
-        self._cores = most_cores(processors, others=_SHARE * processors if math.isfinite(processors) else 0.0)
+        self._others = _SHARE * processors if math.isfinite(processors) else 0.0
+        """Cores that the rest of this process takes. A mean: a look that ends in the next second counts there."""
         self._spent_ns = spent_ns
         self._costs: dict[Part, float] = {}
         self._had_ns: dict[Part, int] = {}
@@ -122,7 +123,8 @@ class CpuBudget:
     def plan(self) -> Plan:
         if math.isinf(self._processors):
             return Plan()
-        return share_out(self._cores * self._left, self._costs, fps=self._fps)
+        cores = most_cores(self._processors, others=self._others)
+        return share_out(cores * self._left, self._costs, fps=self._fps)
 
     @property
     def too_slow(self) -> bool:
@@ -149,15 +151,20 @@ class CpuBudget:
 
     def admits_detection(self, at_ns: int, *, due: bool = True) -> bool:
         """Whether the detector searches the source of that frame, where that is ``due``."""
-        free = self.queued < _MOST_QUEUED and not (self.keyframe_soon and math.isfinite(self._processors))
-        admitted = due and free and self._take("detect", self.plan.detect_s, at_ns)
+        admitted = due and self._has_time and self._take("detect", self.plan.detect_s, at_ns)
         if admitted or not due:
             self._waits_ns = None
         return admitted
 
     def admits_comparison(self, at_ns: int) -> bool:
         """Whether it searches the base of that frame besides."""
-        return self.queued < _MOST_QUEUED and self._take("compare", self.plan.compare_s, at_ns)
+        return self._has_time and self._take("compare", self.plan.compare_s, at_ns)
+
+    @property
+    def _has_time(self) -> bool:
+        # For what takes longer than from one frame to the next.
+        waits = self.keyframe_soon and math.isfinite(self._processors)
+        return self.queued < _MOST_QUEUED and not waits
 
     def _take(self, part: Part, every_s: float, at_ns: int) -> bool:
         # Frames come when they come: the nearest to the plan is meant, not the first beyond.
@@ -183,5 +190,4 @@ class CpuBudget:
         if before is None or now_ns <= before[0]:
             return
         perceived = (self._perceived_ns - before[1]) / (now_ns - before[0])
-        others = max(0.0, cores - perceived)
-        self._cores = most_cores(self._processors, others=others)
+        self._others += _NEWEST * (max(0.0, cores - perceived) - self._others)

@@ -251,6 +251,22 @@ def test_the_detector_does_not_begin_just_before_a_keyframe():
     assert [index for index, one in enumerate(soon) if one] == list(range(keyframe - 4, keyframe))
 
 
+def test_a_keyframe_that_waits_for_its_room_does_not_keep_the_detector_for_long():
+    """It may wait for two seconds: boxes were three seconds old."""
+    out, stills = TimedOut(SteppedTime()), BlockedStills()
+    stills.released.set()
+    base, soon = base_stage(out), []
+    base.keyframes.due = lambda _now_ns: True
+    with RealtimePace(
+        base, stills, inbox=FeedbackInbox(), clock=out.time, fps=15, live=False, counts=FrameCounts(),
+        stop=out.time, failures=Failures(out.time),
+    ) as pace:  # fmt: skip
+        for frame in framed(smooth_pictures(1, size=SIZE) * 30):
+            pace.step(frame)
+            soon.append(stills.analyzer.cpu_budget.keyframe_soon)
+    assert not any(soon[10:])
+
+
 def test_a_clip_behind_a_link_that_stood_still_catches_up():
     """The machine would be called too slow for an outage of the link."""
     out = TimedOut(SteppedTime(), blocks_s=lambda count: 6.0 if count == 20 else 0.0)

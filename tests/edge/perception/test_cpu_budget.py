@@ -168,6 +168,7 @@ def test_just_before_a_keyframe_nothing_is_searched_but_in_lockstep():
         budget.keyframe_soon = True
         assert budget.admits_frame(0, lost=0, late=False)
         assert budget.admits_detection(0) is admitted
+        assert budget.admits_comparison(0) is admitted
 
 
 def test_with_frames_that_wait_nothing_is_searched():
