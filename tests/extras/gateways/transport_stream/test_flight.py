@@ -30,15 +30,21 @@ def test_video_tracks_and_places_are_those_of_the_other_sinks(drawn):
     for row in drawn.tracks():
         if row["doubted"] == "0":
             rows[int(row["frame_index"])][int(row["id"])] = row
+    words = {
+        (one.frame_index, track_id): word
+        for one in recorded.overlays()
+        for track_id, word in zip(one.track_ids.tolist(), one.words, strict=True)
+    }
     assert len(found.klv) >= FRAMES
     placed, wide = 0, VIEW.base_size[0]
     for packet in found.klv:
         assert packet.vmti is not None
-        mine = rows.pop(int.from_bytes(packet.vmti[7]), {})
+        frame = int.from_bytes(packet.vmti[7])
+        mine = rows.pop(frame, {})
         assert {one.track_id for one in packet.targets} == set(mine)
         for target in packet.targets:
             row = mine[target.track_id]
-            assert target.class_name == row["class"]
+            assert target.class_name == words[frame, target.track_id]
             assert target.number(5) == pytest.approx(100 * float(row["confidence"]), abs=0.6)
             x, y = target.number(2) % wide - 1, target.number(2) // wide
             assert (x, y) == pytest.approx((float(row["x"]), float(row["y"])), abs=1.1)
