@@ -235,36 +235,32 @@ def test_a_frame_that_is_dear_to_code_now_and_then_costs_no_other():
     assert often.dropped_cpu > 20, "a machine that is too slow would gain delay"
 
 
-def test_the_detector_does_not_begin_just_before_a_keyframe():
-    """Both together take longer than the frames behind them can wait."""
-    out, stills = TimedOut(SteppedTime()), BlockedStills()
+def keyframes_soon(*, frames: int, due_from_s: float | None = None) -> list[int]:
+    """Frames of a clip at 15 fps after which the detector waits for a keyframe; one is due from that time on."""
+    out, stills, found = TimedOut(SteppedTime()), BlockedStills(), []
     stills.released.set()
-    cpu_budget, base, soon = stills.analyzer.cpu_budget, base_stage(out), []
+    base = base_stage(out)
+    if due_from_s is not None:
+        base.keyframes.due = lambda now_ns: now_ns >= START_NS + due_from_s * SECOND_NS
     with RealtimePace(
         base, stills, inbox=FeedbackInbox(), clock=out.time, fps=15, live=False, counts=FrameCounts(),
         stop=out.time, failures=Failures(out.time),
     ) as pace:  # fmt: skip
-        for frame in framed(smooth_pictures(1, size=SIZE) * 160):
+        for index, frame in enumerate(framed(smooth_pictures(1, size=SIZE) * frames)):
             pace.step(frame)
-            soon.append(cpu_budget.keyframe_soon)
+            found += [index] if stills.analyzer.cpu_budget.keyframe_soon else []
+    return found
+
+
+def test_the_detector_does_not_begin_just_before_a_keyframe():
+    """Both together take longer than the frames behind them can wait."""
     keyframe = 150
-    assert [index for index, one in enumerate(soon) if one] == list(range(keyframe - 4, keyframe))
+    assert keyframes_soon(frames=160) == list(range(keyframe - 4, keyframe))
 
 
 def test_a_keyframe_that_waits_for_its_room_does_not_keep_the_detector_for_long():
     """It may wait for two seconds: boxes were three seconds old."""
-    out, stills = TimedOut(SteppedTime()), BlockedStills()
-    stills.released.set()
-    base, soon = base_stage(out), []
-    base.keyframes.due = lambda _now_ns: True
-    with RealtimePace(
-        base, stills, inbox=FeedbackInbox(), clock=out.time, fps=15, live=False, counts=FrameCounts(),
-        stop=out.time, failures=Failures(out.time),
-    ) as pace:  # fmt: skip
-        for frame in framed(smooth_pictures(1, size=SIZE) * 30):
-            pace.step(frame)
-            soon.append(stills.analyzer.cpu_budget.keyframe_soon)
-    assert not any(soon[10:])
+    assert keyframes_soon(frames=60, due_from_s=1.0) == list(range(11, 19))
 
 
 def test_a_clip_behind_a_link_that_stood_still_catches_up():
