@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from hvt_common.camera_motion import Affine, CameraMotion
 from hvt_common.tracking import kalman
-from hvt_common.tracking.association import grown, overlaps, pair
+from hvt_common.tracking.association import Overlaps, grown, larger, overlaps, pair
 from hvt_common.tracking.track_table import LOST, TRACKED, UNCONFIRMED, TrackerInput, TrackTable
 from hvt_common.values import Detections, Image, Tracks
 
@@ -221,17 +221,19 @@ class ByteTracker:
         self._gaps.append(gap)
         self._forget_stale(frame_index)
         self._widen_for(seen)
-        match, free = self._match(seen, frame_index, growth=self._growth(frame_index))
-        self._steady = self._steady + 1 if self._as_predicted(seen, match, free) else 0
+        match, free, same = self._match(seen, frame_index, growth=self._growth(frame_index))
+        self._steady = self._steady + 1 if self._as_predicted(same, len(free)) else 0
         self._updated_index = frame_index
         self._correct(seen, match, frame_index, gap=gap)
         retained = self._retire(match, frame_index)
         self._start(seen.take(free), frame_index, confirmed=first)
         retained = np.concatenate((retained, np.ones(len(self._table) - len(retained), bool)))
-        retained &= ~self._duplicates(retained)
+        boxes = kalman.boxes_of(self._table.states)
+        retained &= ~self._duplicates(retained, boxes)
         if not retained.all():
             self._table.retain(retained)
-        return self._listed(frame_index)
+            boxes = boxes[retained]
+        return self._listed(frame_index, boxes)
 
     def predict(self, *, frame_index: int, image_bgr: Image | None = None, searched: bool = False) -> Tracks:
         """The tracks at a frame without detection: those of the last update, moved on by the Kalman filter.
@@ -249,7 +251,7 @@ class ByteTracker:
                 del steps[1:-1]  # whatever is found, all tracks will have ended
         self._advance(frame_index, affine, hold_unconfirmed=False)
         self._table.started[:] = False
-        return self._listed(frame_index)
+        return self._listed(frame_index, kalman.boxes_of(self._table.states))
 
     def extrapolated(self, *, frame_index: int) -> Tracks:
         """The list of `predict` at this or a later frame if the camera stood still; nothing is changed.
@@ -264,7 +266,7 @@ class ByteTracker:
         ended = self._outdated(frame_index)
         for _ in range(0 if ended else frame_index - last):
             kalman.predict(states)
-        listed = self._listed(frame_index, states=states[:0] if ended else states)
+        listed = self._listed(frame_index, kalman.boxes_of(states[:0] if ended else states))
         return replace(listed, started=np.zeros(len(listed), bool))
 
     def _check_rises(self, frame_index: int) -> None:
@@ -334,39 +336,41 @@ class ByteTracker:
         unsearched = frame_index - self._updated_index - 1
         return min(_MOST_GROWTH, self._settings.search_growth_per_s * unsearched / self._fps)
 
-    def _match(self, seen: TrackerInput, frame_index: int, *, growth: float) -> tuple[_Indices, _Indices]:
-        # The detection of each track (-1: none), and the confident detections left that may start tracks.
+    def _match(
+        self, seen: TrackerInput, frame_index: int, *, growth: float
+    ) -> tuple[_Indices, _Indices, int]:
+        # The detection of each track (-1: none), the confident detections left that may start tracks, and how many
+        # tracks of the last list are where they were predicted.
         settings, table = self._settings, self._table
         # A detection at exactly the threshold is neither confident nor weak in the authors' program.
         confident = seen.confidences > settings.track_confidence
         match = np.full(len(table), -1)
         free = confident.copy()
+        same = 0
         if len(table) and len(seen):
             boxes = kalman.boxes_of(table.states)
-            iou = overlaps(boxes, seen.boxes)
-            fused = self._fused(iou, seen)
+            shared = overlaps(boxes, seen.boxes)
+            fused = self._fused(shared, seen)
             limit = 1 - settings.match_iou
             unconfirmed = table.phase == UNCONFIRMED
             pair(fused, ~unconfirmed, free, match, limit=limit)
             weak = seen.confidences < settings.track_confidence
-            pair(iou, (table.phase == TRACKED) & (match < 0), weak, match, limit=_WEAK_COST_LIMIT)
+            pair(shared, (table.phase == TRACKED) & (match < 0), weak, match, limit=_WEAK_COST_LIMIT)
             pair(fused, unconfirmed, free, match, limit=_UNCONFIRMED_COST_LIMIT)
             if growth > 0:
                 wide = overlaps(grown(boxes, growth), grown(seen.boxes, growth))
                 if max(self._gaps) > self._buffer_frames + 1:
                     held = grown(self._held(frame_index), growth)
-                    wide = np.maximum(wide, overlaps(held, grown(seen.boxes, growth)))
+                    wide = larger(wide, overlaps(held, grown(seen.boxes, growth)))
                 pair(self._fused(wide, seen), match < 0, free, match, limit=limit)
+            own = (match[shared.rows] == shared.columns) & (table.phase[shared.rows] == TRACKED)
+            same = np.count_nonzero(own & (shared.iou >= _AS_PREDICTED_IOU))
         free &= seen.confidences >= settings.birth_confidence
-        return match, free.nonzero()[0]
+        return match, free.nonzero()[0], same
 
-    def _as_predicted(self, seen: TrackerInput, match: _Indices, free: _Indices) -> bool:
-        tracked = self._table.phase == TRACKED
-        rows = (tracked & (match >= 0)).nonzero()[0]
-        shared = overlaps(kalman.boxes_of(self._table.states[rows]), seen.boxes[match[rows]]).diagonal()
-        count = int(tracked.sum())
-        surprises = count - int((shared >= _AS_PREDICTED_IOU).sum()) + len(free)
-        return count > 0 and surprises <= _MOST_SURPRISES * count
+    def _as_predicted(self, same: int, new: int) -> bool:
+        count = np.count_nonzero(self._table.phase == TRACKED)
+        return count > 0 and count - same + new <= _MOST_SURPRISES * count
 
     def _held(self, frame_index: int) -> _Floats:
         # The last boxes, moved with the camera alone: meanwhile a vehicle may have stopped.
@@ -375,8 +379,10 @@ class ByteTracker:
         states[:, kalman.POSITION] -= elapsed * states[:, kalman.VELOCITY]
         return kalman.boxes_of(states)
 
-    def _fused(self, iou: _Floats, seen: TrackerInput) -> _Floats:
-        return iou * seen.confidences if self._settings.fuse_scores else iou
+    def _fused(self, found: Overlaps, seen: TrackerInput) -> Overlaps:
+        if not self._settings.fuse_scores:
+            return found
+        return found._replace(iou=found.iou * seen.confidences[found.columns])
 
     def _correct(self, seen: TrackerInput, match: _Indices, frame_index: int, *, gap: int) -> None:
         table, settings = self._table, self._settings
@@ -420,7 +426,7 @@ class ByteTracker:
         self._next_id += len(seen)
         self._table.append(born)
 
-    def _duplicates(self, living: _Mask) -> _Mask:
+    def _duplicates(self, living: _Mask, boxes: _Floats) -> _Mask:
         # The younger one of each pair of a tracked and a lost track at the same place.
         table = self._table
         duplicate = np.zeros(len(table), bool)
@@ -428,18 +434,17 @@ class ByteTracker:
         lost = (living & (table.phase == LOST)).nonzero()[0]
         if not len(lost) or not len(present):
             return duplicate
-        boxes = kalman.boxes_of(table.states)
-        pairs = (1 - overlaps(boxes[present], boxes[lost]) < _DUPLICATE_COST_LIMIT).nonzero()
-        a, b = present[pairs[0]], lost[pairs[1]]
+        shared = overlaps(boxes[present], boxes[lost])
+        alike = 1 - shared.iou < _DUPLICATE_COST_LIMIT
+        a, b = present[shared.rows[alike]], lost[shared.columns[alike]]
         age = table.seen - table.born
         lost_is_shorter = age[a] > age[b]
         duplicate[b[lost_is_shorter]] = True
         duplicate[a[~lost_is_shorter]] = True
         return duplicate
 
-    def _listed(self, frame_index: int, *, states: kalman.States | None = None) -> Tracks:
+    def _listed(self, frame_index: int, boxes: _Floats) -> Tracks:
         table = self._table
-        boxes = kalman.boxes_of(table.states if states is None else states)
         area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
         tracked = table.phase[: len(boxes)] == TRACKED
         rows = (tracked & (area > self._settings.min_box_area_px2)).nonzero()[0]
