@@ -39,8 +39,8 @@ def overlaps(a_xyxy_px: _Floats, b_xyxy_px: _Floats) -> Overlaps:
         return Overlaps(places, places, np.empty(0))
     rows, columns = np.divmod(places, near.shape[1])
     a, b = a.take(rows, axis=1), b.take(columns, axis=1)
-    width, height = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
-    shared = width * height
+    sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
+    shared = sides[0] * sides[1]
     return Overlaps(rows, columns, shared / (_areas(a) + _areas(b) - shared))
 
 
@@ -49,7 +49,8 @@ def larger(a: Overlaps, b: Overlaps) -> Overlaps:
     iou = np.zeros((1 + max(*a.rows, *b.rows, 0), 1 + max(*a.columns, *b.columns, 0)))
     for rows, columns, shared in (a, b):
         iou[rows, columns] = np.maximum(iou[rows, columns], shared)
-    return Overlaps(*(index := iou.nonzero()), iou[index])
+    rows, columns = iou.nonzero()
+    return Overlaps(rows, columns, iou[rows, columns])
 
 
 def assign(cost: _Floats, *, limit: float) -> tuple[_Indices, _Indices]:

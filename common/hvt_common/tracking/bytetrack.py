@@ -364,12 +364,12 @@ class ByteTracker:
                     wide = larger(wide, overlaps(held, grown(seen.boxes, growth)))
                 pair(self._fused(wide, seen), match < 0, free, match, limit=limit)
             own = (match[shared.rows] == shared.columns) & (table.phase[shared.rows] == TRACKED)
-            same = np.count_nonzero(own & (shared.iou >= _AS_PREDICTED_IOU))
+            same = int((own & (shared.iou >= _AS_PREDICTED_IOU)).sum())
         free &= seen.confidences >= settings.birth_confidence
         return match, free.nonzero()[0], same
 
     def _as_predicted(self, same: int, new: int) -> bool:
-        count = np.count_nonzero(self._table.phase == TRACKED)
+        count = int((self._table.phase == TRACKED).sum())
         return count > 0 and count - same + new <= _MOST_SURPRISES * count
 
     def _held(self, frame_index: int) -> _Floats:
