@@ -27,16 +27,20 @@ _UNLIKE_BELOW = 0.58
 _LIKE_FROM = 0.6
 
 
+def trust_from(detector: str) -> float | None:
+    """`ViewTrust.counts_from` of a detector: it is measured for ``aerial-nano`` alone."""
+    return default_confidence(detector) if detector == EMBEDDED_DETECTOR else None
+
+
 class ViewTrust:
-    """Of one video. It is measured for ``aerial-nano`` alone; every other detector's views are trusted.
+    """Of one video. Boxes count from a confidence of ``counts_from``; None trusts every view.
 
     ``unlike`` holds while the view is unlike what the detector knows; that is said once, with ``hence``, what follows
     from it. ``mean`` is the mean confidence of the boxes that count, None before there were enough. From any thread.
     """
 
-    def __init__(self, detector: str, *, hence: str) -> None:
-        self._measured = detector == EMBEDDED_DETECTOR
-        self._counts_from = default_confidence(detector) if self._measured else 0.0
+    def __init__(self, counts_from: float | None, *, hence: str) -> None:
+        self._counts_from = counts_from
         self._recent: deque[tuple[float, int]] = deque(maxlen=_RUNS)
         self._lock = threading.Lock()
         self._hence = hence
@@ -46,7 +50,7 @@ class ViewTrust:
 
     def take(self, found: Detections) -> None:
         """Count what was found on the next picture."""
-        if not self._measured:
+        if self._counts_from is None:
             return
         counted = found.confidences[found.confidences >= self._counts_from]
         with self._lock:

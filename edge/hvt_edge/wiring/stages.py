@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from hvt_common.inference.detect import FailingDetector
-from hvt_common.inference.view_trust import ViewTrust
+from hvt_common.inference.view_trust import ViewTrust, trust_from
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import fitted_class_names
@@ -212,7 +212,7 @@ class Stills:
         levers = trust = reporter = None
         if config.measures:
             levers = LeverControl(link.operating, lever_settings(config, view))
-            trust = ViewTrust(config.detector, hence="auto gives its tracks no credit")
+            trust = ViewTrust(trust_from(config.detector), hence="auto gives its tracks no credit")
         if config.send_tracks:
             reporter = TrackReporter(link.transmitter, session_id=flight.session_id)
         cpu_budget = CpuBudget()

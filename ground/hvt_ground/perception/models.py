@@ -13,6 +13,7 @@ from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import FailingDetector, open_detector, warm_up
 from hvt_common.inference.labels import default_confidence, is_calibrated, uncalibrated
 from hvt_common.inference.retried import RetriedClassifier, RetriedDetector
+from hvt_common.inference.view_trust import trust_from
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.process import lower_priority
@@ -39,6 +40,8 @@ class ModelFacts:
     """Whether the detector's scores are probabilities."""
     stills_calibrated: bool
     """Whether the model that reads stills gives probabilities."""
+    trust_from: float | None = None
+    """As of `ViewTrust`."""
 
     @classmethod
     def of(cls, config: GroundConfig) -> Self:
@@ -49,6 +52,7 @@ class ModelFacts:
             default_confidence(config.detector) if confidence is None else confidence,
             calibrated,
             calibrated if reader == DETECTOR else _reads_calibrated(reader),
+            trust_from(config.detector),
         )
 
 

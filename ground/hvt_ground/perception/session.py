@@ -45,7 +45,7 @@ class SessionPerception:
 
     def __init__(self, config: GroundConfig, models: Models, info: Info) -> None:
         self._config, self._models, self._info = config, models, info
-        self._trust = ViewTrust(config.detector, hence="are drawn thin and unnamed")
+        self._trust = ViewTrust(models.facts.trust_from, hence="are drawn thin and unnamed")
         self.tilt = ViewTilt(vague_kinds=config.detector == EMBEDDED_DETECTOR)
         """Of the view."""
         self._detect_every = detect_every(config.detect_every, fps=info.fps)

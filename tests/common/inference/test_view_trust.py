@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hvt_common.inference.view_trust import ViewTrust
+from hvt_common.inference.view_trust import ViewTrust, trust_from
 from hvt_common.values import Detections
 
 
@@ -23,7 +23,7 @@ STREET = many(0.9, 0.8, 0.45, 0.2)
 
 def test_a_view_that_it_does_not_know_is_said_once_and_left_again(caplog):
     """Boxes that are right half the time would look like those that are right nine times in ten."""
-    trust = ViewTrust("aerial-nano", hence="are drawn thin and unnamed")
+    trust = ViewTrust(trust_from("aerial-nano"), hence="are drawn thin and unnamed")
     for _ in range(14):
         trust.take(WATER)
     assert not trust.unlike
@@ -44,7 +44,7 @@ def test_a_view_that_it_does_not_know_is_said_once_and_left_again(caplog):
 
 def test_another_scene_is_told_from_the_one_before_within_seconds():
     """Boxes of water would pass for cars for a quarter of a minute after a street of a hundred of them."""
-    trust = ViewTrust("aerial-nano", hence="")
+    trust = ViewTrust(trust_from("aerial-nano"), hence="")
     for _ in range(45):
         trust.take(many(*[0.8] * 100))
     for _ in range(15):
@@ -59,7 +59,7 @@ def test_another_scene_is_told_from_the_one_before_within_seconds():
 @pytest.mark.parametrize("view", [STREET, many(), many(0.41)])
 def test_a_view_that_it_knows_or_that_is_nearly_empty_is_trusted(view):
     """A field with one far car now and then would be called unknown."""
-    trust = ViewTrust("aerial-nano", hence="are drawn thin and unnamed")
+    trust = ViewTrust(trust_from("aerial-nano"), hence="are drawn thin and unnamed")
     for index in range(200):
         trust.take(view if index % 2 or view is STREET else many())
         assert not trust.unlike
@@ -67,7 +67,7 @@ def test_a_view_that_it_knows_or_that_is_nearly_empty_is_trusted(view):
 
 def test_scores_that_are_no_probabilities_say_nothing():
     """A network whose scores are low by habit would never have a name."""
-    trust = ViewTrust("boat.onnx", hence="")
+    trust = ViewTrust(trust_from("boat.onnx"), hence="")
     for _ in range(200):
         trust.take(WATER)
     assert not trust.unlike

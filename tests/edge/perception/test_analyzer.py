@@ -58,7 +58,7 @@ def make(*, detector=None, view: View = VIEW, search: ScaleSearch | None = None,
 
 def test_every_frame_is_decoded_and_each_nth_is_searched():
     """Candidates would be of other frames than the stills, or the processor would melt."""
-    trust, taken = ViewTrust("motion", hence=""), []
+    trust, taken = ViewTrust(None, hence=""), []
     trust.take = lambda found: taken.append(len(found))
     analyzer = make(detect_every=5, trust=trust)
     seen = [analyzer.analyze(frame, unit) for frame, unit in zip(FRAMES, UNITS, strict=True)]

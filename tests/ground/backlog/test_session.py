@@ -284,7 +284,7 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
 
 def test_stored_video_of_an_unknown_view_is_doubted_as_it_is_live(flight):
     """Boxes that were dashed and unnamed before an outage were certain in the middle of it."""
-    trust, found, taken = ViewTrust("motion", hence=""), [], []
+    trust, found, taken = ViewTrust(None, hence=""), [], []
     trust.take = lambda seen: taken.append(len(seen))
     perception, decoder = StoredPerception(flight.info(), trust=trust), BaseDecoder()
     analyze = perception.track(found.append)

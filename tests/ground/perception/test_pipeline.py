@@ -326,7 +326,7 @@ def test_a_guess_stays_one_until_a_still_is_sure_of_it(flight, pictures, confide
 
 def test_where_the_view_is_unlike_what_the_detector_knows_boxes_are_doubted(flight, pictures):
     """A box that is a guess would be drawn and named like one that is right nine times in ten."""
-    trust, taken = ViewTrust("motion", hence=""), []
+    trust, taken = ViewTrust(None, hence=""), []
     trust.take = lambda found: taken.append(len(found))
     rig = Rig(trust=trust)
     for picture in pictures[:20]:

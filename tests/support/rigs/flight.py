@@ -185,7 +185,7 @@ def pipeline_of(
         fusion=Fusion(fps=15, edge_classes=places, path=path),
         path=path,
         detector_thread=detector_thread or DetectsAtOnce(),
-        trust=trust or ViewTrust(MOTION, hence=""),
+        trust=trust or ViewTrust(None, hence=""),
         guesses=guesses,
         search=search,
     )
