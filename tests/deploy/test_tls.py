@@ -167,32 +167,6 @@ def test_direct_either_side_may_listen(fleet: Fleet, free_port: int, listens: st
         eventually(lambda: edge.reports == [b"base"], what="the report arrives")
 
 
-@pytest.mark.parametrize(("who", "said"), [("base", b"control of uav-1"), ("guest", None)])
-def test_who_asks_by_way_of_a_ground_has_its_own_rights(
-    fleet: Fleet, free_port: int, who: str, said: bytes | None
-) -> None:
-    """`hvt-ground still` connects to the ground: a guest must not command with the ground's rights."""
-    where = (f"tls/127.0.0.1:{free_port}",)
-    with (
-        open_session(fleet.settings("base", "ground", listen=where)),
-        open_session(fleet.settings("uav-1", "edge", connect=where)) as edge_session,
-        open_session(LinkSettings("client", connect=where, zenoh_config=fleet.file(who))) as client,
-    ):
-        edge = _Edge(edge_session, "uav-1")
-        eventually(
-            lambda: query(client, Channel.INFO, keys=edge.keys, question=b"", timeout_s=1),
-            what="info is answered",
-        )
-        told: list[bytes | None] = []
-
-        def commanded() -> bool:
-            told.append(query(client, Channel.CONTROL, keys=edge.keys, question=b"", timeout_s=2))
-            return said in (None, told[-1])
-
-        eventually(commanded, what="who may command is answered")
-        assert told[-1] == said
-
-
 def test_who_asks_with_keys_of_another_fleet_is_told(fleet: Fleet, tmp_path: Path, free_port: int) -> None:
     """'Nobody answers' would be said of a ground that is running."""
     other = Fleet(tmp_path / "other")

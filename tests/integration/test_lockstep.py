@@ -10,7 +10,7 @@ from typing import Any
 import av
 import pytest
 
-from programs.processes import Link
+from programs.processes import Link, agree
 from programs.rrd import Recording
 
 pytestmark = [pytest.mark.nightly, pytest.mark.integration, pytest.mark.realdata]
@@ -53,6 +53,7 @@ def flown(folder: Path, *, edge_settings: tuple[str, ...], ground_settings: tupl
             *("--record-base", "base.mkv", "--wait", "60s", *edge_settings),
         )
         summaries = edge.finish(), ground.finish()
+        agree(*summaries)
     with av.open(str(folder / "base.mkv")) as container:
         base = [(packet.pts, bytes(packet)) for packet in container.demux(video=0) if packet.size]
     return Play(*summaries, recording=Recording(folder / "flight.rrd"), base=base)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
+from hvt_common.inference.class_names import IMAGENET_NAMES
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
 from hvt_common.inference.runtimes.model import open_model
 from media.onnx_models import colour_classifier, colour_detector, constant_model
@@ -68,10 +69,14 @@ def test_any_batch_and_layout_gives_the_same_answers(
 
 
 def test_more_crops_than_one_batch_keep_their_order(tmp_path: Path) -> None:
-    """A busy second with forty stills would be answered in disorder."""
-    classifier = open_classifier(str(colour_classifier(tmp_path / "c.onnx", metadata=PLAIN, gain=0.01)))
+    """A busy second with forty stills would be answered in disorder, or by a run of the network for each."""
+    taken: list[int] = []
+    model = open_model(colour_classifier(tmp_path / "c.onnx", metadata=PLAIN, gain=0.01))
+    classifier, run = OnnxClassifier(model), model.run
+    model.run = lambda feed: taken.append(len(feed)) or run(feed)  # type: ignore[method-assign, func-returns-value]
     crops = [np.full((8, 8, 3), (0, 0, 3 * i), np.uint8) for i in range(70)]
     confidences = [answer.confidence for answer in classifier.classify(crops)]
+    assert taken == [32, 32, 6]
     assert len(confidences) == 70
     assert confidences == sorted(confidences)
     assert confidences[69] > confidences[0] + 0.4
@@ -134,8 +139,20 @@ def test_odd_crops_do_not_crash(tmp_path: Path) -> None:
     assert all(np.isfinite(answer.probabilities).all() for answer in answers)
 
 
+def test_a_large_crop_is_averaged(tmp_path: Path) -> None:
+    """Sharp stills would come as noise: of each square of pixels one would speak for all."""
+    path = colour_classifier(tmp_path / "c.onnx", gain=1, metadata=PLAIN)
+    dots = np.zeros((128, 128, 3), np.uint8)
+    dots[::4, ::4] = (160, 80, 0)
+    np.testing.assert_allclose(scores(path, dots), (-10, -5, 0), atol=1e-4)
+
+
 def test_names_of_1000_and_1001_classes_are_reconciled(tmp_path: Path) -> None:
     """Every class would be off by one: a tench for every goldfish."""
+    assert (
+        open_classifier(str(colour_classifier(tmp_path / "c.onnx", classes=1000))).class_names
+        == IMAGENET_NAMES
+    )
     labels = tmp_path / "labels.txt"
     thousand = [f"thing {i}, synonym {i}" for i in range(1000)]
     for rows, classes, first in (

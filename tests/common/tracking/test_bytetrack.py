@@ -109,24 +109,6 @@ def test_every_fifth_frame_still_follows_the_scene(data: Path) -> None:
     assert result.mota > 0.84
 
 
-@pytest.mark.realdata
-@pytest.mark.parametrize(
-    ("sequence", "mota", "idf1"), [("TUD-Campus", 0.526, 0.558), ("TUD-Stadtmitte", 0.564, 0.645)]
-)
-def test_the_yardstick_gives_published_figures(data: Path, sequence: str, mota: float, idf1: float) -> None:
-    """The tests that compare tracks would measure with a wrong yardstick."""
-    frames = []
-    for name in ("gt.txt", "test.txt"):
-        rows = np.loadtxt(data / "tracking/motmetrics_tud" / sequence / name, delimiter=",")
-        rows = rows[rows[:, 6] == 1] if name == "gt.txt" else rows
-        rows[:, 4:6] += rows[:, 2:4]
-        frames.append(
-            {int(k): (rows[rows[:, 0] == k, 1], rows[rows[:, 0] == k, 2:6]) for k in set(rows[:, 0])}
-        )
-    result = score(*frames)
-    assert (round(result.mota, 3), round(result.idf1, 3)) == (mota, idf1)
-
-
 def dense_filter(measurements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """One track through the textbook 8x8 filter: initiate, then predict and correct for each measurement."""
     transition, observe = np.eye(8) + np.eye(8, k=4), np.eye(4, 8)

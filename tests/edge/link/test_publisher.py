@@ -58,6 +58,11 @@ def test_a_ground_of_another_version_commands_nothing(caplog, monkeypatch):
     assert caplog.messages == [
         said
     ]  # and none of the newer one on info, which says that it also speaks this one
+    for junk in (b"", bytes(100_000), b"\x93\x01", FEEDBACK.pack()[:-1]) * 25:
+        report(SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda junk=junk: junk)))
+        assert asked[Channel.CONTROL](junk) is None
+    assert (listener.unusable, len(reports)) == (206, 1)
+    assert len(caplog.messages) < 10, "a flood does not fill the log"
 
 
 def test_what_a_ground_does_not_use_is_declared_again(monkeypatch):

@@ -7,10 +7,12 @@ import threading
 import time
 from dataclasses import replace
 from functools import partial
+from random import Random
 from typing import Self
 
 import pytest
 
+from hvt_common.protocol.channels import MAX_PAYLOAD_BYTES
 from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import Info, PoseEncoder
 from hvt_common.transport.inbox import Inbox, Received
@@ -260,6 +262,52 @@ def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
         assert session.frames_decoded == 4
     counters = rig.ended[0].reception.counters
     assert (counters.corrupt, counters.duplicates + counters.replayed) == (1, 2)
+
+
+def spoilt(item: Received, rng: Random) -> list[Received]:
+    """A message, damaged in each way there is."""
+    payload, attachment = item.payload, item.attachment
+
+    def flipped(data: bytes) -> bytes:
+        at = rng.randrange(len(data))
+        return data[:at] + bytes((data[at] ^ 1 << rng.randrange(8),)) + data[at + 1 :]
+
+    damaged = [
+        (flipped(payload), attachment),
+        (payload, flipped(attachment)),
+        (payload[: rng.randrange(len(payload))], attachment),
+        (payload, attachment[: rng.randrange(1, len(attachment))]),
+        (payload, b""),
+        (rng.randbytes(rng.randrange(2000)), rng.randbytes(rng.randrange(1, 80))),
+        (payload, attachment + bytes(10_000)),
+        (bytes(MAX_PAYLOAD_BYTES + 1), attachment),
+    ]
+    return [replace(item, payload=one, attachment=other) for one, other in damaged]
+
+
+def test_whatever_comes_damaged_is_counted_and_costs_no_frame_and_no_byte(flight, caplog):
+    """Anybody on the link could blind the operator with one packet, and the account would blame the link."""
+    rng, bad, good = Random(3), 0, []
+    with Rig() as rig:
+        rig.port.flight = flight
+        for index in range(20):
+            items = [flight.base(index), flight.still(index, index)]
+            rig.put(*items)
+            wrong = [one for item in items for one in spoilt(item, rng)]
+            wrong.append(Received("hvt/uav-1/status", rng.randbytes(300), b"", "", 1))
+            rig.put(*wrong, *(Received(f"hvt/{key}", b"x", b"", "", 1) for key in ("UAV_1/base", "uav-1/no")))
+            rig.settle()
+            good += items
+            bad += len(wrong)
+        reception = rig.receiver.session.reception
+        assert (rig.receiver.receiver.unusable, rig.receiver.session.frames_decoded) == (bad, 20)
+        assert (reception.frames, reception.stills) == (20, 20)
+        assert reception.ledger.line_bytes == sum(
+            one.size_bytes
+            + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
+            for one in good
+        )
+    assert sum("unusable" in text for text in caplog.messages) < 10, "the one line that matters scrolls away"
 
 
 def test_a_still_that_came_twice_is_shown_once_and_counted_twice(flight):
