@@ -9,7 +9,6 @@ Times ending in ``_ns`` are Unix time in nanoseconds unless the name says otherw
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -219,35 +218,6 @@ class Posterior:
     """Entropy of the whole distribution; 0 is certain."""
     probabilities: npt.NDArray[np.float32] = field(repr=False)
     """(C,) over the classifier's ``class_names``."""
-
-
-@dataclass(frozen=True, slots=True)
-class Still:
-    """A coded high-detail crop of one source frame."""
-
-    sequence: int
-    """0, 1, 2 … in this session."""
-    frame_index: int
-    capture_ns: int
-    track_id: int
-    """The edge's own track id."""
-    box_source_px: tuple[float, float, float, float]
-    """The track's box at that frame, source pixels."""
-    crop_source_px: tuple[int, int, int, int]
-    """The padded box that was cropped, whole source pixels, inside the frame."""
-    class_name: str
-    """What the edge's detector called it."""
-    confidence: float
-    reason: str
-    """Why the policy sent it, in a word or two."""
-    codec: str
-    quality_pct: int
-    data: bytes
-    media_type: str = "image/jpeg"
-    parameters: Mapping[str, int | float | str] = field(default_factory=dict)
-    """What the ground needs beside the bytes to undo the coding; see the codec."""
-    also: tuple[tuple[int, tuple[float, float, float, float]], ...] = ()
-    """Further tracks that the same crop shows: each with its edge track id and its box, source pixels."""
 
 
 def iou(

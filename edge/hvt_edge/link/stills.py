@@ -1,28 +1,207 @@
-"""A still on its way: its header, packed once, and which codecs the grounds read."""
+"""A still from its crop to the line, and which codecs the grounds read."""
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from hvt_common.protocol.messages import (
-    BASE_CODEC,
-    AlsoShown,
-    InfoRequest,
-    PackedMessage,
-    RoiHeader,
-    fitted_text,
-)
-from hvt_common.values import Still
+import cv2
+import numpy as np
+
+from hvt_common.protocol.messages import BASE_CODEC, AlsoShown, InfoRequest, RoiHeader
+from hvt_common.values import Image, View
+from hvt_common.video.base_crop import base_crop
+from hvt_common.video.hevc import YuvPicture
+from hvt_common.video.still_codecs import StillCodec, psnr_y_db
 
 _log = logging.getLogger(__name__)
 
+Box = tuple[float, float, float, float]
+Crop = tuple[int, int, int, int]
+Place = tuple[slice, slice]
+"""(rows, columns)."""
+
+_BT601 = np.array([[0.114, 0.587, 0.299]], np.float32)
+_FAR_OFF_SHARE = 0.5
+"""With half of the crop's own variance in the difference to the base, there is little in the base to build on."""
+_NO_PIXELS: Image = np.empty((0, 0, 3), np.uint8)
+_PLAIN_ENCODING = "application/octet-stream"
+"""The encoding of formats that only HVT reads; one byte on the wire."""
+_OWN_TYPES = "application/vnd.hvt."
 _FORGET_NS = 60_000_000_000
 """A ground asks for ``info`` three times in it; after that it counts as gone."""
 _MOST_READERS = 16
 _MOST_SAID = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """The distance of the base from the source at a crop, which bounds that of a still."""
+
+    places: tuple[Place, ...]
+    """The boxes in the crop, without their padding."""
+    limits: tuple[float, ...]
+    """Sums of squared differences that a still must stay below."""
+    psnr_y_db: float
+    """Quality of the base crop, luma, over the whole crop."""
+    error_share: float
+    """Its squared luma error over the variance of the crop's luma: 1 is no better than one flat grey."""
+
+    @classmethod
+    def of(
+        cls, base_crop: Image, *, crop: Image, places: tuple[Place, ...], min_gain_db: float
+    ) -> Alternative:
+        """``min_gain_db`` is by how much a still must be closer than the base."""
+        share = 10 ** (-min_gain_db / 10)
+        limits = tuple(share * error for error in _errors(base_crop, crop, places))
+        _, spread = cv2.meanStdDev(cv2.transform(crop.astype(np.float32), _BT601))
+        error = limits[1] / share / (crop.shape[0] * crop.shape[1])
+        return cls(
+            places=places,
+            limits=limits,
+            psnr_y_db=psnr_y_db(base_crop, crop),
+            error_share=error / max(1.0, float(spread[0, 0]) ** 2),
+        )
+
+    def gain_db(self, still: Image, *, crop: Image) -> float:
+        """The still's gain over the base: the least of colour and luma, over the crop and over each box."""
+        errors = _errors(still, crop, self.places)
+        return min(
+            10 * math.log10(limit / mine) if mine and limit else math.inf if limit else -math.inf
+            for mine, limit in zip(errors, self.limits, strict=True)
+        )
+
+    def loses_to(self, still: Image, *, crop: Image) -> bool:
+        """Whether the still is closer to the source: colour and luma, over the crop and over each box."""
+        errors = _errors(still, crop, self.places)
+        return all(mine < limit for mine, limit in zip(errors, self.limits, strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class Still:
+    """A still: its crop until it is coded, its bytes from then on.
+
+    A pending one holds no whole frames: a 4K frame takes 25 MB, its crops a few kilobytes each.
+    """
+
+    header: RoiHeader
+    """As it goes out, but for session, delay and flags; sequence and quality once it is coded."""
+    media_type: str
+    crop_bgr: Image = field(default_factory=lambda: _NO_PIXELS, repr=False, compare=False)
+    """The crop of the source, at the size at which it is coded; empty once it is."""
+    base_crop_bgr: Image | None = field(default=None, repr=False, compare=False)
+    """The same place in the decoded base frame of the same source frame, at that size; None without one."""
+    alternative: Alternative | None = field(default=None, repr=False, compare=False)
+    """None where the base was not at hand."""
+    data: bytes = b""
+
+    @classmethod
+    def cropped(
+        cls,
+        source_bgr: Image,
+        crop_px: Crop,
+        size: tuple[int, int],
+        *,
+        codec: StillCodec,
+        also: tuple[AlsoShown, ...] = (),
+        **facts: Any,
+    ) -> Still:
+        """Crop it to ``size`` (width, height), never larger than the crop; ``facts`` are those of the header."""
+        x1, y1, x2, y2 = crop_px
+        crop = source_bgr[y1:y2, x1:x2]
+        shrinks = size != (x2 - x1, y2 - y1)
+        pixels = cv2.resize(crop, size, interpolation=cv2.INTER_AREA) if shrinks else crop.copy()
+        header = RoiHeader(
+            session_id=0,
+            sequence=0,
+            send_delay_ns=0,
+            flags=0,
+            crop_source_px=crop_px,
+            codec=codec.name,
+            also=also,
+            parameters=size_parameters(crop_px, size),
+            **facts,
+        )
+        return cls(header, codec.media_type, np.asarray(pixels, np.uint8))
+
+    def beside(
+        self, base: Image | YuvPicture, *, view: View, min_gain_db: float, used: bool = False
+    ) -> Still:
+        """The same with what the base of its frame shows there; ``used``: the still builds on that."""
+        height, width = self.crop_bgr.shape[:2]
+        size, header = (width, height), self.header
+        shown = base_crop(base, view=view, crop_source_px=header.crop_source_px, size=size)
+        boxes = (header.box_source_px, *(one.box_source_px for one in header.also))
+        places = tuple(inner_box(box, header.crop_source_px, size) for box in boxes)
+        alternative = Alternative.of(shown, crop=self.crop_bgr, places=places, min_gain_db=min_gain_db)
+        return replace(self, base_crop_bgr=shown if used else None, alternative=alternative)
+
+    @property
+    def size_bytes(self) -> int:
+        """Of its pixels."""
+        return self.crop_bgr.nbytes + (0 if self.base_crop_bgr is None else self.base_crop_bgr.nbytes)
+
+    @property
+    def base_far_off(self) -> bool:
+        """Whether the base shows something else here, so that a codec may do better without it."""
+        return self.alternative is not None and self.alternative.error_share > _FAR_OFF_SHARE
+
+    @property
+    def encoding(self) -> str:
+        """What Zenoh is told of the payload: its media type, if any program beside HVT could read it.
+
+        Spelling a type of our own out would cost up to 34 bytes a still, and the header names the codec anyway.
+        """
+        return _PLAIN_ENCODING if self.media_type.startswith(_OWN_TYPES) else self.media_type
+
+    def with_header(self, **changes: Any) -> Still:
+        return replace(self, header=replace(self.header, **changes))
+
+    def of_codec(self, codec: StillCodec) -> Still:
+        """The same for a codec."""
+        return replace(self.with_header(codec=codec.name), media_type=codec.media_type)
+
+    def without_base(self, codec: StillCodec) -> Still:
+        """The same for a codec that needs no base; it must be closer than the base all the same."""
+        return replace(self.of_codec(codec), base_crop_bgr=None)
+
+    def coded(self, data: bytes, *, quality_pct: int, parameters: Mapping[str, int | float | str]) -> Still:
+        """As it goes out; ``parameters`` beside those it has."""
+        header = replace(
+            self.header, quality_pct=quality_pct, parameters={**self.header.parameters, **parameters}
+        )
+        return Still(header, self.media_type, data=data)
+
+
+def size_parameters(crop_px: Crop, size: tuple[int, int]) -> dict[str, int | float | str]:
+    """The coded size for the header; nothing if it is the size of the crop."""
+    if size == (crop_px[2] - crop_px[0], crop_px[3] - crop_px[1]):
+        return {}
+    return {"w": size[0], "h": size[1]}
+
+
+def inner_box(box_source_px: Box, crop_px: Crop, size: tuple[int, int]) -> Place:
+    """The box without its padding as (rows, columns) of the coded crop; never empty."""
+    ranges = []
+    for axis in (1, 0):
+        scale = size[axis] / (crop_px[axis + 2] - crop_px[axis])
+        start = min(max(0, round((box_source_px[axis] - crop_px[axis]) * scale)), size[axis] - 1)
+        end = round((box_source_px[axis + 2] - crop_px[axis]) * scale)
+        ranges.append(slice(start, min(max(end, start + 1), size[axis])))
+    return ranges[0], ranges[1]
+
+
+def _errors(image: Image, crop: Image, places: tuple[Place, ...]) -> tuple[float, ...]:
+    # Sums of squared differences: colour and luma, over the crop and over each box in it.
+    # Luma of the difference, not difference of the lumas: rounded to bytes these would be off by up to 5 %.
+    colour = cv2.subtract(image, crop, dtype=cv2.CV_32F)
+    luma = cv2.transform(colour, _BT601)
+    parts = [part[place] for place in places for part in (colour, luma)]
+    return tuple(cv2.norm(one, cv2.NORM_L2SQR) for one in (colour, luma, *parts))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,48 +250,3 @@ class StillReaders:
         if news:
             _log.warning("a ground does not read stills of %s: others are sent while it listens", codec)
         return good
-
-
-_PLAIN_ENCODING = "application/octet-stream"
-"""The encoding of formats that only HVT reads; one byte on the wire."""
-_OWN_TYPES = "application/vnd.hvt."
-_AS_THEY_ARE = {one.name for one in fields(Still)} & {one.name for one in fields(RoiHeader)} - {
-    "class_name",
-    "reason",
-    "also",
-}
-"""Fields of a still that its header has too."""
-
-
-@dataclass(frozen=True, slots=True)
-class StillEnvelope:
-    """Send delay, flags and checksum are packed when it goes out."""
-
-    still: Still
-    header: PackedMessage
-    encoding: str
-    """What Zenoh is told of the payload: its media type, if there is any program beside HVT that could read it.
-
-    Spelling a type of our own out would cost up to 34 bytes a still, and the header names the codec anyway.
-    """
-
-    @classmethod
-    def of(cls, still: Still, *, session_id: int) -> StillEnvelope:
-        header = RoiHeader(
-            session_id=session_id,
-            send_delay_ns=0,
-            flags=0,
-            class_name=fitted_text(still.class_name, 64),
-            reason=fitted_text(still.reason, 48),
-            also=tuple(AlsoShown(track_id=one, box_source_px=box) for one, box in still.also),
-            **{name: getattr(still, name) for name in _AS_THEY_ARE},
-        )
-        own = still.media_type.startswith(_OWN_TYPES)
-        return cls(still, PackedMessage.of(header), _PLAIN_ENCODING if own else still.media_type)
-
-    def header_at(self, send_ns: int, *, flags: int, frame_sent: bool = False) -> PackedMessage:
-        """The header of a still that goes out at this time; ``frame_sent``: who gets it can have the capture time."""
-        times = {"send_delay_ns": send_ns - self.still.capture_ns}
-        if frame_sent and "ask" not in self.still.parameters:  # who asks need not have the video
-            times["capture_ns"] = -1
-        return self.header.with_fields(flags=int(flags), **times)

@@ -19,7 +19,7 @@ same windows.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Protocol
 
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
@@ -33,12 +33,14 @@ from hvt_common.protocol.messages import (
     Flags,
     ObjectKey,
     PackedMessage,
+    RoiHeader,
+    fitted_text,
 )
 from hvt_common.units import SECOND_NS
-from hvt_common.values import AccessUnit, Still
+from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, RollingBudget
 from hvt_edge.link.pacer import BaseInFlight, Pacer
-from hvt_edge.link.stills import StillEnvelope
+from hvt_edge.link.stills import Still
 
 STILL_ATTACHMENT_BYTES = 60
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
@@ -103,7 +105,7 @@ class Transmitter:
         self.base_waited_ns = 0
         """How long base messages have waited for the budget's window, all together."""
         self._captures = CaptureTimes()
-        self._newest: StillEnvelope | None = None
+        self._packed: tuple[RoiHeader, PackedMessage] | None = None
         self._ended = False
 
     def base(self, unit: AccessUnit, *, now_ns: int, after_hole: bool = False, announced: bool = True) -> int:
@@ -141,13 +143,6 @@ class Transmitter:
             Channel.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Channel.BASE].encoding
         )
         return line_bytes
-
-    def _envelope(self, still: Still) -> StillEnvelope:
-        # The newest is cached: its header is packed once, however often it is asked for.
-        newest = self._newest
-        if newest is None or newest.still is not still:
-            self._newest = newest = StillEnvelope.of(still, session_id=self.session_id)
-        return newest
 
     def still_allowance_bytes(self, now_ns: int, *, still: Still | None = None, paced: bool = True) -> int:
         """Payload that a still with the header of this one may take now, whatever data it holds itself.
@@ -201,25 +196,25 @@ class Transmitter:
         Its outcome is noted with its bytes: ``sent``, or ``dropped`` once the run has ended.
         """
         with self._lock:
-            envelope = self._envelope(still)
+            header = still.header
             if self._ended:
                 self.ledger.record_outcome("dropped", "ended")
                 return
-            self.ledger.record_outcome("sent", copy or still.reason)
-            self.still_sequence = max(self.still_sequence, still.sequence)
-            at_ns = self._still_at_ns(envelope, max(now_ns, now_ns if self.clock is None else self.clock()))
-            attachment = self._header_at(envelope, at_ns).pack(still.data)
+            self.ledger.record_outcome("sent", copy or header.reason)
+            self.still_sequence = max(self.still_sequence, header.sequence)
+            at_ns = self._still_at_ns(still, max(now_ns, now_ns if self.clock is None else self.clock()))
+            attachment = self._header_at(still, at_ns).pack(still.data)
             line_bytes = self._count(
-                Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=envelope.encoding
+                Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=still.encoding
             )
             record = self.budget.record_requested if requested else self.budget.record_still
             record(line_bytes, now_ns=at_ns)
             if self.pacer is not None and copy:  # its number stands for the first copy, or for later stills
                 self.pacer.sent_other(line_bytes, now_ns=at_ns)
             elif self.pacer is not None:
-                self.pacer.sent_still(still.sequence, line_bytes, now_ns=at_ns)
+                self.pacer.sent_still(header.sequence, line_bytes, now_ns=at_ns)
         self.wait_until(at_ns)
-        self.outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=envelope.encoding)
+        self.outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=still.encoding)
 
     def store_base(self, unit: AccessUnit, *, now_ns: int) -> None:
         """An access unit is stored: it has used up its share, and left nothing of it to a still."""
@@ -229,15 +224,12 @@ class Transmitter:
 
     def store_still(self, still: Still, *, now_ns: int, counted: bool = True) -> BacklogStill:
         """The still as it would have gone out, for the backlog; ``counted``: its share of the budget is taken."""
-        envelope = self._envelope(still)
-        attachment = envelope.header_at(now_ns, flags=self._flags | Flags.STORED).pack(still.data)
+        attachment = self._header_at(still, now_ns, stored=True).pack(still.data)
         if counted:
-            line_bytes = self._line_bytes(
-                Channel.ROI, still.data, len(attachment), encoding=envelope.encoding
-            )
+            line_bytes = self._line_bytes(Channel.ROI, still.data, len(attachment), encoding=still.encoding)
             with self._lock:
                 self.budget.record_still(line_bytes, now_ns=now_ns)
-        return BacklogStill(attachment, envelope.encoding, still.data)
+        return BacklogStill(attachment, still.encoding, still.data)
 
     @property
     def round_trip_ns(self) -> int:
@@ -364,23 +356,35 @@ class Transmitter:
         with self._lock:
             self.ledger.record_outcome(outcome, reason)  # type: ignore[arg-type]
 
-    def _still_at_ns(self, envelope: StillEnvelope, now_ns: int) -> int:
-        header_bytes = self._header_at(envelope, now_ns).size_bytes
-        line_bytes = self._line_bytes(
-            Channel.ROI, envelope.still.data, header_bytes, encoding=envelope.encoding
-        )
+    def _still_at_ns(self, still: Still, now_ns: int) -> int:
+        header_bytes = self._header_at(still, now_ns).size_bytes
+        line_bytes = self._line_bytes(Channel.ROI, still.data, header_bytes, encoding=still.encoding)
         if self.budget.fits(line_bytes, now_ns=now_ns):
             return now_ns
         return self.budget.earliest_ns(line_bytes + _GROWTH_BYTES, now_ns=now_ns)
 
-    def _header_at(self, envelope: StillEnvelope, send_ns: int) -> PackedMessage:
-        frame_sent = self._captures.knows(self.session_id, envelope.still.frame_index)
-        return envelope.header_at(send_ns, flags=self._flags, frame_sent=frame_sent)
+    def _header_at(self, still: Still, send_ns: int, *, stored: bool = False) -> PackedMessage:
+        # As it goes out at this time. The newest is packed once, however often it is asked for.
+        header, packed = still.header, self._packed
+        if packed is None or packed[0] is not header:
+            sent = replace(
+                header,
+                session_id=self.session_id,
+                class_name=fitted_text(header.class_name, 64),
+                reason=fitted_text(header.reason, 48),
+            )
+            self._packed = packed = header, PackedMessage.of(sent)
+        times = {"send_delay_ns": send_ns - header.capture_ns}
+        # A ground that has the frame knows when it was captured; but who asks need not have the video.
+        known = not stored and self._captures.knows(self.session_id, header.frame_index)
+        if known and "ask" not in header.parameters:
+            times["capture_ns"] = -1
+        flags = self._flags | Flags.STORED if stored else self._flags
+        return packed[1].with_fields(flags=int(flags), **times)
 
     def _payload(self, line_bytes: int, still: Still, now_ns: int) -> int:
-        envelope = self._envelope(still)
-        header_bytes = self._header_at(envelope, now_ns).size_bytes
-        around = self._around(Channel.ROI, line_bytes, header_bytes, encoding=envelope.encoding)
+        header_bytes = self._header_at(still, now_ns).size_bytes
+        around = self._around(Channel.ROI, line_bytes, header_bytes, encoding=still.encoding)
         return max(0, line_bytes - around)
 
     def _usual_payload(self, line_bytes: int) -> int:

@@ -13,10 +13,11 @@ same picture.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
-from hvt_common.values import Frame, Image, Still, View
+from hvt_common.protocol.messages import AlsoShown
+from hvt_common.values import Frame, Image, View
 from hvt_common.video.base_crop import MAX_SIDE_PX, coded_size
 from hvt_common.video.hevc import YuvPicture
 from hvt_common.video.still_codecs import (
@@ -28,8 +29,9 @@ from hvt_common.video.still_codecs import (
     psnr_y_db,
     smallest_reaching,
 )
+from hvt_edge.link.stills import Still
 from hvt_edge.perception.candidates import PADDING
-from hvt_edge.stills.crop_job import CropJob, union_crop
+from hvt_edge.stills.merging import union_crop
 from hvt_edge.stills.policy.base import Request
 
 Allowance = Callable[[Still], int]
@@ -109,7 +111,7 @@ class StillMaker:
 
     def crop(
         self, frame: Frame, request: Request, *, view: View, base: Image | YuvPicture | None = None
-    ) -> CropJob | NoStill:
+    ) -> Still | NoStill:
         """Take the request's crop out of ``frame``, which is the frame the request was made at.
 
         ``base`` is the decoded base frame of the same index; without it the second promise is not checked.
@@ -120,7 +122,7 @@ class StillMaker:
         size = coded_size(crop_px, max_side_px=self.max_side_px)
         if base is not None and size[0] < (crop_px[2] - crop_px[0]) * min(1.0, view.scale):
             return NoStill("base_good")  # shrunk below the base's own grid: the base has more pixels of it
-        job = CropJob.of(
+        job = Still.cropped(
             frame.source_bgr,
             crop_px,
             size,
@@ -133,7 +135,9 @@ class StillMaker:
             confidence=lead.confidence,
             reason=request.reason,
             quality_pct=self.quality_pct,
-            also=tuple((one.track_id, one.box_source_px) for one in request.also),
+            also=tuple(
+                AlsoShown(track_id=one.track_id, box_source_px=one.box_source_px) for one in request.also
+            ),
         )
         if base is None:
             return job
@@ -141,34 +145,32 @@ class StillMaker:
         good = job.alternative is not None and 0 < self.fidelity_db <= job.alternative.psnr_y_db
         return NoStill("base_good") if good else job
 
-    def code(self, job: CropJob, *, sequence: int, allowance: Allowance) -> Still | NoStill:
+    def code(self, job: Still, *, sequence: int, allowance: Allowance) -> Still | NoStill:
         """Code a crop so that ``allowance``, called with the very still that comes out, holds its data."""
-        header, codec = replace(job.header, sequence=sequence), self.preferred
+        job, codec = job.with_header(sequence=sequence), self.preferred
         builds = job.base_crop_bgr is not None and codec.needs_base
-        made = self._fitted(codec if builds else self.without_base, job, header, allowance)
+        made = self._fitted(codec if builds else self.without_base, job, allowance)
         if builds and job.base_far_off:
             if not isinstance(made, NoStill):
-                return self._cheaper(*made, job, header) or made[0]
-            made = self._fitted(self.without_base, job, header, allowance)
+                return self._cheaper(*made, job) or made[0]
+            made = self._fitted(self.without_base, job, allowance)
         return made if isinstance(made, NoStill) else made[0]
 
-    def _fitted(
-        self, codec: StillCodec, job: CropJob, header: Still, allowance: Allowance
-    ) -> tuple[Still, _Fitted] | NoStill:
-        header = _of_codec(header, codec)
-        limit_bytes = allowance(header)
+    def _fitted(self, codec: StillCodec, job: Still, allowance: Allowance) -> tuple[Still, _Fitted] | NoStill:
+        job = job.of_codec(codec)
+        limit_bytes = allowance(job)
         for _ in range(_TRIES):
             fitted = self._best(codec, job, limit_bytes)
             if isinstance(fitted, NoStill):
                 return fitted
-            still = _filled(header, fitted)
+            still = _filled(job, fitted)
             excess_bytes = len(still.data) - allowance(still)  # the codec's parameters have taken their part
             if excess_bytes <= 0:
                 return still, fitted
             limit_bytes = min(limit_bytes, len(still.data)) - excess_bytes
         return NoStill("too_large")
 
-    def _cheaper(self, built: Still, fitted: _Fitted, job: CropJob, header: Still) -> Still | None:
+    def _cheaper(self, built: Still, fitted: _Fitted, job: Still) -> Still | None:
         # The fallback's still, where it shows no less than the one built on the base, in fewer bytes.
         codec = self.without_base
         smaller = _reaching(codec, job, psnr_y_db(fitted.shown_bgr, job.crop_bgr))
@@ -176,9 +178,9 @@ class StillMaker:
             return None
         if len(smaller.data) < self.least_bytes:
             return None
-        return _filled(_of_codec(header, codec), smaller)
+        return _filled(job.of_codec(codec), smaller)
 
-    def _best(self, codec: StillCodec, job: CropJob, limit_bytes: int) -> _Fitted | NoStill:
+    def _best(self, codec: StillCodec, job: Still, limit_bytes: int) -> _Fitted | NoStill:
         # The requested fidelity or quality, or the best below that fits; then upwards until the base is beaten.
         if limit_bytes < self.least_bytes:
             return NoStill("too_large")
@@ -202,7 +204,7 @@ class StillMaker:
         return fitted
 
     def _best_fitting(
-        self, codec: StillCodec, job: CropJob, limit_bytes: int, *, below_pct: int
+        self, codec: StillCodec, job: Still, limit_bytes: int, *, below_pct: int
     ) -> _Fitted | None:
         found = best_fitting(
             codec,
@@ -215,7 +217,7 @@ class StillMaker:
         return None if found is None else _decoded(codec, job, *found)
 
 
-def _reaching(codec: StillCodec, job: CropJob, psnr_db: float) -> _Fitted | None:
+def _reaching(codec: StillCodec, job: Still, psnr_db: float) -> _Fitted | None:
     found = smallest_reaching(
         codec,
         job.crop_bgr,
@@ -230,12 +232,12 @@ def _reaching(codec: StillCodec, job: CropJob, psnr_db: float) -> _Fitted | None
     return _Fitted(coded.data, coded.parameters, quality_pct, shown_bgr)
 
 
-def _at(codec: StillCodec, job: CropJob, quality_pct: int) -> _Fitted:
+def _at(codec: StillCodec, job: Still, quality_pct: int) -> _Fitted:
     coded = codec.encode(job.crop_bgr, quality_pct=quality_pct, base_bgr=_base(codec, job))
     return _decoded(codec, job, coded, quality_pct)
 
 
-def _decoded(codec: StillCodec, job: CropJob, coded: CodedCrop, quality_pct: int) -> _Fitted:
+def _decoded(codec: StillCodec, job: Still, coded: CodedCrop, quality_pct: int) -> _Fitted:
     height, width = job.crop_bgr.shape[:2]
     shown = codec.decode(
         coded.data, size=(width, height), parameters=coded.parameters, base_bgr=_base(codec, job)
@@ -243,22 +245,13 @@ def _decoded(codec: StillCodec, job: CropJob, coded: CodedCrop, quality_pct: int
     return _Fitted(coded.data, coded.parameters, quality_pct, shown)
 
 
-def _base(codec: StillCodec, job: CropJob) -> Image | None:
+def _base(codec: StillCodec, job: Still) -> Image | None:
     return job.base_crop_bgr if codec.needs_base else None
 
 
-def _beats_base(fitted: _Fitted, job: CropJob) -> bool:
+def _beats_base(fitted: _Fitted, job: Still) -> bool:
     return job.alternative is None or job.alternative.loses_to(fitted.shown_bgr, crop=job.crop_bgr)
 
 
-def _filled(header: Still, fitted: _Fitted) -> Still:
-    return replace(
-        header,
-        quality_pct=fitted.quality_pct,
-        data=fitted.data,
-        parameters={**header.parameters, **fitted.parameters},
-    )
-
-
-def _of_codec(header: Still, codec: StillCodec) -> Still:
-    return replace(header, codec=codec.name, media_type=codec.media_type)
+def _filled(job: Still, fitted: _Fitted) -> Still:
+    return job.coded(fitted.data, quality_pct=fitted.quality_pct, parameters=fitted.parameters)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.video.base_crop import MAX_SIDE_PX
+from hvt_common.video.base_crop import MAX_SIDE_PX, coded_size
 from hvt_edge.perception.candidates import crop_box
 from hvt_edge.stills.policy.base import CostEstimate, Request
 
@@ -64,6 +64,28 @@ def group(
     joined = [board.request(members, compared) for members in board.groups()]
     joined += [(one, []) for one in requests[_MOST_COMPARED:]]
     return sorted(joined, key=lambda one: (-one[0].score, one[0].candidate.track_id))
+
+
+def union_crop(
+    request: Request, *, padding: float, source_size: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """The area of a still of it: the smallest box around the padded crops of all its tracks, source pixels."""
+    crops = [
+        crop_box(one.box_source_px, padding=padding, source_size=source_size)
+        for one in (request.candidate, *request.also)
+    ]
+    x1, y1, x2, y2 = zip(*crops, strict=True)
+    return min(x1), min(y1), max(x2), max(y2)
+
+
+def expected_bytes(
+    request: Request, *, cost: CostEstimate, padding: float, source_size: tuple[int, int]
+) -> float:
+    """Expected payload of a still of this request, of one track or of several."""
+    if not request.also:
+        return cost.of(request.candidate)
+    width, height = coded_size(union_crop(request, padding=padding, source_size=source_size))
+    return cost.of_px(width * height)
 
 
 @dataclass(slots=True)

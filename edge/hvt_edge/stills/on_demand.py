@@ -18,14 +18,14 @@ import numpy as np
 from hvt_common.protocol.messages import MAX_TRACKS_NOW, TrackNow
 from hvt_common.runtime.failures import reason_of
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Boxes, Image, Still, View
+from hvt_common.values import Boxes, Image, View
 from hvt_common.video.base_crop import MAX_REQUESTED_SIDE_PX, coded_size
 from hvt_common.video.hevc import YuvPicture
+from hvt_edge.link.stills import Box, Crop, Still
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import MIN_SIDE_PX, crop_box
 from hvt_edge.perception.frame_ring import FrameRing, RingFrame
-from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxStill, StillState
 from hvt_edge.stills.policy.base import CostModel
@@ -33,9 +33,6 @@ from hvt_edge.stills.requested_coding import Capacity, RefusedError, code_reques
 
 ON_DEMAND = "asked"
 """The reason that such a still carries on the wire and in the ledger."""
-
-Box = tuple[float, float, float, float]
-Crop = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +80,9 @@ def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
     return frame
 
 
-def crop_job_for(
+def crop_for(
     request: OnDemandRequest, frame: RingFrame, *, maker: StillMaker, view: View, class_names: tuple[str, ...]
-) -> CropJob:
+) -> Still:
     """Crop what is requested out of that frame; raises `RefusedError` where it is not in it."""
     width, height = frame.size
     box: Box
@@ -104,7 +101,7 @@ def crop_job_for(
     else:
         crop = _inside(request.box_xywh_px or (0, 0, width, height), (width, height))
         box, name, confidence = (*map(float, crop),), "", 0.0  # type: ignore[assignment]
-    return CropJob.of(
+    return Still.cropped(
         frame.source_bgr,
         crop,
         coded_size(crop, max_side_px=MAX_REQUESTED_SIDE_PX),
@@ -246,12 +243,12 @@ class OnDemand:
         self._check_queue()
         if request.track_id is not None:
             self._want_tracks(frame.capture_ns)
-        job = crop_job_for(request, frame, maker=self._maker, view=self.view, class_names=self.class_names)
+        job = crop_for(request, frame, maker=self._maker, view=self.view, class_names=self.class_names)
         with self._lock:
             self._check_queue()
             number = self._next_number
             parameters = {**job.header.parameters, REQUEST_PARAMETER: number}
-            job = replace(job, header=replace(job.header, parameters=parameters))
+            job = job.with_header(parameters=parameters)
             pending = OnDemandStill(
                 *(job, None, float("inf"), None),
                 number=number,
@@ -318,7 +315,7 @@ class OnDemand:
         if due and not self._code_anew(pending, most_bytes, now_ns=now_ns):
             return None
         assert pending.ready is not None, "it was coded just now"
-        still = pending.ready = replace(pending.ready, sequence=sequence)
+        still = pending.ready = pending.ready.with_header(sequence=sequence)
         fits = len(still.data) <= self.line.requested_allowance_bytes(now_ns, still=still)
         pending.link_busy = fits and paced and not self.line.link_is_free(now_ns)
         if fits and not pending.link_busy:
@@ -336,7 +333,7 @@ class OnDemand:
         if pending.base is not None:
             pending.job = job = job.beside(pending.base, view=self.view, min_gain_db=0.0)
             pending.base = None
-        job = job.recoded(codec, reason=ON_DEMAND)
+        job = job.without_base(codec)
         capacity = Capacity(
             prompt_bytes=max(0, round(_PROMPT_SHARE * most_bytes) - _MARGIN_BYTES),
             most_bytes=max(0, most_bytes - _MARGIN_BYTES),

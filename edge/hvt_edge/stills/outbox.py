@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Still
 from hvt_edge.backlog.entry import FIRST_STORED
-from hvt_edge.stills.crop_job import CropJob
+from hvt_edge.link.stills import Still
 from hvt_edge.stills.policy.base import Request
 
 AGAIN = "again"
@@ -52,7 +51,7 @@ class OutboxSettings:
 class OutboxStill:
     """One still. Only the outbox changes its state."""
 
-    job: CropJob | None
+    job: Still | None
     """The crop to be coded; of a sent still the crop to be coded again, None where that cannot be."""
     request: Request | None
     """The method's request; None if a ground requested it."""
@@ -73,18 +72,18 @@ class OutboxStill:
         return self.coded
 
     @property
-    def crop(self) -> CropJob:
+    def crop(self) -> Still:
         assert self.job is not None, f"{self.state}: its crop is gone"
         return self.job
 
     @property
     def track_id(self) -> int:
         """The track of the candidate that leads it."""
-        return (self.coded or self.crop.header).track_id
+        return (self.coded or self.crop).header.track_id
 
     @property
     def track_ids(self) -> set[int]:
-        return {self.track_id, *(track_id for track_id, _ in self.crop.header.also)}
+        return {self.track_id, *(one.track_id for one in self.crop.header.also)}
 
 
 class Outbox:
@@ -226,7 +225,7 @@ class Outbox:
         """The number of the next still: for the link, or for the backlog; of one `turn`."""
         return self._next_sequences[store]
 
-    def sent(self, pending: OutboxStill, still: Still, *, now_ns: int, resend: CropJob | None = None) -> None:
+    def sent(self, pending: OutboxStill, still: Still, *, now_ns: int, resend: Still | None = None) -> None:
         """It goes out. ``resend`` is its crop as it would be coded for a ground that cannot decode the still."""
         settings = self.settings
         with self._lock:
@@ -235,7 +234,7 @@ class Outbox:
             pending.state, pending.coded = StillState.SENT, still
             pending.sent_ns, pending.copies, pending.job = now_ns, 1, resend
             if self._reports or resend is not None:
-                self._sent[still.sequence] = pending
+                self._sent[still.header.sequence] = pending
             for one in tuple(self._sent.values()):
                 if self.crop_bytes <= settings.max_crop_bytes:
                     break
@@ -287,7 +286,7 @@ class Outbox:
             for one in named:
                 one.state = StillState.ACKNOWLEDGED
                 if one.job is None:
-                    del self._sent[one.still.sequence]
+                    del self._sent[one.still.header.sequence]
         return bool(named)
 
     def on_undecodable(self, sequence: int) -> None:
@@ -313,10 +312,8 @@ class Outbox:
                 self._drop_crop(sent)
                 if job.header.track_id in self or not self.admits(request, now_ns=now_ns):
                     continue
-                header = replace(
-                    job.header, reason=AGAIN, parameters={**job.header.parameters, AGAIN: sequence}
-                )
-                again = OutboxStill(replace(job, header=header), request, sent.utility, now_ns, again=True)
+                job = job.with_header(reason=AGAIN, parameters={**job.header.parameters, AGAIN: sequence})
+                again = OutboxStill(job, request, sent.utility, now_ns, again=True)
                 left += self.offer(again)
         return left
 
@@ -343,8 +340,8 @@ class Outbox:
             lost = self._unnamed()
             for one in lost:
                 one.state = StillState.LOST
-                del self._sent[one.still.sequence]
-                self._undecodable.discard(one.still.sequence)
+                del self._sent[one.still.header.sequence]
+                self._undecodable.discard(one.still.header.sequence)
         return sorted(lost, key=lambda one: -one.utility)
 
     def _unnamed(self) -> list[OutboxStill]:
@@ -364,22 +361,22 @@ class Outbox:
 
     def _drop_crop(self, sent: OutboxStill) -> None:
         sent.job = None
-        self._undecodable.discard(sent.still.sequence)
+        self._undecodable.discard(sent.still.header.sequence)
         if sent.state is StillState.ACKNOWLEDGED or not self._reports:
             self._forget(sent)
 
     def _forget(self, sent: OutboxStill) -> None:
         sent.state, sent.job = StillState.EXPIRED, None
-        del self._sent[sent.still.sequence]
-        self._undecodable.discard(sent.still.sequence)
+        del self._sent[sent.still.header.sequence]
+        self._undecodable.discard(sent.still.header.sequence)
 
 
 def _take_off(pending: OutboxStill, track_ids: set[int]) -> None:
     # These tracks are named no more; the crop stays as it is.
     job, request = pending.crop, pending.request
     assert request is not None, "only stills of the method show several tracks"
-    named = tuple(shown for shown in job.header.also if shown[0] not in track_ids)
-    pending.job = replace(job, header=replace(job.header, also=named))
+    named = tuple(one for one in job.header.also if one.track_id not in track_ids)
+    pending.job = job.with_header(also=named)
     pending.request = replace(
         request, also=tuple(one for one in request.also if one.track_id not in track_ids)
     )

@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field
 
 import cv2
 import numpy as np
 
 from hvt_common.units import bitrate_text
-from hvt_common.values import Image, Still
+from hvt_common.values import Image
 from hvt_common.video.still_codecs import CodedCrop, StillCodec, best_fitting
-from hvt_edge.stills.crop_job import CropJob, size_parameters
+from hvt_edge.link.stills import Still, size_parameters
 
 _PLAIN_GAIN_DB = 2.0
 """A still that is closer to the source than the base by so much shows plainly more."""
@@ -66,7 +66,7 @@ class _Tried:
         return len(self.coded.data)
 
 
-def code_requested(job: CropJob, *, codec: StillCodec, capacity: Capacity) -> tuple[Still, str]:
+def code_requested(job: Still, *, codec: StillCodec, capacity: Capacity) -> tuple[Still, str]:
     """Code the crop of ``job`` at its quality; ``alternative`` is the base's crop, None if that is not known.
 
     Returns the still with a note for its requester, empty if it comes as requested; else raises `RefusedError`.
@@ -79,16 +79,9 @@ def code_requested(job: CropJob, *, codec: StillCodec, capacity: Capacity) -> tu
     best = best or _shrunk(job, codec, capacity.most_bytes, wanted=wanted)
     if best is None:
         raise RefusedError(_refusal(tries, wanted, capacity))
-    header = job.header
-    still = replace(
-        header,
-        quality_pct=best.quality_pct,
-        data=best.coded.data,
-        parameters={
-            **header.parameters,
-            **size_parameters(header.crop_source_px, best.size),
-            **best.coded.parameters,
-        },
+    size = size_parameters(job.header.crop_source_px, best.size)
+    still = job.coded(
+        best.coded.data, quality_pct=best.quality_pct, parameters={**size, **best.coded.parameters}
     )
     return still, _note(best, wanted, capacity)
 
@@ -97,7 +90,7 @@ def code_requested(job: CropJob, *, codec: StillCodec, capacity: Capacity) -> tu
 class _Tries:
     # Codings of one crop at one size, each once.
 
-    job: CropJob
+    job: Still
     codec: StillCodec
     _: KW_ONLY
     pixels: Image | None = None
@@ -167,7 +160,7 @@ def _lower(tries: _Tries, wanted: _Tried, limit_bytes: int) -> _Tried | None:
     return found if tries.beats_base(found) else None
 
 
-def _shrunk(job: CropJob, codec: StillCodec, limit_bytes: int, *, wanted: _Tried) -> _Tried | None:
+def _shrunk(job: Still, codec: StillCodec, limit_bytes: int, *, wanted: _Tried) -> _Tried | None:
     # The largest picture with fewer pixels that fits, if it too is closer to the source.
     height, width = job.crop_bgr.shape[:2]
     for shrink in _SHRINKS:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field
 
-from hvt_common.values import Still
+from hvt_edge.link.stills import Still
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import BaseLoss, Candidate, TrackMemory
-from hvt_edge.stills.crop_job import CropJob, expected_bytes
 from hvt_edge.stills.maker import Allowance, NoStill
-from hvt_edge.stills.merging import group
+from hvt_edge.stills.merging import expected_bytes, group
 from hvt_edge.stills.on_demand import OnDemand, OnDemandStill
 from hvt_edge.stills.outbox import OutboxStill
 from hvt_edge.stills.policy.base import CostModel, Method, Request, Step
@@ -280,8 +279,8 @@ class Chooser:
             yield from self._overdue(over=pending.utility, now_ns=now_ns, allowance=allowance)
             job = pending.crop
             if store:
-                job = job.recoded(self.maker.without_base, reason=job.header.reason)
-            limit_bytes = allowance(replace(job.header, sequence=self.outbox.sequence(store=store)))
+                job = job.without_base(self.maker.without_base)
+            limit_bytes = allowance(job.with_header(sequence=self.outbox.sequence(store=store)))
             if not self._may_go(pending, job, limit_bytes, now_ns=now_ns):
                 break  # the most useful waits for its allowance; a lesser one does not slip in before it
             made = self._code(pending, job, now_ns=now_ns, allowance=allowance, store=store)
@@ -304,7 +303,7 @@ class Chooser:
                 self.outbox.sent_again(sent)
                 yield sent
 
-    def _may_go(self, pending: OutboxStill, job: CropJob, limit_bytes: int, *, now_ns: int) -> bool:
+    def _may_go(self, pending: OutboxStill, job: Still, limit_bytes: int, *, now_ns: int) -> bool:
         # Whether it is allowed as much as it will need, or has waited for that long enough.
         assert pending.request is not None, "it is of the method"
         if limit_bytes < self.maker.least_bytes:
@@ -322,7 +321,7 @@ class Chooser:
         return now_ns - since_ns >= _PATIENCE_SHARE * self.outbox.settings.max_pending_ns
 
     def _code(
-        self, pending: OutboxStill, job: CropJob, *, now_ns: int, allowance: Allowance, store: bool
+        self, pending: OutboxStill, job: Still, *, now_ns: int, allowance: Allowance, store: bool
     ) -> Still | None:
         assert pending.request is not None, "it is of the method"
         made = self.maker.code(job, sequence=self.outbox.sequence(store=store), allowance=allowance)
@@ -334,22 +333,22 @@ class Chooser:
         return made
 
     def _record_coded(
-        self, pending: OutboxStill, job: CropJob, made: Still, *, now_ns: int, store: bool
+        self, pending: OutboxStill, job: Still, made: Still, *, now_ns: int, store: bool
     ) -> None:
         assert pending.request is not None, "it is of the method"
         self._held_up.pop(pending.track_id, None)
         height, width = job.crop_bgr.shape[:2]
-        self._cost_of(made.codec).observe(area_px=width * height, size_bytes=len(made.data))
+        self._cost_of(made.header.codec).observe(area_px=width * height, size_bytes=len(made.data))
         resend = None
         if (
             not pending.again
         ):  # else its tracks have rested since it was sent first, and it is not sent a third time
             for one in (pending.request.candidate, *pending.request.also):
-                self.memory.record_sent(one, frame_index=made.frame_index, now_ns=now_ns)
+                self.memory.record_sent(one, frame_index=made.header.frame_index, now_ns=now_ns)
             if (
-                made.codec != self.maker.without_base.name
+                made.header.codec != self.maker.without_base.name
             ):  # it builds on the base, and a ground may lack that
-                resend = job.recoded(self.maker.without_base, reason=made.reason)
+                resend = job.without_base(self.maker.without_base)
         self._coded(pending, made, now_ns=now_ns, store=store, resend=resend)
 
     def _coded(
@@ -359,11 +358,11 @@ class Chooser:
         *,
         now_ns: int,
         store: bool,
-        resend: CropJob | None = None,
+        resend: Still | None = None,
     ) -> None:
         # It goes out, with the number that is next now: while it was coded another may have gone.
-        if still.sequence != (number := self.outbox.sequence(store=store)):
-            still = replace(still, sequence=number)
+        if still.header.sequence != (number := self.outbox.sequence(store=store)):
+            still = still.with_header(sequence=number)
         if store:
             self.outbox.stored(pending, still)
             self.on_outcome("deferred", "stored")

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import KW_ONLY, dataclass
 
 from hvt_common.inference.class_names import same_kind
 from hvt_common.protocol.messages import StillResult
-from hvt_common.values import AccessUnit, Frame, Still, Tracks
+from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.keyframes import Keyframes
+from hvt_edge.link.stills import Still
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating import Levers
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
 from hvt_edge.perception.levers import LeverControl
 from hvt_edge.perception.shadow import Detected, ShadowGround
-from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import Allowance, NoStill, StillMaker
 from hvt_edge.stills.outbox import AGAIN, Outbox, OutboxStill
 from hvt_edge.stills.scheduler import Chooser, Coded
@@ -48,8 +48,9 @@ class StillStage:
     def __post_init__(self) -> None:
         self.outbox = self.sender.outbox
         self.latest_tracks: Tracks | None = None
-        """Those of the frame that `send` took last. In lockstep they change at the same point of the frame loop in
+        """Those of the frame that `report` took last. In lockstep they change at the same point of the frame loop in
         every run, whatever `analyze` does meanwhile."""
+        self._levers = _ALL
         self._scene_began = -1
         self._detected: Detected | None = None
         """Reported since the decision before; in lockstep a frame may be compared at this very moment."""
@@ -81,28 +82,32 @@ class StillStage:
         wanted = self.tracks_used or not self.chooser.method.video_only
         return wanted or self.chooser.on_demand.wants_tracks(capture_ns)
 
+    def report(self, analyzed: AnalyzedFrame, *, now_ns: int) -> None:
+        """Decide what is worth sending beside the video, and tell grounds of the tracks; before `send`."""
+        self.latest_tracks = analyzed.tracks
+        with self._spending(analyzed):
+            self._levers = self._decided(now_ns)
+            if self.reporter is not None and analyzed.detected and self._levers.tracks:
+                self.reporter.report(analyzed, now_ns=now_ns)
+
     def send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Choose, and send the stills of the method that may go now; return their sequence numbers.
 
         ``now_ns`` is the time that windows go by. With ``held`` none is sent, because a keyframe is to come; None
         asks the plan.
         """
-        with self.analyzer.cpu_budget.spending("choose") if analyzed.detected else nullcontext():
-            return self._send(analyzed, now_ns=now_ns, held=held)
+        with self._spending(analyzed):
+            if most_bytes := self.sender.transmitter.most_still_bytes():
+                self.chooser.most_bytes = most_bytes
+            # What a method requests waits until the link is free, which right behind a base frame it never is.
+            allowance_bytes = self.sender.transmitter.still_allowance_bytes(now_ns, paced=False)
+            self.chooser.consider(
+                analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not self._levers.stills
+            )
+            return self.send_pending(now_ns=now_ns, held=held)
 
-    def _send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None) -> set[int]:
-        self.latest_tracks = analyzed.tracks
-        levers = self._decided(now_ns)
-        if self.reporter is not None and analyzed.detected and levers.tracks:
-            self.reporter.report(analyzed, now_ns=now_ns)
-        if most_bytes := self.sender.transmitter.most_still_bytes():
-            self.chooser.most_bytes = most_bytes
-        # What a method requests waits until the link is free, which right behind a base frame it never is.
-        allowance_bytes = self.sender.transmitter.still_allowance_bytes(now_ns, paced=False)
-        self.chooser.consider(
-            analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not levers.stills
-        )
-        return self.send_pending(now_ns=now_ns, held=held)
+    def _spending(self, analyzed: AnalyzedFrame) -> AbstractContextManager[object]:
+        return self.analyzer.cpu_budget.spending("choose") if analyzed.detected else nullcontext()
 
     def send_pending(self, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Send those of the method that are pending and may go now, without another frame; the rest as of `send`."""
@@ -130,7 +135,7 @@ class StillStage:
             for coded in stills:
                 self.sender.put(coded, now_ns=now_ns, store=store)
                 if not store:
-                    sent.add(coded.still.sequence)
+                    sent.add(coded.still.header.sequence)
         return sent
 
     def on_results(self, results: Sequence[StillResult], *, detected: Detected | None = None) -> None:
@@ -240,13 +245,16 @@ class StillSender:
         assert self.backlog is not None, "nothing is stored without one"
         packed = self.transmitter.store_still(one.still, now_ns=now_ns, counted=counted)
         self.backlog.store_still(
-            packed, number=one.still.sequence, capture_ns=one.still.capture_ns, utility=one.utility
+            packed,
+            number=one.still.header.sequence,
+            capture_ns=one.still.header.capture_ns,
+            utility=one.utility,
         )
 
-    def _without_base(self, still: Still, job: CropJob | None) -> Still:
+    def _without_base(self, still: Still, job: Still | None) -> Still:
         # A sent still, coded anew without the base; itself where it is so, or its crop is gone.
         if job is None:
             return still
         most_bytes = self.transmitter.most_still_bytes()
-        made = self.maker.code(job, sequence=still.sequence, allowance=lambda _: most_bytes)
+        made = self.maker.code(job, sequence=still.header.sequence, allowance=lambda _: most_bytes)
         return still if isinstance(made, NoStill) else made

@@ -130,7 +130,7 @@ def test_stills_that_the_outage_took_are_known_with_their_worth(tmp_path):
         (entry,) = folder.best_stills()
         kept = parse_backlog_still(folder.read(entry))
         assert (entry.number, kept.payload) == (0, STILL.data)
-        assert entry.rank == worth(2.5, STILL.capture_ns), "with its utility"
+        assert entry.rank == worth(2.5, STILL.header.capture_ns), "with its utility"
 
 
 def test_a_store_that_cannot_be_written_costs_a_warning_and_no_frame(tmp_path, caplog):

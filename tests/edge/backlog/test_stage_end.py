@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_edge.backlog.entry import worth
 from hvt_edge.backlog.worker import ChunkAllowance
-from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.outbox import OutboxStill
 from programs.processes import eventually
-from rigs.keeping import STILL, Rig
+from rigs.keeping import PENDING, STILL, Rig
 from rigs.kept import S, add_stills, opened
 
 
@@ -24,7 +22,7 @@ def test_what_nobody_acknowledged_is_kept_when_the_run_ends(tmp_path):
     rig.still(0, utility=2.5)
     kept = [unit.frame_index for unit in rig.kept()]
     assert kept == list(range(28, 40))
-    assert rig.stored_stills() == {0: worth(2.5, STILL.capture_ns)}
+    assert rig.stored_stills() == {0: worth(2.5, STILL.header.capture_ns)}
 
 
 def test_a_run_that_was_heard_to_its_end_keeps_nothing(tmp_path):
@@ -75,7 +73,7 @@ def test_a_still_that_is_pending_at_the_end_does_not_hold_up_what_was_stored(tmp
     rig.play(0, 21, reports=True)
     rig.play(21, 45, linked=False)
     rig.linked = True
-    rig.outbox.offer(OutboxStill(CropJob(STILL, np.zeros((4, 4, 3), np.uint8)), None, 1.0, rig.now_ns))
+    rig.outbox.offer(OutboxStill(PENDING, None, 1.0, rig.now_ns))
     rig.finish()
     assert rig.backlog.worker.numbers.empty
     sizes = [len(data) for _, data in rig.out.backlog]
@@ -94,7 +92,7 @@ def test_an_outage_at_the_end_of_a_clip_is_waited_out(tmp_path):
     ground = rig.out.ground
     assert ground.frames | set(ground.backlog_frames) == set(range(45))
     assert {number: ground.backlog_frames[number] for number in range(21, 45)}.items() <= rig.coded.items()
-    assert ground.backlog_stills == {STILL.sequence}
+    assert ground.backlog_stills == {STILL.header.sequence}
     assert rig.ledger.outcomes("sent")["stored"] == 1
     assert rig.backlog.worker.numbers.empty
     rig.backlog.close()
@@ -121,7 +119,7 @@ def test_stills_sent_while_the_link_was_coming_back_are_kept(tmp_path):
     rig.play(30, 31, linked=True)
     assert not rig.backlog.offline
     rig.stills.store_lost(rig.now_ns)
-    assert rig.stored_stills() == {0: worth(1.5, STILL.capture_ns)}
+    assert rig.stored_stills() == {0: worth(1.5, STILL.header.capture_ns)}
 
 
 def test_after_frames_that_were_kept_the_link_goes_on_with_a_keyframe(tmp_path):
@@ -190,7 +188,7 @@ def test_what_may_be_sent_now_and_how_much(tmp_path):
     assert rig.backlog.chunk_allowance(rig.now_ns) is None, "a keyframe is to come"
     rig.play(60, 75, reports=True)
     assert rig.backlog.chunk_allowance(rig.now_ns) is not None
-    pending = OutboxStill(CropJob(STILL, np.zeros((4, 4, 3), np.uint8)), None, 1.0, rig.now_ns)
+    pending = OutboxStill(PENDING, None, 1.0, rig.now_ns)
     assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(5000), "50 ms of 800 kbps"
     rig.outbox.offer(pending)
     assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(1400, trickle=True)

@@ -14,14 +14,23 @@ from hypothesis import strategies as st
 
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
-from hvt_common.protocol.messages import MAX_ALSO, BaseHeader, CaptureTimes, Flags, RoiHeader, Status
-from hvt_common.values import AccessUnit, Still
+from hvt_common.protocol.messages import (
+    MAX_ALSO,
+    AlsoShown,
+    BaseHeader,
+    CaptureTimes,
+    Flags,
+    RoiHeader,
+    Status,
+)
+from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import PrimaryReceiver
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.stills import Still
 from hvt_edge.video.encoder_settings import STATUS_BYTES, base_overhead_bps
-from rigs.messages import STATUS, feedback
+from rigs.messages import STATUS, feedback, still_of
 from rigs.world import Puts, make_transmitter
 
 SECOND_NS = 1_000_000_000
@@ -94,7 +103,6 @@ def unit(index: int, size: int = 1_000, *, keyframe: bool = False) -> AccessUnit
 def still(size: int = 100, **changes) -> Still:
     """One still."""
     fields = {
-        "sequence": 0,
         "frame_index": 3,
         "capture_ns": NOW_NS,
         "track_id": 5,
@@ -103,11 +111,8 @@ def still(size: int = 100, **changes) -> Still:
         "class_name": "car",
         "confidence": 0.5,
         "reason": "utility",
-        "codec": "jpeg",
-        "quality_pct": 65,
-        "data": bytes(size),
     }
-    return Still(**(fields | changes))
+    return still_of(bytes(size), **(fields | changes))
 
 
 def send_status(rig, make, **how) -> bool:
@@ -168,8 +173,8 @@ def test_a_still_says_what_it_shows():
         "reason",
         "codec",
     ):
-        assert getattr(header, name) == getattr(sent, name)
-    assert header.box_source_px == sent.box_source_px
+        assert getattr(header, name) == getattr(sent.header, name)
+    assert header.box_source_px == sent.header.box_source_px
     assert (header.confidence, header.quality_pct, header.send_ns) == (0.5, 65, NOW_NS + 50)
     assert rig.sender.still_sequence == 6
 
@@ -251,7 +256,7 @@ def test_a_still_of_just_the_room_takes_just_the_room(  # noqa: PLR0917 - hypoth
         crop_source_px=(far, far, far + 700, far + 700),
         media_type=media_type,
         parameters=parameters,
-        also=tuple(also),
+        also=tuple(AlsoShown(track_id=one, box_source_px=box) for one, box in also),
     )
     room_line = rig.budget.still_allowance(now_ns)
     room = rig.sender.still_allowance_bytes(now_ns, still=asked)

@@ -50,6 +50,9 @@ class Unmoved:
         """Nothing."""
         return set()
 
+    def report(self, seen, *, now_ns):
+        """Nothing."""
+
     def send(self, seen, *, now_ns, held=None):
         """Nothing."""
         return set()

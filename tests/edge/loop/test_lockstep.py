@@ -67,6 +67,9 @@ class Stills:
         """Nothing."""
         return set()
 
+    def report(self, seen, *, now_ns):
+        """Nothing."""
+
     def send(self, seen, *, now_ns, held):
         """Nothing."""
         self.sends += 1

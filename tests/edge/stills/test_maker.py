@@ -12,10 +12,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hvt_common.values import Frame, Still, View
+from hvt_common.protocol.messages import AlsoShown
+from hvt_common.values import Frame, View
 from hvt_common.video.base_crop import base_crop, coded_size
 from hvt_common.video.still_codecs import BaseMissingError, JpegCodec, still_codec
 from hvt_common.video.still_codecs.jpeg import jpeg_size
+from hvt_edge.link.stills import Still
 from hvt_edge.perception.candidates import crop_box
 from hvt_edge.stills.maker import NoStill, StillMaker
 from hvt_edge.stills.policy.base import Request
@@ -106,9 +108,15 @@ def test_a_still_says_what_it_shows():
     source = scene(1920, 1080)
     still = make(source, (300.0, 200.0, 400.0, 260.0), index=17)
     assert isinstance(still, Still)
-    assert (still.sequence, still.frame_index, still.capture_ns, still.track_id) == (9, 17, 123, 4)
-    assert still.crop_source_px == (285, 191, 415, 269)
-    assert (still.class_name, still.reason, still.codec, still.quality_pct) == ("car", "utility", "jpeg", 65)
+    shown = still.header
+    assert (shown.sequence, shown.frame_index, shown.capture_ns, shown.track_id) == (9, 17, 123, 4)
+    assert still.header.crop_source_px == (285, 191, 415, 269)
+    assert (shown.class_name, shown.reason, shown.codec, shown.quality_pct) == (
+        "car",
+        "utility",
+        "jpeg",
+        65,
+    )
     assert jpeg_size(still.data) == (130, 78)
     crop = source[191:269, 285:415]
     assert still.data == CODEC.encode(np.ascontiguousarray(crop), quality_pct=65).data
@@ -131,10 +139,10 @@ def test_never_larger_than_admitted_and_the_best_that_fits(limit, side, seed):
         assert sizes[35] > limit
     else:
         assert len(made.data) <= limit
-        assert made.quality_pct == 65 or sizes[made.quality_pct + 1] > limit
+        assert made.header.quality_pct == 65 or sizes[made.header.quality_pct + 1] > limit
         # Sizes may dip by a few bytes from one quality to the next, and the search miss what fits beyond such a dip.
         if list(sizes.values()) == sorted(sizes.values()):
-            assert made.quality_pct == max(quality for quality, size in sizes.items() if size <= limit)
+            assert made.header.quality_pct == max(quality for quality, size in sizes.items() if size <= limit)
 
 
 def test_long_crops_are_bounded():
@@ -146,7 +154,7 @@ def test_long_crops_are_bounded():
     assert isinstance(still, Still)
     width, height = jpeg_size(still.data)
     assert width == 512
-    crop = still.crop_source_px
+    crop = still.header.crop_source_px
     assert height / width == pytest.approx((crop[3] - crop[1]) / (crop[2] - crop[0]), rel=0.01)
 
 
@@ -169,8 +177,8 @@ def test_quality_rises_until_the_base_is_beaten():
         for quality in (30, 72, 84)
     }
     made = {quality: make(source, box, base=base) for quality, base in base_pictures.items()}
-    assert made[30].quality_pct == 65
-    assert 72 < made[72].quality_pct < 84 < made[84].quality_pct <= 90
+    assert made[30].header.quality_pct == 65
+    assert 72 < made[72].header.quality_pct < 84 < made[84].header.quality_pct <= 90
     assert make(source, box, base=source) == NoStill("base_good")
     assert make(source, box, base=base_pictures[72], limit=len(made[72].data) - 1) == NoStill("too_large")
     assert make(source, box, base=base_pictures[72], limit=len(made[72].data)) == made[72]
@@ -260,12 +268,12 @@ def test_stills_on_the_decoded_base_cost_a_part_and_show_as_much(data, kbps, mos
             if isinstance(built, NoStill):
                 assert isinstance(plain, NoStill)
                 continue
-            crop, base = built.crop_source_px, None
+            crop, base = built.header.crop_source_px, None
             size = (crop[2] - crop[0], crop[3] - crop[1])
-            if built.codec == "residual":
+            if built.header.codec == "residual":
                 base = base_crop(shown[20], view=view, crop_source_px=crop, size=size)
-            seen = still_codec(built.codec).decode(
-                built.data, size=size, parameters=built.parameters, base_bgr=base
+            seen = still_codec(built.header.codec).decode(
+                built.data, size=size, parameters=built.header.parameters, base_bgr=base
             )
             assert psnr_db(seen, crop_px(sources[20], built)) >= 38 - 1e-6
             built_bytes, plain_bytes = built_bytes + len(built.data), plain_bytes + len(plain.data)
@@ -291,13 +299,13 @@ def test_every_still_is_closer_to_the_source_than_the_base(data, kbps, raised):
     assert len(stills) > 0.8 * asked
     for still in stills:
         assert len(still.data) <= 6_000
-        x1, y1, x2, y2 = still.crop_source_px
-        truth = sources[still.frame_index][y1:y2, x1:x2]
-        base = shown[still.frame_index][y1:y2, x1 + left : x2 + left]
+        x1, y1, x2, y2 = still.header.crop_source_px
+        truth = sources[still.header.frame_index][y1:y2, x1:x2]
+        base = shown[still.header.frame_index][y1:y2, x1 + left : x2 + left]
         sent = cv2.imdecode(np.frombuffer(still.data, np.uint8), cv2.IMREAD_COLOR)
         assert mse(sent, truth) < mse(base, truth)
         assert mse(luma(sent), luma(truth)) < mse(luma(base), luma(truth))
-    assert any(still.quality_pct > 65 for still in stills) == raised
+    assert any(still.header.quality_pct > 65 for still in stills) == raised
 
 
 # Codecs that build on the base, and fidelity
@@ -313,18 +321,18 @@ def blurred(source: np.ndarray) -> np.ndarray:
 
 def shown_of(still: Still, *, base: np.ndarray | None = None, view: View | None = None) -> np.ndarray:
     """What the ground sees: it has nothing but the still's header, its bytes and its own base frame."""
-    x1, y1, x2, y2 = still.crop_source_px
-    size = (int(still.parameters.get("w", x2 - x1)), int(still.parameters.get("h", y2 - y1)))
-    if still.codec == "jpeg":
+    x1, y1, x2, y2 = still.header.crop_source_px
+    size = (int(still.header.parameters.get("w", x2 - x1)), int(still.header.parameters.get("h", y2 - y1)))
+    if still.header.codec == "jpeg":
         return CODEC.decode(still.data, size=size)
     view = view or View.fitted(SIZE, SIZE, fit="letterbox")
-    seen = base_crop(base, view=view, crop_source_px=still.crop_source_px, size=size)
-    return StandIn().decode(still.data, size=size, parameters=still.parameters, base_bgr=seen)
+    seen = base_crop(base, view=view, crop_source_px=still.header.crop_source_px, size=size)
+    return StandIn().decode(still.data, size=size, parameters=still.header.parameters, base_bgr=seen)
 
 
 def crop_px(source: np.ndarray, still: Still) -> np.ndarray:
     """The source's pixels of a still."""
-    x1, y1, x2, y2 = still.crop_source_px
+    x1, y1, x2, y2 = still.header.crop_source_px
     return source[y1:y2, x1:x2]
 
 
@@ -338,8 +346,8 @@ def test_a_still_that_builds_on_the_base_says_so_and_can_be_undone():
     source = scene(*SIZE)
     base = blurred(source)
     still = make(source, CAR, base=base, maker=BASE_CODED)
-    assert (still.codec, still.media_type) == ("stand-in", "image/webp")
-    assert set(still.parameters) == {"c"}
+    assert (still.header.codec, still.media_type) == ("stand-in", "image/webp")
+    assert set(still.header.parameters) == {"c"}
     assert psnr_db(shown_of(still, base=base), crop_px(source, still)) > 30
     with pytest.raises(BaseMissingError):
         shown_of(still, base=np.roll(base, 1, axis=1))
@@ -351,8 +359,8 @@ def test_a_long_crop_says_its_coded_size_beside_the_codecs_own_parameters():
     view = View.fitted((3840, 2160), SIZE, fit="letterbox")
     base = cv2.resize(blurred(source), SIZE, interpolation=cv2.INTER_AREA)
     still = make(source, (1000.0, 800.0, 1700.0, 1200.0), base=base, maker=BASE_CODED, limit=10**6)
-    assert (still.parameters["w"], still.parameters["h"]) == (512, 293)
-    assert "c" in still.parameters
+    assert (still.header.parameters["w"], still.header.parameters["h"]) == (512, 293)
+    assert "c" in still.header.parameters
     assert shown_of(still, base=base, view=view).shape == (293, 512, 3)
 
 
@@ -374,7 +382,7 @@ def test_what_a_ground_does_not_read_is_not_sent(read, sent):
 def test_without_a_base_frame_the_fallback_serves():
     """A still of a frame that was not coded could never be shown, or would never be sent."""
     still = make(scene(*SIZE), CAR, maker=BASE_CODED)
-    assert (still.codec, still.media_type, still.parameters) == ("jpeg", "image/jpeg", {})
+    assert (still.header.codec, still.media_type, still.header.parameters) == ("jpeg", "image/jpeg", {})
 
 
 @pytest.mark.parametrize("fidelity_db", [0.0, 36.0])
@@ -391,7 +399,7 @@ def test_where_the_base_shows_something_else_the_fallback_is_smaller(fidelity_db
         base=elsewhere,
         maker=StillMaker(codec=StandIn(), fallback=Hopeless(), fidelity_db=fidelity_db),
     )
-    assert chosen.codec == "jpeg"
+    assert chosen.header.codec == "jpeg"
     assert len(chosen.data) < len(built.data)
     crop = crop_px(source, chosen)
     assert psnr_db(shown_of(chosen), crop) >= psnr_db(shown_of(built, base=elsewhere), crop) - 1e-6
@@ -415,12 +423,12 @@ def test_fidelity_is_reached_with_the_fewest_bytes(target, side, seed, built):
         assert psnr_db(seen, crop) > target - 0.1
         return
     reached = psnr_db(shown_of(still, base=base, view=view), crop)
-    assert reached >= target - 1e-6 or still.quality_pct == 95
-    if still.quality_pct == 1:
+    assert reached >= target - 1e-6 or still.header.quality_pct == 95
+    if still.header.quality_pct == 1:
         return
 
     def with_less(pct: int) -> np.ndarray:
-        coded = maker.codec.encode(crop, quality_pct=max(1, still.quality_pct - pct), base_bgr=seen)
+        coded = maker.codec.encode(crop, quality_pct=max(1, still.header.quality_pct - pct), base_bgr=seen)
         size = (x2 - x1, y2 - y1)
         return maker.codec.decode(coded.data, size=size, parameters=coded.parameters, base_bgr=seen)
 
@@ -444,7 +452,7 @@ def test_fidelity_that_does_not_fit_gives_the_best_that_does():
     assert psnr_db(base[185:295, 279:441][: crop.shape[0], : crop.shape[1]], crop) < psnr_db(
         shown_of(tight, base=base), crop
     )
-    assert tight.quality_pct < whole.quality_pct
+    assert tight.header.quality_pct < whole.header.quality_pct
 
 
 def test_parameters_take_their_part_of_the_admission():
@@ -457,11 +465,11 @@ def test_parameters_take_their_part_of_the_admission():
     limit = len(whole.data) + 3
 
     def room(still: Still) -> int:
-        return limit - 10 * len(still.parameters)
+        return limit - 10 * len(still.header.parameters)
 
     still = BASE_CODED.code(job, sequence=0, allowance=room)
     assert len(still.data) <= limit - 10
-    assert still.quality_pct < whole.quality_pct
+    assert still.header.quality_pct < whole.header.quality_pct
 
 
 def test_one_still_of_several_beats_the_base_at_each_of_them():
@@ -477,8 +485,8 @@ def test_one_still_of_several_beats_the_base_at_each_of_them():
     view = View.fitted(SIZE, SIZE, fit="letterbox")
     job = StillMaker().crop(frame_of(source), both, view=view, base=base)
     still = StillMaker().code(job, sequence=0, allowance=lambda _: 10**6)
-    assert still.also == ((7, other.box_source_px),)
-    assert still.crop_source_px == (282, 188, 578, 292)
+    assert still.header.also == (AlsoShown(track_id=7, box_source_px=other.box_source_px),)
+    assert still.header.crop_source_px == (282, 188, 578, 292)
     shown = shown_of(still)
     for x1, x2 in ((300, 420), (440, 560)):
         truth = source[200:280, x1:x2]

@@ -10,23 +10,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_common.values import Still
+from hvt_common.protocol.messages import AlsoShown
 from hvt_edge.backlog.entry import FIRST_STORED
+from hvt_edge.link.stills import Still
 from hvt_edge.perception.candidates import Candidate
-from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.outbox import AGAIN, Outbox, OutboxSettings, OutboxStill, StillState
 from hvt_edge.stills.policy.base import Request
+from rigs.messages import still_of
 
 MS, S = 1_000_000, 1_000_000_000
 RTT = 80 * MS
 BOX = (0.0, 0.0, 10.0, 10.0)
-HEADER = Still(0, 0, 0, 1, BOX, (0, 0, 10, 10), "car", 0.5, "test", "residual", 65, b"")
 
 
-def crop(track: int = 1, *also: int, side: int = 10) -> CropJob:
+def crop(track: int = 1, *also: int, side: int = 10) -> Still:
     """A crop of ``3 * side * side`` bytes."""
-    header = replace(HEADER, track_id=track, also=tuple((one, BOX) for one in also))
-    return CropJob(header, np.zeros((side, side, 3), np.uint8))
+    shown = tuple(AlsoShown(track_id=one, box_source_px=BOX) for one in also)
+    crop_bgr = np.zeros((side, side, 3), np.uint8)
+    return replace(still_of(track_id=track, also=shown), crop_bgr=crop_bgr)
 
 
 def request_of(track: int, score: float, *also: int) -> Request:
@@ -49,7 +50,7 @@ def sent(outbox: Outbox, sequence: int, *, at_ns: int = 0, size: int = 400, rese
     """One that goes out, of a track and a utility of its own; ``resend``: the side of its crop."""
     one = pending(100 + sequence, float(sequence), since_ns=at_ns)
     job = crop(100 + sequence, side=resend) if resend else None
-    still = replace(one.crop.header, sequence=sequence, data=bytes(size))
+    still = still_of(bytes(size), track_id=one.track_id, sequence=sequence)
     outbox.sent(one, still, now_ns=at_ns, resend=job)
     return one
 
@@ -64,12 +65,12 @@ def flown(count: int = 4) -> Outbox:
 
 def overdue(outbox: Outbox, at_s: float) -> list[int]:
     """The sequences that are to be sent again."""
-    return [one.still.sequence for one in outbox.overdue(round(at_s * S))]
+    return [one.still.header.sequence for one in outbox.overdue(round(at_s * S))]
 
 
 def lost(outbox: Outbox) -> list[int]:
     """What an outage takes, by sequence."""
-    return [one.still.sequence for one in outbox.lose()]
+    return [one.still.header.sequence for one in outbox.lose()]
 
 
 # Pending
@@ -165,7 +166,7 @@ def test_what_grounds_request_waits_in_its_own_queue_in_order():
     assert (outbox.on_demand, outbox.on_demand_pending, len(outbox)) == (first, 2, 1)
     assert outbox.expire_on_demand(5 * S) == [], "their own time begins when they are met"
     assert outbox.expire(5 * S) == [(other, "stale")]
-    outbox.sent(first, replace(HEADER, data=b"x"), now_ns=6 * S)
+    outbox.sent(first, still_of(b"x"), now_ns=6 * S)
     assert outbox.on_demand is second
     assert outbox.expire_on_demand(16 * S) == [(second, "stale")]
     assert not outbox.any_pending
@@ -208,7 +209,7 @@ def test_what_a_report_names_is_acknowledged_and_what_is_missing_is_not():
     assert not outbox.on_report(3, (1,), now_ns=S), "it is no news"
     assert (outbox.unacknowledged, outbox.sent_bytes) == (1, 400)
     (one,) = outbox.lose()
-    assert (one.still.sequence, one.state) == (1, StillState.LOST)
+    assert (one.still.header.sequence, one.state) == (1, StillState.LOST)
     assert (outbox.unacknowledged, outbox.sent_bytes, lost(outbox)) == (0, 0, [])
     outbox.stored(one, one.still)
     assert one.state is StillState.STORED
@@ -223,9 +224,9 @@ def test_numbers_of_stored_stills_leave_no_hole_in_those_that_are_sent():
     """The ground would ask for numbers that never come."""
     outbox = Outbox()
     one = pending(1, 1.0)
-    outbox.stored(one, replace(HEADER, sequence=outbox.sequence(store=True), data=b"x"))
+    outbox.stored(one, still_of(b"x", sequence=outbox.sequence(store=True)))
     assert (outbox.sequence(store=True), outbox.sequence(store=False)) == (FIRST_STORED + 1, 0)
-    outbox.stored(sent(outbox, 0), HEADER)
+    outbox.stored(sent(outbox, 0), still_of())
     assert (outbox.sequence(store=True), outbox.sequence(store=False)) == (FIRST_STORED + 1, 1)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,14 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_common.values import Image, Still
+from hvt_common.values import Image
 from hvt_common.video.still_codecs import JpegCodec, psnr_y_db
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.stills.crop_job import Alternative, CropJob
+from hvt_edge.link.stills import Alternative, Still
 from hvt_edge.stills.requested_coding import Capacity, RefusedError, code_requested
 from media.clips import START_NS, hard_pictures
 from media.pictures import write_scene
 from rigs.closer_looks import LookFlight, RequestedLook
+from rigs.messages import still_of
 
 SIZE = (240, 160)
 CROP = hard_pictures(1, size=SIZE)[0]
@@ -26,27 +28,14 @@ JPEG = JpegCodec()
 PLENTY = Capacity(prompt_bytes=100_000, most_bytes=150_000, total_bps=1_500_000)
 
 
-def job(base: Image | None, *, quality_pct: int = 65) -> CropJob:
+def job(base: Image | None, *, quality_pct: int = 65) -> Still:
     """The crop, with what the base shows of it."""
     whole = (slice(0, SIZE[1]), slice(0, SIZE[0]))
     alternative = None
     if base is not None:
         alternative = Alternative.of(base, crop=CROP, places=(whole,), min_gain_db=0.0)
-    header = Still(
-        sequence=0,
-        frame_index=3,
-        capture_ns=START_NS,
-        track_id=-1,
-        box_source_px=(0.0, 0.0, *map(float, SIZE)),
-        crop_source_px=(0, 0, *SIZE),
-        class_name="",
-        confidence=0.0,
-        reason="asked",
-        codec="jpeg",
-        quality_pct=quality_pct,
-        data=b"",
-    )
-    return CropJob(header, CROP, alternative=alternative)
+    whole_px = {"box_source_px": (0.0, 0.0, *map(float, SIZE)), "crop_source_px": (0, 0, *SIZE)}
+    return replace(still_of(quality_pct=quality_pct, **whole_px), crop_bgr=CROP, alternative=alternative)
 
 
 def as_base(quality_pct: int) -> Image:
@@ -57,8 +46,8 @@ def as_base(quality_pct: int) -> Image:
 
 def shown(still: Still) -> Image:
     """What its requester sees, at the size of the crop."""
-    size = still.parameters.get("w", SIZE[0]), still.parameters.get("h", SIZE[1])
-    image = JPEG.decode(still.data, size=size, parameters=still.parameters)
+    size = still.header.parameters.get("w", SIZE[0]), still.header.parameters.get("h", SIZE[1])
+    image = JPEG.decode(still.data, size=size, parameters=still.header.parameters)
     return np.asarray(cv2.resize(image, SIZE, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
@@ -79,7 +68,7 @@ def test_what_comes_is_closer_to_the_source_than_the_video_and_fits(base_pct, wa
         return
     assert len(still.data) <= most_bytes
     assert psnr_y_db(shown(still), CROP) > psnr_y_db(base, CROP)
-    full = "w" not in still.parameters
+    full = "w" not in still.header.parameters
     assert full or note, "fewer pixels are said before they come"
 
 
@@ -87,14 +76,14 @@ def test_quality_goes_up_until_it_plainly_shows_more_and_down_before_pixels():
     """At the stills' usual quality it would be as good as the video, or small where it could be whole."""
     base = as_base(65)
     better, _ = code_requested(job(base), codec=JPEG, capacity=PLENTY)
-    assert better.quality_pct > 65
+    assert better.header.quality_pct > 65
     assert psnr_y_db(shown(better), CROP) > psnr_y_db(base, CROP) + 1.5
     whole = len(JPEG.encode(CROP, quality_pct=65).data)
     thin = Capacity(round(0.5 * whole), round(0.7 * whole), total_bps=8 * whole)
     lower, note = code_requested(job(as_base(10)), codec=JPEG, capacity=thin)
-    assert lower.quality_pct < 65
-    assert "w" not in lower.parameters
-    assert f"{SIZE[0]}x{SIZE[1]} pixels at quality {lower.quality_pct} come within about" in note
+    assert lower.header.quality_pct < 65
+    assert "w" not in lower.header.parameters
+    assert f"{SIZE[0]}x{SIZE[1]} pixels at quality {lower.header.quality_pct} come within about" in note
 
 
 def test_what_the_video_shows_as_well_is_refused_and_what_is_too_large_says_what_would_do():

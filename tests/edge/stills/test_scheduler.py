@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_common.values import Frame, Still, View
+from hvt_common.values import Frame, View
 from hvt_common.video.still_codecs import JpegCodec
+from hvt_edge.link.stills import Still
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import Candidate, TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing
-from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox, OutboxSettings, OutboxStill
@@ -26,6 +26,7 @@ from hvt_edge.stills.scheduler import Chooser, Gate, Suppression
 from media.base_coded import StandIn
 from media.clips import START_NS, hard_pictures
 from rigs.examples import tracks_of
+from rigs.messages import still_of
 
 SIZE = (640, 360)
 PICTURE = hard_pictures(1, size=SIZE)[0]
@@ -112,7 +113,7 @@ class Rig:
             left.append(left[-1] - len(one.still.data))
             coded.append(one)
             self.sent.append(one.still)
-            self.outcomes["sent", "again" if one.copies > 1 else one.still.reason] += 1
+            self.outcomes["sent", "again" if one.copies > 1 else one.still.header.reason] += 1
         return coded
 
     def stills(self, allowance: int) -> list[int]:
@@ -196,7 +197,7 @@ def test_sequence_numbers_count_stills_and_nothing_else():
     numbers = []
     for step in range(4):
         rig.consider({1: SMALL, 2: box_at(7)}, base=PICTURE if step % 2 else FLAT)
-        numbers += [one.still.sequence for one in rig.coded(10**6)]
+        numbers += [one.still.header.sequence for one in rig.coded(10**6)]
         rig.number += 3  # past the rest of what was refused
     assert numbers == list(range(len(numbers)))
     assert len(numbers) >= 4
@@ -222,8 +223,8 @@ def test_neighbours_share_a_still_and_all_of_them_count_as_sent():
     rig = Rig(share=True, cooldown=5.0)
     rig.consider(NEIGHBOURS)
     assert rig.stills(100_000) == [3, 2]
-    alone, pair = rig.sent
-    assert (alone.also, [track for track, _ in pair.also]) == ((), [1])
+    alone, pair = (one.header for one in rig.sent)
+    assert (alone.also, [one.track_id for one in pair.also]) == ((), [1])
     assert pair.crop_source_px == (16, 17, 74, 45)
     assert rig.outcomes == {("sent", "test"): 2}, "one for each still"
     rig.consider(NEIGHBOURS)
@@ -275,7 +276,7 @@ def test_stills_that_build_on_the_base_wait_for_a_frame_that_has_one():
     assert rig.stills(100_000) == []
     rig.consider({1: SMALL}, base=BLURRED, detected=False)
     assert rig.stills(100_000) == [1]
-    assert (rig.sent[0].codec, rig.sent[0].frame_index) == ("stand-in", 1)
+    assert (rig.sent[0].header.codec, rig.sent[0].header.frame_index) == ("stand-in", 1)
     rig.consider({1: SMALL}, base=BLURRED, detected=False)
     assert rig.stills(100_000) == [], "one step, one decision"
     plain = Rig()
@@ -292,14 +293,14 @@ def test_a_still_without_its_base_is_sent_once_more_and_only_once():
         rig.outbox.on_undecodable(sequence)
     rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
     assert rig.stills(100_000) == [1]
-    first, again = rig.sent[1:]
+    first, again = (one.header for one in rig.sent[1:])
     assert (again.sequence, again.reason, again.codec, again.parameters) == (2, "again", "jpeg", {"again": 1})
     for name in ("frame_index", "capture_ns", "track_id", "box_source_px", "crop_source_px", "class_name"):
         assert getattr(again, name) == getattr(first, name)
     crop = PICTURE[
         first.crop_source_px[1] : first.crop_source_px[3], first.crop_source_px[0] : first.crop_source_px[2]
     ]
-    seen = JpegCodec().decode(again.data, size=crop.shape[1::-1])
+    seen = JpegCodec().decode(rig.sent[2].data, size=crop.shape[1::-1])
     assert np.mean((seen.astype(float) - crop) ** 2) < 150
     for sequence in (1, 2):
         rig.outbox.on_undecodable(sequence)
@@ -351,10 +352,8 @@ class LossRig(Rig):
         """So many stills of (track, utility, bytes)."""
         self.number = 0
         for track, utility, size in losses:
-            still = replace(
-                LOST, sequence=self.outbox.sequence(store=False), track_id=track, data=bytes(size)
-            )
-            one = OutboxStill(CropJob(still, PICTURE[:4, :4], None, None), None, utility, 0)
+            still = still_of(bytes(size), sequence=self.outbox.sequence(store=False), track_id=track)
+            one = OutboxStill(replace(still, crop_bgr=PICTURE[:4, :4]), None, utility, 0)
             self.outbox.sent(one, still, now_ns=self.now_ns - 2 * STEP_NS * 3)
         self.outbox.on_report(-1, (), now_ns=self.now_ns)
         self.number = -1
@@ -362,9 +361,6 @@ class LossRig(Rig):
     def sent_tracks(self, allowance: int = 100_000) -> list[tuple[int, float]]:
         """(track, utility) of each that goes out."""
         return [(one.track_id, one.utility) for one in self.coded(allowance)]
-
-
-LOST = Still(0, 0, START_NS, 50, (0, 0, 9, 9), (0, 0, 9, 9), "car", 0.5, "test", "jpeg", 65, b"")
 
 
 def test_a_lost_still_goes_before_pending_ones_that_are_less_useful():

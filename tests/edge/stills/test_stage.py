@@ -94,6 +94,7 @@ class Rig:
         """Frame after frame, as the lockstep loop does."""
         for frame, unit in list(zip(FRAMES, UNITS, strict=True))[start:count]:
             seen = self.stage.analyze(frame, unit)
+            self.stage.report(seen, now_ns=frame.capture_ns)
             self.stage.send(seen, now_ns=frame.capture_ns)
 
 
@@ -164,7 +165,9 @@ def test_between_coded_ticks_tracks_go_on_and_stills_wait_for_a_coded_one():
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=1.5, bitrate_bps=120_000, preset="ultrafast"))
     for frame in FRAMES:
         unit = encoder.encode(frame) if frame.index % 10 == 3 else None
-        rig.stage.send(rig.stage.analyze(frame, unit), now_ns=frame.capture_ns)
+        seen = rig.stage.analyze(frame, unit)
+        rig.stage.report(seen, now_ns=frame.capture_ns)
+        rig.stage.send(seen, now_ns=frame.capture_ns)
     headers = [header for header, _ in rig.out.stills]
     assert headers
     assert all(one.frame_index % 10 == 3 for one in headers)
@@ -347,6 +350,7 @@ def test_a_pending_still_holds_no_frame():
     watch = weakref.ref(source)
     frame = Frame(0, FRAMES[0].capture_ns, source, FRAMES[0].base_bgr)
     seen = rig.stage.analyze(frame, UNITS[0])
+    rig.stage.report(seen, now_ns=frame.capture_ns)
     rig.stage.send(seen, now_ns=frame.capture_ns, held=True)
     assert len(rig.stage.outbox) == 1
     del source, frame, seen

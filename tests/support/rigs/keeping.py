@@ -23,7 +23,7 @@ from hvt_common.protocol.messages import (
     parse_backlog_units,
 )
 from hvt_common.runtime.failures import Failures
-from hvt_common.values import AccessUnit, Frame, Still
+from hvt_common.values import AccessUnit, Frame
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, check
@@ -33,7 +33,6 @@ from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxStill
 from hvt_edge.stills.stage import StillSender
@@ -43,25 +42,13 @@ from hvt_ground.backlog.assembly import BacklogAssembly
 from media.clips import START_NS, framed, smooth_pictures
 from programs.processes import eventually
 from rigs.kept import INFO, S, opened
-from rigs.messages import feedback
+from rigs.messages import feedback, still_of
 from rigs.world import make_base_stage, make_operating, make_reconfiguration, make_transmitter
 
 SIZE = (320, 192)
 FRAMES = framed(smooth_pictures(210, size=SIZE))
-STILL = Still(
-    sequence=2**31,
-    frame_index=3,
-    capture_ns=START_NS,
-    track_id=1,
-    box_source_px=(10.0, 10.0, 42.0, 42.0),
-    crop_source_px=(6, 6, 46, 46),
-    class_name="car",
-    confidence=0.5,
-    reason="utility",
-    codec="jpeg",
-    quality_pct=65,
-    data=b"\xff" * 1500,
-)
+STILL = still_of(b"\xff" * 1500, sequence=2**31, frame_index=3, capture_ns=START_NS, track_id=1)
+PENDING = replace(STILL, crop_bgr=np.zeros((4, 4, 3), np.uint8), data=b"")
 
 
 class Ground:
@@ -271,7 +258,7 @@ class Rig:
     def still(self, sequence: int, *, utility: float = 1.0) -> None:
         """One goes out."""
         one = _pending(utility, self.now_ns)
-        self.outbox.sent(one, replace(STILL, sequence=sequence), now_ns=self.now_ns)
+        self.outbox.sent(one, STILL.with_header(sequence=sequence), now_ns=self.now_ns)
         self.stills.put(one, now_ns=self.now_ns, store=False)
 
     def store(self, *, utility: float = 1.0) -> None:
@@ -325,5 +312,4 @@ class Rig:
 
 def _pending(utility: float, now_ns: int) -> OutboxStill:
     """A still about to be coded."""
-    job = CropJob(STILL, np.zeros((4, 4, 3), np.uint8))
-    return OutboxStill(job, None, utility, now_ns)
+    return OutboxStill(PENDING, None, utility, now_ns)

@@ -28,6 +28,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.protocol.messages.fields import I63, U32, U64
 from hvt_edge.link.feedback import Report
+from hvt_edge.link.stills import Still
 
 BASE = BaseHeader(
     session_id=0x1234567890ABCDEF,
@@ -55,6 +56,24 @@ ROI = RoiHeader(
     parameters={"base": 9_099, "gain": 1.5, "how": "residual"},
     also=(AlsoShown(track_id=60, box_source_px=(40.0, 2.5, 104.875, 70.0)),),
 )
+PLAIN = replace(
+    ROI,
+    session_id=0,
+    sequence=0,
+    send_delay_ns=0,
+    box_source_px=(0.0, 0.0, 10.0, 10.0),
+    crop_source_px=(0, 0, 10, 10),
+    parameters={},
+    also=(),
+)
+"""A still's header before it goes out."""
+
+
+def still_of(data: bytes = b"", *, media_type: str = "image/jpeg", **header: Any) -> Still:
+    """A coded still of the edge."""
+    return Still(replace(PLAIN, **header), media_type, data=data)
+
+
 STEP = TrackStep(
     session_id=0x1234567890ABCDEF,
     sequence=1_800,
