@@ -33,9 +33,9 @@ _MOST_S = 100.0
 
 # Functions: name and bound of their walk, the largest of each taken together.
 _WALKS = {
-    ("RealtimePace.step",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 35),
+    ("RealtimePace.send",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 28),
     ("StillStage.analyze",): ("a frame's objects at the edge", 24),
-    ("StillStage.send",): ("a still at the edge, from choosing to put", 40),
+    ("StillStage.send",): ("a still at the edge, from choosing to put", 28),
     ("commands.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
         "a command, from hvt-ground set-budget to the encoder",
         38,
@@ -116,7 +116,7 @@ def fly(walks: Walks) -> None:
         commander = threading.Thread(target=commands.run, args=[words])
         for one in (ground, edge):
             one.start()
-        _wait_for(walks, "RealtimePace.step", _LEAST_FRAMES)
+        _wait_for(walks, "RealtimePace.send", _LEAST_FRAMES)
         commander.start()
         commander.join(_MOST_S)
         _wait_for(walks, _GOES, _LEAST_STILLS)

@@ -113,8 +113,7 @@ class LockstepPace:
         self._wait_for_answers(before=frame.index - self._ahead_frames + 1)
         analyzed = analysis.result()
         sent = self.stills.send_requested(now_ns=frame.capture_ns, held=held)
-        self.stills.report(analyzed, now_ns=frame.capture_ns)
-        sent |= self.stills.send(analyzed, now_ns=frame.capture_ns, held=held)
+        sent |= self.stills.step(analyzed, now_ns=frame.capture_ns, held=held)
         # Of other frames the ground learns nothing, and answers nothing.
         if sent or coded_index == frame.index:
             self._in_flight.append((frame.index, coded_index, sent))

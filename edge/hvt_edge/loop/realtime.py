@@ -10,7 +10,7 @@ from typing import Self
 from hvt_common.protocol.edge_words import FrameGroup
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Frame
+from hvt_common.values import AccessUnit, Frame
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.stills.stage import StillStage
@@ -106,6 +106,11 @@ class RealtimePace:
                 return
             self._must_code_ns = frame.capture_ns + _MOST_GAP_NS
             behind = self.clock() - frame.capture_ns > _BEHIND_SHARE * SECOND_NS / self.fps
+        unit = self.send(frame)
+        self._hand_over(frame, unit, behind=behind)
+
+    def send(self, frame: Frame) -> AccessUnit | None:
+        """Encode and send one frame; None where it is not coded."""
         now_ns = self.clock()
         self.before_frame(now_ns)
         began_ns, budget_ns = self.clock(), self.base.budget_waited_ns
@@ -124,6 +129,9 @@ class RealtimePace:
         if sending_ns > max(encoded_ns - decided_ns, _LINK_BOUND_NS):
             for_budget = 2 * (self.base.budget_waited_ns - budget_ns) > sending_ns
             self._bound = self.base.holder(self._sent_ns) if for_budget else "link"
+        return unit
+
+    def _hand_over(self, frame: Frame, unit: AccessUnit | None, *, behind: bool) -> None:
         # Video goes first: perception gets no frame while the loop is late, and fewer for a while after it lost one.
         # Where nobody uses it, it takes no time.
         used = self.stills.is_used(frame.capture_ns)

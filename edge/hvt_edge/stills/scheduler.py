@@ -177,7 +177,6 @@ class Chooser:
 
         Where stills build on the base, a step that falls on a frame without one is put off to the next that has one.
         """
-        self.on_demand.add(analyzed)
         if self.method.video_only:
             return
         due = analyzed.detected or self._put_off

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import KW_ONLY, dataclass
 
 from hvt_common.inference.class_names import same_kind
@@ -48,7 +48,7 @@ class StillStage:
     def __post_init__(self) -> None:
         self.outbox = self.sender.outbox
         self.latest_tracks: Tracks | None = None
-        """Those of the frame that `report` took last. In lockstep they change at the same point of the frame loop in
+        """Those of the frame that `step` took last. In lockstep they change at the same point of the frame loop in
         every run, whatever `analyze` does meanwhile."""
         self._levers = _ALL
         self._scene_began = -1
@@ -82,13 +82,15 @@ class StillStage:
         wanted = self.tracks_used or not self.chooser.method.video_only
         return wanted or self.chooser.on_demand.wants_tracks(capture_ns)
 
-    def report(self, analyzed: AnalyzedFrame, *, now_ns: int) -> None:
-        """Decide what is worth sending beside the video, and tell grounds of the tracks; before `send`."""
+    def step(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
+        """Decide what is worth sending beside the video, tell grounds of the tracks, and `send` stills."""
         self.latest_tracks = analyzed.tracks
-        with self._spending(analyzed):
+        self.chooser.on_demand.add(analyzed)
+        with self.analyzer.cpu_budget.spending("choose") if analyzed.detected else nullcontext():
             self._levers = self._decided(now_ns)
             if self.reporter is not None and analyzed.detected and self._levers.tracks:
                 self.reporter.report(analyzed, now_ns=now_ns)
+            return self.send(analyzed, now_ns=now_ns, held=held)
 
     def send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Choose, and send the stills of the method that may go now; return their sequence numbers.
@@ -96,18 +98,14 @@ class StillStage:
         ``now_ns`` is the time that windows go by. With ``held`` none is sent, because a keyframe is to come; None
         asks the plan.
         """
-        with self._spending(analyzed):
-            if most_bytes := self.sender.transmitter.most_still_bytes():
-                self.chooser.most_bytes = most_bytes
-            # What a method requests waits until the link is free, which right behind a base frame it never is.
-            allowance_bytes = self.sender.transmitter.still_allowance_bytes(now_ns, paced=False)
-            self.chooser.consider(
-                analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not self._levers.stills
-            )
-            return self.send_pending(now_ns=now_ns, held=held)
-
-    def _spending(self, analyzed: AnalyzedFrame) -> AbstractContextManager[object]:
-        return self.analyzer.cpu_budget.spending("choose") if analyzed.detected else nullcontext()
+        if most_bytes := self.sender.transmitter.most_still_bytes():
+            self.chooser.most_bytes = most_bytes
+        # What a method requests waits until the link is free, which right behind a base frame it never is.
+        allowance_bytes = self.sender.transmitter.still_allowance_bytes(now_ns, paced=False)
+        self.chooser.consider(
+            analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not self._levers.stills
+        )
+        return self.send_pending(now_ns=now_ns, held=held)
 
     def send_pending(self, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Send those of the method that are pending and may go now, without another frame; the rest as of `send`."""

@@ -146,8 +146,7 @@ class StillWorker:
                 self.stage.analyzer.cpu_budget.queued = self._frames.qsize()
                 self.stage.on_results(self.results(), detected=self.detected())
                 analyzed = self.stage.analyze(*item)
-                self.stage.report(analyzed, now_ns=self.clock())
-                self.stage.send(analyzed, now_ns=self.clock())
+                self.stage.step(analyzed, now_ns=self.clock())
                 self.failures.works(_PART)
             except Exception as error:  # noqa: BLE001 - it ends stills for a while, never the flight
                 self._fail(error)

@@ -44,6 +44,7 @@ from hvt_edge.stills.scheduler import Chooser, Gate
 from hvt_edge.stills.stage import StillSender, StillStage
 from hvt_edge.video.encoder_settings import PresetControl, share_of
 from hvt_edge.video.passthrough import PassthroughStage
+from hvt_edge.video.reconfigure import encoder_opener
 from hvt_edge.video.stage import BaseStage, LocalCopy
 from hvt_edge.video.x265 import TrackRegions
 from hvt_edge.wiring.link import (
@@ -59,7 +60,7 @@ from hvt_edge.wiring.perception import make_analyzer, make_maker, make_method, m
 from hvt_edge.wiring.storing import open_local_copy, store_folder
 from hvt_edge.wiring.trial import Beginning
 from hvt_edge.wiring.video import (
-    encoder_opener,
+    encoder_plan,
     make_frame_skip,
     make_keyframes,
     make_reconfiguration,
@@ -117,9 +118,8 @@ class Link:
             presets = PresetControl(
                 self.operating, nominal_fps=config.nominal_fps, most_cores=share_of(processors())
             )
-        open_encoder = encoder_opener(
-            config, self.operating, size=size, headroom=flight.headroom, presets=presets
-        )
+        plan = encoder_plan(config, size, headroom=flight.headroom)
+        open_encoder = encoder_opener(plan, self.operating, presets=presets)
         self.encoder = open_encoder(Rates(config.budget_bps, base_bps, decimation))
         budget = make_budget(config, base_bps=base_bps, decimation=decimation)
         self.transmitter = Transmitter(

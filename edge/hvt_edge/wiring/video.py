@@ -21,8 +21,6 @@ from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, shown
 from hvt_edge.video.encoder_settings import (
     SLOWEST,
-    PresetControl,
-    encoder_settings,
     keyframe_interval_s,
     keyframe_total_bps,
     payload_bps,
@@ -30,7 +28,7 @@ from hvt_edge.video.encoder_settings import (
 )
 from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
 from hvt_edge.video.encoders.qualification import Allowed, allowed, headroom_of, run_frames
-from hvt_edge.video.encoders.registry import X265, CheckedEncoder, Encoder, open_encoder
+from hvt_edge.video.encoders.registry import X265, Encoder, EncoderPlan
 from hvt_edge.video.rate_model import (
     LEAST_SIDE_PX,
     PROMPT,
@@ -41,8 +39,7 @@ from hvt_edge.video.rate_model import (
     most_decimation,
     sizes_of,
 )
-from hvt_edge.video.reconfigure import EncoderReconfiguration, OpenEncoder
-from hvt_edge.video.x265 import BaseEncoder
+from hvt_edge.video.reconfigure import EncoderReconfiguration
 
 _log = logging.getLogger(__name__)
 
@@ -163,57 +160,27 @@ def first_rates(config: EdgeConfig, decimation: int) -> Rates:
     return Rates(config.budget_bps, config.base_bps, decimation)
 
 
+def encoder_plan(config: EdgeConfig, size: tuple[int, int], *, headroom: float = 1.0) -> EncoderPlan:
+    """What encoders are opened with; with several threads only where bytes need not repeat."""
+    return EncoderPlan(
+        name=config.encoder,
+        size=size,
+        nominal_fps=config.nominal_fps,
+        edge_id=config.edge_id,
+        window_s=config.window,
+        metadata_bps=config.metadata_bps,
+        side_data=config.roi_depth > 0,
+        threads=1 if config.pace == "lockstep" else min(_MOST_ENCODER_THREADS, os.cpu_count() or 1),
+        headroom=headroom,
+    )
+
+
 def make_encoder(
     config: EdgeConfig, rates: Rates, *, size: tuple[int, int], preset: str = "", headroom: float = 1.0
 ) -> Encoder:
-    """The encoder at the rate that the budget leaves it; with several threads only where bytes need not repeat.
-
-    It is set to ``headroom`` (0…1) of that rate, and has the ``preset`` of the settings unless another is given;
-    with ``--preset auto`` the slowest. Raises `UserError` where it does not take the settings.
-    """
-    settings = encoder_settings(
-        size=size,
-        fps=config.nominal_fps / rates.decimation,
-        preset=preset or (SLOWEST if config.preset == AUTO else config.preset),
-        # What is kept for tracks may be the base's while none are sent.
-        total_bps=_video_bps(config, rates),
-        base_bps=rates.base_bps,
-        edge_id=config.edge_id,
-        window_s=config.window,
-        side_data=config.roi_depth > 0,
-    )
-    threads = 1 if config.pace == "lockstep" else min(_MOST_ENCODER_THREADS, os.cpu_count() or 1)
-    bitrate_bps = max(1, round(settings.bitrate_bps * headroom))
-    return open_encoder(config.encoder, replace(settings, bitrate_bps=bitrate_bps, threads=threads))
-
-
-def encoder_opener(
-    config: EdgeConfig,
-    operating: Operating,
-    *,
-    size: tuple[int, int],
-    headroom: float,
-    presets: PresetControl | None,
-) -> OpenEncoder:
-    """Opens encoders in flight, with the preset that is in force then; the one before is closed first.
-
-    Two at a time take 15 to 20 MB more at 1280x720 and twice the threads; a device of one session refuses the second.
-    """
-    last: Encoder | None = None
-
-    def open_for(rates: Rates) -> Encoder:
-        nonlocal last
-        before, last = last, None  # it may be that no other opens now
-        if isinstance(before, BaseEncoder | CheckedEncoder):
-            before.close()
-        last = encoder = make_encoder(
-            config, rates, size=size, preset=operating.now.preset, headroom=headroom
-        )
-        if presets is not None and isinstance(encoder, BaseEncoder):
-            presets.watch(lambda: encoder.spent)
-        return encoder
-
-    return open_for
+    """One encoder, with the ``preset`` of the settings unless another is given; with ``auto`` the slowest."""
+    plan = encoder_plan(config, size, headroom=headroom)
+    return plan.open(rates, preset=preset or (SLOWEST if config.preset == AUTO else config.preset))
 
 
 def _video_bps(config: EdgeConfig, rates: Rates) -> int:

@@ -50,10 +50,7 @@ class Unmoved:
         """Nothing."""
         return set()
 
-    def report(self, seen, *, now_ns):
-        """Nothing."""
-
-    def send(self, seen, *, now_ns, held=None):
+    def step(self, seen, *, now_ns, held=None):
         """Nothing."""
         return set()
 

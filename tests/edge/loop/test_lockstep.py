@@ -67,10 +67,7 @@ class Stills:
         """Nothing."""
         return set()
 
-    def report(self, seen, *, now_ns):
-        """Nothing."""
-
-    def send(self, seen, *, now_ns, held):
+    def step(self, seen, *, now_ns, held):
         """Nothing."""
         self.sends += 1
         return set()

@@ -304,9 +304,7 @@ class Rig:
     def run(self, count: int = 30) -> None:
         """Frame after frame, as the lockstep loop does."""
         for frame, unit in zip(FRAMES[:count], UNITS, strict=False):
-            seen = self.stage.analyze(frame, unit)
-            self.stage.report(seen, now_ns=frame.capture_ns)
-            self.stage.send(seen, now_ns=frame.capture_ns)
+            self.stage.step(self.stage.analyze(frame, unit), now_ns=frame.capture_ns)
 
 
 def test_a_track_gets_its_stills_when_they_are_due():

@@ -94,8 +94,7 @@ class Rig:
         """Frame after frame, as the lockstep loop does."""
         for frame, unit in list(zip(FRAMES, UNITS, strict=True))[start:count]:
             seen = self.stage.analyze(frame, unit)
-            self.stage.report(seen, now_ns=frame.capture_ns)
-            self.stage.send(seen, now_ns=frame.capture_ns)
+            self.stage.step(seen, now_ns=frame.capture_ns)
 
 
 def decoded_bases() -> list[YuvPicture]:
@@ -166,8 +165,7 @@ def test_between_coded_ticks_tracks_go_on_and_stills_wait_for_a_coded_one():
     for frame in FRAMES:
         unit = encoder.encode(frame) if frame.index % 10 == 3 else None
         seen = rig.stage.analyze(frame, unit)
-        rig.stage.report(seen, now_ns=frame.capture_ns)
-        rig.stage.send(seen, now_ns=frame.capture_ns)
+        rig.stage.step(seen, now_ns=frame.capture_ns)
     headers = [header for header, _ in rig.out.stills]
     assert headers
     assert all(one.frame_index % 10 == 3 for one in headers)
@@ -350,8 +348,7 @@ def test_a_pending_still_holds_no_frame():
     watch = weakref.ref(source)
     frame = Frame(0, FRAMES[0].capture_ns, source, FRAMES[0].base_bgr)
     seen = rig.stage.analyze(frame, UNITS[0])
-    rig.stage.report(seen, now_ns=frame.capture_ns)
-    rig.stage.send(seen, now_ns=frame.capture_ns, held=True)
+    rig.stage.step(seen, now_ns=frame.capture_ns, held=True)
     assert len(rig.stage.outbox) == 1
     del source, frame, seen
     gc.collect()

@@ -62,7 +62,7 @@ class StillRig(Rig):
             unit = self.base(frame)
             source = np.clip(frame.base_bgr + _TEXTURE, 0, 255).astype(np.uint8)
             seen = self.side.analyze(Frame(frame.index, frame.capture_ns, source, frame.base_bgr), unit)
-            self.side.send(seen, now_ns=self.now_ns)
+            self.side.step(seen, now_ns=self.now_ns)
 
     @property
     def live(self) -> list[RoiHeader]:

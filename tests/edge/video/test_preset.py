@@ -12,9 +12,10 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.operating import Operating
 from hvt_edge.video.encoder_settings import PresetControl, choose_preset, share_of
+from hvt_edge.video.encoders.registry import EncoderPlan
+from hvt_edge.video.reconfigure import encoder_opener
 from hvt_edge.video.x265 import BaseEncoder
-from hvt_edge.wiring import video
-from hvt_edge.wiring.video import encoder_opener, make_encoder, make_reconfiguration
+from hvt_edge.wiring.video import encoder_plan, make_reconfiguration
 
 SECOND = 1_000_000_000
 MOST = 0.4
@@ -99,7 +100,7 @@ def test_a_step_opens_x265_at_the_same_rates_and_video_goes_on(monkeypatch):
         config,
         operating,
         (320, 192),
-        open_encoder=encoder_opener(config, operating, size=(320, 192), headroom=1.0, presets=control),
+        open_encoder=encoder_opener(encoder_plan(config, (320, 192)), operating, presets=control),
         budget=SimpleNamespace(set_total=lambda *_rates, **_when: None),
         split=None,
         presets=control,
@@ -107,13 +108,15 @@ def test_a_step_opens_x265_at_the_same_rates_and_video_goes_on(monkeypatch):
     first = reconfiguration.open_again()
     ended_first = []
 
+    real = EncoderPlan.open
+
     def opened(*given, **settings):
         with pytest.raises(AssertionError, match="it is open"):
             first.encode(Frame(1, 0, picture, picture))
         ended_first.append(True)
-        return make_encoder(*given, **settings)
+        return real(*given, **settings)
 
-    monkeypatch.setattr(video, "make_encoder", opened)
+    monkeypatch.setattr(EncoderPlan, "open", opened)
     decoder, picture = BaseDecoder(), np.full((192, 320, 3), 90, np.uint8)
     assert reconfiguration(1, 0) is None
     assert decoder.decode_yuv(first.encode(Frame(0, 0, picture, picture), keyframe=True).data) is not None

@@ -23,10 +23,11 @@ from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.operating import Rates
 from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings
 from hvt_edge.video.encoders.hardware import HardwareEncoder
-from hvt_edge.video.encoders.registry import CheckedEncoder, Encoder
+from hvt_edge.video.encoders.registry import CheckedEncoder, Encoder, EncoderPlan
 from hvt_edge.video.rate_model import FrameSkip, MeasuredFrameSkip
+from hvt_edge.video.reconfigure import encoder_opener
 from hvt_edge.video.x265 import BaseEncoder, TrackRegions, encoder_context
-from hvt_edge.wiring import video
+from hvt_edge.wiring.video import encoder_plan
 from media.clips import START_NS, framed, hard_pictures, smooth_pictures
 from rigs.flight import tracks_at
 from rigs.world import Puts, make_base_stage, make_operating, make_transmitter
@@ -226,10 +227,10 @@ def test_the_device_of_an_encoder_that_failed_is_free_before_each_try_to_open_an
             raise UserError("not at this moment")
         return CheckedEncoder(Broken()) if len(busy) == 1 else BaseEncoder(SETTINGS)
 
-    monkeypatch.setattr(video, "make_encoder", make)
+    monkeypatch.setattr(EncoderPlan, "open", make)
     config = check(EdgeConfig(source="demo"))
     operating, rates = make_operating(config), Rates(800_000, 400_000, 1)
-    opened = video.encoder_opener(config, operating, size=SIZE, headroom=1.0, presets=None)
+    opened = encoder_opener(encoder_plan(config, SIZE), operating)
     rig = Rig()
     rig.stage.encoder, rig.stage.open_again = opened(rates), lambda: opened(rates)
     assert stepped(rig, framed(smooth_pictures(3, size=SIZE))) == [1, 2]

@@ -116,6 +116,7 @@ class Rig:
             if shown:
                 size, now_ns = int(self.budget.base_step_bytes), self.now_ns
                 self.budget.record_base(size, now_ns=self.budget.earliest_ns(size, now_ns=now_ns, base=True))
+            self.chooser.on_demand.add(seen)
             self.chooser.consider(seen, now_ns=self.now_ns, allowance_bytes=1000)
             sender = StillSender(self.outbox, maker=self.maker, transmitter=self.sender)
             self.chooser.expire_requested(self.now_ns)

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Protocol
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.plug_ins import installed, loaded, the_one
 from hvt_common.values import AccessUnit, Frame
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.operating import Rates
+from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings
 
 if TYPE_CHECKING:
     from hvt_edge.video.x265 import Region
@@ -156,3 +157,36 @@ def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
     entry = the_one(GROUP, name, what=_WHAT, built_in=False)
     assert entry is not None, "checked"
     return CheckedEncoder(loaded(entry, lambda make: make(settings), what=_WHAT))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncoderPlan:
+    """All that an encoder is opened with but rates and preset."""
+
+    name: str
+    size: tuple[int, int]
+    nominal_fps: float
+    """Source frames a second."""
+    edge_id: str
+    window_s: float
+    metadata_bps: int
+    side_data: bool
+    threads: int
+    headroom: float = 1.0
+    """The share of its rate that the encoder is set to."""
+
+    def open(self, rates: Rates, *, preset: str) -> Encoder:
+        """Open it at the rate that the budget leaves it. Raises `UserError` where it does not take the settings."""
+        settings = encoder_settings(
+            size=self.size,
+            fps=self.nominal_fps / rates.decimation,
+            preset=preset,
+            # What is kept for tracks may be the base's while none are sent.
+            total_bps=max(rates.total_bps - self.metadata_bps, rates.base_bps),
+            base_bps=rates.base_bps,
+            edge_id=self.edge_id,
+            window_s=self.window_s,
+            side_data=self.side_data,
+        )
+        bitrate_bps = max(1, round(settings.bitrate_bps * self.headroom))
+        return open_encoder(self.name, replace(settings, bitrate_bps=bitrate_bps, threads=self.threads))
