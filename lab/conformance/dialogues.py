@@ -47,6 +47,7 @@ _SIZES: tuple[tuple[str, tuple[int, int, int, int], tuple[int, int] | None], ...
     ("beyond the source's right side", (3900, 2900, 4001, 3000), None),
     ("beyond the source's lower side", (3900, 2900, 4000, 3001), None),
     ("smaller than its crop", (0, 0, 1000, 600), (500, 300)),
+    ("a plain picture of far fewer pixels than the base has", (0, 0, 4000, 3000), (8, 6)),
     ("wider than its crop", (0, 0, 500, 300), (501, 300)),
     ("higher than its crop", (0, 0, 500, 300), (500, 301)),
     ("as large as a still may be", (0, 0, 2048, 2048), None),

@@ -71,6 +71,9 @@ def decode_still(still: ReceivedStill, *, base: Image | YuvPicture | None, view:
         raise StillError(str(error)) from None
     if not codec.needs_base:
         return codec.decode(still.data, size=size, parameters=header.parameters)
+    x1, y1, x2, y2 = header.crop_source_px
+    if max((x2 - x1) / size[0], (y2 - y1) / size[1]) * view.scale > _MOST_BASE_PX:
+        raise StillError(f"size {size[0]}x{size[1]} is far smaller than what the base shows of it")
     if base is None:
         raise BaseMissingError(f"it builds on frame {header.frame_index}, which is not at hand")
     crop = base_crop(base, view=view, crop_source_px=header.crop_source_px, size=size)
@@ -91,8 +94,6 @@ def coded_size(header: RoiHeader, *, view: View) -> tuple[int, int]:
         # Both sides are shrunk by one factor, each rounded to a pixel. A needle of a picture would cost the base
         # crop the area of the whole frame for each of its pixels.
         raise StillError(f"size {width}x{height} is not the shape of what it shows")
-    if max((x2 - x1) / width, (y2 - y1) / height) * view.scale > _MOST_BASE_PX:
-        raise StillError(f"size {width}x{height} is far smaller than what the base shows of it")
     most = MAX_REQUESTED_SIDE_PX if "ask" in header.parameters else MAX_SIDE_PX
     if max(width, height) > most:
         raise StillError(f"size {width}x{height} is larger than such a still, whose sides are up to {most}")

@@ -21,8 +21,9 @@ from PIL import Image as Pillow
 from hvt_codecs.avif import av1_data, avif_file
 from hvt_common.protocol.messages import RoiHeader, WireError
 from hvt_common.protocol.messages.bits import BitWriter
+from hvt_common.values import View
 from hvt_common.video.hevc import BaseDecoder
-from hvt_common.video.still_codecs import StillError, still_codec, still_codec_names
+from hvt_common.video.still_codecs import JpegCodec, StillError, still_codec, still_codec_names
 from hvt_common.video.still_codecs.h264_syntax import parameter_sets
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
@@ -262,6 +263,14 @@ def test_a_scale_that_no_picture_has_costs_nothing(scale, good):
     header = replace(ROI, codec="residual", crop_source_px=(0, 0, 64, 64), parameters=size)
     with pytest.raises(StillError, match="another base picture" if good else "far smaller"):
         decode_still(ReceivedStill(header, b"\x20still"), base=picture, view=view)
+
+
+def test_a_plain_picture_may_be_as_small_as_it_likes():
+    """A thumbnail of a 4K frame would be refused for a cost that only what builds on the base has."""
+    view = View.fitted((3840, 2160), (1280, 720), fit="letterbox")
+    header = replace(ROI, codec="jpeg", crop_source_px=(0, 0, 3840, 2160), parameters={"w": 32, "h": 18})
+    coded = JpegCodec().encode(np.full((18, 32, 3), 90, np.uint8), quality_pct=65)
+    assert decode_still(ReceivedStill(header, coded.data), base=None, view=view).shape == (18, 32, 3)
 
 
 def test_a_still_of_more_bytes_than_any_has_is_not_taken():
