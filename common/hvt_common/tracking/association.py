@@ -38,9 +38,8 @@ def overlaps(a_xyxy_px: _Floats, b_xyxy_px: _Floats) -> Overlaps:
     if not len(places):
         return Overlaps(places, places, np.empty(0))
     rows, columns = np.divmod(places, near.shape[1])
-    a, b = a.take(rows, axis=1), b.take(columns, axis=1)
-    sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
-    shared = sides[0] * sides[1]
+    a, b = np.take(a, rows, axis=1), np.take(b, columns, axis=1)
+    shared = _areas(np.concatenate((np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:]))))
     return Overlaps(rows, columns, shared / (_areas(a) + _areas(b) - shared))
 
 
