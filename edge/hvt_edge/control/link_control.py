@@ -17,9 +17,10 @@ from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 
 _PART = "reports"
-_MOST_WAIT_NS = 100_000_000
-"""A frame that would wait longer for the budget's window, and longer than half the time to the camera's next, is left
-out before it is encoded."""
+_MOST_WAIT_NS, _MOST_WAIT_FRAMES = 100_000_000, 1.5
+"""A frame that would wait longer than both for the budget's window is left out before it is encoded. A wait until the
+camera's next frame costs none, and about so long each waits a second after a keyframe that took long to code.
+"""
 
 
 @dataclass(eq=False)
@@ -77,7 +78,7 @@ class LinkControl:
         if self.pacer is None:
             return True
         wait_ns = self.transmitter.base_wait_ns(now_ns + coding_ns, line_bytes=line_bytes)
-        most_ns = max(_MOST_WAIT_NS, SECOND_NS / 2 / self.reconfiguration.nominal_fps)
+        most_ns = max(_MOST_WAIT_NS, _MOST_WAIT_FRAMES * SECOND_NS / self.reconfiguration.nominal_fps)
         return self.pacer.admits_base(now_ns, coding_ns=coding_ns) and wait_ns <= most_ns
 
     def holder(self, now_ns: int) -> FrameGroup:

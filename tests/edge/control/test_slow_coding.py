@@ -41,3 +41,23 @@ def test_nearly_every_frame_is_sent_where_a_window_holds_no_whole_number_of_them
     ).fly(30)
     assert len(flight.sent) >= 0.99 * 30 * fps
     assert flight.ledger.worst_window_bps.total <= 300_000
+
+
+@pytest.mark.parametrize("method", ["M0", "M6"])
+@pytest.mark.parametrize("budget", [100_000, 300_000, 800_000])
+@pytest.mark.parametrize(("fps", "coding_s"), [(5, 0.04), (5, 0.1), (10, 0.07)])
+def test_no_frame_is_left_out_a_second_after_a_keyframe_that_took_long(fps, coding_s, budget, method):
+    """A small board would lose one frame in a hundred: a second later each next one waits for one that went late."""
+    flight = LiveFlight(
+        SteppedLink(((0, 2 * budget),)),
+        coding_s=coding_s,
+        keyframe_times=5,
+        keyframe_s=7,
+        track_bytes=0 if method == "M0" else 250,
+        fps=fps,
+        budget=budget,
+        method=method,
+        size=(640, 360) if budget > 100_000 else (320, 180),
+    ).fly(60)
+    assert flight.held == 0
+    assert flight.ledger.worst_window_bps.total <= budget

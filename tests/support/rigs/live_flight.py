@@ -35,6 +35,7 @@ from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
 from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.encoders.registry import Encoder
+from hvt_edge.video.stage import Action
 from hvt_edge.wiring.link import make_budget, make_pacer
 from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, make_frame_skip
 from rigs.kept import INFO
@@ -137,7 +138,8 @@ class LiveFlight:
 
     ``late_s(second)`` is how much later a report comes that is made then, None: not at all. ``joins_s`` is when the
     ground comes. ``commands`` are ``(second, budget)``. ``store`` is a folder for what is stored while the link is
-    away. To code a frame takes about ``coding_s``. The real x265 codes ``pictures``, one after the other, for ever.
+    away. To code a frame takes about ``coding_s``, a keyframe ``keyframe_times`` as long. The real x265 codes
+    ``pictures``, one after the other, for ever.
     """
 
     def __init__(
@@ -152,6 +154,8 @@ class LiveFlight:
         track_bytes: int = 250,
         pose_bytes: int = 60,
         coding_s: float = 0.0,
+        keyframe_times: float = 1.0,
+        keyframe_s: float = 60.0,
         pictures: Sequence[Image] = (),
         loss: float = 0.0,
         seed: int = 0,
@@ -162,7 +166,8 @@ class LiveFlight:
         assert size is not None, "given"
         check_rate(config, size)
         self.link, self.loss, self.late_s, self.joins_s = link, loss, late_s, joins_s
-        self.commands, self.coding_s, self.pictures = list(commands), coding_s, pictures or [_PIXELS]
+        self.commands, self.pictures = list(commands), pictures or [_PIXELS]
+        self.coding_s, self.keyframe_times, self.held = coding_s, keyframe_times, 0
         self.track_bytes, self.pose_bytes = track_bytes, pose_bytes
         self.chance, self.texture = random.Random(seed), texture
         self.now_ns = _START_NS
@@ -172,7 +177,7 @@ class LiveFlight:
         self.rates: list[tuple[float, int]] = []
         self._left: list[tuple[float, float]] = []
         """(second at which a message was sent, second at which it had left)."""
-        self.keyframes = Keyframes(KeyframeSettings(interval_ns=60 * SECOND_NS))
+        self.keyframes = Keyframes(KeyframeSettings(interval_ns=round(keyframe_s * SECOND_NS)))
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._count = itertools.count()
         self._in_loop = False
@@ -349,9 +354,11 @@ class LiveFlight:
         self._in_loop = True
         self.link_control.before_frame(self.now_ns)
         decision = self.stage.decide(frame, now_ns=self.now_ns)
+        self.held += decision.action is Action.HOLD
         unit = self.stage.encode(frame, decision, now_ns=self.now_ns)
         if unit is not None:
-            self._pass(self.now_ns + round(self.coding_s * self.chance.uniform(0.7, 1.3) * SECOND_NS))
+            coding_s = self.coding_s * (self.keyframe_times if unit.keyframe else 1)
+            self._pass(self.now_ns + round(coding_s * self.chance.uniform(0.7, 1.3) * SECOND_NS))
             self.stage.send(unit, decision, now_ns=self.now_ns)
         self._in_loop = False
         if self.pacer is not None:
