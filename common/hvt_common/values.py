@@ -9,7 +9,7 @@ Times ending in ``_ns`` are Unix time in nanoseconds unless the name says otherw
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -164,7 +164,6 @@ class Detections:
 
     @classmethod
     def none(cls) -> Detections:
-        """No detections at all."""
         return cls(np.empty((0, 4), np.float32), np.empty(0, np.float32), np.empty(0, np.int32))
 
 
@@ -190,7 +189,6 @@ class Tracks:
 
     @classmethod
     def none(cls, frame_index: int) -> Tracks:
-        """No track at this frame."""
         none = np.empty(0, np.int64)
         return cls(
             frame_index=frame_index,
@@ -205,6 +203,11 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def take(self, rows: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> Tracks:
+        """Those at ``rows``, an index or mask."""
+        arrays = (one.name for one in fields(self) if one.name != "frame_index")
+        return Tracks(self.frame_index, **{name: getattr(self, name)[rows] for name in arrays})
 
 
 @dataclass(frozen=True, slots=True)

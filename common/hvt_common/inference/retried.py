@@ -16,7 +16,6 @@ class RetriedDetector(Retried[Detector]):
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """The model's."""
         return self.part.class_names
 
     def detect(self, image_bgr: Image) -> Detections | None:
@@ -33,7 +32,6 @@ class RetriedClassifier(Retried[Classifier]):
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """The model's."""
         return self.part.class_names
 
     def classify(self, crops_bgr: Sequence[Image]) -> list[Posterior]:

@@ -161,7 +161,6 @@ class TiledDetector:
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Those of the detector inside."""
         return self._detector.class_names
 
     def grid(self, source_size: tuple[int, int]) -> Grid:

@@ -128,7 +128,6 @@ class LedgerSummary:
 
     @property
     def line_bytes(self) -> int:
-        """Everything."""
         return self.base_bytes + self.roi_bytes + self.backlog_bytes + self.meta_bytes + self.overhead_bytes
 
 
@@ -160,7 +159,6 @@ class Ledger:
         """On the line, with all headers."""
 
     def count_reply(self, line_bytes: int) -> None:
-        """Add an answer to a query."""
         self.replies += 1
         self.reply_bytes += line_bytes
 
@@ -186,7 +184,6 @@ class Ledger:
         return dict(self._outcomes[outcome])
 
     def messages(self, channel: Account) -> int:
-        """Messages counted so far."""
         return self._messages[channel]
 
     @property
@@ -201,7 +198,6 @@ class Ledger:
 
     @property
     def line_bytes(self) -> int:
-        """Everything counted so far."""
         return sum(self._bytes.values()) + self._overhead_bytes
 
     def window_bytes(self, channel: Account | None, now_ns: int) -> int:

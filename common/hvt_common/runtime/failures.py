@@ -109,7 +109,6 @@ class Failures:
                 self._parts[part] = replace(one, over=True)
 
     def works(self, part: str) -> None:
-        """It works, or works again."""
         with self._lock:
             before = self._parts.get(part)
             if before is None or before.working:

@@ -124,7 +124,6 @@ class SequenceWindow:
         return self.count - before
 
     def discard(self, number: int) -> None:
-        """Take a number out again."""
         if number in self:
             self._pages[number >> _PAGE_BITS] ^= 1 << (number & (1 << _PAGE_BITS) - 1)
             self.count -= 1

@@ -84,7 +84,6 @@ class TrackTable:
 
     @classmethod
     def empty(cls) -> TrackTable:
-        """No tracks."""
         return cls.new(
             TrackerInput.of(Detections.none(), low_confidence=0), first_id=1, frame_index=0, classes=0
         )

@@ -30,7 +30,6 @@ class Received:
 
     @property
     def size_bytes(self) -> int:
-        """Payload and attachment."""
         return len(self.payload) + len(self.attachment)
 
 
@@ -63,7 +62,6 @@ class Inbox:
         """Messages that did not fit."""
 
     def put(self, item: Received) -> None:
-        """Add a message, or drop it."""
         with self._changed:
             if not self._fits(item):
                 self.dropped += 1

@@ -51,7 +51,6 @@ class YuvPicture:
 
     @property
     def nbytes(self) -> int:
-        """The bytes of its pixels."""
         return sum(plane.buffer_size for plane in self._picture.planes)
 
     @property

@@ -201,7 +201,6 @@ class Store:
             self._measure()
 
     def end_segment(self) -> None:
-        """Make the appended units an object."""
         if self._open is None or self._db is None:
             return
         try:
@@ -230,11 +229,9 @@ class Store:
     # Giving back
 
     def best_stills(self) -> Iterator[Entry]:
-        """Most useful first."""
         return self._ranked(BacklogKind.STILL)
 
     def newest_segments(self) -> Iterator[Entry]:
-        """Newest first, without the open one."""
         return self._ranked(BacklogKind.BASE)
 
     def info_of(self, session_id: int) -> Entry | None:

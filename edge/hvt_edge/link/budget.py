@@ -129,7 +129,6 @@ class VideoLoan:
         self._wanted = line_bytes, since_ns
 
     def withdraw(self) -> None:
-        """None waits any more."""
         self._wanted = None
 
     def take(self, line_bytes: int, *, now_ns: int) -> None:

@@ -78,9 +78,7 @@ class EdgeLink(Outlet, Protocol):
         """Whether a ground subscribes to base, stills and status."""
         ...
 
-    def has_subscriber(self, channel: Channel) -> bool:
-        """Whether somebody subscribes to this channel."""
-        ...
+    def has_subscriber(self, channel: Channel) -> bool: ...
 
     def listen(self, answers: Answers) -> None:
         """Answer grounds from now on: all that answers them is there."""

@@ -142,7 +142,6 @@ class Still:
 
     @property
     def size_bytes(self) -> int:
-        """Of its pixels."""
         return self.crop_bgr.nbytes + (0 if self.base_crop_bgr is None else self.base_crop_bgr.nbytes)
 
     @property
@@ -162,7 +161,6 @@ class Still:
         return replace(self, header=replace(self.header, **changes))
 
     def of_codec(self, codec: StillCodec) -> Still:
-        """The same for a codec."""
         return replace(self.with_header(codec=codec.name), media_type=codec.media_type)
 
     def without_base(self, codec: StillCodec) -> Still:
@@ -225,7 +223,6 @@ class StillReaders:
         self._video_said = False
 
     def on_request(self, request: InfoRequest) -> None:
-        """A ground says what it reads."""
         if BASE_CODEC not in request.base_codecs and not self._video_said:
             self._video_said = True
             _log.warning(

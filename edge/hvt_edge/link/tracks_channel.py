@@ -6,8 +6,6 @@ from copy import copy
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Final
 
-import numpy as np
-
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import TrackStepEncoder
 from hvt_common.units import SECOND_NS
@@ -68,16 +66,5 @@ class TrackReporter:
 
 
 def _fresh(tracks: Tracks, *, most_frames: int) -> Tracks:
-    fresh = np.flatnonzero(tracks.frame_index - tracks.seen_frames <= most_frames)
-    if len(fresh) == len(tracks):
-        return tracks
-    return Tracks(
-        frame_index=tracks.frame_index,
-        ids=tracks.ids[fresh],
-        boxes_xyxy_px=tracks.boxes_xyxy_px[fresh],
-        confidences=tracks.confidences[fresh],
-        class_ids=tracks.class_ids[fresh],
-        born_frames=tracks.born_frames[fresh],
-        seen_frames=tracks.seen_frames[fresh],
-        started=tracks.started[fresh],
-    )
+    fresh = tracks.frame_index - tracks.seen_frames <= most_frames
+    return tracks if fresh.all() else tracks.take(fresh)

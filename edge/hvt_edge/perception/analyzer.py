@@ -102,7 +102,6 @@ class Analyzer:
 
     @property
     def tracks(self) -> int:
-        """Distinct tracks so far."""
         return self._track_ids.count
 
     @property

@@ -158,7 +158,6 @@ class Candidate:
 
     @property
     def area_px(self) -> float:
-        """Box area in source pixels."""
         x1, y1, x2, y2 = self.box_source_px
         return max(0.0, x2 - x1) * max(0.0, y2 - y1)
 

@@ -51,7 +51,6 @@ class RingFrame:
 
     @property
     def source_bgr(self) -> Image:
-        """The whole source frame."""
         if self.pixels.ndim == 3:
             return self.pixels
         return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_YUV2BGR_I420), np.uint8)

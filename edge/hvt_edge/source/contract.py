@@ -120,7 +120,6 @@ class ClipSource(Source):
     _running: Generator[Frame, None, None] | None = None
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
-        """The clip from its beginning."""
         self.close()
         self._running = self._play(start_ns)
         return self._running

@@ -141,7 +141,6 @@ def _inside(box_xywh_px: tuple[int, int, int, int], size: tuple[int, int]) -> Cr
 
 
 def box_of(boxes: Boxes, row: int) -> Box:
-    """One row as plain numbers."""
     x1, y1, x2, y2 = (float(one) for one in boxes[row])
     return x1, y1, x2, y2
 
@@ -371,7 +370,6 @@ class OnDemand:
             self._note(pending.number, refusal=_ENDED if reason == "ended" else f"in {waited_s:g} s {why}")
 
     def close(self) -> None:
-        """No more is accepted."""
         self._ended = True
 
     def _want_tracks(self, capture_ns: int) -> None:

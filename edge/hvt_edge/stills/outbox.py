@@ -210,7 +210,6 @@ class Outbox:
             return [self._expire(one, "stale") for one in old]
 
     def give_up(self, pending: OutboxStill) -> None:
-        """No still comes of it."""
         with self._lock:
             self._expire(pending, "")
 

@@ -47,7 +47,6 @@ def open_local_copy(path: Path, *, failures: Failures, wait: bool) -> AbstractCo
 
 
 def store_folder(config: EdgeConfig) -> Path:
-    """The folder of the backlog."""
     return config.store_folder or default_folder(config.edge_id)
 
 

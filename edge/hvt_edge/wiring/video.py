@@ -140,7 +140,6 @@ def _least_fps(config: EdgeConfig, size: tuple[int, int]) -> float:
 def make_frame_skip(
     config: EdgeConfig, decimation: int, *, size: tuple[int, int], least_decimation: Callable[[], int]
 ) -> FrameSkip:
-    """Which source frames are coded."""
     if not config.auto_fps:
         return FrameSkip(decimation, least_decimation=least_decimation)
     most = most_decimation(config.nominal_fps, least_fps=_least_fps(config, size))

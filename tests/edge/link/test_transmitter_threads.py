@@ -36,7 +36,7 @@ class Rig:
 
     def still(self, number: int, size: int, *, now_ns: int = NOW_NS) -> None:
         """One of so many bytes."""
-        still = replace(STILL, sequence=number, data=b"\xff" * size)
+        still = replace(STILL.with_header(sequence=number), data=b"\xff" * size)
         self.sender.still(still, now_ns=now_ns)
 
     def backlog(self, size: int, *, now_ns: int = NOW_NS, offset: int = 0) -> int:

@@ -177,7 +177,6 @@ class Kind:
         return self.match(trial.up_to(255 if self.preparation.scale[0] == 1 else 1))
 
     def head(self, name: str, match: Match, why: str) -> Head:
-        """The head that a match means."""
         return Head(
             name,
             match.classes,

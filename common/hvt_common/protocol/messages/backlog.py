@@ -78,7 +78,6 @@ class BacklogHeader(Message):
 
     @property
     def key(self) -> ObjectKey:
-        """Of the object."""
         return self.session_id, self.kind, self.number
 
 
@@ -94,7 +93,6 @@ class AcknowledgedRange:
 
     @property
     def key(self) -> ObjectKey:
-        """Of the object."""
         return self.session_id, self.kind, self.number
 
 

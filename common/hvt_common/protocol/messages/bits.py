@@ -40,7 +40,6 @@ class BitWriter:
         return self
 
     def se(self, value: int, order: int = 0) -> BitWriter:
-        """``value`` as a signed Exp-Golomb number."""
         return self.ue(2 * value - 1 if value > 0 else -2 * value, order=order)
 
     def ended(self, *, stop: str = "1", fill: str = "0") -> bytes:
@@ -66,7 +65,6 @@ class BitReader:
         return int(self._text[start:end] or "0", 2)
 
     def ue(self, order: int = 0) -> int:
-        """The next unsigned Exp-Golomb number."""
         zeros = 0
         while not self.u(1):
             zeros += 1
@@ -76,11 +74,9 @@ class BitReader:
         return (1 << bits | self.u(bits)) - (1 << order)
 
     def ues(self, number: int) -> list[int]:
-        """Read so many of them."""
         return [self.ue() for _ in range(number)]
 
     def se(self, order: int = 0) -> int:
-        """The next signed Exp-Golomb number."""
         code = self.ue(order)
         return (code + 1) // 2 if code % 2 else -(code // 2)
 

@@ -39,7 +39,6 @@ class PoseReport(Message):
     """1: as docs/wire-messages.md has it."""
 
     def is_of(self, session_id: int) -> bool:
-        """Whether it is of this session."""
         return self.session == session_id & U32
 
     @property

@@ -186,7 +186,6 @@ class Status(Message):
 
     @property
     def frame_account(self) -> FrameAccount:
-        """The outcome of each source frame."""
         return FrameAccount.of_counts(self.frames, coded_fps=self.coded_fps, auto_fps=self.auto_fps)
 
     @property

@@ -70,7 +70,6 @@ class BaseHeader(Message):
 
     @property
     def keyframe(self) -> bool:
-        """True where a decoder can start."""
         return bool(self.flags & Flags.KEYFRAME)
 
     @property
@@ -216,7 +215,6 @@ class RoiHeader(Message):
     """Further tracks that the same crop shows."""
 
     def on_wire(self) -> StillWire:
-        """As it is sent."""
         return StillWire.of(self)
 
     @classmethod
@@ -240,7 +238,6 @@ class CaptureTimes:
         """Session and frame → capture time, the newest."""
 
     def note(self, header: BaseHeader) -> None:
-        """A frame came, or was sent."""
         self._known[header.session_id, header.frame_index] = header.capture_ns
 
     def knows(self, session_id: int, frame_index: int) -> bool:

@@ -122,7 +122,6 @@ class IntraCodec(ABC):
     needs_base = False
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
-        """See `StillCodec`."""
         return CodedCrop(self._encoded(crop_bgr, quality_pct))
 
     def decode(
@@ -133,7 +132,6 @@ class IntraCodec(ABC):
         parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
         base_bgr: Image | None = None,  # noqa: ARG002
     ) -> Image:
-        """See `StillCodec`."""
         return self._decoded(data, size)
 
     @abstractmethod

@@ -89,7 +89,6 @@ class Uncertain:
     video_only: bool = field(default=False, init=False)
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:  # noqa: ARG002
-        """Least confident first."""
         return ranked(candidates, score=self._doubt, reason="uncertain")
 
     def _doubt(self, candidate: Candidate) -> float | None:
@@ -150,7 +149,6 @@ class Utility:
         return wanted
 
     def score(self, candidate: Candidate, step: Step) -> float:
-        """``S`` of one candidate."""
         gain = (
             self.uncertainty_weight * uncertainty(candidate)
             + self.small_weight * smallness(candidate, area_share=self.area_share)

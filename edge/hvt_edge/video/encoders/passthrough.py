@@ -131,7 +131,6 @@ class LeastLink:
         self._drained_ns = 0
 
     def sent(self, size_bytes: int, *, now_ns: int) -> None:
-        """Count line bytes that go out."""
         self._drain(now_ns)
         self._queued_bytes += size_bytes
 
