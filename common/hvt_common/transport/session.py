@@ -24,6 +24,7 @@ from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, 
 from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.transport.inbox import Received, ReceivedQueue
 from hvt_common.transport.link_doctor import link_doctor
+from hvt_common.transport.stale_sockets import StaleSockets
 from hvt_common.transport.zenoh_config import LinkSettings, configure, without_build_paths
 
 _log = logging.getLogger(__name__)
@@ -57,7 +58,8 @@ def open_session(settings: LinkSettings, *, failures: Failures | None = None) ->
             raise UserError(why) from None
         session = _open_listening_later(config, listen, why, failures, stop)
     try:
-        yield session
+        with StaleSockets(session, config):
+            yield session
     finally:
         stop.set()
         _close(session)

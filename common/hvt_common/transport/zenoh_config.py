@@ -33,7 +33,7 @@ _DEFAULTS: Mapping[str, Any] = {
     "listen/exit_on_failure": True,
     "connect/timeout_ms": -1,
     "connect/exit_on_failure": False,
-    "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
+    "connect/retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5},
     "transport/unicast/open_timeout": 3000,
     # An outage is noticed after about this long in place of 10 s.
     "transport/link/tx/lease": 3000,

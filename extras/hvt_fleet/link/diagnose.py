@@ -19,6 +19,7 @@ import zenoh
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.link_doctor import LinkDoctor, LinkWatch
+from hvt_common.transport.stale_sockets import end_of
 from hvt_common.transport.zenoh_config import LinkSettings, connect_endpoints
 from hvt_fleet.link.certificate import TlsFiles, check_own_keys
 from hvt_fleet.link.duplicate_edge import refuse_duplicate_edge
@@ -278,7 +279,7 @@ def _connected_twice(config: zenoh.Config) -> set[str]:
 
 
 def _ends(link: zenoh.Link) -> list[str]:
-    return [_bare(str(end)).partition("/")[2] for end in (link.src, link.dst)]
+    return [end_of(end) for end in (link.src, link.dst)]
 
 
 def _bare(endpoint: str) -> str:

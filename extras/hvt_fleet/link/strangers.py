@@ -7,17 +7,14 @@ that has had a link it is taken for one of its own that broke off, as in an outa
 
 from __future__ import annotations
 
-import ipaddress
 import re
-import struct
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from hvt_common.runtime.statistics import Newest
+from hvt_common.transport.stale_sockets import TCP_TABLES, connections
 
-_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
-_LISTEN = "0A"
 _TIMES, _WITHIN_S = 3, 600.0
 """Who is refused tries again each second, and on a quick link is seen now and then only."""
 _AGAIN_S = 60.0
@@ -27,7 +24,7 @@ _MOST_HOSTS = 256
 class Strangers:
     """``ports`` are those that we listen on. For one thread; check several times a second."""
 
-    def __init__(self, ports: Iterable[int], *, tables: Iterable[Path] = _TABLES) -> None:
+    def __init__(self, ports: Iterable[int], *, tables: Iterable[Path] = TCP_TABLES) -> None:
         self._ports = frozenset(ports)
         self._tables = [one for one in tables if one.exists()] if self._ports else []
         self._linked: set[str] = set()
@@ -50,7 +47,8 @@ class Strangers:
 
     def check(self, links: Callable[[], Iterable[str]], now_s: float) -> list[str]:
         """Return the hosts to be named now; ``links`` gives the far ends of the links that stand."""
-        connected = {one for table in self._tables for one in self._connected(table)}
+        here = (one for table in self._tables for one in connections(table))
+        connected = {one.theirs for one in here if int(one.ours.rpartition(":")[2]) in self._ports}
         if connected <= self._linked and not self._pending:
             self._linked = connected
             return []
@@ -74,27 +72,11 @@ class Strangers:
         self._said_s[host] = now_s
         return True
 
-    def _connected(self, table: Path) -> Iterable[str]:
-        for line in table.read_text(encoding="ascii").splitlines()[1:]:
-            _, ours, theirs, state = line.split(maxsplit=4)[:4]
-            if state != _LISTEN and int(ours.rpartition(":")[2], 16) in self._ports:
-                address, _, port = theirs.rpartition(":")
-                yield f"{_address(address)}:{int(port, 16)}"
-
 
 def listening_ports(endpoints: Iterable[str]) -> set[int]:
     """The ports of the TCP and TLS endpoints, such as ``tls/0.0.0.0:7447``."""
     found = (re.match(r"(?:tcp|tls)/.*:(\d+)(?:[?#]|$)", one) for one in endpoints)
     return {int(one[1]) for one in found if one is not None}
-
-
-def _address(text: str) -> str:
-    # The kernel writes words of four bytes in the machine's own order.
-    words = [int(text[at : at + 8], 16) for at in range(0, len(text), 8)]
-    address = ipaddress.ip_address(struct.pack(f"={len(words)}I", *words))
-    if isinstance(address, ipaddress.IPv6Address):
-        return str(address.ipv4_mapped or f"[{address}]")
-    return str(address)
 
 
 def _host(far_end: str) -> str:

@@ -67,7 +67,7 @@ def test_each_stranger_once_a_minute(tmp_path: Path) -> None:
     def shown(now_s: float, *far_ends: str, links: tuple[str, ...] = ()) -> list[str]:
         lines = [f"   0: 00000000:1D17 {one} 01 0 0 0 0 0 0 0\n" for one in far_ends]
         lines.append(
-            "   1: 00000000:1D17 00000000:0000 0A 0 0 0 0 0 0 0\n   2: 0100007F:0016 0200000A:9999 01 0 0\n"
+            "   1: 00000000:1D17 00000000:0000 0A 0 0 0 0 0 0 0\n   2: 0100007F:0016 0200000A:9999 01 0 0 0 0 0 0 0\n"
         )
         table.write_text(header + "".join(lines))
         return strangers.check(lambda: links, now_s)

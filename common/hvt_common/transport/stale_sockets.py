@@ -1,0 +1,205 @@
+"""Frees Zenoh of TCP sockets that a dark line leaves behind (Linux only: /proc says which they are)."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import re
+import socket
+import stat
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import zenoh
+
+from hvt_common.transport.zenoh_config import connect_endpoints
+
+TCP_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
+
+_EVERY_S = 0.25
+_HANGS_S = 0.5
+"""After so long a handshake is doubted: the place is probed, and again each time so much later."""
+_PROBE_S = 3.0
+_LINGER, _NO_LINGER = struct.pack("ii", 1, 10), struct.pack("ii", 0, 0)
+_LAST_DATA_RECEIVED = 52
+"""Offset of ``tcpi_last_data_recv`` (ms) in Linux's ``struct tcp_info``."""
+_INIT_SYN = bytes((4, 0, 0x01, 0x09, 0x01, 0x01))
+"""The first message of Zenoh's protocol 9: its length, InitSyn, the version, a peer, its id of one byte. Whatever
+listens there answers: Zenoh with an InitAck, TLS with an alert, a web socket by hanging up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """One line of the kernel's table; an end is like ``10.0.0.2:7447`` or ``[::1]:7447``."""
+
+    ours: str
+    theirs: str
+    inode: int
+
+
+def connections(table: Path) -> Iterator[Connection]:
+    """What one of `TCP_TABLES` has, but listening sockets."""
+    for line in table.read_text(encoding="ascii").splitlines()[1:]:
+        _, ours, theirs, state, *_, inode = line.split(maxsplit=10)[:10]
+        if state != "0A":
+            yield Connection(_end(ours), _end(theirs), int(inode))
+
+
+def end_of(locator: object) -> str:
+    """The end that a locator of Zenoh's names, such as ``tcp/[::1]:7447?prio=1-3``, as `Connection` has it."""
+    host, _, port = re.sub(r"^\w+/|[?#].*", "", str(locator)).rpartition(":")
+    with suppress(ValueError):  # no address of a network
+        host = _host(ipaddress.ip_address(host.strip("[]").partition("%")[0]))
+    return f"{host}:{port}"
+
+
+class StaleSockets:
+    """Watches the sockets of one session, in a thread; a context manager, left before the session is closed.
+
+    Zenoh (1.10) closes with SO_LINGER: while nobody acknowledges what was sent last, close(2) holds one of its few
+    threads for ten seconds, and with it the next connection, at either end, and what others send. And a handshake
+    that began in darkness has all of ``open_timeout``, even if the line is back: a tunnel or proxy on the way may
+    have accepted it, and says nothing. So no socket lingers, and a handshake that hangs is shut down as soon as a
+    probe that began after it was answered, and it was not: on a slow line the older has its answer first. The next
+    one has its full time, should the other side be slow.
+    """
+
+    def __init__(self, session: zenoh.Session, config: zenoh.Config) -> None:
+        self._session = session
+        self._open_s = int(config.get_json("transport/unicast/open_timeout")) / 1000
+        self._tables = [one for one in TCP_TABLES if one.exists()]
+        self._ports = {end_of(one).rpartition(":")[2] for one in connect_endpoints(config)}
+        self._done: set[int] = set()
+        """Sockets that linger no more."""
+        self._pending_s: dict[int, float] = {}
+        """Handshakes, and when each was first seen."""
+        self._probes: set[int] = set()
+        """Our own sockets."""
+        self._probed_s: dict[str, float] = {}
+        self._answered_s: dict[str, float] = {}
+        """When the last probe of a place began that was answered."""
+        self._spare_until_s = 0.0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hvt-sockets", daemon=True)
+
+    def __enter__(self) -> Self:
+        if self._tables:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        if self._tables:
+            self._thread.join(1.0)
+
+    def _run(self) -> None:
+        while not self._stop.wait(_EVERY_S):
+            with suppress(OSError, zenoh.ZError):
+                self._check(time.monotonic())
+
+    def _check(self, now_s: float) -> None:
+        own = _own_sockets()
+        self._done = {inode for inode, fd in own.items() if inode in self._done or _linger_ended(fd, inode)}
+        if not self._ports:
+            return
+        here = {one.inode: one for table in self._tables for one in connections(table) if one.inode in own}
+        links = {(end_of(link.src), end_of(link.dst)) for link in self._session.info.links()}
+        pending = {
+            inode: one.theirs
+            for inode, one in here.items()
+            if (one.ours, one.theirs) not in links
+            and one.theirs.rpartition(":")[2] in self._ports
+            and inode not in self._probes
+        }
+        self._pending_s = {inode: self._pending_s.get(inode, now_s) for inode in pending}
+        for inode, theirs in pending.items():
+            if now_s - max(self._pending_s[inode], self._probed_s.get(theirs, 0.0)) >= _HANGS_S:
+                self._probed_s[theirs] = now_s
+                threading.Thread(target=self._probe, args=[theirs], name="hvt-probe", daemon=True).start()
+        stale = [inode for inode, theirs in pending.items() if self._is_stale(own[inode], inode, theirs)]
+        if stale and now_s > self._spare_until_s:
+            self._spare_until_s = now_s + self._open_s
+            for inode in stale:
+                _shut_down(own[inode], inode)
+
+    def _is_stale(self, fd: int, inode: int, theirs: str) -> bool:
+        answered_s = self._answered_s.get(theirs, 0.0)
+        return self._pending_s[inode] < answered_s and _received_s(fd, inode) < answered_s
+
+    def _probe(self, theirs: str) -> None:
+        began_s = time.monotonic()
+        host, _, port = theirs.rpartition(":")
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with suppress(OSError), socket.socket(family) as probe:
+            inode = os.fstat(probe.fileno()).st_ino
+            self._probes.add(inode)
+            probe.settimeout(_PROBE_S)
+            try:
+                probe.connect((host.strip("[]"), int(port)))
+                probe.sendall(_INIT_SYN)
+                probe.recv(1)  # hung up: somebody was there, too
+                self._answered_s[theirs] = max(began_s, self._answered_s.get(theirs, 0.0))
+            finally:
+                probe.close()
+                self._probes.discard(inode)
+
+
+def _own_sockets() -> dict[int, int]:
+    # Inode → descriptor.
+    found = {}
+    for one in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # closed meanwhile
+            status = os.fstat(int(one.name))
+            if stat.S_ISSOCK(status.st_mode):
+                found[status.st_ino] = int(one.name)
+    return found
+
+
+@contextmanager
+def _same(fd: int, inode: int) -> Iterator[socket.socket]:
+    # Zenoh may close it at any moment, and its number be another's. OSError where it is.
+    with socket.socket(fileno=os.dup(fd)) as one:
+        if os.fstat(one.fileno()).st_ino != inode:
+            raise OSError("closed meanwhile")
+        yield one
+
+
+def _linger_ended(fd: int, inode: int) -> bool:
+    with suppress(OSError), _same(fd, inode) as one:
+        if one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, len(_LINGER)) == _LINGER:
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+            return True
+    return False
+
+
+def _shut_down(fd: int, inode: int) -> None:
+    with suppress(OSError), _same(fd, inode) as one:
+        one.shutdown(socket.SHUT_RDWR)
+
+
+def _received_s(fd: int, inode: int) -> float:
+    # When data came last, or else when it was connected; long ago for what still connects.
+    with suppress(OSError), _same(fd, inode) as one:
+        info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 104)
+        (ago_ms,) = struct.unpack_from("=I", info, _LAST_DATA_RECEIVED)
+        return time.monotonic() - float(ago_ms) / 1000
+    return time.monotonic()
+
+
+def _end(text: str) -> str:
+    # The kernel writes words of four bytes in the machine's own order.
+    address, _, port = text.rpartition(":")
+    words = [int(address[at : at + 8], 16) for at in range(0, len(address), 8)]
+    return f"{_host(ipaddress.ip_address(struct.pack(f'={len(words)}I', *words)))}:{int(port, 16)}"
+
+
+def _host(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str:
+    if isinstance(address, ipaddress.IPv6Address):
+        return str(address.ipv4_mapped or f"[{address}]")
+    return str(address)
