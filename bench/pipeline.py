@@ -30,6 +30,7 @@ from hvt_ground.link.reassemble import Arrival
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.sdk import leave_out_pandas
 from hvt_ground.wiring import Models, SessionPerception
 
 _FRAMES = 200
@@ -38,6 +39,7 @@ _ROUNDS = 3
 
 
 def rows() -> list[dict[str, object]]:
+    leave_out_pandas()  # as hvt-ground does
     taken = frames(_FRAMES)
     edge, ground, floor_edge, floor_ground = [], [], [], []
     for _ in range(_ROUNDS):

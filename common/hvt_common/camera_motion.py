@@ -196,22 +196,17 @@ def _by_flow(previous: _Gray, current: _Gray) -> Affine | None:
 
 
 def _plausible(affine: Affine) -> bool:
-    if not np.isfinite(affine).all():
-        return False
-    stretch = np.linalg.svd(affine[:, :2], compute_uv=False)
-    mirrored = np.linalg.det(affine[:, :2]) <= 0
-    return bool(not mirrored and stretch[-1] >= _SCALE_RANGE[0] and stretch[0] <= _SCALE_RANGE[1])
+    # Of a similarity, which is never mirrored.
+    scale = float(np.hypot(affine[0, 0], affine[1, 0]))
+    return bool(np.isfinite(affine).all()) and _SCALE_RANGE[0] <= scale <= _SCALE_RANGE[1]
 
 
 def _at_full_size(affine: Affine, *, full_size: tuple[int, int], small_size: tuple[int, int]) -> Affine:
     # The same motion between full images, whose pixel centres map as ``small = full * k + (k - 1) / 2``.
     ratio = np.array(small_size, np.float64) / np.array(full_size, np.float64)
-    to_small = np.eye(3)
-    to_small[:2, :2] = np.diag(ratio)
-    to_small[:2, 2] = (ratio - 1) / 2
-    small = np.vstack((affine, [0.0, 0.0, 1.0]))
-    full = np.linalg.inv(to_small) @ small @ to_small
-    return np.asarray(full[:2], np.float64)
+    offset = (ratio - 1) / 2
+    linear = affine[:, :2] * ratio / ratio[:, None]
+    return np.column_stack((linear, (affine[:, :2] @ offset + affine[:, 2] - offset) / ratio))
 
 
 def _identity() -> Affine:
