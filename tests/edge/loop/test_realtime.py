@@ -73,7 +73,7 @@ class BlockedStills:
             self.decoded += self.decoder.decode(one.data) is not None
         self.frames.append(frame.index)
 
-    def send(self, seen, *, now_ns):
+    def step(self, seen, *, now_ns):
         """A ``put`` that blocks."""
         assert self.released.wait(60)
 
