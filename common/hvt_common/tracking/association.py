@@ -45,7 +45,7 @@ def overlaps(a_xyxy_px: _Floats, b_xyxy_px: _Floats) -> Overlaps:
 
 def larger(a: Overlaps, b: Overlaps) -> Overlaps:
     """The larger IoU of each pair that either has."""
-    iou = np.zeros((1 + max(*a.rows, *b.rows, 0), 1 + max(*a.columns, *b.columns, 0)))
+    iou = np.zeros([1 + max((*one, *other), default=0) for one, other in zip(a[:2], b[:2], strict=True)])
     for rows, columns, shared in (a, b):
         iou[rows, columns] = np.maximum(iou[rows, columns], shared)
     rows, columns = iou.nonzero()

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
 from hvt_common.tracking import kalman
-from hvt_common.tracking.association import assign, overlaps
+from hvt_common.tracking.association import assign, larger, overlaps
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Detections, Tracks
 from studies.clear_mot import Frames, score
@@ -171,6 +171,10 @@ def test_overlap_counts_whole_pixels() -> None:
     shared = overlaps(a, b)
     assert (shared.rows.tolist(), shared.columns.tolist()) == ([0, 0], [0, 1]), "nothing of the third"
     np.testing.assert_allclose(shared.iou, [1.0, 50 / 150])
+    nothing = overlaps(a, b[2:])
+    assert [len(column) for column in larger(nothing, nothing)] == [0, 0, 0], "a session ended with it"
+    for pair in ((shared, nothing), (nothing, shared)):
+        np.testing.assert_array_equal(larger(*pair).iou, shared.iou)
 
 
 # --- properties
