@@ -23,7 +23,7 @@ from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.compare import print_result
 from hvt_study.matrix.compare import ComparePlan, CompareResult, CompareRow, compare
 from hvt_study.matrix.pools import local_pool
-from hvt_study.report.figures.compare_plot import plot
+from hvt_study.report.figures.drawing import plot
 from hvt_study.runs.spec import ModelChoice
 
 _RATES = (150_000, 200_000, 300_000, 400_000, 800_000)

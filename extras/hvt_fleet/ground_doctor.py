@@ -19,7 +19,7 @@ from hvt_fleet.checkup import check_clock, check_folder, check_link, print_findi
 from hvt_ground.config import GroundConfig
 from hvt_ground.extras import checked, config_class, extras_of, written
 from hvt_ground.perception.models import Models
-from hvt_ground.wiring.files import is_file
+from hvt_ground.wiring.sessions import is_file
 
 _DESCRIPTION = (
     "Check what a ground with these settings needs; takes the settings of hvt-ground. --json is for programs."

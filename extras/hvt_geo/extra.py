@@ -45,7 +45,6 @@ class GeoExtra(Extra[GeoOptions]):
         if terrain is None:
             return lambda _flight: SurfaceLocator()
         with needs_extra("'hvt[terrain]'"):
-            from hvt_geo.elevation import ElevationModel  # noqa: PLC0415 - who has none needs no GDAL
-            from hvt_geo.terrain import Terrain  # noqa: PLC0415 - as above
+            from hvt_geo.elevation import ElevationModel, Terrain  # noqa: PLC0415 - who has none needs no GDAL
         model = ElevationModel(terrain)
         return lambda flight: SurfaceLocator(Terrain(model, flight))

@@ -24,8 +24,7 @@ if TYPE_CHECKING:  # an extra brings settings, and ``--help`` is to open no reco
     from hvt_ground.control import EdgeClient
     from hvt_ground.events import Event, Refinement
     from hvt_ground.poses import Locator
-    from hvt_ground.recordings.contract import Recorded
-    from hvt_ground.recordings.row import RecordingRow
+    from hvt_ground.recordings.row import Recorded, RecordingRow
     from hvt_ground.report.state import GroundState
     from hvt_ground.sinks import Outputs, SinkWriter
 

@@ -16,7 +16,7 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.extras import checked, config_class
 from hvt_ground.sinks.line_file import has_nothing
 from hvt_ground.wiring import check_outputs, make_folders, output_path
-from hvt_ground.wiring.files import backlog_path, free_path
+from hvt_ground.wiring.sessions import backlog_path, free_path
 
 
 def read(*argv: str) -> GroundConfig:

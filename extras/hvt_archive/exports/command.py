@@ -6,21 +6,140 @@ Video is copied, not coded again, unless boxes are drawn into it.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+import csv
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from pathlib import Path
+
+import av.error
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from hvt_archive.exports.maps import write_geojson, write_kml
 from hvt_archive.exports.pictures import write_coco, write_stills
-from hvt_archive.exports.tables import write_csv, write_mot, write_parquet
 from hvt_archive.exports.video import CONTAINERS, write_video
-from hvt_archive.exports.whole import whole_file, whole_folder
 from hvt_archive.reading.recorded import read_recordings
 from hvt_common.errors import Parser, UserError, check_not_read
 from hvt_common.runtime.reporting import say
 from hvt_ground.extras import all_extras, locators
-from hvt_ground.recordings.contract import Recorded
+from hvt_ground.recordings.row import Recorded
+from hvt_ground.sinks.event_tables import TRACK_COLUMNS, plain_cells, track_rows
+from hvt_ground.sinks.line_file import claim_name
 from hvt_ground.sinks.rerun.stills import still_of_event
+
+_BATCH_ROWS = 100_000
+_TYPES = {
+    "frame_index": pa.int64(),
+    "capture_utc": pa.string(),
+    "id": pa.int64(),
+    **dict.fromkeys(("x", "y", "w", "h", "confidence"), pa.float32()),
+    **dict.fromkeys(("base_class", "class", "origin"), pa.dictionary(pa.int32(), pa.string())),
+    **dict.fromkeys(("refined", "late", "doubted"), pa.bool_()),
+    **dict.fromkeys(("latitude", "longitude"), pa.float64()),
+    "error_m": pa.float32(),
+}
+
+
+def write_csv(recorded: Recorded, path: Path) -> None:
+    """One line a track and frame, the columns of `hvt_ground.sinks.event_tables`."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(TRACK_COLUMNS)
+        writer.writerows(map(plain_cells, _rows(recorded)))
+
+
+def write_parquet(recorded: Recorded, path: Path) -> None:
+    """The same as a Parquet file."""
+    schema = pa.schema([(name, _TYPES[name]) for name in TRACK_COLUMNS])
+    rows = _rows(recorded)
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        while batch := list(islice(rows, _BATCH_ROWS)):
+            writer.write_table(_table(batch, schema))
+
+
+def _table(rows: Sequence[tuple[object, ...]], schema: pa.Schema) -> pa.Table:
+    columns = []
+    for field, column in zip(schema, zip(*rows, strict=True), strict=True):
+        kind = field.type
+        number = float if pa.types.is_floating(kind) else bool if pa.types.is_boolean(kind) else None
+        values = column if number is None else [None if one == "" else number(one) for one in column]
+        text = pa.types.is_dictionary(kind)
+        columns.append(pa.array(values, pa.string()).cast(kind) if text else pa.array(values, kind))
+    return pa.table(columns, schema=schema)
+
+
+def write_mot(recorded: Recorded, path: Path) -> None:
+    """``frame,id,x,y,w,h,confidence,-1,-1,-1``: base pixels, frames from 1 (MOTChallenge, Dendorfer et al., 2020).
+
+    Tracks that stills doubt are left out: the format has no word for them.
+    """
+    doubted = TRACK_COLUMNS.index("doubted")
+    with path.open("w", encoding="utf-8") as file:
+        for overlay in recorded.overlays():
+            for row in track_rows(overlay):
+                if not row[doubted]:
+                    _, _, *values = row[: TRACK_COLUMNS.index("confidence") + 1]
+                    file.write(",".join(map(str, (overlay.frame_index + 1, *values))) + ",-1,-1,-1\n")
+
+
+def _rows(recorded: Recorded) -> Iterator[tuple[object, ...]]:
+    for overlay in recorded.overlays():
+        yield from track_rows(overlay)
+
+
+@contextmanager
+def whole_file(path: Path, *, new: bool = False) -> Iterator[Path]:
+    """The name to write to; it takes the place of ``path`` at the end, and is removed where that fails.
+
+    Raises:
+        UserError: it cannot be written, or is to be ``new`` and somebody has made one meanwhile.
+    """
+    part = _part_of(path)
+    if path.exists() and not path.is_file():  # moved over /dev/null, every program would fill the file
+        raise UserError(f"{path} is there and no file: name a file with --out")
+    try:
+        yield part
+        if new and not claim_name(path):
+            raise UserError(f"{path} is there already: name another with --out")
+        part.replace(path)
+    except (OSError, av.error.FFmpegError) as error:
+        raise UserError(f"{path} cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """The same of a folder, which may be there if it is empty.
+
+    Raises:
+        UserError: it is not empty, or cannot be written.
+    """
+    part = _part_of(path)
+    try:
+        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+            raise UserError(f"{path} is there and not an empty folder: name one that is new")
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        yield part
+        if path.is_dir():
+            path.rmdir()
+        part.replace(path)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _part_of(path: Path) -> Path:
+    if not path.name:
+        raise UserError(f"--out {path} has no name: name a file, or a folder that is new")
+    return path.with_name(f".{path.name}.{os.getpid()}.part")  # another export may write the same
+
 
 _Write = Callable[[Recorded, Path], None]
 _FOLDERS: dict[str, _Write] = {"coco": write_coco, "stills": write_stills}

@@ -19,7 +19,7 @@ from typing import Any, Final
 from hvt_common.errors import UserError
 from hvt_common.geodesy import metres_per_degree, moved, turned_deg
 from hvt_common.units import SECOND_NS, utc_text
-from hvt_ground.recordings.contract import Recorded
+from hvt_ground.recordings.row import Recorded
 from hvt_ground.sinks.palette import class_colour
 
 _EVERY_NS: Final = SECOND_NS

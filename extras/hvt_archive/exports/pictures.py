@@ -13,7 +13,7 @@ from hvt_archive.exports.video import pictures
 from hvt_common.errors import UserError
 from hvt_common.units import utc_text
 from hvt_ground.events import Overlay
-from hvt_ground.recordings.contract import Recorded
+from hvt_ground.recordings.row import Recorded
 from hvt_ground.sinks.event_tables import plain_cells
 
 STILL_COLUMNS = ("file", "base_file", "frame_index", "capture_utc", "caption")

@@ -17,7 +17,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder, parameter_sets
 from hvt_ground.events import Overlay, VideoSample
-from hvt_ground.recordings.contract import Recorded
+from hvt_ground.recordings.row import Recorded
 from hvt_ground.sinks.palette import class_colour
 
 CONTAINERS = {"mp4": "mp4", "mkv": "matroska", "ts": "mpegts"}

@@ -26,7 +26,7 @@ from hvt_common.protocol.messages import READ_VERSIONS, Info, RoiHeader, WireErr
 from hvt_common.video.hevc import is_keyframe
 from hvt_ground.events import VEHICLE, Notice, Overlay, PoseUpdate, VideoSample
 from hvt_ground.poses import NOWHERE, Locator
-from hvt_ground.recordings.contract import Recorded, RecordedStill
+from hvt_ground.recordings.row import Recorded, RecordedStill
 from hvt_ground.sinks.rerun.blueprint import (
     DOUBTED,
     EVENTS,

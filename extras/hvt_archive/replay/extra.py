@@ -82,7 +82,7 @@ class _Logging(Service):
     def _open(self) -> MessageLog:
         # One that failed stays as it is: the next has a number in its name.
         from hvt_archive.replay.message_log import MessageLog  # noqa: PLC0415
-        from hvt_ground.wiring.files import free_path  # noqa: PLC0415
+        from hvt_ground.wiring.sessions import free_path  # noqa: PLC0415
 
         path = free_path([self._path], self._taken, number=2, may_exist=self._path)
         try:

@@ -73,7 +73,7 @@ class CotExtra(Extra[CotOptions]):
         if config.cot:
             with needs_extra("'hvt[cot]'"):
                 from hvt_gateways.cot.connection import check_connection  # noqa: PLC0415 - who has none needs no pytak
-                from hvt_gateways.cot.type_table import read_types  # noqa: PLC0415
+                from hvt_gateways.cot.event import read_types  # noqa: PLC0415
             read_types(config.cot_types)
             for url in config.cot:
                 check_connection(url)
@@ -94,9 +94,9 @@ class CotExtra(Extra[CotOptions]):
             return lambda _flight: ()
         self.check_outputs(config)
         from hvt_gateways.cot.connection import CotConnection  # noqa: PLC0415 - as above
+        from hvt_gateways.cot.event import read_types  # noqa: PLC0415 - as above
         from hvt_gateways.cot.reporter import SessionReporter  # noqa: PLC0415 - as above
         from hvt_gateways.cot.schedule import STALE_NS  # noqa: PLC0415 - as above
-        from hvt_gateways.cot.type_table import read_types  # noqa: PLC0415 - as above
 
         # A server that cuts one connection shall not see everything go stale before the next.
         pause_s = STALE_NS / SECOND_NS / 3

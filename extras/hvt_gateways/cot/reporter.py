@@ -14,9 +14,8 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Info
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose, View
-from hvt_gateways.cot.event import CotEvent, CotMessage, Motion, Parent, Point, Sensor
+from hvt_gateways.cot.event import CotEvent, CotMessage, Motion, Parent, Point, Sensor, TypeTable
 from hvt_gateways.cot.schedule import STALE_NS, MotionTrail, PlacedTrack, TrackSchedule
-from hvt_gateways.cot.type_table import TypeTable
 from hvt_ground.events import Event, MessageTiming, Overlay, PoseUpdate, Refinement
 from hvt_ground.sinks import Sink, SinkWriter
 

@@ -16,7 +16,7 @@ from hvt_ground.extras import Extra, Flight, Opening, OpenSinks
 
 if TYPE_CHECKING:
     from hvt_gateways.mcap.file import McapFile
-    from hvt_ground.recordings.contract import Recorded
+    from hvt_ground.recordings.row import Recorded
     from hvt_ground.sinks import Outputs
 
 

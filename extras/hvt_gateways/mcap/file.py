@@ -29,7 +29,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose
 from hvt_gateways.decodable import DecodableRun
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, VideoSample
-from hvt_ground.recordings.contract import RecordedStill
+from hvt_ground.recordings.row import RecordedStill
 from hvt_ground.sinks import SinkWriter
 from hvt_ground.sinks.line_file import check_there
 from hvt_ground.sinks.palette import Rgb, class_colour

@@ -35,7 +35,7 @@ from hvt_ground.poses import PoseTrail
 from hvt_ground.sinks import SinkWriter
 
 if TYPE_CHECKING:
-    from hvt_ground.recordings.contract import Recorded
+    from hvt_ground.recordings.row import Recorded
 
 _BUFFER_BYTES: Final = 24 * 7 * 188
 """A buffer of whole datagrams of whole packets."""

@@ -1,9 +1,14 @@
-"""One moment as a UAS Datalink local set (MISB ST 0601.16). Unknown values are left out."""
+"""One moment as a UAS Datalink local set (MISB ST 0601.16). Unknown values are left out.
+
+Items are key, length, value (SMPTE ST 336). The tracks of one frame are a VMTI local set (MISB ST 0903.5), nested as
+item 74: the class of a target is the detector's or the classifier's own word, as a VObject (item 102) with a class
+and no ontology: there is none that knows these words.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,10 +17,76 @@ import numpy.typing as npt
 
 from hvt_common.geodesy import turned_deg
 from hvt_common.values import Orientation, Pose, View
-from hvt_gateways.transport_stream.klv import item, packet, signed, unsigned
-from hvt_gateways.transport_stream.vmti import vmti_local_set
 from hvt_ground.events import Overlay
 from hvt_ground.poses import NOWHERE, Footprint, Locator
+
+_SHORT = 128
+"""BER lengths and identifiers below take one byte (ITU-T X.690, 8.1.3)."""
+
+
+def ber_length(size: int) -> bytes:
+    """A length: one byte below 128, else how many bytes there are and those (ST 336; ST 0107)."""
+    if size < _SHORT:
+        return bytes((size,))
+    data = whole(size)
+    return bytes((0x80 | len(data),)) + data
+
+
+def ber_oid(number: int) -> bytes:
+    """A number from 0 on, seven bits a byte, the first ones first (ITU-T X.690, 8.19)."""
+    data = [number & 0x7F]
+    while number := number >> 7:
+        data.append(0x80 | (number & 0x7F))
+    return bytes(reversed(data))
+
+
+def item(tag: int, value: bytes) -> bytes:
+    """One item of a local set."""
+    return ber_oid(tag) + ber_length(len(value)) + value
+
+
+def packet(key: bytes, items: Iterable[bytes]) -> bytes:
+    """A set with its 16-byte key, and behind its items the checksum, item 1.
+
+    The checksum is the sum of the 16-bit words from the key to its own length, modulo 2^16 (ST 0601, item 1).
+    """
+    body = b"".join(items) + b"\x01\x02"
+    data = key + ber_length(len(body) + 2) + body
+    padded = data + bytes(len(data) % 2)
+    return data + (sum(memoryview(padded)[::2]) * 256 + sum(memoryview(padded)[1::2]) & 0xFFFF).to_bytes(2)
+
+
+def whole(number: int) -> bytes:
+    """A number from 0 on, in as few bytes as hold it."""
+    return number.to_bytes(max(1, (number.bit_length() + 7) // 8))
+
+
+def signed(value: float, limit: float, *, size: int) -> bytes:
+    """From -limit … limit onto -(2^(8·size-1)-1) … 2^(8·size-1)-1 (ST 0601, items 6, 13 and others).
+
+    What is out of range is the lowest integer, which means just that, or an error.
+    """
+    top = (1 << (8 * size - 1)) - 1
+    if not abs(value) <= limit:
+        return (-top - 1).to_bytes(size, signed=True)
+    return round(value * top / limit).to_bytes(size, signed=True)
+
+
+def unsigned(value: float, low: float, high: float, *, size: int) -> bytes:
+    """From low … high onto 0 … 2^(8·size)-1 (ST 0601, items 5, 15 and others); empty out of range: it has no code."""
+    if not low <= value <= high:
+        return b""
+    return round((value - low) * ((1 << (8 * size)) - 1) / (high - low)).to_bytes(size)
+
+
+def imapb(value: float, low: float, high: float, *, size: int) -> bytes:
+    """ST 1201, 'Starting Point B'; empty out of range."""
+    if not low <= value <= high:
+        return b""
+    scale = 2.0 ** (8 * size - 1 - math.ceil(math.log2(high - low)))
+    offset = scale * low - math.floor(scale * low) if low < 0 < high else 0.0
+    return math.floor(scale * (value - low) + offset).to_bytes(size)
+
 
 KEY: Final = bytes.fromhex("060e2b34020b01010e01030101000000")
 _VERSION: Final = 16
@@ -164,3 +235,79 @@ def _ground_items(pose: Pose, ground: Footprint) -> Iterator[tuple[int, bytes]]:
 def _altitude(metres: float) -> bytes:
     """Metres above mean sea level (items 15 and 25)."""
     return unsigned(metres, _LOWEST_M, _HIGHEST_M, size=2)
+
+
+MOST_BYTES: Final = 48 * 1024
+"""Limit of all targets: a PES packet holds 64 kB."""
+_SYSTEM: Final = b"HVT"
+_VMTI_VERSION: Final = 5
+_MOST_COUNT: Final = 0xFFFFFF
+_OFFSET_DEG: Final = 19.2
+_LONGEST_CLASS: Final = 127
+
+
+def vmti_local_set(
+    overlay: Overlay, *, size: tuple[int, int], centre: tuple[float, float] | None, time: bytes
+) -> bytes:
+    """The value of item 74, without key and checksum, as it is nested.
+
+    ``size`` is (width, height) of the picture, base pixels. Places are offsets (items 10 and 11) from ``centre``, the
+    frame centre of the set around it, latitude and longitude in degrees; None leaves them out. (Item 17 would need a
+    height above the ellipsoid, which nobody knows.) ``time`` is the precision time stamp.
+
+    Tracks that stills doubt are counted (item 5) but not reported (item 6), and so are those for which there is no
+    room, the least sure ones.
+    """
+    rows = np.flatnonzero(~overlay.doubted)
+    targets: dict[int, bytes] = {}
+    left_bytes = MOST_BYTES
+    for row in sorted(rows.tolist(), key=lambda one: -float(overlay.confidences[one])):
+        target = _target(overlay, row, size=size, centre=centre)
+        left_bytes -= len(target)
+        if left_bytes < 0:
+            break
+        targets[row] = target
+    items = [
+        item(2, time),
+        item(3, _SYSTEM),
+        item(4, whole(_VMTI_VERSION)),
+        item(5, whole(min(len(overlay.track_ids), _MOST_COUNT))),
+        item(6, whole(len(targets))),
+        item(7, whole(overlay.frame_index & _MOST_COUNT)),
+        item(8, whole(size[0])),
+        item(9, whole(size[1])),
+    ]
+    if targets:
+        items.append(item(101, b"".join(targets[row] for row in sorted(targets))))
+    return b"".join(items)
+
+
+def _target(
+    overlay: Overlay, row: int, *, size: tuple[int, int], centre: tuple[float, float] | None
+) -> bytes:
+    """One VTarget pack with its length."""
+    x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
+    items = [
+        item(1, _pixel((x1 + x2) / 2, (y1 + y2) / 2, size=size)),
+        item(2, _pixel(x1, y1, size=size)),
+        item(3, _pixel(math.ceil(x2) - 1, math.ceil(y2) - 1, size=size)),
+        item(5, whole(round(100 * min(max(float(overlay.confidences[row]), 0.0), 1.0)))),
+    ]
+    if centre is not None and overlay.places is not None:
+        latitude, longitude = overlay.places.places_deg[row].tolist()
+        across = turned_deg(longitude - centre[1])
+        offsets = [imapb(one, -_OFFSET_DEG, _OFFSET_DEG, size=3) for one in (latitude - centre[0], across)]
+        if all(offsets):
+            items += [item(10, offsets[0]), item(11, offsets[1])]
+    name = overlay.words[row].encode()[:_LONGEST_CLASS].decode(errors="ignore").encode()
+    items.append(item(102, item(2, name)))
+    pack = ber_oid(max(0, int(overlay.track_ids[row]))) + b"".join(items)
+    return ber_length(len(pack)) + pack
+
+
+def _pixel(x: float, y: float, *, size: tuple[int, int]) -> bytes:
+    """The number of the pixel that a point lies in: from 1 at the top left, row by row (ST 0903, VTarget item 1)."""
+    column, line = (
+        min(max(math.floor(value), 0), side - 1) for value, side in zip((x, y), size, strict=True)
+    )
+    return whole(column + 1 + line * size[0])

@@ -2,5 +2,5 @@
 
 `history` is what was decoded lately; `fusion` makes one list of all tracks, `stills` refines them,
 and `guesses` are those that are more likely nothing.
-Sessions share the detector, which has a `detector_thread`.
+Sessions share the detector, which has a thread (`models`).
 """

@@ -21,11 +21,11 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Boxes, Detections, Image, Tracks, View
 from hvt_common.video.hevc import YuvPicture
 from hvt_ground.events import Event, Overlay
-from hvt_ground.perception.detector_thread import Detection, DetectorThread
-from hvt_ground.perception.fusion.camera_path import CameraPath
+from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import FusedTracks, Fusion
 from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import History, as_bgr
+from hvt_ground.perception.models import Detection, DetectorThread
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.posterior import SURE

@@ -22,7 +22,7 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Detections, Image
 from hvt_ground.config import DETECTOR, GroundConfig
 from hvt_ground.events import Event, Overlay
-from hvt_ground.perception.fusion.camera_path import CameraPath
+from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import History

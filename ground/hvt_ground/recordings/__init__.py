@@ -1,4 +1,4 @@
 """The files of a session's recording: `session_files` writes them and says of each what a `row` has.
 
-Extras that read recordings back give others what the `contract` says.
+Extras that read recordings back give others `Recorded`.
 """

@@ -21,8 +21,8 @@ from pathlib import Path
 from hvt_common.units import SECOND_NS, Limit
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.row import FileAccount, RecordingRow
-from hvt_ground.sinks.contract import SinkWriter
 from hvt_ground.sinks.line_file import claim_name
+from hvt_ground.sinks.queued import SinkWriter
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.recording_file import RecordingFile
 

@@ -19,8 +19,8 @@ import numpy as np
 from hvt_common.errors import telling
 from hvt_common.units import utc_text
 from hvt_ground.events import Event, MessageTiming, Overlay, Places, Refinement, StillsRead
-from hvt_ground.sinks.contract import Sink, SinkWriter
 from hvt_ground.sinks.line_file import LineFile
+from hvt_ground.sinks.queued import Sink, SinkWriter
 
 TRACK_COLUMNS = (
     *("frame_index", "capture_utc", "id", "x", "y", "w", "h", "confidence"),

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from hvt_common.errors import UserError, telling
-from hvt_ground.sinks.contract import SinkWriter
+from hvt_ground.sinks.queued import SinkWriter
 
 
 def check_there(file: int, path: Path) -> None:

@@ -1,4 +1,7 @@
-"""A sink behind a bounded queue, in a thread of its own: its failures and delays are felt nowhere else."""
+"""A sink behind a bounded queue, in a thread of its own: its failures and delays are felt nowhere else.
+
+`Sink` is what those see that log, `SinkWriter` the contract of who writes in that thread.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +12,47 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Overlay, Refinement, VideoSample
-from hvt_ground.sinks.contract import SinkWriter
-
-_log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+T_contra = TypeVar("T_contra", contravariant=True)
 
+
+class Sink(Protocol[T_contra]):
+    """Takes the events of one session, or other items, and uses those that it knows."""
+
+    def log(self, item: T_contra) -> None:
+        """Take an item."""
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """Write the buffer; skip slow extras once ``hurry`` is set."""
+
+
+class SinkWriter(Generic[T]):
+    """A sink that one thread uses; this one writes to no file, and holds nothing. An error that it raises ends it."""
+
+    path: Path | None = None
+    """The file that was opened last; None without one."""
+    awaits_keyframe = False
+    """Without one it can show nothing of what came last, and somebody looks: one is asked for, once."""
+
+    def log(self, item: T) -> None:
+        """Write an item, or pass it by."""
+        raise NotImplementedError
+
+    def skipped(self, count: int) -> None:
+        """So many items were left out before the next one."""
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """Write what is held back; skip slow extras once ``hurry`` is set. A second call does nothing."""
+
+
+_log = logging.getLogger(__name__)
 _MOST_ITEMS = 4096
 _MOST_BYTES = 32 * 2**20
 """Some minutes of a thin link, or some hundred large stills."""

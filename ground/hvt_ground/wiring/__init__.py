@@ -1,6 +1,5 @@
-"""From settings to objects: the parts of each session of an edge, as one tree; `files` names what they write."""
+"""From settings to objects: the parts of each session of an edge, as one tree; `sessions` names their files, too."""
 
 from hvt_ground.perception.models import Models
 from hvt_ground.perception.session import SessionPerception
-from hvt_ground.wiring.files import check_outputs, make_folders, output_path
-from hvt_ground.wiring.sessions import OpenSink, SessionFactory
+from hvt_ground.wiring.sessions import OpenSink, SessionFactory, check_outputs, make_folders, output_path

@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         result = compare(plan, pool=pool, workers=jobs, on_flights=progress.update)
     if not result.rows:
         raise UserError(f"nothing could be flown: {result.missing[0].reason}")
-    from hvt_study.report.figures.compare_plot import plot  # noqa: PLC0415 - Matplotlib, before it says a word
+    from hvt_study.report.figures.drawing import plot  # noqa: PLC0415 - Matplotlib, before it says a word
 
     with writing(folder):
         write_json(file, list(result.rows))

@@ -56,7 +56,7 @@ class Estimate:
 
 
 def estimate(plan: StudyPlan, sequences: tuple[Sequence, ...], *, frame_s: float) -> Estimate:
-    """Count what `hvt_study.matrix.schedule.run_all` would do; ``frame_s`` is what a flight takes for a frame."""
+    """Count what `hvt_study.matrix.plan.run_all` would do; ``frame_s`` is what a flight takes for a frame."""
     frames = sum(one.limited(plan.max_frames).clip_frames for one in sequences)
     video = [method for method in plan.methods if method.kind is Kind.VIDEO]
     first = list(first_runs(replace(plan, sequences=plan.sequences[:1])))  # of each sequence

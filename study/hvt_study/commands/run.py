@@ -19,8 +19,7 @@ from hvt_study.commands.arguments import (
     study_plan,
 )
 from hvt_study.commands.output import RunProgress, make_out
-from hvt_study.matrix.plan import StudyPlan, check_parameters, first_runs, staying
-from hvt_study.matrix.schedule import RunRow, in_order, run_all
+from hvt_study.matrix.plan import RunRow, StudyPlan, check_parameters, first_runs, in_order, run_all, staying
 from hvt_study.metrics.bits import in_accounting
 from hvt_study.report.data.table_file import RESULTS, read_results, write_results
 from hvt_study.report.example.choice import choose_run, load_example, save_example

@@ -28,8 +28,7 @@ from hvt_edge.perception.shadow import Detected
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.link.reassemble import Arrival as AccessUnitArrival
-from hvt_ground.perception.detector_thread import DetectorThread
-from hvt_ground.perception.models import ModelFacts
+from hvt_ground.perception.models import DetectorThread, ModelFacts
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
 from hvt_ground.session.session import GroundSession

@@ -21,9 +21,8 @@ from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Orientation, Pose, View
 from hvt_geo.camera import Surface, SurfaceLocator, ground_points, places_of_boxes
-from hvt_geo.elevation import ElevationModel
+from hvt_geo.elevation import ElevationModel, Terrain
 from hvt_geo.extra import GeoExtra
-from hvt_geo.terrain import Terrain
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.config import check
 from hvt_ground.extras import config_class

@@ -11,13 +11,13 @@ import pytest
 
 from hvt_common.protocol.messages import BacklogUnit, RoiHeader, parse_backlog_units
 from hvt_common.runtime.failures import Failures, RetryPause
-from hvt_ground.backlog.jobs import read_still, show_video
+from hvt_ground.backlog.edge_backlog import read_still, show_video
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job
 from hvt_ground.sinks import QueuedSink
-from hvt_ground.sinks.contract import SinkWriter
+from hvt_ground.sinks.queued import SinkWriter
 from programs.processes import eventually
 from rigs.backlog_chunks import video_object
 from rigs.examples import refinement

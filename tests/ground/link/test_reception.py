@@ -9,7 +9,9 @@ import pytest
 
 from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader, Feedback
-from hvt_ground.link.reception import REPORT_LINE_BYTES, ReceptionStatistics
+from hvt_common.units import SECOND_NS
+from hvt_ground.link.receiver import Uptime
+from hvt_ground.link.reception import REPORT_LINE_BYTES, CaptureClock, ReceptionStatistics
 from rigs.footprint import footprint_bytes
 from rigs.messages import INFO
 
@@ -227,3 +229,67 @@ def test_a_time_of_the_future_does_not_stop_the_measurement():
         reception.traffic(one, tracks=0, tracks_refined=0)
         due.append(len(given) > before)
     assert due == [True, False, True, True, True, False, True]
+
+
+# Capture times by the ground's clock.
+
+
+YEAR_NS = 365 * 86_400 * SECOND_NS
+
+
+@pytest.mark.parametrize("off_ns", [-YEAR_NS, -61 * SECOND_NS, 6 * SECOND_NS, YEAR_NS])
+def test_a_clock_that_cannot_be_right_counts_from_the_quickest_arrival(off_ns: int) -> None:
+    """An operator would read that there is no picture for 66 days, beside one of this moment."""
+    clock = CaptureClock(ClockOffset())
+    for index, late_ns in enumerate((300, 100, 250)):  # each on its way so much longer than the shortest
+        clock.note(index * SECOND_NS + off_ns, received_ns=index * SECOND_NS + late_ns)
+    assert not clock.is_sound
+    assert clock.to_local_ns(2 * SECOND_NS + off_ns) == 2 * SECOND_NS + 100
+
+
+def test_a_clock_that_becomes_right_counts_again() -> None:
+    """A camera that got the time a minute after its start would have no delay for the rest of the flight."""
+    edge_clock = ClockOffset()
+    clock = CaptureClock(edge_clock)
+    clock.note(YEAR_NS, received_ns=0)
+    assert not clock.is_sound
+    edge_clock.add(t0_ns=0, t1_ns=YEAR_NS, t2_ns=YEAR_NS, t3_ns=0)
+    clock.note(YEAR_NS + SECOND_NS, received_ns=2 * SECOND_NS)
+    assert clock.is_sound
+    assert clock.to_local_ns(YEAR_NS + SECOND_NS) == SECOND_NS
+
+
+# Silence, as a thread sees it that is kept from its messages now and then.
+
+
+def test_gaps_count_as_far_as_both_arrival_and_handling_show_them():
+    """While a recording is opened the edge would seem silent, and another be shown in its place."""
+    time, start = Uptime(), 10**18
+
+    def handle(arrived_ms: int, now_ms: int) -> int:
+        return (time.handle(arrived_ns=start + arrived_ms * MS, now_ns=start + now_ms * MS) - start) // MS
+
+    assert time.at(start, pending=False) == start
+    assert handle(0, 0) == 0
+    assert handle(60, 61) == 60
+    # Away for eight seconds, in which messages came as ever: they are taken up in one go.
+    assert [handle(arrived, 8_061) for arrived in range(120, 8_061, 60)][-1] <= 120
+    # Away again, and the edge waits for an answer: one message a second.
+    before = handle(8_100, 8_101)
+    assert [handle(arrived, 12_000) for arrived in range(9_000, 12_001, 1000)][-1] <= before + 900
+    # A true silence of three seconds.
+    before = handle(12_060, 12_060)
+    assert handle(15_060, 15_060) == before + 3_000
+    assert (time.at(start + 16_060 * MS, pending=False) - start) // MS == before + 4_000
+    assert (time.at(start + 16_060 * MS, pending=True) - start) // MS == before + 3_000
+
+
+def test_it_never_goes_back():
+    """Callbacks of two threads may come the wrong way round, and a keyframe would never be asked for again."""
+    time = Uptime()
+    shown = [
+        time.handle(arrived_ns=arrived, now_ns=now)
+        for arrived, now in ((50, 50), (40, 60), (90, 80), (85, 95))
+    ]
+    assert shown == sorted(shown)
+    assert shown[-1] <= 95

@@ -13,7 +13,7 @@ import pytest
 
 from hvt_common.values import Detections
 from hvt_ground.config import GroundConfig, check
-from hvt_ground.perception.detector_thread import DetectorThread
+from hvt_ground.perception.models import DetectorThread
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.session import SessionPerception
 from hvt_ground.wiring import Models

@@ -18,9 +18,9 @@ from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import still_codec
 from hvt_ground.events import Notice, Overlay, Refinement
-from hvt_ground.perception.detector_thread import DetectorThread
 from hvt_ground.perception.guesses import Guesses
 from hvt_ground.perception.history import as_bgr
+from hvt_ground.perception.models import DetectorThread
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
 from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.perception.worker import RealtimeWorker

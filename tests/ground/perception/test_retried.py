@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,15 +12,17 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
+from hvt_common.inference.retried import RetriedDetector
 from hvt_common.protocol.messages import RoiHeader
 from hvt_common.runtime.failures import RetryPause
+from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.models import Models
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.session import SessionPerception
 from media.onnx_models import colour_classifier, colour_detector
-from rigs.flight import Flight
+from rigs.flight import Flight, pipeline_of
 
 
 def fragile(path: Path, *, bright: float, dark: bool = False) -> Path:
@@ -132,3 +135,48 @@ def test_a_session_begins_though_the_files_of_the_models_are_gone(tmp_path: Path
     classifier.unlink()
     SessionPerception(config, models, info).pipeline(lambda _: None).end()
     SessionPerception(config, models, info).track(lambda _: None)
+
+
+# What a session leaves behind at the ground when it has ended: its numbers, and nothing large.
+
+
+def test_pictures_are_let_go_of():
+    """A ground whose edges come and go would grow by a hundred megabytes each time."""
+    flight, decoder, pipeline = Flight(6), BaseDecoder(), pipeline_of(lambda _event: None)
+    for unit in flight.units:
+        image = decoder.decode(unit.data)
+        pipeline.analyze(DecodedFrame(unit.frame_index, unit.capture_ns, unit.capture_ns, image), hurry=False)
+    assert pipeline.history_bytes > 0
+    pipeline.end()
+    assert pipeline.history_bytes == 0
+    assert pipeline.tracks == 1
+
+
+def test_all_sessions_take_turns_with_the_same_models():
+    """Each edge, and each reconnection, would cost another set of networks, their memory and their threads."""
+    models = Models(check(GroundConfig()))
+    (detector, classifier), other = models.take(), models.take()
+    assert (detector, classifier) == other
+    inside, most = [], []
+    assert isinstance(detector, RetriedDetector)
+    model, found = detector.part, detector.part.detect
+
+    def watched(image):
+        inside.append(1)
+        most.append(len(inside))
+        try:
+            return found(image)
+        finally:
+            inside.pop()
+
+    model.detect = watched
+    picture = np.zeros((360, 640, 3), np.uint8)
+    with ThreadPoolExecutor(4) as sessions:
+        list(sessions.map(detector.detect, [picture] * 8))
+    assert most == [1] * 8, "they share buffers"
+
+
+def test_a_detector_that_remembers_pictures_is_each_ones_own():
+    """One flight's background would be the next one's."""
+    models = Models(check(GroundConfig(detector="motion", classifier="none")))
+    assert models.take()[0] is not models.take()[0]

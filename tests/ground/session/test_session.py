@@ -17,7 +17,7 @@ from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import Info, PoseEncoder
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Pose
-from hvt_ground.perception.detector_thread import DetectorThread
+from hvt_ground.perception.models import DetectorThread
 from hvt_ground.perception.worker import LockstepWorker
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports

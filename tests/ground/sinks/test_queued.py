@@ -15,8 +15,8 @@ from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
 from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.sinks import Outputs, QueuedSink
-from hvt_ground.sinks.contract import SinkWriter
 from hvt_ground.sinks.line_file import LineFile
+from hvt_ground.sinks.queued import SinkWriter
 from hvt_ground.sinks.rerun.live_view import LiveView, listening
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames

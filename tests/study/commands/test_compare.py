@@ -13,8 +13,7 @@ from hvt_edge.config import check as check_edge
 from hvt_scene import Scene
 from hvt_study.cli import main
 from hvt_study.matrix.compare import COMPARED, CompareResult, Missing
-from hvt_study.report.figures.compare_plot import plot
-from hvt_study.report.figures.drawing import style_of
+from hvt_study.report.figures.drawing import plot, style_of
 from hvt_study.runs.methods import DDS, METHODS
 
 FIRST_COLUMNS = [

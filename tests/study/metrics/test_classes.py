@@ -7,8 +7,7 @@ import math
 import pytest
 
 from hvt_common.inference.class_names import kind_of
-from hvt_study.metrics.classes import ClassCounts, class_score
-from hvt_study.metrics.first_correct import first_correct
+from hvt_study.metrics.classes import ClassCounts, class_score, first_correct
 from hvt_study.metrics.judged import FrameView, judged
 from studies.metric_frames import labels, square, view
 

@@ -19,9 +19,8 @@ from hvt_study.datasets.sequence import NOMINAL_FPS, Clip
 from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
 from hvt_study.metrics.bits import line_rates, still_counts
-from hvt_study.metrics.classes import class_score
+from hvt_study.metrics.classes import class_score, first_correct
 from hvt_study.metrics.detection import detection_score
-from hvt_study.metrics.first_correct import first_correct
 from hvt_study.metrics.judged import judged
 from hvt_study.metrics.observed import (
     arrivals,

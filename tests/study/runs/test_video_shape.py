@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-import pytest
+import math
 
-from hvt_study.runs.video_shape import VideoShape, competing_sizes, search_shape
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hvt_scene import Scene
+from hvt_study.runs.run_context import open_run_context
+from hvt_study.runs.spec import ModelChoice, RunSpec
+from hvt_study.runs.video_shape import VideoShape, competing_sizes, grid_target, match, search_shape, within
 
 RATES = (15.0, 5.0, 2.0, 1.0)
 SIZES = ((640, 360), (960, 540), (1280, 720), (1920, 1080))
@@ -62,3 +71,83 @@ def test_what_cannot_be_flown_is_passed_over():
     seen = flown(lambda fps, size: None if size[0] > 1280 else -abs(fps - 1) - size[0])
     assert {one.size for one in seen} == {None, (640, 360), (960, 540), (1920, 1080)}
     assert {one.fps for one in seen if one.size} == {2.0, 1.0}
+
+
+# The search for the budget at which a method spends what another did.
+
+
+totals = st.floats(2e4, 1e7)
+
+
+@given(target=totals, ratio=st.floats(0.5, 1.3), power=st.floats(0.8, 1.2), seed=st.integers(0, 99))
+def test_a_method_that_follows_its_budget_is_matched(target, ratio, power, seed):
+    """A comparison at other bits than the hybrid's would say nothing, or lie."""
+
+    def spends(budget):
+        wobble = 1 + 0.002 * math.sin(budget * (seed + 1))
+        return ratio * 1e6 * (budget / 1e6) ** power * wobble
+
+    found = match(spends, target_bps=target)
+    assert within(found.total_bps, target)
+    assert found.tries <= 7
+    assert found.total_bps == spends(found.budget_bps)
+
+
+def test_a_method_that_cannot_spend_so_much_is_told_apart():
+    """It would be averaged as if it had spent the same."""
+    found = match(lambda budget: min(budget, 300_000), target_bps=800_000)
+    assert not within(found.total_bps, 800_000)
+    assert found.total_bps == 300_000
+
+
+def test_a_curve_of_steps_ends_the_search():
+    """x265 may jump from one total to the next: the search would go on for ever, or return the worse side."""
+    asked = []
+
+    def spends(budget):
+        asked.append(budget)
+        return 500_000 if budget < 616_000 else 640_000
+
+    found = match(spends, target_bps=600_000)
+    assert found.total_bps == 640_000
+    assert len(asked) == len(set(asked)) <= 7
+
+
+@given(target=totals)
+def test_near_totals_share_their_target(target):
+    """Two methods that spent the same would be compared with two different flights of video."""
+    near = grid_target(target)
+    assert abs(near / target - 1) < 0.0051
+    assert grid_target(near) == pytest.approx(near)
+
+
+def test_a_budget_that_is_refused_ends_the_search():
+    """A run would be lost because a budget beside the right one cannot be flown, or the search crash."""
+    assert match(lambda _: None, target_bps=300_000) is None
+    found = match(lambda budget: None if budget < 300_000 else budget * 1.2, target_bps=300_000)
+    assert found.tries == 1
+    assert found.total_bps == pytest.approx(1.2 * found.budget_bps)
+
+
+# What all flights over one sequence are judged by.
+
+
+def test_the_reference_sees_no_less_than_the_edge_does(tmp_path):
+    """What the edge truly finds in tiles of the source would be called false."""
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    town = np.tile(Scene(0).image(0.0), (1, 2, 1))  # 3840x1080
+    cv2.imwrite(str(pictures / "000000.png"), town)
+    spec = RunSpec(
+        dataset=f"clips:{pictures}",
+        sequence="pictures",
+        method="M0",
+        regime="200kbps",
+        budget_bps=200_000,
+        models=ModelChoice("aerial-nano", "aerial-nano"),
+        size=(640, 360),
+    )
+    context = open_run_context(spec, cache=tmp_path / "cache")
+    whole = context.detector.detect(town)
+    assert len(context.labels[0]) > 1.2 * (whole.confidences >= 0.25).sum() > 0
+    assert context.labels[0].boxes_xyxy_px.max() > 1920, "in pixels of the source"

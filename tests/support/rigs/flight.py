@@ -32,11 +32,10 @@ from hvt_common.values import Detections, Image, Posterior, Tracks, View
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.config import GroundConfig
-from hvt_ground.perception.detector_thread import Detection, DetectorThread
-from hvt_ground.perception.fusion.camera_path import CameraPath
+from hvt_ground.perception.fusion.entity import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.guesses import Guesses
-from hvt_ground.perception.models import ModelFacts, Models
+from hvt_ground.perception.models import Detection, DetectorThread, ModelFacts, Models
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.session import SessionPerception
 from hvt_ground.perception.stills.classify import FrameReadings, ObjectReading

@@ -1,1 +1,1 @@
-"""One list of tracks out of base, edge and stills: `fuse`, moved along the `camera_path`."""
+"""One list of tracks out of base, edge and stills: `fuse`, moved along the `CameraPath` of `entity`."""

@@ -48,8 +48,13 @@ import numpy.typing as npt
 
 from hvt_common.tracking.association import assign
 from hvt_common.values import Detections, Tracks, iou
-from hvt_ground.perception.fusion.camera_path import CameraPath
-from hvt_ground.perception.fusion.entity import MISSED_STEPS, Entity, MissedDetections, Observation
+from hvt_ground.perception.fusion.entity import (
+    MISSED_STEPS,
+    CameraPath,
+    Entity,
+    MissedDetections,
+    Observation,
+)
 from hvt_ground.perception.fusion.object_list import FusedTracks, FusionRules, list_entities, reported_boxes
 
 __all__ = ["FusedTracks", "Fusion", "unified_names"]

@@ -11,8 +11,7 @@ import numpy.typing as npt
 from hvt_common.tracking.recall import EDGE_ONLY_CONFIDENCE
 from hvt_common.values import Tracks, iou
 from hvt_ground.events import Origin
-from hvt_ground.perception.fusion.camera_path import CameraPath
-from hvt_ground.perception.fusion.entity import Entity, Observation
+from hvt_ground.perception.fusion.entity import CameraPath, Entity, Observation
 
 _Floats = npt.NDArray[np.float64]
 

@@ -20,9 +20,8 @@ from rerun.chunk import Chunk
 from hvt_common.units import bitrate_text
 from hvt_common.video.hevc import parameter_sets
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, PoseUpdate, Refinement, Traffic, VideoSample
-from hvt_ground.sinks.contract import SinkWriter
 from hvt_ground.sinks.palette import AMBER, GREY, VERMILLION, Rgb
-from hvt_ground.sinks.queued import is_stored
+from hvt_ground.sinks.queued import SinkWriter, is_stored
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.blueprint import session_chunk, static_chunks
 from hvt_ground.sinks.rerun.live_view import LiveRecording

@@ -24,7 +24,7 @@ from mcap.reader import make_reader
 from motmetrics.io import loadtxt
 
 import hvt_ground.cli
-from hvt_archive.exports.whole import whole_file
+from hvt_archive.exports.command import whole_file
 from hvt_archive.joined import join_recordings
 from hvt_common.errors import UserError
 from hvt_common.units import Limit

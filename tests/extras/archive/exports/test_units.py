@@ -16,10 +16,10 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcap.reader import make_reader
 
 from hvt_archive.exports import pictures
+from hvt_archive.exports.command import write_csv, write_mot, write_parquet
 from hvt_archive.exports.maps import write_geojson, write_kml
-from hvt_archive.exports.tables import write_csv, write_mot, write_parquet
 from hvt_gateways.mcap.file import McapFile
-from hvt_gateways.transport_stream.vmti import vmti_local_set
+from hvt_gateways.transport_stream.uas import vmti_local_set
 from hvt_ground.events import Places
 from rigs.examples import overlay
 

@@ -14,7 +14,7 @@ import pytest
 
 from hvt_archive.reading.recorded import read_recordings
 from hvt_archive.reading.spool import Mapped, Spool, SpooledRows
-from hvt_archive.replay.from_recording import messages_of
+from hvt_archive.replay.command import messages_of
 from hvt_common.errors import UserError
 from hvt_ground.events import VideoSample
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings

@@ -12,8 +12,7 @@ import pytest
 
 import hvt_ground.cli
 from hvt_archive.reading.recorded import read_recordings
-from hvt_archive.replay.command import messages_in
-from hvt_archive.replay.from_recording import messages_of
+from hvt_archive.replay.command import messages_in, messages_of
 from hvt_archive.replay.message_log import MessageLog, read_log
 from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (

@@ -15,9 +15,8 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Info
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose, View
-from hvt_gateways.cot.event import CotMessage
+from hvt_gateways.cot.event import CotMessage, default_types
 from hvt_gateways.cot.reporter import SessionReporter, sensor_of
-from hvt_gateways.cot.type_table import default_types
 from hvt_ground.events import MessageTiming, Overlay, Places, PoseUpdate, Refinement
 from rigs import examples
 from rigs.messages import INFO

@@ -14,18 +14,20 @@ from hypothesis import strategies as st
 from hvt_common.geodesy import metres_per_degree
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose, View
-from hvt_gateways.transport_stream.klv import (
+from hvt_gateways.transport_stream.uas import (
+    MOST_BYTES,
+    Platform,
     ber_length,
     ber_oid,
     imapb,
     item,
     packet,
+    sensor_angles,
     signed,
+    uas_local_set,
     unsigned,
     whole,
 )
-from hvt_gateways.transport_stream.uas import Platform, sensor_angles, uas_local_set
-from hvt_gateways.transport_stream.vmti import MOST_BYTES
 from hvt_geo.camera import SurfaceLocator
 from hvt_ground.events import Overlay, Places
 from media.klv_reader import KlvPacket, packets_of
