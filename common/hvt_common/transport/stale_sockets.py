@@ -10,11 +10,11 @@ import stat
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import zenoh
 
@@ -29,6 +29,9 @@ _PROBE_S = 3.0
 _LINGER, _NO_LINGER = struct.pack("ii", 1, 10), struct.pack("ii", 0, 0)
 _LAST_DATA_RECEIVED = 52
 """Offset of ``tcpi_last_data_recv`` (ms) in Linux's ``struct tcp_info``."""
+_CONNECTS = 2
+_UNCONNECTED = (_CONNECTS, 7, 10)
+"""States of Linux's TCP: a socket that connects, is new or listens has no other end that it could name."""
 _INIT_SYN = bytes((4, 0, 0x01, 0x09, 0x01, 0x01))
 """The first message of Zenoh's protocol 9: its length, InitSyn, the version, a peer, its id of one byte. Whatever
 listens there answers: Zenoh with an InitAck, TLS with an alert, a web socket by hanging up."""
@@ -108,8 +111,13 @@ class StaleSockets:
         self._done = {inode for inode, fd in own.items() if inode in self._done or _linger_ended(fd, inode)}
         if not self._ports:
             return
-        here = {one.inode: one for table in self._tables for one in connections(table) if one.inode in own}
         links = {(end_of(link.src), end_of(link.dst)) for link in self._session.info.links()}
+        here = {}
+        if any(self._may_hang(fd, inode, links) for inode, fd in own.items()):
+            # 5 ms: the kernel goes through all places that the machine's connections might have.
+            here = {
+                one.inode: one for table in self._tables for one in connections(table) if one.inode in own
+            }
         pending = {
             inode: one.theirs
             for inode, one in here.items()
@@ -127,6 +135,15 @@ class StaleSockets:
             self._spare_until_s = now_s + self._open_s
             for inode in stale:
                 _shut_down(own[inode], inode)
+
+    def _may_hang(self, fd: int, inode: int, links: Container[tuple[str, str]]) -> bool:
+        with suppress(OSError), _same(fd, inode) as one:
+            state = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0]
+            if state in _UNCONNECTED:
+                return state == _CONNECTS
+            ours, theirs = (_end_of_name(name) for name in (one.getsockname(), one.getpeername()))
+            return theirs.rpartition(":")[2] in self._ports and (ours, theirs) not in links
+        return False
 
     def _is_stale(self, fd: int, inode: int, theirs: str) -> bool:
         answered_s = self._answered_s.get(theirs, 0.0)
@@ -197,6 +214,10 @@ def _end(text: str) -> str:
     address, _, port = text.rpartition(":")
     words = [int(address[at : at + 8], 16) for at in range(0, len(address), 8)]
     return f"{_host(ipaddress.ip_address(struct.pack(f'={len(words)}I', *words)))}:{int(port, 16)}"
+
+
+def _end_of_name(name: tuple[Any, ...]) -> str:
+    return f"{_host(ipaddress.ip_address(name[0].partition('%')[0]))}:{name[1]}"
 
 
 def _host(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str:
