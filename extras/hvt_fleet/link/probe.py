@@ -94,7 +94,10 @@ def _plain(place: _Place, protocol: str) -> str:
         try:
             tls = _is_tls(tcp, place)
         except TimeoutError:  # Zenoh too says nothing to it
-            return "somebody listens there and says nothing: does the other side of HVT run, or stand still there?"
+            return (
+                "somebody listens there and says nothing: a tunnel or proxy whose line is dark, or a side of HVT "
+                "that stands still?"
+            )
         if tls:
             return (
                 f"this is a TLS port, and plain {protocol} does not get in: connect to tls/… with the keys of this "

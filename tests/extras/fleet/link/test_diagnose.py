@@ -105,7 +105,8 @@ def test_a_ground_that_stands_still_is_not_called_something_else() -> None:
     with _server(None) as port:
         said = why_no_link(f"tcp/127.0.0.1:{port}", TlsFiles())
     assert said.endswith(
-        "somebody listens there and says nothing: does the other side of HVT run, or stand still there?"
+        "somebody listens there and says nothing: a tunnel or proxy whose line is dark, or a side of HVT "
+        "that stands still?"
     )
 
 
