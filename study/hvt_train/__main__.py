@@ -43,6 +43,7 @@ def _parser() -> argparse.ArgumentParser:
         own.add_argument("--scenes", type=int, default=102, help="demo scenes in the pool")
         own.add_argument("--codes", type=int, default=120, help="more of them, with codes on roofs")
         own.add_argument("--places", type=int, default=323, help="other places in the pool")
+        own.add_argument("--aslant", type=int, default=160, help="places seen aslant")
         own.add_argument("--crop-scenes", type=int, default=45, help="demo scenes that stills are cut from")
         own.add_argument("--rate", type=float, default=2e-3, help="greatest learning rate")
         own.add_argument("--steps", type=int, default=9000, help="of the detector")

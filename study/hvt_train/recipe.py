@@ -53,8 +53,9 @@ _SUMMARY = {
 _CREDITS = (
     "Begun from YOLOX-nano's COCO weights (Megvii, Apache-2.0); drawn scenes of this project; KIT AIS (CC BY 3.0,"
     " labels by jekhor); HIT-UAV (Suo et al., Sci Data 2023, CC BY 4.0); CATS-Lab Madison drone-view vehicles, with"
-    " our marks of people; seven clips of intel-iot-devkit/sample-videos (CC BY 4.0); SeaDronesSee (Varga et al.,"
-    " WACV 2022, CC0); contains information from Traffic Images accessed March 2021 from data.gov.sg, made"
+    " our marks of people; clips of intel-iot-devkit/sample-videos (CC BY 4.0); SeaDronesSee (Varga et al., WACV"
+    " 2022, CC0); drone pictures of Brighton Beach (Piero Toffanin, BSD-2-Clause) and Seneca (Ohio Department of"
+    " Transportation, CC0); contains information from Traffic Images accessed March 2021 from data.gov.sg, made"
     " available under the terms of the Singapore Open Data Licence version 1.0"
 )
 
@@ -65,7 +66,9 @@ def run_recipe(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(arguments.threads)
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
-    plan = PoolPlan(scenes=arguments.scenes, codes=arguments.codes, places=arguments.places)
+    plan = PoolPlan(
+        scenes=arguments.scenes, codes=arguments.codes, places=arguments.places, aslant=arguments.aslant
+    )
     pool = fill_pool(out / "pool", plan, workers=arguments.workers)
     if arguments.real is not None:
         pool += fill_real(out / "pool", arguments.real, teachers=_teachers(arguments))

@@ -7,6 +7,7 @@ the others are YOLOX-nano, of the picture as it is and enlarged, and the aerial 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,9 @@ _GROUPS = {
 _SURE, _ALONE, _NAMED = 0.25, 0.42, 0.45
 """Of two; of the best one alone; from which YOLOX-nano's kind holds."""
 _SAME, _LEAST_PX = 0.45, 4.0
+_SAME_DOUBT = 0.3
+_AT_ONE_PLACE, _STANDS, _MOVES = 0.65, 0.25, 0.6
+"""IoU of what is at one place; the share of a camera's pictures that have it there; from which score it may be."""
 _POSSIBLE, _GROUND = 0.15, 0.1
 """From which the best one's box counts neither way, and the share of the picture beyond which none does."""
 
@@ -44,8 +48,8 @@ class Said:
     box_px: npt.NDArray[np.float32]
 
 
-def unlabelled(folder: Path, *, of_a_clip: int = 26) -> Iterator[Image]:
-    """The pictures in ``folder``, and about so many of each clip there, evenly over its length."""
+def unlabelled(folder: Path, *, of_a_clip: int = 34) -> Iterator[tuple[str, Image]]:
+    """The pictures in ``folder``, and about so many of each clip there, evenly over it, with their file's name."""
     for path in sorted(folder.glob("*")):
         if path.suffix in {".gif", ".mp4"}:
             with av.open(str(path)) as container:
@@ -53,9 +57,9 @@ def unlabelled(folder: Path, *, of_a_clip: int = 26) -> Iterator[Image]:
             with av.open(str(path)) as container:
                 for number, frame in enumerate(container.decode(video=0)):
                     if number % max(1, count // of_a_clip) == 0:
-                        yield np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+                        yield path.stem, np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
         elif (image := cv2.imread(str(path))) is not None:
-            yield np.asarray(image, np.uint8)
+            yield path.stem, np.asarray(image, np.uint8)
 
 
 class Teachers:
@@ -68,18 +72,58 @@ class Teachers:
             (aerial, aerial.class_names, (1.0,)),
         )
 
-    def name(self, image: Image) -> tuple[Boxes, npt.NDArray[np.int32]]:
-        """(N, 4) boxes and (N,) class ids, as of a pool."""
+    def say(self, image: Image) -> list[Said]:
+        """All boxes of all teachers, in pixels of the picture."""
         said = []
         for number, (teacher, names, zooms) in enumerate(self._teachers):
             for scale in zooms:
                 big = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-                found = teacher.detect(np.asarray(big, np.uint8))
-                for box, score, kind in zip(
-                    found.boxes_xyxy_px, found.confidences, found.class_ids, strict=True
-                ):
-                    said.append(Said(number, names[kind], float(score), np.asarray(box / scale, np.float32)))
-        return agreed(said, area_px=image.shape[0] * image.shape[1])
+                said += _said(number, teacher, names, np.asarray(big, np.uint8), scale)
+        best, names, _ = self._teachers[0]
+        size = np.array([image.shape[1], image.shape[0]])
+        for place, part in _quarters(image):
+            sides = np.array([part.shape[1], part.shape[0]])
+            for one in _said(0, best, names, part, 1.0):
+                # What a quarter's inner edge cuts is whole in another one, or in the picture.
+                low, high = one.box_px[:2] < 2, one.box_px[2:] > sides - 2
+                if not (low & (place > 0) | high & (place + sides < size)).any():
+                    shifted = one.box_px + np.tile(place, 2).astype(np.float32)
+                    said.append(dataclasses.replace(one, box_px=shifted))
+        return said
+
+
+def without_what_stands(said: Sequence[Sequence[Said]]) -> list[list[Said]]:
+    """Pictures of one camera without unsure boxes that a quarter of them has in one place: signs, lane marks."""
+    known = [[one for one in picture if one.name in _GROUPS] for picture in said]
+    boxes = [np.array([one.box_px for one in picture], np.float32).reshape(-1, 4) for picture in known]
+    left = []
+    for number, picture in enumerate(known):
+        others = [rows for other, rows in enumerate(boxes) if other != number]
+        seen = sum(
+            (iou(boxes[number], rows).max(1, initial=0) > _AT_ONE_PLACE for rows in others),
+            start=np.zeros(len(picture)),
+        )
+        stands = seen >= _STANDS * max(1, len(others))
+        pairs = zip(picture, stands, strict=True)
+        left.append([one for one, still in pairs if not still or one.score >= _MOVES])
+    return left
+
+
+def _said(number: int, teacher: Detector, names: Sequence[str], image: Image, scale: float) -> list[Said]:
+    found = teacher.detect(image)
+    return [
+        Said(number, names[kind], float(score), np.asarray(box / scale, np.float32))
+        for box, score, kind in zip(found.boxes_xyxy_px, found.confidences, found.class_ids, strict=True)
+    ]
+
+
+def _quarters(image: Image) -> Iterator[tuple[npt.NDArray[np.int64], Image]]:
+    """The four corners, 60 % of each side: the best teacher sees any picture at one size, small things too small."""
+    high, wide = (round(0.6 * side) for side in image.shape[:2])
+    for top in (0, image.shape[0] - high):
+        for left in (0, image.shape[1] - wide):
+            part = np.ascontiguousarray(image[top : top + high, left : left + wide])
+            yield np.array([left, top]), part
 
 
 def agreed(said: Sequence[Said], *, area_px: float) -> tuple[Boxes, npt.NDArray[np.int32]]:
@@ -108,6 +152,9 @@ def agreed(said: Sequence[Said], *, area_px: float) -> tuple[Boxes, npt.NDArray[
     counted = (sides.max(1, initial=0) >= _LEAST_PX) & (
         (numbers >= 0) | (sides.prod(1) <= _GROUND * area_px) | (numbers < -1)
     )
+    objects = found[counted & (numbers != -1)]
+    if len(objects):  # a doubt about what is an object says nothing
+        counted &= (numbers != -1) | (iou(found, objects).max(1) <= _SAME_DOUBT)
     return found[counted], numbers[counted]
 
 

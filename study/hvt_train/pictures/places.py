@@ -7,6 +7,7 @@ ground is foreshortened along the direction of the tilt. That is exact for a dis
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -37,9 +38,12 @@ class Picture:
     """(N,) share of the body that is in the picture and not hidden, 0…1."""
 
 
-def draw_place(rng: _Rng, *, size: int = 1280) -> Picture:
-    """Draw one place of ``size`` by ``size`` pixels; the same generator state draws the same bytes."""
-    view = _View.random(rng, size=size)
+def draw_place(rng: _Rng, *, size: int = 1280, aslant: bool = False) -> Picture:
+    """Draw one place of ``size`` by ``size`` pixels; the same generator state draws the same bytes.
+
+    ``aslant`` is as from a far camera at 45 to 74 degrees from straight down: cars of 25 to 100 pixels.
+    """
+    view = _View.aslant(rng, size=size) if aslant else _View.random(rng, size=size)
     surface = Surface(view.to_px, size=size, px_per_m=view.px_per_m, half_m=view.half_m)
     things = settle(rng, surface)
     image = paint_surface(surface, rng)
@@ -79,6 +83,17 @@ class _View:
             sun=sun / np.linalg.norm(sun),
             ambient=float(rng.uniform(0.35, 0.9)),
             shadow=float(rng.uniform(0.1, 0.75)) if rng.random() < 0.85 else 0.0,
+        )
+
+    @classmethod
+    def aslant(cls, rng: _Rng, *, size: int) -> _View:
+        way = -math.pi / 2 + rng.normal(0, 0.12)
+        return dataclasses.replace(
+            cls.random(rng, size=size),
+            px_per_m=float(np.exp(rng.uniform(math.log(5), math.log(22)))),
+            tilt=math.radians(rng.uniform(45, 74)),
+            up=np.array([math.cos(way), math.sin(way)]),
+            height_px=float(rng.uniform(1.5, 6)) * size,
         )
 
     @property

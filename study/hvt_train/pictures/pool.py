@@ -1,9 +1,9 @@
 """The pool of drawn pictures that training cuts its views from, one file each, made by seeds alone.
 
-Five kinds: ``demo`` (the demo's scene, clean), ``base`` (the same after x265 as the base stream carries it), ``thin``
-(as a base of 640x360 carries it, enlarged as the detector does), ``codes`` (all three, with codes on roofs) and
-``place`` (`draw_place`). Seeds of training lie from `TRAIN_SEED` on; those of `held_out` and the demo's own seed 0
-never occur among them.
+Six kinds: ``demo`` (the demo's scene, clean), ``base`` (the same after x265 as the base stream carries it), ``thin``
+(as a base of 640x360 carries it, enlarged as the detector does), ``codes`` (all three, with codes on roofs),
+``place`` and ``aslant`` (`draw_place`). Seeds of training lie from `TRAIN_SEED` on; those of `held_out` and the
+demo's own seed 0 never occur among them.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ _CODED_FRAMES = 6
 
 @dataclass(frozen=True, slots=True)
 class PoolPlan:
-    """How many: ``scenes`` worlds with ``moments`` each, ``codes`` with one (clean and coded), and ``places``."""
+    """How many: ``scenes`` worlds with ``moments`` each, ``codes`` with one (clean and coded), and places."""
 
     scenes: int = 220
     moments: int = 3
     codes: int = 120
     places: int = 700
+    aslant: int = 160
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +109,7 @@ def thin_kbps(rng: np.random.Generator) -> float:
 def fill_pool(folder: Path, plan: PoolPlan, *, workers: int = 1) -> list[Path]:
     """Draw what is missing in ``folder`` and return all files of the plan, in the order of their names."""
     folder.mkdir(parents=True, exist_ok=True)
-    counts = {"demo": plan.scenes, "codes": plan.codes, "place": plan.places}
+    counts = {"demo": plan.scenes, "codes": plan.codes, "place": plan.places, "aslant": plan.aslant}
     jobs = [
         (kind, number, plan.moments if kind == "demo" else 1)
         for kind, count in counts.items()
@@ -124,10 +125,11 @@ def fill_pool(folder: Path, plan: PoolPlan, *, workers: int = 1) -> list[Path]:
 def _draw(job: tuple[Path, str, int, int]) -> list[Path]:
     cv2.setNumThreads(1)
     folder, kind, number, moments = job
-    if kind == "place":
-        path = folder / f"place-{number:05d}.npz"
+    if kind in {"place", "aslant"}:
+        path, aslant = folder / f"{kind}-{number:05d}.npz", kind == "aslant"
         if not path.exists():
-            save_picture(path, draw_place(np.random.default_rng([TRAIN_SEED, number])))
+            rng = np.random.default_rng([TRAIN_SEED, number, *([1] if aslant else [])])
+            save_picture(path, draw_place(rng, size=1024 if aslant else 1280, aslant=aslant))
         return [path]
     names = ("demo", "base", "thin") if kind == "demo" else ("codes-demo", "codes-base", "codes-thin")
     paths = [folder / f"{name}-{number:05d}-{m}.npz" for name in names for m in range(moments)]

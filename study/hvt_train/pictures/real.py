@@ -1,4 +1,4 @@
-"""Real labelled pictures for the pool: four public sets, each with what it labels and what it leaves out.
+"""Real labelled pictures for the pool: five public sets, each with what it labels and what it leaves out.
 
 Every picture goes through x265 at 80 to 1400 kbps (of a 1280x720 base) or stays clean, and is kept as one file of the
 pool. ``class_ids`` beyond the classes: -1 is neither object nor background, `LARGE_VEHICLE` is a van,
@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Image
-from hvt_train.pictures.camera import Teachers, unlabelled
+from hvt_train.pictures.camera import Teachers, agreed, unlabelled, without_what_stands
 from hvt_train.pictures.kinds import ID as _ID
 from hvt_train.pictures.kinds import LARGE_VEHICLE
 from hvt_train.pictures.places import Picture
@@ -33,6 +33,8 @@ _HIT_HELD_OUT = {"20210114", "20210119"}
 _KIT_HELD_OUT = "MunichStreet02"
 _WATER_HELD_OUT_FROM = {"seq00": 300, "seq03": 14010}
 _CODED_SHARE = 0.65
+_CODED_SHARE_SMALL = 0.5
+_WIDEST_PX = 1600
 _BORDER_PX = 26  # Madison leaves out vehicles that the border cuts
 _LARGE_PX = 128  # a car is 96 pixels long there, one in twenty vehicles longer than 118
 
@@ -68,21 +70,45 @@ def fill_real(folder: Path, data: Path, *, seed: int = 1, teachers: Teachers | N
                 rng = np.random.default_rng([seed, number])
                 loaded = cv2.imread(str(path))
                 assert loaded is not None, path
-                image = np.asarray(loaded, np.uint8)
+                image, scale = np.asarray(loaded, np.uint8), min(1.0, _WIDEST_PX / loaded.shape[1])
+                if scale < 1:
+                    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+                    image = np.asarray(small, np.uint8)
                 if rng.random() < _CODED_SHARE:
                     image = _coded(image, rng)
                 high, wide = image.shape[:2]
-                inside = boxes.clip(0, (wide, high, wide, high)).astype(np.float32)
+                inside = (boxes * scale).clip(0, (wide, high, wide, high)).astype(np.float32)
                 save_picture(target, Picture(image, inside, kinds, np.ones(len(kinds), np.float32)))
     if teachers is not None:
         for name in ("street", "camera"):
-            for number, image in enumerate(unlabelled(data / name)):
-                target = folder / f"{name}-{number:05d}.npz"
-                written.append(target)
-                if not target.exists():
-                    boxes, kinds = teachers.name(image)
-                    save_picture(target, Picture(image, boxes, kinds, np.ones(len(kinds), np.float32)))
+            written += _named(folder, data / name, name, teachers)
     return written
+
+
+def _named(folder: Path, data: Path, kind: str, teachers: Teachers) -> list[Path]:
+    """Pictures and clips that teachers name; those of traffic cameras begin with the camera's name and a dash."""
+    pictures = [*unlabelled(data)]
+    targets = [folder / f"{kind}-{number:05d}.npz" for number in range(len(pictures))]
+    if all(target.exists() for target in targets):
+        return targets
+    said = [teachers.say(image) for _, image in pictures]
+    if kind == "camera":
+        cameras: dict[str, list[int]] = {}
+        for number, (name, _) in enumerate(pictures):
+            cameras.setdefault(name.split("-")[0], []).append(number)
+        for numbers in cameras.values():
+            moving = without_what_stands([said[number] for number in numbers])
+            for number, left in zip(numbers, moving, strict=True):
+                said[number] = left
+    for number, ((_, image), target) in enumerate(zip(pictures, targets, strict=True)):
+        boxes, kinds = agreed(said[number], area_px=image.shape[0] * image.shape[1])
+        rng = np.random.default_rng([9, number])
+        seen = image
+        if rng.random() < _CODED_SHARE_SMALL:
+            share = max(0.5, image.shape[0] * image.shape[1] / (640 * 480))
+            seen = in_flight(image, rng, kbps=share * float(np.exp(rng.uniform(np.log(120), np.log(900)))))
+        save_picture(target, Picture(seen, boxes, kinds, np.ones(len(kinds), np.float32)))
+    return targets
 
 
 def _coded(image: Image, rng: np.random.Generator) -> Image:
@@ -169,6 +195,20 @@ def _water(data: Path, *, held_out: bool = False) -> Iterator[_Labelled]:
             )
 
 
+def _field(data: Path) -> Iterator[_Labelled]:
+    """Woods, stones, shores and fields straight down: nothing but the cars of ``field_vehicles.csv`` is there."""
+    marks: dict[str, list[list[float]]] = {}
+    with resources.files("hvt_train.pictures").joinpath("field_vehicles.csv").open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            kind = _ID["car"] if row["kind"] == "car" else -1
+            marks.setdefault(row["file"], []).append(
+                [kind, *(float(row[name]) for name in ("x1", "y1", "x2", "y2"))]
+            )
+    for path in sorted((data / "field").glob("*.[jJ][pP][gG]")):
+        rows = np.array(marks.get(path.name, []), np.float32).reshape(-1, 5)
+        yield path, rows[:, 1:], rows[:, 0].astype(np.int32)
+
+
 def held_out_labelled(data: Path, *, every: int = 4) -> Iterator[Picture]:
     """Every n-th picture that training never sees, as it is, with classes as in the pool."""
     for read in (_kit, _thermal):
@@ -197,4 +237,5 @@ SETS: dict[str, Callable[[Path], Iterator[_Labelled]]] = {
     "thermal": _thermal,
     "road": _road,
     "water": _water,
+    "field": _field,
 }

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Boxes, Image
+from hvt_train.pictures.kinds import BIKE, ID
 from hvt_train.pictures.places import Picture
 
 _Rng = np.random.Generator
@@ -27,14 +28,19 @@ _KINDS = {
     "street": (0.5, 0.2, 0.3, 3.5),
     "camera": (0.5, 0.15, 0.5, 4.0),
     "water": (0.8, 0.2, 0.3, 2.2),
+    "aslant": (1.0, 0.4, 0.25, 1.6),
+    "field": (0.8, 0.2, 0.2, 1.6),
 }
 """Strength of the damage and how often the codec is bad (base, thin and most codes pictures have been through
 x265); least and greatest scale."""
-_STRAIGHT_DOWN = frozenset({"kit", "road", "water"})
+_STRAIGHT_DOWN = frozenset({"kit", "road", "field", "water"})
 """Have no up; the others are aslant, at least in part, and mostly left upright."""
-_UPRIGHT = frozenset({"street", "camera"})
+_UPRIGHT = frozenset({"street", "camera", "aslant"})
+_RIDERS = (ID["pedestrian"], ID["bicycle"], ID["motor"], BIKE)
 _SPECKLED = 0.4
 """How often small blobs lie about: stones, litter, chipped paint, which are no people."""
+_FLATTENED = frozenset({"kit", "road", "thermal", "place", "base", "demo", "codes"})
+"""May be shown as flatter than they are, as ground is that a camera sees aslant."""
 _PITTED = {"kit": 0.9, "road": 0.9, "place": 0.9, "demo": 0.5, "base": 0.5, "thin": 0.5, "codes": 0.4}
 """How often there are bollards, plants and the pits of young trees, which from above are as large as people."""
 
@@ -55,8 +61,9 @@ class ViewSettings:
 
     side: int = 416
     shares: tuple[tuple[str, float], ...] = (
-        *(("demo", 0.04), ("base", 0.09), ("thin", 0.07), ("codes", 0.2), ("place", 0.06), ("kit", 0.09)),
-        *(("road", 0.08), ("thermal", 0.19), ("street", 0.08), ("camera", 0.05), ("water", 0.05)),
+        *(("demo", 0.03), ("base", 0.07), ("thin", 0.06), ("codes", 0.14), ("place", 0.05), ("aslant", 0.09)),
+        *(("kit", 0.08), ("road", 0.06), ("field", 0.03), ("thermal", 0.16)),
+        *(("street", 0.06), ("camera", 0.08), ("water", 0.04)),
     )
     """How often each kind of picture is taken."""
     tiled: float = 0.3
@@ -100,27 +107,38 @@ class ViewSource:
         kind = str(rng.choice(self._kinds, p=self._shares))
         files = self._files[kind]
         picture = read_picture(files[int(rng.integers(len(files)))])
-        view = self._cropped(picture, _scale(kind, rng) * smaller, side)
+        flat = float(rng.uniform(0.4, 1.0)) if kind in _FLATTENED and rng.random() < 0.3 else 1.0
+        view = self._cropped(picture, _scale(kind, rng) * smaller, flat, side)
         view = _turned(
             view, rng, upright=kind in _UPRIGHT or (kind not in _STRAIGHT_DOWN and rng.random() < 0.6)
         )
+        tinted = kind == "thermal" and rng.random() < 0.3
         if kind == "thermal" and rng.random() < 0.4:  # cameras show heat black or white
             view = View(255 - view.image_bgr, view.boxes_px, view.class_ids)
+        if tinted:  # as a picture in colour: vehicles keep their shape, a person is a spot like others
+            people = np.isin(view.class_ids, _RIDERS)
+            view = View(
+                _tinted(view.image_bgr, rng),
+                view.boxes_px,
+                np.where(people, -1, view.class_ids).astype(np.int32),
+            )
         if kind not in {"thermal", "street", "camera"} and rng.random() < _SPECKLED:
             view = View(_speckled(view.image_bgr, rng), view.boxes_px, view.class_ids)
         if rng.random() < _PITTED.get(kind, 0.0):
             view = View(_pitted(view.image_bgr, rng), view.boxes_px, view.class_ids)
         strength, compress, *_ = _KINDS[kind]
         image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
-        if kind == "thermal":  # alone without colour: a white blob is a person there, a stone elsewhere
+        if (
+            kind == "thermal" and not tinted
+        ):  # alone without colour: a white blob is a person there, a stone elsewhere
             image = np.repeat(image[..., 1:2], 3, axis=2)
         return View(image, view.boxes_px, view.class_ids)
 
-    def _cropped(self, picture: Picture, scale: float, side: int) -> View:
-        """A square window, usually around an object, every class that is there as often."""
+    def _cropped(self, picture: Picture, scale: float, flat: float, side: int) -> View:
+        """A square view, usually around an object, every class as often; ``flat`` squeezes its height."""
         rng = self._rng
         high, wide = picture.image_bgr.shape[:2]
-        window = side / scale
+        window = side / np.array([scale, scale * flat])
         if len(picture.boxes_px) and rng.random() < 0.7:
             _, which, counts = np.unique(picture.class_ids, return_inverse=True, return_counts=True)
             weights = 1.0 / counts[which] * np.where(picture.class_ids == -1, 0.2, 1.0)
@@ -131,19 +149,21 @@ class ViewSource:
         slack = np.array([wide, high]) - window  # negative where the picture is smaller than the window
         margin = rng.uniform(0, 0.06, 2) * window
         low = np.clip(middle - window / 2, np.minimum(slack, 0) - margin, np.maximum(slack, 0) + margin)
-        return self._window(picture, low, scale, side)
+        return self._window(picture, low, window, side)
 
-    def _window(self, picture: Picture, low: npt.NDArray[np.float64], scale: float, side: int) -> View:
+    def _window(
+        self, picture: Picture, low: npt.NDArray[np.float64], window: npt.NDArray[np.float64], side: int
+    ) -> View:
         settings = self._settings
         x0, y0 = (round(float(v)) for v in low)
-        reach = max(1, round(side / scale))
-        image = np.full((reach, reach, 3), _FILL, np.uint8)
+        reach_x, reach_y = (max(1, round(float(v))) for v in window)
+        image = np.full((reach_y, reach_x, 3), _FILL, np.uint8)
         high, wide = picture.image_bgr.shape[:2]
-        left, top, right, bottom = max(x0, 0), max(y0, 0), min(x0 + reach, wide), min(y0 + reach, high)
+        left, top, right, bottom = max(x0, 0), max(y0, 0), min(x0 + reach_x, wide), min(y0 + reach_y, high)
         if right > left and bottom > top:
             image[top - y0 : bottom - y0, left - x0 : right - x0] = picture.image_bgr[top:bottom, left:right]
-        exact = side / reach
-        how = cv2.INTER_AREA if exact < 0.6 else cv2.INTER_LINEAR
+        exact = side / np.array([reach_x, reach_y, reach_x, reach_y])
+        how = cv2.INTER_AREA if exact.min() < 0.6 else cv2.INTER_LINEAR
         small = cv2.resize(image, (side, side), interpolation=how)
         whole = (picture.boxes_px - np.array([x0, y0, x0, y0])) * exact
         boxes = whole.clip(0, side).astype(np.float32)
@@ -204,6 +224,13 @@ def degrade(image_bgr: Image, rng: _Rng, *, strength: float, compress: float) ->
         _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
         image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
     return np.ascontiguousarray(image)
+
+
+def _tinted(image: Image, rng: _Rng) -> Image:
+    """A grey picture with a colour for its dark, one for its middle and one for its bright."""
+    stops = rng.uniform(0, 255, (3, 3)) * 0.5 + np.array([30.0, 85.0, 150.0])[:, None] * 0.8
+    table = np.stack([np.interp(np.arange(256), (0, 128, 255), stops[:, one]) for one in range(3)], axis=1)
+    return np.asarray(cv2.LUT(image, table.clip(0, 255).astype(np.uint8)[None]), np.uint8)
 
 
 def _blurred(image: Image, rng: _Rng) -> Image:

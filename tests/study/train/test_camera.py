@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hvt_train.pictures.camera import Said, agreed
+from hvt_train.pictures.camera import Said, agreed, without_what_stands
 from hvt_train.pictures.kinds import BIKE, ID, LARGE_VEHICLE, VEHICLE
 
 AREA_PX = 640 * 360
@@ -45,3 +45,19 @@ def test_half_a_picture_is_not_left_out_for_a_guess():
         [said(0, "vehicle", 0.2, 0, side=300), said(1, "car", 0.12, 0, side=40)], area_px=AREA_PX
     )
     assert boxes[:, 2].tolist() == [40]
+
+
+def test_what_stands_at_one_place_in_a_cameras_pictures_is_ground_and_who_is_sure_stays():
+    """Signs and lane marks would count neither way for ever, and the network would go on calling them vehicles."""
+    sign, car = np.array([10, 10, 60, 30], np.float32), np.array([100, 100, 140, 130], np.float32)
+    pictures = [
+        [
+            Said(0, "vehicle", 0.3 if number else 0.7, sign + number % 2),
+            Said(0, "vehicle", 0.3, car + 60 * number),
+            Said(1, "toothbrush", 0.9, car),
+        ]
+        for number in range(4)
+    ]
+    left = without_what_stands(pictures)
+    assert [len(picture) for picture in left] == [2, 1, 1, 1]
+    assert all(picture[-1].box_px is boxes[1].box_px for picture, boxes in zip(left, pictures, strict=True))

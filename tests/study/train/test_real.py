@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -109,6 +110,20 @@ def test_madison_has_vehicles_our_marks_of_people_and_a_border_that_says_nothing
     assert border[:, :26].all()
     assert border[:, -26:].all()
     assert not border[26:-26, 26:-26].any()
+
+
+def test_of_a_field_all_but_the_marked_cars_is_ground(tmp_path):
+    """Stones were people and shadows of trees cars: only marks say what stands there, whatever size is kept."""
+    write_hit(tmp_path / "hit_uav", [])
+    folder = tmp_path / "field"
+    folder.mkdir()
+    for name in ("DJI_0024.JPG", "nothing.jpg"):
+        cv2.imwrite(str(folder / name), np.full((3000, 4000, 3), 90, np.uint8))
+    marked, empty = (read_picture(path) for path in fill_real(tmp_path / "pool", tmp_path))
+    assert marked.image_bgr.shape[1] == 1600
+    assert marked.class_ids.tolist() == [ID["car"], -1]
+    assert marked.boxes_px[0] == pytest.approx([3111 * 0.4, 130 * 0.4, 3286 * 0.4, 273 * 0.4])
+    assert len(empty.boxes_px) == 0
 
 
 def test_the_pool_gives_views_of_each_set(pool):

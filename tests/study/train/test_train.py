@@ -47,6 +47,15 @@ def test_a_place_is_the_same_every_time_and_its_boxes_are_in_it(place):
     assert ((place.visible >= 0) & (place.visible <= 1)).all()
 
 
+def test_a_place_seen_aslant_has_small_cars():
+    """Cars of 30 pixels that a far camera sees aslant were hardly in any picture, and hardly found."""
+    boxes = [draw_place(np.random.default_rng(seed), size=512, aslant=True) for seed in range(3)]
+    cars = np.concatenate([picture.boxes_px[picture.class_ids == 0] for picture in boxes])
+    sides = cars[:, 2:] - cars[:, :2]
+    assert len(cars) > 10
+    assert 15 < np.median(sides[:, 0]) < 120
+
+
 @pytest.mark.parametrize("name", CLASSES)
 def test_every_class_can_be_made_and_has_its_size(name):
     """A class would be missing from training, or as large as another one."""
@@ -102,7 +111,7 @@ def test_roofs_with_codes_are_a_kind_of_their_own(tmp_path, monkeypatch):
 
     monkeypatch.setattr("hvt_train.pictures.pool.shoot", shot)
     monkeypatch.setattr("hvt_train.pictures.pool.ProcessPoolExecutor", lambda _: ThreadPoolExecutor(1))
-    files = fill_pool(tmp_path, PoolPlan(scenes=0, codes=1, places=0))
+    files = fill_pool(tmp_path, PoolPlan(scenes=0, codes=1, places=0, aslant=0))
     assert [file.name for file in files] == [f"codes-{how}-00000-0.npz" for how in ("base", "demo", "thin")]
     assert shown[0].codes(1.0)
     assert len(ViewSource(files, seed=1, settings=ViewSettings(side=64)).next().image_bgr) == 64
