@@ -35,7 +35,7 @@ _MOST_S = 100.0
 _WALKS = {
     ("RealtimePace.send",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 28),
     ("StillStage.analyze",): ("a frame's objects at the edge", 24),
-    ("StillStage.send",): ("a still at the edge, from choosing to put", 28),
+    ("StillStage.send",): ("a still at the edge, from choosing to put", 29),
     ("commands.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
         "a command, from hvt-ground set-budget to the encoder",
         38,
