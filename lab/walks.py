@@ -40,9 +40,9 @@ _WALKS = {
         "a command, from hvt-ground set-budget to the encoder",
         38,
     ),
-    ("EdgeSessions.handle",): ("a message at the ground, received", 40),
-    ("SessionPerception.pipeline",): ("a session's perception at the ground, made", 27),
-    ("Pipeline.analyze",): ("a frame at the ground, analyzed", 34),
+    ("EdgeSessions.handle",): ("a message at the ground, received", 36),
+    ("SessionPerception.pipeline",): ("a session's perception at the ground, made", 26),
+    ("Pipeline.analyze",): ("a frame at the ground, analyzed", 28),
     ("Recorder.log",): ("an event at the ground, recorded", 13),
 }
 _MEASURED = {one for functions in _WALKS for one in functions}

@@ -50,7 +50,6 @@ from hvt_study.report.tables import (
     matrix_table,
     named_table,
     spent_table,
-    sweep_table,
 )
 from hvt_study.report.write import html_page, write_report
 from hvt_study.runs.run_context import RunContext
@@ -468,15 +467,6 @@ def test_a_study_of_one_method_or_none_that_counts_has_a_report():
     assert "Method matrix" not in titles
     assert "<h1>" in html_page(failed)
     assert "0 runs" in make_report([]).lead[0]
-
-
-def test_a_wrong_sweep_gets_one_sentence(tmp_path):
-    """A file of another program that happens to be called sweep.csv."""
-    path = tmp_path / "sweep.csv"
-    assert sweep_table(path) is None
-    path.write_text("policy,selected\npermissive,many\n")
-    with pytest.raises(UserError, match=r"sweep\.csv is not a table of policy,selected"):
-        sweep_table(path)
 
 
 def test_the_pilots_accounting_divides_by_the_clip_and_changes_no_match(tmp_path):

@@ -326,11 +326,19 @@ def test_only_numbers_have_a_minus_and_captions_name_what_is_there():
 
 
 @pytest.mark.parametrize(
-    "text", ["", "foo,bar\n", "policy,selected,ratio,frame_coverage\n", "foo,bar\n1,2\n"]
+    "text",
+    [
+        "",
+        "foo,bar\n",
+        "policy,selected,ratio,frame_coverage\n",
+        "foo,bar\n1,2\n",
+        "policy,selected\nall,many\n",
+    ],
 )
 def test_a_sweep_without_its_columns_or_rows_gets_one_sentence(tmp_path, text):
     """An empty table in a report says that no selector keeps anything."""
     path = tmp_path / "sweep.csv"
+    assert sweep_table(path) is None
     path.write_text(text)
     with pytest.raises(UserError, match=r"sweep\.csv is not a table of policy,selected"):
         sweep_table(path)
