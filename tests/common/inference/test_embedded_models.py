@@ -113,8 +113,10 @@ def test_vehicles_and_people_that_training_never_saw(data, tmp_path):
 
 @pytest.mark.nightly
 @pytest.mark.realdata
-@pytest.mark.parametrize("name", ["uav123_car10", "uavdt_S0601", "otb_Crossing"])
-def test_what_is_seen_aslant(data, name):
+@pytest.mark.parametrize(
+    ("name", "share"), [("uav123_car10", 0.9), ("uavdt_S0601", 0.5), ("otb_Crossing", 0.8)]
+)
+def test_what_is_seen_aslant(data, name, share):
     """A camera that does not look straight down would show a street with nobody in it."""
     folder = data / "aerial" / "sequences_dev" / name
     labels = np.loadtxt(folder / "gt" / "gt.txt", delimiter=",")[::8]
@@ -126,7 +128,7 @@ def test_what_is_seen_aslant(data, name):
         boxes = detector.detect(cv2.resize(picture, None, fx=scale, fy=scale)).boxes_xyxy_px / scale
         truth = np.array([[x, y, x + width, y + height]], np.float32)
         found += bool(len(boxes)) and iou(boxes, truth).max() >= 0.5
-    assert found / len(labels) >= 0.65
+    assert found / len(labels) >= share
 
 
 @pytest.mark.nightly
