@@ -14,7 +14,7 @@ from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import zenoh
 
@@ -29,12 +29,13 @@ _PROBE_S = 3.0
 _LINGER, _NO_LINGER = struct.pack("ii", 1, 10), struct.pack("ii", 0, 0)
 _LAST_DATA_RECEIVED = 52
 """Offset of ``tcpi_last_data_recv`` (ms) in Linux's ``struct tcp_info``."""
-_CONNECTS = 2
-_UNCONNECTED = (_CONNECTS, 7, 10)
+_FAMILIES = (socket.AF_INET, socket.AF_INET6)
+_CONNECTS, _NEW = 2, 7
+_UNCONNECTED = (_CONNECTS, _NEW, 10)
 """States of Linux's TCP: a socket that connects, is new or listens has no other end that it could name."""
 _INIT_SYN = bytes((4, 0, 0x01, 0x09, 0x01, 0x01))
 """The first message of Zenoh's protocol 9: its length, InitSyn, the version, a peer, its id of one byte. Whatever
-listens there answers: Zenoh with an InitAck, TLS with an alert, a web socket by hanging up."""
+listens there answers: Zenoh with an InitAck, TLS with an alert."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +47,11 @@ class Connection:
     inode: int
 
 
-def connections(table: Path) -> Iterator[Connection]:
-    """What one of `TCP_TABLES` has, but listening sockets."""
+def connections(table: Path, *, inodes: Container[str] | None = None) -> Iterator[Connection]:
+    """What one of `TCP_TABLES` has, but listening sockets; with ``inodes`` those alone, quickly out of thousands."""
     for line in table.read_text(encoding="ascii").splitlines()[1:]:
         _, ours, theirs, state, *_, inode = line.split(maxsplit=10)[:10]
-        if state != "0A":
+        if state != "0A" and (inodes is None or inode in inodes):
             yield Connection(_end(ours), _end(theirs), int(inode))
 
 
@@ -71,19 +72,26 @@ class StaleSockets:
     have accepted it, and says nothing. So no socket lingers, and a handshake that hangs is shut down as soon as a
     probe that began after it was answered, and it was not: on a slow line the older has its answer first. The next
     one has its full time, should the other side be slow.
+
+    Other sockets of the process are none of its business, even where they are connected to the same place: Zenoh's
+    have the send buffer that its configuration says. What is a link of any session here is no handshake.
     """
+
+    _sessions: ClassVar[list[zenoh.Session]] = []
+    """All that are watched in this process."""
 
     def __init__(self, session: zenoh.Session, config: zenoh.Config) -> None:
         self._session = session
         self._open_s = int(config.get_json("transport/unicast/open_timeout")) / 1000
         self._tables = [one for one in TCP_TABLES if one.exists()]
         self._ports = {end_of(one).rpartition(":")[2] for one in connect_endpoints(config)}
+        self._buffers = {_given_buffer(size) for size in _send_buffers(config)} if self._tables else set()
+        self._known: dict[int, bool] = {}
+        """Sockets of this process, and whether each is one of Zenoh's."""
         self._done: set[int] = set()
         """Sockets that linger no more."""
         self._pending_s: dict[int, float] = {}
         """Handshakes, and when each was first seen."""
-        self._probes: set[int] = set()
-        """Our own sockets."""
         self._probed_s: dict[str, float] = {}
         self._answered_s: dict[str, float] = {}
         """When the last probe of a place began that was answered."""
@@ -93,37 +101,36 @@ class StaleSockets:
 
     def __enter__(self) -> Self:
         if self._tables:
+            self._sessions.append(self._session)
             self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         if self._tables:
+            self._sessions.remove(self._session)
             self._thread.join(1.0)
 
     def _run(self) -> None:
         while not self._stop.wait(_EVERY_S):
-            with suppress(OSError, zenoh.ZError):
+            with suppress(Exception):  # such as no thread for a probe: the next time is soon
                 self._check(time.monotonic())
 
     def _check(self, now_s: float) -> None:
-        own = _own_sockets()
+        own = self._zenohs()
         self._done = {inode for inode, fd in own.items() if inode in self._done or _linger_ended(fd, inode)}
         if not self._ports:
             return
-        links = {(end_of(link.src), end_of(link.dst)) for link in self._session.info.links()}
+        links = {(end_of(link.src), end_of(link.dst)) for link in self._links()}
         here = {}
         if any(self._may_hang(fd, inode, links) for inode, fd in own.items()):
             # 5 ms: the kernel goes through all places that the machine's connections might have.
-            here = {
-                one.inode: one for table in self._tables for one in connections(table) if one.inode in own
-            }
+            inodes = set(map(str, own))
+            here = {one.inode: one for table in self._tables for one in connections(table, inodes=inodes)}
         pending = {
             inode: one.theirs
             for inode, one in here.items()
-            if (one.ours, one.theirs) not in links
-            and one.theirs.rpartition(":")[2] in self._ports
-            and inode not in self._probes
+            if (one.ours, one.theirs) not in links and one.theirs.rpartition(":")[2] in self._ports
         }
         self._pending_s = {inode: self._pending_s.get(inode, now_s) for inode in pending}
         for inode, theirs in pending.items():
@@ -132,14 +139,31 @@ class StaleSockets:
                 threading.Thread(target=self._probe, args=[theirs], name="hvt-probe", daemon=True).start()
         stale = [inode for inode, theirs in pending.items() if self._is_stale(own[inode], inode, theirs)]
         if stale and now_s > self._spare_until_s:
-            self._spare_until_s = now_s + self._open_s
+            self._spare_until_s = now_s + 2 * self._open_s  # the next begins after a pause
             for inode in stale:
                 _shut_down(own[inode], inode)
 
+    def _zenohs(self) -> dict[int, int]:
+        # Inode → descriptor. Each socket is looked at once: a host program may have thousands.
+        own = _own_sockets()
+        self._known = {inode: self._known[inode] for inode in own.keys() & self._known.keys()}
+        for inode in own.keys() - self._known.keys():
+            with suppress(OSError), same_socket(own[inode], inode) as one:
+                if one.family not in _FAMILIES or one.type != socket.SOCK_STREAM:
+                    self._known[inode] = False
+                elif _state(one) != _NEW:  # else it may get its buffer yet
+                    size = one.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+                    self._known[inode] = size in self._buffers
+        return {inode: fd for inode, fd in own.items() if self._known.get(inode)}
+
+    def _links(self) -> Iterator[zenoh.Link]:
+        for session in list(self._sessions):
+            with suppress(zenoh.ZError):  # closed elsewhere
+                yield from session.info.links()
+
     def _may_hang(self, fd: int, inode: int, links: Container[tuple[str, str]]) -> bool:
-        with suppress(OSError), _same(fd, inode) as one:
-            state = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0]
-            if state in _UNCONNECTED:
+        with suppress(OSError), same_socket(fd, inode) as one:
+            if (state := _state(one)) in _UNCONNECTED:
                 return state == _CONNECTS
             ours, theirs = (_end_of_name(name) for name in (one.getsockname(), one.getpeername()))
             return theirs.rpartition(":")[2] in self._ports and (ours, theirs) not in links
@@ -154,17 +178,11 @@ class StaleSockets:
         host, _, port = theirs.rpartition(":")
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with suppress(OSError), socket.socket(family) as probe:
-            inode = os.fstat(probe.fileno()).st_ino
-            self._probes.add(inode)
             probe.settimeout(_PROBE_S)
-            try:
-                probe.connect((host.strip("[]"), int(port)))
-                probe.sendall(_INIT_SYN)
-                probe.recv(1)  # hung up: somebody was there, too
-                self._answered_s[theirs] = max(began_s, self._answered_s.get(theirs, 0.0))
-            finally:
-                probe.close()
-                self._probes.discard(inode)
+            probe.connect((host.strip("[]"), int(port)))
+            probe.sendall(_INIT_SYN)
+            probe.recv(1)  # hung up: somebody was there, too
+            self._answered_s[theirs] = max(began_s, self._answered_s.get(theirs, 0.0))
 
 
 def _own_sockets() -> dict[int, int]:
@@ -178,17 +196,47 @@ def _own_sockets() -> dict[int, int]:
     return found
 
 
+def _send_buffers(config: zenoh.Config) -> list[int]:
+    # Those that a configuration gives its sockets; an endpoint may have its own.
+    texts = [config.get_json(f"transport/link/{kind}/so_sndbuf") for kind in ("tcp", "tls")]
+    for side in ("connect", "listen"):
+        texts += re.findall(r"so_sndbuf=(\d+)", config.get_json(f"{side}/endpoints"))
+    return [int(text) for text in texts if text.isdigit()]
+
+
+def _given_buffer(size: int) -> int:
+    # What the kernel makes of it.
+    with socket.socket() as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, min(size, 2**31 - 1))
+        return one.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+
+
+def _state(one: socket.socket) -> int:
+    return one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0]
+
+
 @contextmanager
-def _same(fd: int, inode: int) -> Iterator[socket.socket]:
-    # Zenoh may close it at any moment, and its number be another's. OSError where it is.
-    with socket.socket(fileno=os.dup(fd)) as one:
-        if os.fstat(one.fileno()).st_ino != inode:
-            raise OSError("closed meanwhile")
+def same_socket(fd: int, inode: int) -> Iterator[socket.socket]:
+    """The socket of that descriptor; OSError where that is another's: Zenoh may close its own at any moment."""
+    _check_same(fd, inode)  # closing a mere copy of a file would end all locks that this process has on it
+    copy = os.dup(fd)
+    try:
+        _check_same(copy, inode)
+        one = socket.socket(fileno=copy)
+    except OSError:
+        os.close(copy)
+        raise
+    with one:
         yield one
 
 
+def _check_same(fd: int, inode: int) -> None:
+    if os.fstat(fd).st_ino != inode:
+        raise OSError("closed meanwhile")
+
+
 def _linger_ended(fd: int, inode: int) -> bool:
-    with suppress(OSError), _same(fd, inode) as one:
+    with suppress(OSError), same_socket(fd, inode) as one:
         if one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, len(_LINGER)) == _LINGER:
             one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
             return True
@@ -196,13 +244,13 @@ def _linger_ended(fd: int, inode: int) -> bool:
 
 
 def _shut_down(fd: int, inode: int) -> None:
-    with suppress(OSError), _same(fd, inode) as one:
+    with suppress(OSError), same_socket(fd, inode) as one:
         one.shutdown(socket.SHUT_RDWR)
 
 
 def _received_s(fd: int, inode: int) -> float:
     # When data came last, or else when it was connected; long ago for what still connects.
-    with suppress(OSError), _same(fd, inode) as one:
+    with suppress(OSError), same_socket(fd, inode) as one:
         info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 104)
         (ago_ms,) = struct.unpack_from("=I", info, _LAST_DATA_RECEIVED)
         return time.monotonic() - float(ago_ms) / 1000

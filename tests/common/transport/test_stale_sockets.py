@@ -7,17 +7,22 @@ import os
 import socket
 import stat
 import struct
+import threading
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import json5
 import pytest
 
 from hvt_common.transport.session import open_session
-from hvt_common.transport.stale_sockets import TCP_TABLES, end_of
+from hvt_common.transport.stale_sockets import TCP_TABLES, end_of, same_socket
 from hvt_common.transport.zenoh_config import LinkSettings
 from programs.fleet_keys import Fleet
 from programs.processes import eventually
 from programs.silent_tunnel import SilentTunnel
+
+PROBE_BYTES = 6
 
 pytestmark = pytest.mark.skipif(not TCP_TABLES[0].exists(), reason="needs the kernel's table")
 
@@ -58,6 +63,65 @@ def test_no_socket_of_zenoh_lingers(free_port: int) -> None:
         eventually(lambda: not lingering())
 
 
+def test_two_sessions_of_one_process_leave_each_other_alone(free_port: int) -> None:
+    """Each took the other's link for a handshake that hangs, and ended it every few seconds."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    here = LinkSettings("edge", connect=(endpoint,))
+    with (
+        open_session(LinkSettings("ground", listen=(endpoint,))),
+        open_session(here) as one,
+        open_session(here) as other,
+    ):
+        eventually(lambda: one.info.links() and other.info.links())
+        before = [str(link.src) for session in (one, other) for link in session.info.links()]
+        time.sleep(2.5)
+        assert [str(link.src) for session in (one, other) for link in session.info.links()] == before
+
+
+def test_sockets_of_a_host_program_are_left_alone(free_port: int) -> None:
+    """Its connection to the port that HVT connects to would be shut down, and what it set undone."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    as_zenoh = struct.pack("ii", 1, 10)
+    with (
+        open_session(LinkSettings("ground", listen=(endpoint,))),
+        open_session(LinkSettings("edge", connect=(endpoint,))) as edge,
+        socket.create_connection(("127.0.0.1", free_port)) as one,
+    ):
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, as_zenoh)
+        eventually(edge.info.links)
+        one.settimeout(2.5)
+        with pytest.raises(TimeoutError):
+            one.recv(1)
+        assert one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, len(as_zenoh)) == as_zenoh
+
+
+def test_a_watch_outlives_what_goes_wrong_once(free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a thread to spare for a probe it ended for good, and sockets of Zenoh lingered again."""
+    looks = []
+    is_socket = stat.S_ISSOCK
+
+    def look(mode: int) -> bool:
+        if threading.current_thread().name == "hvt-sockets":
+            looks.append(1)
+            if len(looks) == 1:
+                raise RuntimeError("can't start new thread")
+        return is_socket(mode)
+
+    monkeypatch.setattr(stat, "S_ISSOCK", look)
+    with open_session(LinkSettings("ground", listen=(f"tcp/127.0.0.1:{free_port}",))):
+        eventually(lambda: len(looks) > 1)
+
+
+def test_a_number_that_is_another_file_by_now_is_not_copied(tmp_path: Path) -> None:
+    """Each such copy stayed open."""
+    with (tmp_path / "file").open("wb") as file:
+        before = len(list(Path("/proc/self/fd").iterdir()))
+        for inode in (os.fstat(file.fileno()).st_ino, 1):
+            with pytest.raises(OSError, match=r"closed|socket"), same_socket(file.fileno(), inode):
+                pass
+        assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
 @pytest.mark.parametrize("protocol", ["tcp", "tls"])
 def test_a_handshake_begun_in_darkness_is_given_up_in_light(
     tmp_path: Path, free_port: int, protocol: str
@@ -81,3 +145,43 @@ def test_a_handshake_begun_in_darkness_is_given_up_in_light(
         eventually(lambda: tunnel.in_vain)
         tunnel.lighten()
         eventually(edge.info.links, what="a link again")
+
+
+def test_who_answers_slowly_is_waited_for(tmp_path: Path, free_port: int) -> None:
+    """A handshake that is long because the other side is would be cut short each time, and no link ever come."""
+    slow_s = 2.25
+    file = tmp_path / "link.json5"
+    retry = {"period_init_ms": 1500, "period_max_ms": 1500, "period_increase_factor": 1}
+    file.write_text(json.dumps({"connect": {"retry": retry}}))
+    with socket.create_server(("127.0.0.1", 0)) as door:
+
+        def greet(one: socket.socket) -> None:
+            with one, suppress(OSError):
+                first = one.recv(4096)
+                if len(first) == PROBE_BYTES:
+                    one.sendall(b"!")
+                    return
+                time.sleep(slow_s)
+                with socket.create_connection(("127.0.0.1", free_port)) as other:
+                    other.sendall(first)
+                    back = threading.Thread(target=pump, args=(other, one), daemon=True)
+                    back.start()
+                    pump(one, other)
+
+        def pump(one: socket.socket, other: socket.socket) -> None:
+            with suppress(OSError):
+                while data := one.recv(4096):
+                    other.sendall(data)
+
+        def serve() -> None:
+            with suppress(OSError):
+                while True:
+                    threading.Thread(target=greet, args=[door.accept()[0]], daemon=True).start()
+
+        threading.Thread(target=serve, daemon=True).start()
+        way = f"tcp/127.0.0.1:{door.getsockname()[1]}"
+        with (
+            open_session(LinkSettings("ground", listen=(f"tcp/127.0.0.1:{free_port}",))),
+            open_session(LinkSettings("edge", connect=(way,), zenoh_config=file)) as edge,
+        ):
+            eventually(edge.info.links, what="a link")
