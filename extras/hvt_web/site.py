@@ -29,6 +29,7 @@ MOST_MESSAGE_BYTES = 4096
 MOST_VIEWERS = 64
 _MOST_MESSAGES_A_S = 30
 WATCH_PAUSE_S = 0.2
+_SOCKET = "/ws"
 _COOKIE_S = 30 * 86400
 _KINDS = {"js": "text/javascript", "css": "text/css", "html": "text/html", "svg": "image/svg+xml"}
 _FILES = {
@@ -65,6 +66,10 @@ class Site:
     async def file(self, request: Request) -> Response:
         """One of its files."""
         return _file(request.path_params["name"])
+
+    async def admits(self, _: Request) -> Response:
+        """Nothing: who is refused got words before; a browser does not tell a page why its WebSocket was."""
+        return Response(status_code=204)
 
     async def still(self, request: Request) -> Response:
         """A picture of a still, or of the base's view of it."""
@@ -252,7 +257,7 @@ class _Guard:
         acts = scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD")
         if acts and (foreign := self._access.foreign(headers)):
             return PlainTextResponse(foreign, 403)
-        if acts and scope["type"] == "http" and role != "operator":
+        if acts and scope["type"] == "http" and role != "operator" and scope["path"] != _SOCKET:
             return PlainTextResponse("only an operator may do this", 403)
         return None
 
@@ -269,6 +274,7 @@ def make_site(
         Route("/edges/{edge}/still", site.request_still, methods=["POST"]),
         Route("/edges/{edge}/keyframe", site.keyframe, methods=["POST"]),
         Route("/edges/{edge}/settings", site.settings, methods=["POST"]),
-        WebSocketRoute("/ws", site.socket),
+        WebSocketRoute(_SOCKET, site.socket),
+        Route(_SOCKET, site.admits, methods=["POST"]),
     ]
     return _Guard(Starlette(routes=routes), access)

@@ -176,6 +176,7 @@ def test_a_page_of_another_site_cannot_watch_or_command(local):
     assert refused.value.response.status_code == 403
     with pytest.raises(InvalidStatus):
         connect(f"ws://127.0.0.1:{local}/ws")
+    assert asked(local, "/ws", "POST", b"", Origin="http://evil.example")[0] == 403
     assert asked(local, "/edges/uav-1/keyframe", "POST", b"{}", Origin="http://evil.example")[0] == 403
 
 
@@ -191,6 +192,8 @@ def test_a_proxy_says_who_somebody_is(port):
                 f"ws://{host}/ws", sock=reached(port), origin=origin, additional_headers={"X-HVT-Role": role}
             ) as one:
                 assert json.loads(one.recv())["role"] == role
+            answer = asked(port, "/ws", "POST", b"", Origin=origin, **headers)
+            assert answer[0] == 204, "no reason is told to who may come in: a viewer read of operators"
             answer = asked(port, "/edges/uav-1/keyframe", "POST", b"{}", Origin=origin, **headers)
             assert answer[0] == (403 if role == "viewer" else 400), answer[2]
         for role in ("", "admin", "operator, viewer"):
