@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import logging
 import os
@@ -25,6 +26,8 @@ from programs.processes import Link, free_ports
 from rigs.drawn_flight import DrawnFlight, fly_into_all_sinks
 from rigs.watched_flight import WatchedFlight, fly_watched
 
+STDERR = pytest.StashKey[int]()
+HANGS_S = 420
 ROOT = Path(__file__).resolve().parent.parent
 
 # Hypothesis' own 200 ms for an example are an assertion on speed: a machine that stops the process for so long would
@@ -54,8 +57,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """By day the golden flights alone."""
+    """By day the golden flights alone; what is said of a hang goes past what a test writes."""
     Link.flights = None if config.getoption("nightly") else FLIGHTS
+    config.stash[STDERR] = os.dup(2)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -74,6 +78,12 @@ def pytest_collection_finish() -> None:
     """Six thousand tests live as long as the process: the collector does not look through them again and again."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """A test that failed has no limit any more, and what it leaves may hang: the run would never end."""
+    faulthandler.dump_traceback_later(HANGS_S, exit=True, file=item.config.stash[STDERR])
 
 
 @pytest.fixture(autouse=True)
