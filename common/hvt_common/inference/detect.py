@@ -24,7 +24,7 @@ from hvt_common.inference.labels import (
     read_labels,
 )
 from hvt_common.inference.letterbox import Letterboxer, Preparation, as_bgr, prepared_as
-from hvt_common.inference.nms import MAX_DETECTIONS, suppress
+from hvt_common.inference.nms import MAX_DETECTIONS, averaged, suppress
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
 from hvt_common.inference.store import MOTION, library_part, model_names, needed_part, parts_of, resolve_model
@@ -229,9 +229,11 @@ class OnnxDetector:
             group_ids = self._group_ids[np.minimum(found.class_ids, len(self._group_ids) - 1)]
             candidates = found.boxes_input_px, found.scores, group_ids
             selected = suppress(*candidates, iou=self._nms_iou, any_class_iou=_TWIN_IOU)
+            boxes = averaged(*candidates, selected)
         else:
             selected = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
-        boxes = letterbox.to_image(found.boxes_input_px[selected])
+            boxes = found.boxes_input_px[selected]
+        boxes = letterbox.to_image(boxes)
         class_ids = found.class_ids[selected]
         named = class_ids < len(self.class_names)
         if not named.all() and not self._beyond_said:

@@ -16,6 +16,8 @@ MAX_CANDIDATES = 8192
 """At most so many of the most confident boxes are compared, so that no image costs more than a tenth of a second."""
 MAX_DETECTIONS = 1000
 """At most so many boxes are returned."""
+_ALIKE = 0.6
+"""Chosen on training pictures: of .5 to .7 the one of the best mean overlap with the labels."""
 
 
 def suppress(
@@ -45,6 +47,32 @@ def suppress(
     if any_class_iou < 1:
         selected = selected[_greedy(rects[selected], any_class_iou)]
     return best[selected[:limit]]
+
+
+def averaged(
+    boxes_xyxy: Boxes,
+    scores: npt.NDArray[np.float32],
+    class_ids: npt.NDArray[np.int32],
+    selected: npt.NDArray[np.intp],
+) -> Boxes:
+    """(K, 4) the ``selected`` boxes, each the mean by scores of all of its class that overlap it by `_ALIKE`.
+
+    A network says an object from several cells: the surest box is not the best one on each of its sides, and from
+    picture to picture another cell is the surest. 0.5 ms for 60 of 900 boxes.
+    """
+    selected_px, all_px = boxes_xyxy[selected].T, boxes_xyxy.T
+    near = np.equal.outer(class_ids[selected], class_ids)
+    for axis in (0, 1):
+        near &= np.less.outer(selected_px[axis], all_px[axis + 2])
+        near &= np.greater.outer(selected_px[axis + 2], all_px[axis])
+    rows, columns = np.divmod(np.flatnonzero(near), len(scores))
+    a, b = selected_px[:, rows], all_px[:, columns]
+    shared = np.prod(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), axis=0)
+    areas = np.prod(a[2:] - a[:2], axis=0) + np.prod(b[2:] - b[:2], axis=0)
+    weights = np.where(shared >= _ALIKE * (areas - shared), scores[columns], 0)
+    sums = [np.bincount(rows, weights * side, len(selected)) for side in (*b, np.ones(len(rows)))]
+    known = sums[4] > 0  # a box without an area overlaps nothing, itself neither
+    return np.where(known, np.array(sums[:4]) / np.where(known, sums[4], 1), selected_px).T.astype(np.float32)
 
 
 def _greedy(rects: npt.NDArray[np.float64], iou: float) -> npt.NDArray[np.intp]:
