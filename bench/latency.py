@@ -19,7 +19,7 @@ from bench.support.material import FPS, SIZE, clip, frames, nano
 from bench.support.processes import Peaks, free_endpoint, pin_to, running
 from hvt_common.inference.detect import open_detector
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.video.encoder_settings import encoder_settings
+from hvt_edge.video.encoder import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 
 

@@ -9,7 +9,7 @@ import time
 
 from bench.bars import measured
 from bench.support.material import FPS, SIZE, clip, frames
-from hvt_edge.video.encoder_settings import encoder_settings
+from hvt_edge.video.encoder import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 
 _FRAMES = 100

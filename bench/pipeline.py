@@ -23,7 +23,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
 from hvt_common.values import AccessUnit, View
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.video.encoder_settings import encoder_settings
+from hvt_edge.video.encoder import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.config import GroundConfig
 from hvt_ground.link.reassemble import Arrival

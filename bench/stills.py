@@ -32,7 +32,7 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import StillCodec, psnr_y_db, still_codec, still_codec_names
 from hvt_edge.perception.candidates import PADDING, crop_box
 from hvt_edge.stills.maker import MAX_SIDE_PX
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 
 KBPS = (800, 400)

@@ -19,7 +19,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.values import AccessUnit, Frame, View
 from hvt_edge.link.publisher import Answers, ZenohLink
-from hvt_edge.video.encoder_settings import encoder_settings
+from hvt_edge.video.encoder import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 
 SIZE = (640, 360)

@@ -22,11 +22,10 @@ from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame
 from hvt_edge.config import EdgeConfig, check_rate
-from hvt_edge.control.link_control import wait_for_ground
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
-from hvt_edge.loop.realtime import RealtimePace
+from hvt_edge.loop.realtime import RealtimePace, wait_for_ground
 from hvt_edge.operating import LoopClock
 from hvt_edge.report.state import Heartbeat, lacks
 from hvt_edge.report.status import status_text, summary

@@ -34,13 +34,19 @@ from hvt_common.runtime.log import LOG_FORMATS
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import bitrate_text
 from hvt_common.video.still_codecs import still_codec
-from hvt_edge.operating import base_rate_bps
+from hvt_edge.operating import FIRST_SHARE, base_rate_bps
 from hvt_edge.profiles import PROFILES, REGIMES
 from hvt_edge.source.contract import check_shape
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
-from hvt_edge.video.encoder_settings import PRESETS, SLOWEST, keyframe_total_bps, least_base_bps
-from hvt_edge.video.encoders.registry import PASSTHROUGH, X265, check_encoder
-from hvt_edge.video.share import FIRST_SHARE
+from hvt_edge.video.encoder import (
+    PASSTHROUGH,
+    PRESETS,
+    SLOWEST,
+    X265,
+    check_encoder,
+    keyframe_total_bps,
+    least_base_bps,
+)
 
 DEFAULT_FPS = 15.0
 DEFAULT_SIZE = (1280, 720)

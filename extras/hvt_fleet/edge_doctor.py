@@ -25,8 +25,8 @@ from hvt_edge.loop.counts import Cores, CpuMeter, processors
 from hvt_edge.perception.cpu_budget import most_cores
 from hvt_edge.source.contract import Source
 from hvt_edge.source.opening import shown
-from hvt_edge.video.encoder_settings import PresetChoice, choose_preset, share_of
-from hvt_edge.video.encoders.registry import Encoder
+from hvt_edge.video.encoder import Encoder
+from hvt_edge.video.rate_model import PresetChoice, choose_preset, share_of
 from hvt_edge.wiring import (
     as_the_camera_is,
     check_codecs,

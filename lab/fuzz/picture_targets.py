@@ -14,7 +14,7 @@ from hvt_common.values import View
 from hvt_common.video.base_crop import base_crop, coded_size
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import CodedCrop, StillError, still_codec, still_codec_names
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
 from lab.fuzz.contract import Target

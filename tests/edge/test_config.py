@@ -15,7 +15,7 @@ from hvt_common.errors import UserError
 from hvt_edge.config import EdgeConfig, check, note_on_share, with_profile
 from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.policy.registry import METHODS
-from hvt_edge.video.encoder_settings import keyframe_floor_bytes
+from hvt_edge.video.encoder import keyframe_floor_bytes
 
 
 def read(*argv: str) -> EdgeConfig:

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from hvt_edge.keyframes import Keyframes, KeyframeSettings
+from hvt_edge.operating import Keyframes, KeyframeSettings
 from hvt_ground.link.reassemble import Reassembler
 
 MS = 1_000_000

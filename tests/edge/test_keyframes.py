@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_edge.keyframes import Keyframes, KeyframeSettings
+from hvt_edge.operating import Keyframes, KeyframeSettings
 
 MS = 1_000_000
 STEP_NS = 66_666_667

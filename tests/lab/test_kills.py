@@ -8,7 +8,7 @@ import sqlite3
 import pytest
 
 from hvt_edge.backlog.disk import FILE_NAME, Store
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from lab.link.kills import BARS, Trial, Verdict, in_matroska, in_recording, missing_s, plan, rows_of
 from lab.link.measures.store_left import StoreLeft, store_left

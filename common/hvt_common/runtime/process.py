@@ -19,8 +19,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import NoReturn, Self, TypeVar
+from typing import NoReturn, TypeVar
 
 T = TypeVar("T")
 
@@ -112,56 +111,6 @@ def lower_priority(*, little: bool = False) -> None:
         own = os.getpriority(os.PRIO_PROCESS, thread)
         with contextlib.suppress(OSError):  # under ``nice -n 19`` root would raise it
             os.setpriority(os.PRIO_PROCESS, thread, max(own, _LITTLE if little else _NICENESS))
-
-
-class NewThreads:
-    """The threads that a library starts within ``with``, so that they can be given the caller's priority.
-
-    Where a library lowers that of its own workers. To raise it again takes a right (``RLIMIT_NICE``, ``LimitNICE=+0``
-    of systemd): without, they stay as they are.
-    """
-
-    def __init__(self) -> None:
-        self._before: set[str] = set()
-        self._threads: set[str] = set()
-
-    def __enter__(self) -> Self:
-        self._before = _threads()
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._threads = _threads() - self._before
-
-    @property
-    def cpu_ns(self) -> int | None:
-        """Processor time that they have taken; None where the system does not say."""
-        spent = [_cpu_ns(thread) for thread in self._threads]
-        return sum(spent) if spent and all(spent) else None
-
-    def raise_priority(self) -> None:
-        """Let them go like the calling thread, whatever they have made of themselves meanwhile."""
-        for thread in list(self._threads):
-            try:
-                own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-                if os.getpriority(os.PRIO_PROCESS, int(thread)) > own:
-                    os.setpriority(os.PRIO_PROCESS, int(thread), own)
-            except OSError:  # it has ended, or this is not allowed
-                self._threads.discard(thread)
-
-
-def _threads() -> set[str]:
-    try:
-        return {one.name for one in Path("/proc/self/task").iterdir()}
-    except OSError:
-        return set()
-
-
-def _cpu_ns(thread: str) -> int:
-    # Of a thread of this process (proc_pid_schedstat(5)); 0 where that is not known.
-    try:
-        return int(Path(f"/proc/self/task/{thread}/schedstat").read_text(encoding="ascii").split()[0])
-    except (OSError, ValueError, IndexError):
-        return 0
 
 
 def put_video_first() -> None:

@@ -18,8 +18,8 @@ from hvt_common.values import AccessUnit
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import FIRST_STORED, SEGMENT_NS, Entry
 from hvt_edge.backlog.worker import ChunkAllowance, IntakeStill, StoreWorker
-from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.operating import Keyframes
 
 SILENCE_NS = 3 * SECOND_NS // 2
 """Three reports in a row that did not come."""

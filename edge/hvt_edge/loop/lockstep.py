@@ -17,10 +17,9 @@ from types import TracebackType
 from typing import Self
 
 from hvt_common.values import Frame
-from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
-from hvt_edge.operating import LoopClock
+from hvt_edge.operating import Keyframes, LoopClock
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.video.stage import BaseStage

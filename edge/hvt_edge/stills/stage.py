@@ -10,11 +10,10 @@ from hvt_common.inference.class_names import same_kind
 from hvt_common.protocol.messages import StillResult
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage
-from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.stills import Still
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating import Levers
+from hvt_edge.operating import Keyframes, Levers
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
 from hvt_edge.perception.levers import LeverControl
 from hvt_edge.perception.shadow import Detected, ShadowGround

@@ -1,5 +1,5 @@
-"""The base stream: `stage` decides whether a frame is coded, and by `x265`, opened by `encoder_settings`.
+"""The base stream: `stage` decides whether a frame is coded, and by which `encoder`: `x265` as a rule.
 
-`encoders` has others in place of x265; `passthrough` is the stage without one. `rate_model` says which frames,
-`share` at which rate; `reconfigure` changes all that with a keyframe.
+`encoders` has others; `passthrough` is the stage without one. `rate_model` decides on frames and preset,
+`reconfigure` on rates; it opens the encoder anew with a keyframe.
 """

@@ -17,9 +17,9 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage, State
-from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.video.encoders.registry import Encoder
+from hvt_edge.operating import Keyframes
+from hvt_edge.video.encoder import Encoder
 from hvt_edge.video.rate_model import FrameSkip
 from hvt_edge.video.x265 import TrackRegions
 

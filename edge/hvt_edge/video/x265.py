@@ -22,11 +22,14 @@ Settings and why (measured on drone_carpark, intel_car-detection and a panning a
 from __future__ import annotations
 
 import math
+import os
+import threading
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from fractions import Fraction
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import av
 import av.error
@@ -37,10 +40,9 @@ from av.video.frame import PictureType
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
 from hvt_common.errors import UserError
-from hvt_common.runtime.process import NewThreads
 from hvt_common.values import AccessUnit, Boxes, Frame, Image, Tracks
 from hvt_common.video.hevc import UNBIASED
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder import EncoderSettings
 
 BLOCK_PX = 16
 """libx265 keeps one offset for each block of 16x16 luma pixels; a region takes all blocks that it touches."""
@@ -313,3 +315,53 @@ def _open(settings: EncoderSettings) -> VideoCodecContext:
             f"({error}): use another --size, --fps or --budget"
         ) from None
     return context
+
+
+class NewThreads:
+    """The threads that a library starts within ``with``, so that they can be given the caller's priority.
+
+    Where a library lowers that of its own workers. To raise it again takes a right (``RLIMIT_NICE``, ``LimitNICE=+0``
+    of systemd): without, they stay as they are.
+    """
+
+    def __init__(self) -> None:
+        self._before: set[str] = set()
+        self._threads: set[str] = set()
+
+    def __enter__(self) -> Self:
+        self._before = _threads()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._threads = _threads() - self._before
+
+    @property
+    def cpu_ns(self) -> int | None:
+        """Processor time that they have taken; None where the system does not say."""
+        spent = [_cpu_ns(thread) for thread in self._threads]
+        return sum(spent) if spent and all(spent) else None
+
+    def raise_priority(self) -> None:
+        """Let them go like the calling thread, whatever they have made of themselves meanwhile."""
+        for thread in list(self._threads):
+            try:
+                own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+                if os.getpriority(os.PRIO_PROCESS, int(thread)) > own:
+                    os.setpriority(os.PRIO_PROCESS, int(thread), own)
+            except OSError:  # it has ended, or this is not allowed
+                self._threads.discard(thread)
+
+
+def _threads() -> set[str]:
+    try:
+        return {one.name for one in Path("/proc/self/task").iterdir()}
+    except OSError:
+        return set()
+
+
+def _cpu_ns(thread: str) -> int:
+    # Of a thread of this process (proc_pid_schedstat(5)); 0 where that is not known.
+    try:
+        return int(Path(f"/proc/self/task/{thread}/schedstat").read_text(encoding="ascii").split()[0])
+    except (OSError, ValueError, IndexError):
+        return 0

@@ -13,10 +13,9 @@ from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.levers import LeverSettings
 from hvt_edge.source.contract import CameraStream
-from hvt_edge.video.encoder_settings import least_base_bps
+from hvt_edge.video.encoder import least_base_bps
 from hvt_edge.video.encoders.passthrough import CameraRates, LeastLink, measure_camera, needed_bps
-from hvt_edge.video.reconfigure import EncoderReconfiguration
-from hvt_edge.video.share import Split
+from hvt_edge.video.reconfigure import EncoderReconfiguration, Split
 from hvt_edge.wiring.perception import shows_details
 from hvt_edge.wiring.video import least_rate_bps
 

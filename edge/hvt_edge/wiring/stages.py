@@ -20,8 +20,7 @@ from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
-from hvt_edge.control.commands import Commands
-from hvt_edge.control.link_control import LinkControl
+from hvt_edge.control import Commands
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import Answers, EdgeLink
 from hvt_edge.link.stills import StillReaders
@@ -29,6 +28,7 @@ from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts, processors
 from hvt_edge.loop.pose import PoseSource, PoseStage
+from hvt_edge.loop.realtime import LinkControl
 from hvt_edge.operating import LoopClock, Operating, Rates, base_rate_bps
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.cpu_budget import CpuBudget
@@ -42,8 +42,8 @@ from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser, Gate
 from hvt_edge.stills.stage import StillSender, StillStage
-from hvt_edge.video.encoder_settings import PresetControl, share_of
 from hvt_edge.video.passthrough import PassthroughStage
+from hvt_edge.video.rate_model import PresetControl, share_of
 from hvt_edge.video.reconfigure import encoder_opener
 from hvt_edge.video.stage import BaseStage, LocalCopy
 from hvt_edge.video.x265 import TrackRegions

@@ -14,12 +14,12 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.loop.counts import processors
+from hvt_edge.operating import FIRST_SHARE
 from hvt_edge.perception.shadow import UNMEASURED, Shadow
 from hvt_edge.source.contract import Source
 from hvt_edge.stills.policy.registry import method
-from hvt_edge.video.encoder_settings import PresetChoice, choose_preset, least_base_bps, share_of
-from hvt_edge.video.encoders.registry import X265
-from hvt_edge.video.share import FIRST_SHARE
+from hvt_edge.video.encoder import X265, least_base_bps
+from hvt_edge.video.rate_model import PresetChoice, choose_preset, share_of
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.link import SPARSE_SHARE, lever_settings
 from hvt_edge.wiring.perception import make_analyzer, make_shadow

@@ -15,12 +15,14 @@ from hvt_common.runtime.log import START_LOGGER
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import Fit, Frame, View
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, least_budget_bps
-from hvt_edge.keyframes import Keyframes, KeyframeSettings
-from hvt_edge.operating import Operating, Rates
+from hvt_edge.operating import Keyframes, KeyframeSettings, Operating, Rates
 from hvt_edge.source.contract import BaseSize, Source, size_within
 from hvt_edge.source.opening import REENCODE, shown
-from hvt_edge.video.encoder_settings import (
+from hvt_edge.video.encoder import (
     SLOWEST,
+    X265,
+    Encoder,
+    EncoderPlan,
     keyframe_interval_s,
     keyframe_total_bps,
     payload_bps,
@@ -28,7 +30,6 @@ from hvt_edge.video.encoder_settings import (
 )
 from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
 from hvt_edge.video.encoders.qualification import Allowed, allowed, headroom_of, run_frames
-from hvt_edge.video.encoders.registry import X265, Encoder, EncoderPlan
 from hvt_edge.video.rate_model import (
     LEAST_SIDE_PX,
     PROMPT,

@@ -14,7 +14,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel
 from hvt_common.values import AccessUnit, Frame, Image
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.video.encoder_settings import VBV_S, EncoderSettings, keyframe_floor_bytes, minimum_bps
+from hvt_edge.video.encoder import VBV_S, EncoderSettings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_study.datasets.sequence import NOMINAL_FPS
 from hvt_study.peers.dds_line import Line, header_bps

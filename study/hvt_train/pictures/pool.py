@@ -19,7 +19,7 @@ import numpy as np
 
 from hvt_common.values import Frame, Image, View
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_scene import Appearance, Scene
 from hvt_train.pictures.places import Picture, draw_place

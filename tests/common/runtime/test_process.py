@@ -15,12 +15,12 @@ import pytest
 from hvt_common.runtime import process
 from hvt_common.runtime.process import (
     STOP_SIGNALS,
-    NewThreads,
     give_back_holes,
     limit_malloc_arenas,
     lower_priority,
     stop_on_signals,
 )
+from hvt_edge.video.x265 import NewThreads
 
 only_with_glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is about glibc's heaps")
 

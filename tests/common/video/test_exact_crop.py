@@ -15,7 +15,7 @@ from hvt_common.values import Frame, View
 from hvt_common.video.base_crop import base_crop, exact_base_crop
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import psnr_y_db
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from media.crops import textured
 

@@ -8,7 +8,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_edge.config import EdgeConfig, check, check_rate
-from hvt_edge.video.encoder_settings import keyframe_total_bps
+from hvt_edge.video.encoder import keyframe_total_bps
 from media.clips import hard_pictures
 from rigs.live_flight import LiveFlight, SteppedLink
 

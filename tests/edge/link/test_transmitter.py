@@ -29,7 +29,7 @@ from hvt_edge.link.feedback import PrimaryReceiver
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.stills import Still
-from hvt_edge.video.encoder_settings import STATUS_BYTES, base_overhead_bps
+from hvt_edge.video.encoder import STATUS_BYTES, base_overhead_bps
 from rigs.messages import STATUS, feedback, still_of
 from rigs.world import Puts, make_transmitter
 

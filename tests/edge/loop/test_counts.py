@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 from hvt_common.protocol.edge_words import FRAME_GROUPS, FrameAccount
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit
-from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
-from hvt_edge.operating import LoopClock
+from hvt_edge.operating import Keyframes, LoopClock
 from hvt_edge.perception.cpu_budget import CpuBudget
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.video.rate_model import FrameSkip

@@ -9,13 +9,12 @@ import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import BaseHeader
-from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
-from hvt_edge.operating import LoopClock
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.operating import Keyframes, LoopClock
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.rate_model import FrameSkip
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures

@@ -22,7 +22,7 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
 from hvt_common.video.hevc import YuvPicture
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.keyframes import Keyframes
+from hvt_edge.operating import Keyframes
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.worker import StillWorker

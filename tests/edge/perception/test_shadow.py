@@ -17,7 +17,7 @@ from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
 from hvt_edge.perception.shadow import Detected, Shadow, ShadowGround
 from hvt_edge.source.contract import SourceSettings
 from hvt_edge.source.demo import DemoSource
-from hvt_edge.video.encoder_settings import encoder_settings
+from hvt_edge.video.encoder import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 from rigs.examples import tracks_of
 

@@ -21,9 +21,9 @@ from hvt_common.values import Frame, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import JpegCodec, StillCodec
-from hvt_edge.keyframes import Keyframes
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.operating import Keyframes
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.frame_ring import FrameRing
 from hvt_edge.stills.maker import StillMaker

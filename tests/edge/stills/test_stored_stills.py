@@ -14,7 +14,7 @@ from hvt_common.values import Frame, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.control.commands import Commands
+from hvt_edge.control import Commands
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.policy.registry import method

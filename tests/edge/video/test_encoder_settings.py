@@ -7,7 +7,7 @@ import pytest
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES
-from hvt_edge.video.encoder_settings import (
+from hvt_edge.video.encoder import (
     STATUS_BYTES,
     EncoderSettings,
     encoder_settings,

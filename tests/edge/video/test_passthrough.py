@@ -17,7 +17,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.backlog.stage import BacklogStage, State
-from hvt_edge.keyframes import Keyframes, KeyframeSettings
+from hvt_edge.operating import Keyframes, KeyframeSettings
 from hvt_edge.source.opening import open_source
 from hvt_edge.video.encoders.passthrough import Passthrough
 from hvt_edge.video.passthrough import PassthroughStage

@@ -13,7 +13,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import CameraUnit, Frame
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.keyframes import Keyframes, KeyframeSettings
+from hvt_edge.operating import Keyframes, KeyframeSettings
 from hvt_edge.source.contract import CameraStream, SeenUnit
 from hvt_edge.video.encoders.passthrough import Passthrough
 from hvt_edge.video.passthrough import PassthroughStage

@@ -11,8 +11,8 @@ from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.operating import Operating
-from hvt_edge.video.encoder_settings import PresetControl, choose_preset, share_of
-from hvt_edge.video.encoders.registry import EncoderPlan
+from hvt_edge.video.encoder import EncoderPlan
+from hvt_edge.video.rate_model import PresetControl, choose_preset, share_of
 from hvt_edge.video.reconfigure import encoder_opener
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.video import encoder_plan, make_reconfiguration

@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_edge.operating import Levers, Operating, Rates
+from hvt_edge.operating import FIRST_SHARE, Levers, Operating, Rates
 from hvt_edge.perception.candidates import BaseLoss, Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import CostEstimate, Step
-from hvt_edge.video.reconfigure import EncoderReconfiguration
-from hvt_edge.video.share import FIRST_SHARE, Split
+from hvt_edge.video.reconfigure import EncoderReconfiguration, Split
 from rigs.examples import candidate
 
 SECOND = 1_000_000_000

@@ -18,12 +18,10 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit, Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check, least_budget_bps
-from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.operating import Rates
-from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings
+from hvt_edge.operating import Keyframes, KeyframeSettings, Rates
+from hvt_edge.video.encoder import CheckedEncoder, Encoder, EncoderPlan, EncoderSettings, encoder_settings
 from hvt_edge.video.encoders.hardware import HardwareEncoder
-from hvt_edge.video.encoders.registry import CheckedEncoder, Encoder, EncoderPlan
 from hvt_edge.video.rate_model import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.reconfigure import encoder_opener
 from hvt_edge.video.x265 import BaseEncoder, TrackRegions, encoder_context

@@ -14,7 +14,7 @@ from av.filter import Graph
 from hvt_common.errors import UserError
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video import x265
-from hvt_edge.video.encoder_settings import PRESETS, EncoderSettings, keyframe_floor_bytes, minimum_bps
+from hvt_edge.video.encoder import PRESETS, EncoderSettings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.x265 import MOST_REGIONS, BaseEncoder, Region
 from media.clips import framed, hard_pictures, smooth_pictures
 

@@ -20,7 +20,7 @@ from hvt_archive.local_copy import LocalCopy, _MatroskaFile
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
 from programs.processes import eventually

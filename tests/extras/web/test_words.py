@@ -399,7 +399,7 @@ ANSWERS = {
 }
 """Every answer of an edge to a command, and what the ground says where there is none that it can use."""
 MORE_ANSWERS = {
-    "edge/hvt_edge/keyframes.py": {
+    "edge/hvt_edge/operating.py": {
         "the last keyframe came … s ago, after many others: ask again in … s",
         (
             "the camera's own video is sent (--encoder passthrough), and it makes no keyframe on request: the next "

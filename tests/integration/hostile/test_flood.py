@@ -19,7 +19,7 @@ import psutil
 import pytest
 
 from hvt_common.protocol.messages import BaseHeader, ControlAnswer, ControlRequest, Feedback
-from hvt_edge.keyframes import KeyframeSettings
+from hvt_edge.operating import KeyframeSettings
 from programs.outsider import Tap, answer, joined
 from programs.processes import Link, Running, eventually
 

@@ -13,9 +13,9 @@ from hvt_common.units import parse_bitrate
 from hvt_common.values import Frame, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.control.commands import Commands
-from hvt_edge.keyframes import Keyframes
+from hvt_edge.control import Commands
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.operating import Keyframes
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing

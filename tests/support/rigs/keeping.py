@@ -27,16 +27,16 @@ from hvt_common.values import AccessUnit, Frame
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.control.link_control import LinkControl
-from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.loop.realtime import LinkControl
+from hvt_edge.operating import Keyframes, KeyframeSettings
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxStill
 from hvt_edge.stills.stage import StillSender
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.backlog.assembly import BacklogAssembly
 from media.clips import START_NS, framed, smooth_pictures

@@ -8,7 +8,7 @@ from pathlib import Path
 from hvt_common.protocol.messages import BacklogStill, pack_backlog_still
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.disk import Store
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
 from rigs.flight import Flight

@@ -26,15 +26,13 @@ from hvt_common.values import AccessUnit, Frame, Image
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, check, check_rate
-from hvt_edge.control.link_control import LinkControl
-from hvt_edge.keyframes import Keyframes, KeyframeSettings
 from hvt_edge.link.feedback import FeedbackInbox
-from hvt_edge.operating import Rates
+from hvt_edge.loop.realtime import LinkControl
+from hvt_edge.operating import Keyframes, KeyframeSettings, Rates
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.stage import StillSender
-from hvt_edge.video.encoder_settings import encoder_settings, keyframe_floor_bytes, minimum_bps
-from hvt_edge.video.encoders.registry import Encoder
+from hvt_edge.video.encoder import Encoder, encoder_settings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.stage import Action
 from hvt_edge.wiring.link import make_budget, make_pacer
 from hvt_edge.wiring.video import first_decimation, first_rates, make_encoder, make_frame_skip

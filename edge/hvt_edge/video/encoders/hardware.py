@@ -12,8 +12,7 @@ from av.video.reformatter import VideoReformatter
 
 from hvt_common.errors import UserError
 from hvt_common.values import AccessUnit, Frame
-from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.encoders.registry import HardwareRow
+from hvt_edge.video.encoder import EncoderSettings, HardwareRow
 from hvt_edge.video.x265 import Region, encoder_context, mean_qp_of, yuv_picture
 
 _BT709, _LIMITED = 1, 1

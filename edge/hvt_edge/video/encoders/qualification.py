@@ -19,8 +19,7 @@ from hvt_common.units import bitrate_text
 from hvt_common.values import AccessUnit, Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, BASE_PEAK
-from hvt_edge.video.encoder_settings import usual_keyframe_bytes
-from hvt_edge.video.encoders.registry import Encoder
+from hvt_edge.video.encoder import Encoder, usual_keyframe_bytes
 
 _RUN_S = 3.0
 _MOST_WINDOW_S = 1.5

@@ -10,7 +10,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.values import AccessUnit, Frame
-from hvt_edge.video.encoder_settings import encoder_settings
+from hvt_edge.video.encoder import encoder_settings
 from hvt_edge.video.encoders.qualification import Allowed, allowed, headroom_of, measure, run_frames
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, hard_pictures

@@ -8,9 +8,15 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoder import (
+    HARDWARE,
+    EncoderSettings,
+    HardwareRow,
+    check_encoder,
+    encoder_names,
+    open_encoder,
+)
 from hvt_edge.video.encoders.hardware import HardwareEncoder
-from hvt_edge.video.encoders.registry import HARDWARE, HardwareRow, check_encoder, encoder_names, open_encoder
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures
 from media.third_party import ENCODERS

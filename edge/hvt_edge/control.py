@@ -17,15 +17,13 @@ from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest,
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, least_budget_bps, stream_text
-from hvt_edge.keyframes import Keyframes
-from hvt_edge.operating import Operating
+from hvt_edge.operating import FIRST_SHARE, Keyframes, Operating
 from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.on_demand import OnDemandRequest
 from hvt_edge.stills.policy.base import Method
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.requested_coding import RefusedError
 from hvt_edge.stills.scheduler import Chooser
-from hvt_edge.video.share import FIRST_SHARE
 
 _MOST_REQUESTS = 32
 """In a second, from all grounds together."""

@@ -1,0 +1,347 @@
+"""The frame loop's contract with an encoder, its settings from a budget in line bits, and every one by its name.
+
+There are x265, none (passthrough), those of hardware, and those that other packages install: an entry point of the
+group ``hvt.encoders`` (`MakeEncoder`), imported when it is named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, Protocol
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
+from hvt_common.protocol.ledger import overhead_bytes
+from hvt_common.runtime.plug_ins import installed, loaded, the_one
+from hvt_common.values import AccessUnit, Frame
+from hvt_edge.link.budget import BASE_ATTACHMENT_BYTES, frames_bps
+from hvt_edge.operating import Rates
+
+if TYPE_CHECKING:
+    from hvt_edge.video.x265 import Region
+
+PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium")
+VBV_S = 0.15
+"""Depth of the VBV buffer in seconds of the base rate."""
+
+# At QP 51 the keyframes of 25 aerial pictures took at the most 0.6, 1.6, 2.5, 3.9 and 7.8 kB at 320x180, 640x360,
+# 960x540, 1280x720 and 1920x1080, half of them less than half of it: 770 bytes and 0.0034 a pixel. x265 can go no
+# lower, whatever the target is; where one takes more, the stage codes it again with less detail.
+_KEYFRAME_FLOOR_BYTES = 770
+_KEYFRAME_FLOOR_BYTES_PER_PX = 0.0034
+# At usual thin rates keyframes take more, as far as the VBV lets them: 3.0, 3.9, 4.9 and 5.9 kB up to 1280x720.
+_KEYFRAME_BYTES = 2060
+_KEYFRAME_BYTES_PER_SIDE_PX = 4.0
+# The frames after a keyframe follow a target down to some 300 bits and 0.0045 bit a pixel each: 67 kbps at 1280x720
+# and 15 fps.
+_FRAME_FLOOR_BITS = 300
+_FRAME_FLOOR_BITS_PER_PX = 0.0045
+
+# The fullest rolling second over the target, keyframes on demand included, from 300 kbps up (see encode).
+_PEAK = 1.14
+_TIGHT_VBV_S = 0.1
+_TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
+_KEYFRAME_EVERY_S = 5.0
+"""x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.
+x265 gets so much less, for the first keyframe, one each ten seconds, and some that grounds ask for."""
+_KEYFRAME_SHARE = 0.005
+"""Of the base's bytes, at most, for keyframes of the schedule."""
+STATUS_BYTES = 320
+"""The size of a `Status`."""
+SLOWEST: Final = "veryfast"
+"""The preset of studies, the demo and all of lockstep: there time does not matter."""
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderSettings:
+    """Settings of x265; ``bitrate_bps`` is the payload alone, without headers of any transport."""
+
+    size: tuple[int, int]
+    fps: float
+    bitrate_bps: int
+    preset: str = SLOWEST
+    vbv_s: float = VBV_S
+    threads: int = 1
+    """Worker threads; more than one is faster, and not the same bytes each run."""
+    side_data: bool = False
+    """Whether `BaseEncoder.encode` takes regions."""
+
+
+def keyframe_floor_bytes(size: tuple[int, int]) -> int:
+    """The smallest keyframe of a textured picture of ``size`` (width, height)."""
+    return round(_KEYFRAME_FLOOR_BYTES + _KEYFRAME_FLOOR_BYTES_PER_PX * size[0] * size[1])
+
+
+def usual_keyframe_bytes(size: tuple[int, int]) -> int:
+    """The usual bytes of a keyframe of ``size`` (width, height) at thin rates."""
+    return round(_KEYFRAME_BYTES + _KEYFRAME_BYTES_PER_SIDE_PX * math.sqrt(size[0] * size[1]))
+
+
+def most_keyframe_bytes(size: tuple[int, int], fps: float, base_bps: int) -> int:
+    """About the most that a keyframe takes: what the VBV holds at this B_v, or what x265 cannot go below."""
+    return max(keyframe_floor_bytes(size), round(_vbv_s(fps) * base_bps / 8))
+
+
+def keyframe_interval_s(size: tuple[int, int], base_bps: int) -> float:
+    """The default time between scheduled keyframes: 10 s, up to 60 s where the rate is thin.
+
+    A keyframe that the VBV lets through at a low rate is far coarser than the frames before it, and the picture takes
+    seconds to recover: at 200 kbps and 1280x720 the objects found fell from 62 to 6. Grounds that join or lose
+    something request theirs anyhow; the schedule only lets a viewer jump within a recording. So its bytes
+    are held to half a percent of the stream.
+    """
+    return min(60.0, max(10.0, 8 * usual_keyframe_bytes(size) / (_KEYFRAME_SHARE * base_bps)))
+
+
+def keyframe_total_bps(size: tuple[int, int], *, window_s: float, metadata_bps: int, edge_id: str) -> int:
+    """The least total of which each window holds a keyframe, with ``status``, tracks and pose beside it."""
+    keyframe_bps = 8 * keyframe_floor_bytes(size) / window_s
+    beside_bps = base_overhead_bps(keyframe_bps, fps=1 / window_s, edge_id=edge_id)
+    return math.ceil(keyframe_bps + beside_bps + metadata_bps)
+
+
+def minimum_bps(size: tuple[int, int], fps: float) -> int:
+    """The lowest payload rate that x265 can follow at this size and frame rate, keyframes apart."""
+    return round(fps * (_FRAME_FLOOR_BITS + size[0] * size[1] * _FRAME_FLOOR_BITS_PER_PX))
+
+
+def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
+    """The share of headers, framing and ``status`` in ``base_bps``: the encoder gets the rest."""
+    payload = round(base_bps / 8 / fps)
+    key = EdgeKeys(edge_id).key(Channel.BASE)
+    encoding = DELIVERIES[Channel.BASE].encoding
+    per_frame = BASE_ATTACHMENT_BYTES + overhead_bytes(
+        payload, BASE_ATTACHMENT_BYTES, key=key, encoding=encoding
+    )
+    per_second = STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=EdgeKeys(edge_id).key(Channel.STATUS))
+    return 8 * (per_frame * fps + per_second)
+
+
+def encoder_settings(
+    *,
+    size: tuple[int, int],
+    fps: float,
+    preset: str,
+    total_bps: int,
+    base_bps: int,
+    edge_id: str,
+    window_s: float = 1.0,
+    side_data: bool = False,
+) -> EncoderSettings:
+    """Settings of x265 that keep the base stream within B_v, and its fullest second within B_tot.
+
+    Where stills have a share, they yield to the base's peaks. Where video takes (nearly) the whole budget, as in M0,
+    nothing can yield: the VBV is made tighter and the target lowered by the peak that is left. Where a window of
+    ``window_s`` holds no whole number of frames, the target is lowered until it holds all that fall into it.
+
+    ``fps`` is the rate of coded frames: with fewer of them less goes into headers, and the VBV holds one at least.
+    ``side_data`` is needed by `TrackRegions`.
+    """
+    tight = base_bps * _PEAK > total_bps
+    line_bps = min(base_bps, total_bps / _TIGHT_PEAK) if tight else base_bps
+    payload_bps = line_bps - _beside_bps(line_bps, size=size, fps=fps, edge_id=edge_id)
+    frames_line_bps = line_bps - _debt_bps(size)
+    payload_bps += frames_bps(frames_line_bps, total_bps, fps=fps, window_s=window_s) - frames_line_bps
+    return EncoderSettings(
+        size=size,
+        fps=fps,
+        bitrate_bps=max(1, round(payload_bps)),
+        preset=preset,
+        vbv_s=_vbv_s(fps, tight=tight),
+        side_data=side_data,
+    )
+
+
+def least_base_bps(size: tuple[int, int], fps: float, *, edge_id: str) -> int:
+    """The lowest B_v at which x265 can still follow its target."""
+    payload_bps = minimum_bps(size, fps)
+    return round(payload_bps + _beside_bps(payload_bps, size=size, fps=fps, edge_id=edge_id))
+
+
+def payload_bps(base_bps: int, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
+    """About what x265 gets of B_v; never below 1."""
+    return max(1.0, base_bps - _beside_bps(base_bps, size=size, fps=fps, edge_id=edge_id))
+
+
+def _vbv_s(fps: float, *, tight: bool = False) -> float:
+    return max(_TIGHT_VBV_S if tight else VBV_S, 1 / fps)
+
+
+def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
+    # The part of the base's rate beside x265: headers, framing, ``status``, and its debt of keyframes.
+    return base_overhead_bps(line_bps, fps=fps, edge_id=edge_id) + _debt_bps(size)
+
+
+def _debt_bps(size: tuple[int, int]) -> float:
+    return 8 * usual_keyframe_bytes(size) / _KEYFRAME_EVERY_S
+
+
+class Encoder(Protocol):
+    """Turns frames into HEVC access units, one for each, at once, and never more bits than it was opened for.
+
+    It is opened anew, with another `EncoderSettings`, for each change of rate, and used from one thread.
+    """
+
+    @property
+    def mean_qp(self) -> float:
+        """Of the frame encoded last: the quantiser parameter (0…51); NaN where it is not known."""
+        ...
+
+    def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
+        """The unit of ``frame.base_bgr``, uint8 (height, width, 3) BGR, not to be written to, as Annex B.
+
+        4:2:0, 8 bits, BT.709, limited range; each picture refers to earlier ones alone. With ``keyframe`` it is an
+        IDR with VPS, SPS and PPS before it, and so is the first. ``regions`` are given to x265 alone. Raises
+        whatever it likes: the frame is left out, and another encoder is opened.
+        """
+        ...
+
+
+MakeEncoder = Callable[[EncoderSettings], Encoder]
+"""The entry point of the group ``hvt.encoders``; it raises if it refuses the settings."""
+
+
+class CheckedEncoder:
+    """One that HVT has not tested itself: `ValueError` for a unit that no ground could use. Without regions."""
+
+    def __init__(self, encoder: Encoder) -> None:
+        self._encoder = encoder
+        self._begun = False
+
+    @property
+    def mean_qp(self) -> float:
+        """See `Encoder`; NaN for one that says nothing, or an impossible value."""
+        said = getattr(self._encoder, "mean_qp", math.nan)
+        return float(said) if isinstance(said, int | float) and 0 <= said <= 51 else math.nan
+
+    def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
+        """See `Encoder`. The unit itself tells whether it is a keyframe, whatever the encoder says of it."""
+        from hvt_common.video.hevc import is_keyframe, parameter_sets  # noqa: PLC0415  (the command line needs no decoder)
+
+        assert not regions, "config.check() refuses regions with another encoder than x265"
+        unit = self._encoder.encode(frame, keyframe=keyframe)
+        data = getattr(unit, "data", None)
+        if not isinstance(data, bytes) or not data:
+            raise ValueError(f"it gave no access unit for frame {frame.index}, and has to give one for each")
+        # To begin a decoder with it takes both; another I picture is a large frame like any other.
+        begins = is_keyframe(data) and bool(parameter_sets(data))
+        if (keyframe or not self._begun) and not begins:
+            raise ValueError(f"frame {frame.index} was to be a keyframe, and is no IDR with VPS, SPS and PPS")
+        self._begun = True
+        return AccessUnit(frame.index, frame.capture_ns, data, keyframe=begins)
+
+    def close(self) -> None:
+        """Let go of it, and so of its device and memory."""
+        del self._encoder
+
+
+@dataclass(frozen=True, slots=True)
+class HardwareRow:
+    """One encoder of FFmpeg."""
+
+    codec: str
+    """Its name there, and of ``--encoder``."""
+    pixel_format: str
+    needs: str
+    """The hardware that it needs."""
+    options: Mapping[str, str] = field(default_factory=dict)
+    """Zero latency, constant rate, and an IDR where a keyframe is forced."""
+
+
+GROUP = "hvt.encoders"
+"""The entry points' group."""
+X265 = "x265"
+"""HVT's own, measured encoder: the only one that takes regions and needs no qualification."""
+PASSTHROUGH = "passthrough"
+"""None at all: the units of a camera that makes HEVC itself."""
+_WHAT = "encoder"
+
+
+# None of them has been run by the project: the rows were written from FFmpeg's documentation. What keeps a wrong row
+# from a flight is the qualification run at the start.
+_ROWS = (
+    HardwareRow(
+        "hevc_nvenc",
+        "yuv420p",
+        "an NVIDIA GPU with NVENC and its driver",
+        {"preset": "p4", "tune": "ull", "rc": "cbr", "delay": "0", "zerolatency": "1", "forced-idr": "1"},
+    ),
+    HardwareRow(
+        "hevc_qsv",
+        "nv12",
+        "an Intel GPU with Quick Sync and its driver",
+        {"preset": "medium", "async_depth": "1", "low_delay_brc": "1", "look_ahead": "0", "forced_idr": "1"},
+    ),
+    HardwareRow("hevc_v4l2m2m", "nv12", "a board whose kernel has an HEVC encoder as a V4L2 device"),
+)
+HARDWARE: Mapping[str, HardwareRow] = MappingProxyType({row.codec: row for row in _ROWS})
+"""By name."""
+_OWN = frozenset({X265, PASSTHROUGH}) | HARDWARE.keys()
+
+
+def encoder_names() -> tuple[str, ...]:
+    """The values of ``--encoder`` here: HVT's own first, whether or not the device is there; none is loaded."""
+    return (X265, PASSTHROUGH, *HARDWARE, *sorted(installed(GROUP).keys() - _OWN))
+
+
+def check_encoder(name: str) -> None:
+    """Raise `UserError` where there is none of that name, or more than one; nothing is opened."""
+    built_in = name in _OWN
+    entry = the_one(GROUP, name, what=_WHAT, built_in=built_in)
+    if not built_in and entry is None:
+        raise UserError(f"--encoder {name!r} is not known: choose one of {', '.join(encoder_names())}")
+
+
+def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
+    """Open it. Raises `UserError` where there is none, or it does not load or take the settings."""
+    # Imported for who opens one: names alone are checked at each start.
+    from hvt_edge.video.encoders.hardware import HardwareEncoder  # noqa: PLC0415
+    from hvt_edge.video.encoders.passthrough import Passthrough  # noqa: PLC0415
+    from hvt_edge.video.x265 import BaseEncoder  # noqa: PLC0415
+
+    if name == X265:
+        return BaseEncoder(settings)
+    if name == PASSTHROUGH:
+        return Passthrough()
+    check_encoder(name)
+    if name in HARDWARE:
+        return CheckedEncoder(HardwareEncoder(settings, row=HARDWARE[name]))
+    entry = the_one(GROUP, name, what=_WHAT, built_in=False)
+    assert entry is not None, "checked"
+    return CheckedEncoder(loaded(entry, lambda make: make(settings), what=_WHAT))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncoderPlan:
+    """All that an encoder is opened with but rates and preset."""
+
+    name: str
+    size: tuple[int, int]
+    nominal_fps: float
+    """Source frames a second."""
+    edge_id: str
+    window_s: float
+    metadata_bps: int
+    side_data: bool
+    threads: int
+    headroom: float = 1.0
+    """The share of its rate that the encoder is set to."""
+
+    def open(self, rates: Rates, *, preset: str) -> Encoder:
+        """Open it at the rate that the budget leaves it. Raises `UserError` where it does not take the settings."""
+        settings = encoder_settings(
+            size=self.size,
+            fps=self.nominal_fps / rates.decimation,
+            preset=preset,
+            # What is kept for tracks may be the base's while none are sent.
+            total_bps=max(rates.total_bps - self.metadata_bps, rates.base_bps),
+            base_bps=rates.base_bps,
+            edge_id=self.edge_id,
+            window_s=self.window_s,
+            side_data=self.side_data,
+        )
+        bitrate_bps = max(1, round(settings.bitrate_bps * self.headroom))
+        return open_encoder(self.name, replace(settings, bitrate_bps=bitrate_bps, threads=self.threads))
