@@ -107,6 +107,8 @@ class CameraMotion:
             raise ValueError(f"camera motion scale is {scale}, must be above 0 and at most 1")
         self._scale = scale
         self._previous: _Gray | None = None
+        self.gray: _Gray | None = None
+        """The newest image, in half where it is large."""
         self.reset()
 
     def mark(self) -> None:
@@ -144,6 +146,7 @@ class CameraMotion:
         )  # first: a third of the time of all at once
         pixels = cv2.resize(image_bgr, half, interpolation=cv2.INTER_AREA) if 2 * scale <= 1 else image_bgr
         gray = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+        self.gray = np.asarray(gray, np.uint8)
         current = np.asarray(cv2.resize(gray, small_size, interpolation=cv2.INTER_AREA), np.uint8)
         previous, self._previous = self._previous, current
         other = self._scene.take(current)

@@ -5,9 +5,10 @@ are matched with predicted tracks first; tracks left over may take a weak detect
 still free starts a new track. The rules, constants and oddities are those of the authors' program, so that its
 results are reproduced.
 What is added: frames may pass without detection (`ByteTracker.predict`), and what finds no match after
-them is matched once more with a margin; all tracks end where another scene begins; the time of lost tracks is counted
-in frames whatever the rate of detection, and where a slow machine detects more seldom than that time lasts, in
-detections; a track has a class.
+them is matched once more with a margin; where the camera is followed, boxes go with what is in them (`flow`); between
+detections a box hardly changes its size by itself; all tracks end where another scene begins; the time of lost tracks
+is counted in frames whatever the rate of detection, and where a slow machine detects more seldom than that time
+lasts, in detections; a track has a class.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy.typing as npt
 from hvt_common.camera_motion import Affine, CameraMotion
 from hvt_common.tracking import kalman
 from hvt_common.tracking.association import Overlaps, grown, larger, overlaps, pair
+from hvt_common.tracking.flow import BoxFlow, Gray, box_flow
 from hvt_common.tracking.track_table import LOST, TRACKED, UNCONFIRMED, TrackerInput, TrackTable
 from hvt_common.values import Detections, Image, Tracks
 
@@ -45,6 +47,12 @@ _MOST_SURPRISES: Final = 0.1
 """Tracks elsewhere than predicted or not found, and what may start new ones, as a share of the tracks."""
 _MOST_SHIFT: Final = 0.1
 """Of the picture's sides, since the last update: what came into view has no tracks yet (`CameraMotion.shift`)."""
+
+_SIZE_DECAY: Final = 0.5
+_MOST_SIZE_STEP: Final = 0.1
+"""Between detections the velocity of a box's sides halves with each frame, and is at most this share of them."""
+_FLOW_WEIGHT: Final = 0.5
+"""Of the motion seen against the velocity before it."""
 
 # Box lengths; wider, and neighbours in a queue of cars are taken for each other.
 _MOST_GROWTH: Final = 0.75
@@ -111,17 +119,35 @@ class TrackerSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class _Step:
+    """To a frame from the one before: the camera's motion, and that of the boxes where it was seen."""
+
+    frame_index: int
+    affine: Affine | None
+    flow: BoxFlow | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class _Searched:
-    """What stood before a frame that is being searched, and the camera's steps to it and to those after it."""
+    """What stood before a frame that is being searched, that picture, and the steps to it and to those after it."""
 
     table: TrackTable
     before: int | None
-    steps: list[tuple[int, Affine | None]]
+    steps: list[_Step]
+    gray: Gray | None
 
 
 def _check_range(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:  # also refuses NaN
         raise ValueError(f"{name} is {value}, must be from {low} to {high}")
+
+
+def _coast(states: kalman.States) -> None:
+    # Step by one frame without detection, in place: what grew or shrank ever on would soon fit nothing.
+    limit = _MOST_SIZE_STEP * np.abs(states[:, kalman.POSITION, 2:])
+    sizes = states[:, kalman.VELOCITY, 2:]
+    states[:, kalman.VELOCITY, 2:] = np.clip(_SIZE_DECAY * sizes, -limit, limit)
+    kalman.predict(states)
 
 
 def weak_confidence(confidence: float) -> float:
@@ -152,6 +178,8 @@ class ByteTracker:
         self._longest_frames = max(self._buffer_frames, round(_LONGEST_S * fps))
         method = self._settings.camera_motion
         self._camera = None if method == "off" else CameraMotion(scale=None)
+        self._size = (0, 0)
+        """(width, height) of the images."""
         self.camera_step: Affine | None = None
         """The camera's motion from the frame before to the newest, base pixels; None where it is not followed."""
         self.reset()
@@ -194,8 +222,7 @@ class ByteTracker:
         """
         self._searched = None
         self._check_rises(frame_index)
-        affine = self._step_of(image_bgr, frame_index, mark=True)
-        return self._update(detections, frame_index, affine)
+        return self._update(detections, self._step_to(frame_index, image_bgr, mark=True))
 
     def update_late(self, detections: Detections) -> Tracks:
         """The tracks at the frame that `predict` last took as ``searched``, where this was found meanwhile.
@@ -206,16 +233,21 @@ class ByteTracker:
         if searched is None:
             raise ValueError("no frame is being searched")
         self._table, self._frame_index = searched.table, searched.before
-        (frame_index, affine), *later = searched.steps
-        listed = self._update(detections, frame_index, affine)
-        for at, step in later:
-            self._advance(at, step, hold_unconfirmed=False)
-            self._table.started[:] = False
+        first, *later = searched.steps
+        listed = self._update(detections, first)
+        table, then = self._table, self._table.states.copy()
+        for step in later:
+            self._advance(replace(step, flow=None), hold_unconfirmed=False)
+            table.started[:] = False
+        if later and len(table) == len(then):
+            flow = self._flow(searched.gray, then, table.states)
+            self._carry(then, flow, frames=later[-1].frame_index - first.frame_index)
         return listed
 
-    def _update(self, detections: Detections, frame_index: int, affine: Affine | None) -> Tracks:
+    def _update(self, detections: Detections, step: _Step) -> Tracks:
+        frame_index = step.frame_index
         seen = TrackerInput.of(detections, low_confidence=self._settings.low_confidence)
-        self._advance(frame_index, affine, hold_unconfirmed=True)
+        self._advance(step, hold_unconfirmed=True)
         first = self._updated_index is None or self._updated_index < self.scene_began <= frame_index
         gap = 1 if self._updated_index is None else frame_index - self._updated_index
         self._gaps.append(gap)
@@ -241,15 +273,15 @@ class ByteTracker:
         ``searched``: that frame is being searched, in place of one that was before.
         """
         self._check_rises(frame_index)
+        step = self._step_to(frame_index, image_bgr, mark=searched)
         if searched:
-            self._searched = _Searched(self._table.copy(), self._frame_index, [])
-        affine = self._step_of(image_bgr, frame_index, mark=searched)
+            self._searched = _Searched(self._table.copy(), self._frame_index, [], self._gray)
         if self._searched is not None:
             steps = self._searched.steps
-            steps.append((frame_index, affine))
-            if frame_index - steps[0][0] > self._longest_frames + 1:
+            steps.append(step)
+            if frame_index - steps[0].frame_index > self._longest_frames + 1:
                 del steps[1:-1]  # whatever is found, all tracks will have ended
-        self._advance(frame_index, affine, hold_unconfirmed=False)
+        self._advance(step, hold_unconfirmed=False)
         self._table.started[:] = False
         return self._listed(frame_index, kalman.boxes_of(self._table.states))
 
@@ -265,7 +297,7 @@ class ByteTracker:
         states = self._table.states.copy()
         ended = self._outdated(frame_index)
         for _ in range(0 if ended else frame_index - last):
-            kalman.predict(states)
+            _coast(states)
         listed = self._listed(frame_index, kalman.boxes_of(states[:0] if ended else states))
         return replace(listed, started=np.zeros(len(listed), bool))
 
@@ -273,17 +305,53 @@ class ByteTracker:
         if self._frame_index is not None and frame_index <= self._frame_index:
             raise ValueError(f"frame_index is {frame_index}, must be above the last one, {self._frame_index}")
 
-    def _step_of(self, image_bgr: Image | None, frame_index: int, *, mark: bool) -> Affine | None:
-        # The camera's step to this image; with ``mark`` `still` compares with it from now on.
-        camera = self._camera
+    @property
+    def _gray(self) -> Gray | None:
+        return None if self._camera is None else self._camera.gray
+
+    def _step_to(self, frame_index: int, image_bgr: Image | None, *, mark: bool) -> _Step:
+        # The step to this image; with ``mark`` `still` compares with it from now on.
+        camera, before = self._camera, self._gray
         self.camera_step = None if camera is None or image_bgr is None else camera.step(image_bgr)
         if camera is not None and image_bgr is not None and camera.new_scene:
             self.scene_began = frame_index
         if camera is not None and mark:
             camera.mark()
-        return self.camera_step
+        flow = None
+        if image_bgr is not None and self._frame_index is not None and self.scene_began != frame_index:
+            self._size = (image_bgr.shape[1], image_bgr.shape[0])
+            states = self._table.states.copy()
+            for _ in range(frame_index - self._frame_index):
+                _coast(states)
+            if self.camera_step is not None:
+                kalman.warp(states, self.camera_step)
+            flow = self._flow(before, self._table.states, states)
+        return _Step(frame_index, self.camera_step, flow)
 
-    def _advance(self, frame_index: int, affine: Affine | None, *, hold_unconfirmed: bool) -> None:
+    def _flow(self, before: Gray | None, then: kalman.States, expected: kalman.States) -> BoxFlow | None:
+        # From that picture to the newest, of the tracks that are not lost; None without pictures.
+        now, moving = self._gray, self._table.phase != LOST
+        if before is None or now is None or before.shape != now.shape or not moving.any():
+            return None
+        shifts = expected[:, kalman.POSITION, :2] - then[:, kalman.POSITION, :2]
+        boxes = kalman.boxes_of(then[moving])
+        return box_flow(before, now, boxes, expected=shifts[moving], size=self._size)
+
+    def _carry(self, then: kalman.States, flow: BoxFlow | None, *, frames: int) -> None:
+        # Put the tracks to where the picture shows them.
+        if flow is None:
+            return
+        states = self._table.states
+        rows = (self._table.phase != LOST).nonzero()[0][flow.found]
+        seen = then[rows, kalman.POSITION]
+        seen[:, :2] += flow.shifts[flow.found]
+        seen[:, 3] *= flow.zooms[flow.found]
+        own = (seen[:, :2] - states[rows, kalman.POSITION, :2]) / frames
+        states[rows, kalman.VELOCITY, :2] += _FLOW_WEIGHT * own
+        states[rows, kalman.POSITION] = seen
+
+    def _advance(self, step: _Step, *, hold_unconfirmed: bool) -> None:
+        frame_index = step.frame_index
         elapsed = 1 if self._frame_index is None else frame_index - self._frame_index
         self._frame_index = frame_index
         table = self._table
@@ -291,19 +359,23 @@ class ByteTracker:
             table.retain(np.zeros(len(table), bool))
         if not len(table):
             return
+        then = table.states.copy()
         for _ in range(elapsed - 1):
-            kalman.predict(table.states)
+            _coast(table.states)
         # The authors' program matches unconfirmed tracks where they started, without the step to this frame.
         # They are at rest; what it changes is the gain of the correction that confirms them.
         moving = table.phase != UNCONFIRMED
-        if hold_unconfirmed and not moving.all():
+        if not hold_unconfirmed:
+            _coast(table.states)
+        elif moving.all():
+            kalman.predict(table.states)
+        else:
             states = table.states[moving]
             kalman.predict(states)
             table.states[moving] = states
-        else:
-            kalman.predict(table.states)
-        if affine is not None:
-            kalman.warp(table.states, affine)
+        if step.affine is not None:
+            kalman.warp(table.states, step.affine)
+        self._carry(then, step.flow, frames=elapsed)
 
     def _outdated(self, frame_index: int) -> bool:
         last = self._updated_index

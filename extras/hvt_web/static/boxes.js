@@ -254,7 +254,7 @@ export class Boxes {
 }
 
 /**
- * The tracks of a list where they would be later, by how far they have gone since a list before it.
+ * The tracks of a list where they would be later, by how far they have gone since a list before it; they keep their size.
  * @param {Overlay} list @param {Overlay | null} before @param {number} captured of the later picture, ms
  */
 export function carried(list, before, captured) {
@@ -263,7 +263,10 @@ export function carried(list, before, captured) {
   const boxes = new Map(before.tracks.map(({ id, box }) => [id, box]));
   return list.tracks.map((track) => {
     const was = boxes.get(track.id);
-    return was ? { ...track, box: track.box.map((value, side) => value + share * (value - was[side])) } : track;
+    if (!was) return track;
+    const { box } = track;
+    const moved = [0, 1].map((side) => (share * (box[side] + box[side + 2] - was[side] - was[side + 2])) / 2);
+    return { ...track, box: box.map((value, side) => value + moved[side % 2]) };
   });
 }
 

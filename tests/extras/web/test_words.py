@@ -119,7 +119,8 @@ def test_every_sentence_of_the_page_is_read():
 @pytest.mark.skipif(NODE is None, reason="needs node (Debian: apt install nodejs)")
 def test_boxes_go_on_with_their_objects_until_the_next_list_comes():
     """The picture is on the screen before its list: a car of 12 px a frame has left its box by then."""
-    before = {"frame": 0, "captured": 1000, "tracks": [{"id": 1, "box": [0, 0, 20, 10]}]}
+    smaller = {"id": 1, "box": [2, 1, 18, 9]}  # it grows, and may do so no longer
+    before = {"frame": 0, "captured": 1000, "tracks": [smaller]}
     parked = {"id": 2, "box": [50, 50, 60, 60]}
     found = {"frame": 5, "captured": 1300, "tracks": [{"id": 1, "box": [60, 0, 80, 10]}, parked]}
     boxes = ran(
