@@ -25,6 +25,8 @@ _STILL_BACKLOG_NS = 50 * _MS
 """A still goes when what was sent before it has (nearly) left: the next base frame finds the link free."""
 _SLACK_NS = 75 * _MS
 _LEAST_HELD_NS, _FIRST_HELD_NS, _MOST_HELD_NS = 50 * _MS, 150 * _MS, 300 * _MS
+_NO_NEWS_NS = 250 * _MS
+"""Where the link loses messages and reports name none for so long, a keyframe asks whether those overdue are lost."""
 _GIVEN_UP_NS = SECOND_NS
 """A message so long overdue is lost, if reports come and name none newer for as long."""
 _SILENCE_NS = 2 * SECOND_NS
@@ -78,6 +80,10 @@ class Flight:
     @property
     def oldest(self) -> Sent | None:
         return self._base[0] if self._base else None
+
+    @property
+    def newest(self) -> Sent | None:
+        return self._base[-1] if self._base else None
 
     @property
     def size_bytes(self) -> int:
@@ -223,6 +229,10 @@ class Pacer:
         """How long reports are on their way, at the shortest, and the difference of the clocks."""
         self._given_up = -1
         """The newest base message that was taken for lost."""
+        self._lossy = False
+        """Whether the primary receiver has ever missed a message."""
+        self._probed = -1
+        """The base message that was overdue when another went out all the same."""
         self._last_sent_ns = self._last_bytes = 0
         self._linked: bool | None = None
         self._reports = True
@@ -277,6 +287,8 @@ class Pacer:
             self._last_sent_ns, self._last_bytes = now_ns, line_bytes
             if keyframe and self._started_ns is None:
                 self._started_ns = now_ns
+            if self._overdue_ns(now_ns) > self._slack_ns and self._flight.oldest is not None:
+                self._probed = self._flight.oldest.sequence
             self._flight.sent_base(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
 
     def sent_still(self, sequence: int, line_bytes: int, *, now_ns: int) -> None:
@@ -302,7 +314,7 @@ class Pacer:
                 self._forget_path()
                 self._progress_ns = now_ns
             silent = self._reported_ns is not None and now_ns - self._reported_ns > _SILENCE_NS
-            self._reported_ns = now_ns
+            self._reported_ns, self._lossy = now_ns, feedback.lost > 0
             sent = self._flight.acknowledge(feedback.base_sequence, feedback.still_sequence)
             if (
                 silent
@@ -341,7 +353,7 @@ class Pacer:
     def link(self, there: bool, *, now_ns: int, reports: bool = True) -> bool:  # noqa: FBT001 - the news itself
         """Whether anybody can be reached at all. ``reports``: a ground.
 
-        True where that has just come back, or what was on its way is given up: who shows the video needs a keyframe.
+        True where that has just come back, or what was on its way seems lost: who shows the video needs a keyframe.
         """
         with self._lock:
             before, self._linked, self._reports = self._linked, there, reports
@@ -352,8 +364,9 @@ class Pacer:
                 if self._reported_ns is not None:
                     self._controller.on_silence(now_ns)
                 self._leave()
-            gave_up = there and self._reported_ns is not None and self._give_up(now_ns, self._reported_ns)
-            return gave_up or (before is False and there and self.backoffs > 0)
+            reported_ns = self._reported_ns if there else None
+            lost = reported_ns is not None and (self._give_up(now_ns, reported_ns) or self._probes(now_ns))
+            return lost or (before is False and there and self.backoffs > 0)
 
     # What may go
 
@@ -370,7 +383,7 @@ class Pacer:
                 # Stored frames have the former rate: they would stand before live video when the link is back.
                 carries_ns = 8 * SECOND_NS * self._last_bytes // self.rate_bps
                 return now_ns - self._last_sent_ns >= max(_PROBE_NS, carries_ns)
-            return self._is_open(now_ns, _MOST_BACKLOG_NS + coding_ns)
+            return self._is_open(now_ns, _MOST_BACKLOG_NS + coding_ns) or self._probes(now_ns)
 
     def holds(self, now_ns: int) -> bool:
         """Whether it is the link that leaves no room for a frame now, and not the budget's own rate."""
@@ -407,15 +420,26 @@ class Pacer:
         backlog_ns = self._flight.backlog_ns(now_ns=now_ns, rate_bps=self.rate_bps)
         return backlog_ns <= most_backlog_ns and self._overdue_ns(now_ns) <= self._slack_ns
 
+    def _probes(self, now_ns: int) -> bool:
+        # Whether a keyframe goes although a message is overdue: if all under way was lost no report can say so, since
+        # nothing comes that it could name. The next goes when that one is overdue, too.
+        oldest, newest = self._flight.oldest, self._flight.newest
+        if not self._lossy or oldest is None or newest is None or self._overdue_ns(now_ns) <= self._slack_ns:
+            return False
+        if oldest.sequence == self._probed:
+            return self._late_ns(newest, now_ns) > self._slack_ns
+        return now_ns - self._progress_ns > _NO_NEWS_NS
+
     @property
     def _slack_ns(self) -> int:
         return _SLACK_NS + 5 * self._held_ns // 4
 
     def _overdue_ns(self, now_ns: int) -> int:
         oldest = self._flight.oldest
-        return (
-            0 if oldest is None else now_ns - oldest.sent_ns - oldest.serialization_ns - self._round_trip_ns
-        )
+        return 0 if oldest is None else self._late_ns(oldest, now_ns)
+
+    def _late_ns(self, sent: Sent, now_ns: int) -> int:
+        return now_ns - sent.sent_ns - sent.serialization_ns - self._round_trip_ns
 
     def _leave(self) -> None:
         self._reported_ns = None

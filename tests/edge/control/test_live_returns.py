@@ -92,6 +92,19 @@ def test_live_video_is_back_after_a_fall_of_the_link(budget, fps, falls_to):
     assert flight.longest_hole(known + 10, 60) <= 1.5
 
 
+@pytest.mark.parametrize("lasts_s", [0.4, 0.6, 0.8])
+@pytest.mark.parametrize(("budget", "fps"), [(300_000, 5), (800_000, 15), (2_000_000, 30)])
+def test_live_video_is_back_after_all_under_way_was_lost(budget, fps, lasts_s):
+    """On UDP each fade of a third of a second took the picture for 1.5 s: the edge waited for what was lost."""
+    for second in (12, 12.04, 12.11):
+        link = SteppedLink(
+            ((0, 1.5 * budget), (6, 0), (6.35, 1.5 * budget), (second, 0), (second + lasts_s, 1.5 * budget)),
+            loses=True,
+        )
+        flight = flown(LiveFlight(link, size=(640, 360), budget=budget, fps=fps), 17)
+        assert flight.longest_hole(11, 17) <= lasts_s + 0.65
+
+
 @pytest.mark.parametrize("window", [5, 60])
 @pytest.mark.parametrize(("budget", "fps"), [(300_000, 2), (800_000, 15)])
 def test_a_long_window_keeps_live_video_away_no_longer(budget, fps, window):
