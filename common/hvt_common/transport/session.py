@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -293,6 +294,8 @@ def _open_failure(text: str, listen: tuple[str, ...], config: zenoh.Config) -> s
 
 def _close(session: zenoh.Session) -> None:
     # Close without waiting for a link that is dead: Zenoh itself may take 10 s when its queue is stuck.
+    if sys.is_finalizing():  # nobody has left the session, and a thread that begins now never does
+        return
 
     def close() -> None:
         try:

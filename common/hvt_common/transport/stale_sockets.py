@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import ipaddress
 import os
 import re
@@ -103,13 +104,18 @@ class StaleSockets:
         if self._tables:
             self._sessions.append(self._session)
             self._thread.start()
+            atexit.register(self._end)  # where nobody leaves: Python would end it within Zenoh, and abort
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stop.set()
         if self._tables:
+            atexit.unregister(self._end)
             self._sessions.remove(self._session)
-            self._thread.join(1.0)
+            self._end()
+
+    def _end(self) -> None:
+        self._stop.set()
+        self._thread.join(1.0)
 
     def _run(self) -> None:
         while not self._stop.wait(_EVERY_S):

@@ -7,6 +7,8 @@ import os
 import socket
 import stat
 import struct
+import subprocess
+import sys
 import threading
 import time
 from contextlib import suppress
@@ -110,6 +112,22 @@ def test_a_watch_outlives_what_goes_wrong_once(free_port: int, monkeypatch: pyte
     monkeypatch.setattr(stat, "S_ISSOCK", look)
     with open_session(LinkSettings("ground", listen=(f"tcp/127.0.0.1:{free_port}",))):
         eventually(lambda: len(looks) > 1)
+
+
+def test_a_program_that_leaves_its_session_open_ends_the_watch(free_port: int) -> None:
+    """It would not end, or abort without a word: Python can end no thread that is within Zenoh, and start none."""
+    code = f"""
+import atexit, threading
+atexit.register(lambda: print(*(one.name for one in threading.enumerate() if one.name.startswith("hvt-"))))
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings
+left = open_session(LinkSettings("ground", listen=("tcp/127.0.0.1:{free_port}",)))
+left.__enter__()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "\n"
 
 
 def test_a_number_that_is_another_file_by_now_is_not_copied(tmp_path: Path) -> None:
