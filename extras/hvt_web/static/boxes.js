@@ -265,7 +265,10 @@ export function carried(list, before, captured) {
     const was = boxes.get(track.id);
     if (!was) return track;
     const { box } = track;
-    const moved = [0, 1].map((side) => (share * (box[side] + box[side + 2] - was[side] - was[side + 2])) / 2);
+    const moved = [0, 1].map((side) => {
+      const [near, far] = [box[side] - was[side], box[side + 2] - was[side + 2]];
+      return share * (near && far ? (near + far) / 2 : near + far); // one is cut off at the rim
+    });
     return { ...track, box: box.map((value, side) => value + moved[side % 2]) };
   });
 }

@@ -454,7 +454,8 @@ def test_between_detections_a_box_goes_with_what_is_in_it(late: int) -> None:
     for k in range(30):
         x, y = (x + 6, y) if k <= 10 else (x - 1, y + 5)
         side *= 1 if k <= 10 else 1.02
-        image, shown = np.roll(ground, 2 * k, axis=1), cv2.resize(car, None, fx=side, fy=side)
+        image = np.roll(np.asarray(ground, np.uint8), 2 * k, axis=1)
+        shown = cv2.resize(car, None, fx=side, fy=side)
         image[round(y) : round(y) + shown.shape[0], round(x) : round(x) + shown.shape[1]] = shown
         box = (round(x), round(y), round(x) + shown.shape[1], round(y) + shown.shape[0])
         begins = k % 5 == 0 and k <= 10
