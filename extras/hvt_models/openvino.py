@@ -7,6 +7,7 @@ convolutions and products; what follows the last of them, such as the decoding o
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 from collections import OrderedDict
 from pathlib import Path
@@ -29,7 +30,7 @@ def find_openvino() -> OpenVinoCpu | None:
     try:
         import openvino  # noqa: PLC0415  (optional)
 
-        abilities = openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+        abilities = _core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
     except (ImportError, RuntimeError):
         return None  # installed for another machine, or without the processor plugin
     version: str = openvino.__version__.partition("-")[0]
@@ -45,10 +46,7 @@ class OpenVinoRunner:
     """
 
     def __init__(self, path: Path, *, threads: int, bf16: bool) -> None:
-        import openvino  # noqa: PLC0415  (optional)
-
         self._path = path
-        self._core = openvino.Core()
         self._settings = {
             "INFERENCE_PRECISION_HINT": "bf16" if bf16 else "f32",
             "INFERENCE_NUM_THREADS": threads,
@@ -57,7 +55,7 @@ class OpenVinoRunner:
             "ENABLE_CPU_PINNING": False,  # the encoder runs on the same cores
         }
         try:
-            self._model = self._core.read_model(path)
+            self._model = _core().read_model(path)
         except RuntimeError as error:
             raise UserError(f"model {path} cannot be read by openvino: {_reason(error)}") from error
         self._requests: OrderedDict[tuple[int, ...], Any] = OrderedDict()
@@ -99,11 +97,19 @@ class OpenVinoRunner:
             model = self._model.clone()
             batch = self._model.input(0).get_partial_shape()[0]
             model.reshape({0: [batch.get_length() if batch.is_static else -1, *key]})
-            self._requests[key] = self._core.compile_model(
-                model, "CPU", self._settings
-            ).create_infer_request()
+            self._requests[key] = _core().compile_model(model, "CPU", self._settings).create_infer_request()
         self._requests.move_to_end(key)
         return self._requests[key]
+
+
+@functools.cache
+def _core() -> Any:
+    # One for the whole process: its processor plugin gives the thread that loads it a stack for signals, and takes
+    # that back when it goes. Where another thread let it go, Ctrl-C would be handled on memory that is gone, and end
+    # the program without a word.
+    import openvino  # noqa: PLC0415  (optional)
+
+    return openvino.Core()
 
 
 def _port(value: Any) -> _Port:

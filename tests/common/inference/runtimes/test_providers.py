@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -232,6 +234,32 @@ def test_a_classifier_takes_every_batch_with_openvino(tmp_path: Path, dtype: typ
     for count in (1, 5, 40):
         runner.run(np.zeros((count, *theirs.model.inputs[0].shape[1:]), dtype))
     assert len(runner.compiled_shapes) == 1
+
+
+DROPPED_ELSEWHERE = """
+import gc, signal, sys, threading
+from pathlib import Path
+import numpy as np
+from hvt_models.openvino import OpenVinoRunner
+
+held = [OpenVinoRunner(Path(sys.argv[1]), threads=1, bf16=False)]
+held[0].run(np.zeros((1, 3, 64, 64), np.float32))
+other = threading.Thread(target=lambda: (held.clear(), gc.collect()))
+other.start()
+other.join()
+signal.signal(signal.SIGINT, lambda *_: print("stopped in order"))
+signal.raise_signal(signal.SIGINT)
+"""
+
+
+@needs_openvino
+def test_ctrl_c_is_heard_after_another_thread_dropped_a_network(tmp_path: Path) -> None:
+    """The program would end with a segmentation fault: no summary, and recordings without an end."""
+    path = colour_detector(tmp_path / "m.onnx", "yolox", size=(64, 64))
+    done = subprocess.run(
+        [sys.executable, "-c", DROPPED_ELSEWHERE, str(path)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, "stopped in order\n"), done.stderr
 
 
 @needs_openvino
