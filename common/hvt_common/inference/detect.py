@@ -42,6 +42,8 @@ _UNNAMED = 100
 """Classes that get a number for a name where a list of objects without names does not tell how many there are."""
 _MAX_FREE_SIDE = 1920
 _MAX_SIDE = 8192
+_OURS = "hvt.training_commit"
+"""In the metadata of a network that was trained here. Of others the surest box counts, as their authors have it."""
 _ENLARGE_TO = "hvt.enlarge_to"
 _MOST_ENLARGED = 2.0
 """Beyond that nothing more is found, and the time grows with the square."""
@@ -182,6 +184,7 @@ class OnnxDetector:
         self.model = model
         self._confidence = confidence
         self._nms_iou = nms_iou
+        self._averages = _OURS in model.metadata
         task = model.metadata.get("task", "")
         if task and "detect" not in task.lower():
             raise UserError(_not_a_detector(model, f"its task is '{task:.80}', and detect is accepted"))
@@ -229,9 +232,11 @@ class OnnxDetector:
             group_ids = self._group_ids[np.minimum(found.class_ids, len(self._group_ids) - 1)]
             candidates = found.boxes_input_px, found.scores, group_ids
             selected = suppress(*candidates, iou=self._nms_iou, any_class_iou=_TWIN_IOU)
-            boxes = averaged(*candidates, selected)
         else:
             selected = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
+        if self.head.suppresses and self._averages:
+            boxes = averaged(*candidates, selected)
+        else:
             boxes = found.boxes_input_px[selected]
         boxes = letterbox.to_image(boxes)
         class_ids = found.class_ids[selected]
