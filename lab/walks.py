@@ -10,9 +10,9 @@ import socket
 import sys
 import tempfile
 import threading
-import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -28,14 +28,14 @@ from hvt_ground.extras import checked, config_class
 _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("hvt_common", "hvt_edge", "hvt_ground", "hvt_fleet")
 _CODECS = "hvt_common/video/still_codecs"
-_LEAST_FRAMES, _LEAST_STILLS = 60, 6
+_FIRST_FRAMES, _LEAST_FRAMES, _LEAST_STILLS = 10, 60, 6
 _MOST_S = 100.0
 
 # Functions: name and bound of their walk, the largest of each taken together.
 _WALKS = {
-    ("RealtimePace.send",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 28),
+    ("RealtimePace.send",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 23),
     ("StillStage.analyze",): ("a frame's objects at the edge", 24),
-    ("StillStage.send",): ("a still at the edge, from choosing to put", 29),
+    ("StillStage.send",): ("a still at the edge, from choosing to put", 28),
     ("commands.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
         "a command, from hvt-ground set-budget to the encoder",
         38,
@@ -46,7 +46,7 @@ _WALKS = {
     ("Recorder.log",): ("an event at the ground, recorded", 13),
 }
 _MEASURED = {one for functions in _WALKS for one in functions}
-_GOES = "Transmitter.still"
+_GOES, _KEYFRAME = "Transmitter.still", "BaseStage._at_keyframe"
 
 
 class Walks:
@@ -113,23 +113,26 @@ def fly(walks: Walks) -> None:
         ground = threading.Thread(target=Ground(checked(ground_config), stop=stop).run)
         edge = threading.Thread(target=Edge(edge_config, stop=landed).run)
         words = ["set-budget", "300kbps", "--connect", endpoint]
-        commander = threading.Thread(target=commands.run, args=[words])
         for one in (ground, edge):
             one.start()
-        _wait_for(walks, "RealtimePace.send", _LEAST_FRAMES)
-        commander.start()
-        commander.join(_MOST_S)
-        _wait_for(walks, _GOES, _LEAST_STILLS)
+        wait = partial(_wait_for, walks, edge)
+        wait({"RealtimePace.send": _FIRST_FRAMES})
+        while edge.is_alive() and not walks.calls["EdgeListener._on_control"]:
+            commander = threading.Thread(target=commands.run, args=[words])
+            commander.start()
+            commander.join(_MOST_S)
+        wait({_KEYFRAME: walks.calls[_KEYFRAME] + 1})
+        wait({"RealtimePace.send": _LEAST_FRAMES, _GOES: _LEAST_STILLS})
         for one, end in ((edge, landed), (ground, stop)):
             end.set()
             one.join(60)
     threading.setprofile(None)
 
 
-def _wait_for(walks: Walks, what: str, count: int) -> None:
-    until_s = time.monotonic() + _MOST_S
-    while walks.calls[what] < count and time.monotonic() < until_s:
-        time.sleep(0.1)
+def _wait_for(walks: Walks, edge: threading.Thread, least: dict[str, int]) -> None:
+    # Until there were so many calls, or the clip has ended.
+    while edge.is_alive() and any(walks.calls[what] < count for what, count in least.items()):
+        edge.join(0.1)
 
 
 def main() -> int:
