@@ -168,7 +168,7 @@ _LAST_CHUNK_S = 1.0
 _MEASURED_NS, _OLD_NS = SECOND_NS, 5 * SECOND_NS
 """How often a disk is asked for its free space, and how long its answer counts."""
 _TRICKLE_SHARE = 1 / 40
-"""Share of the total while live stills are always pending: an admitted chunk must not wait for ever."""
+"""Share of the total that is the backlog's own: what takes all the rest must not keep it waiting for ever."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ class ChunkAllowance:
 
     limit_bytes: int
     trickle: bool = False
-    """Live stills are pending: a little goes all the same, with pauses."""
+    """There is no room, or live stills are pending: a little goes all the same, with pauses."""
 
 
 @dataclass(frozen=True, slots=True)

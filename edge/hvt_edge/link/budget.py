@@ -425,15 +425,17 @@ class RollingBudget:
     def _spare(self) -> float:
         return _SPARE_SHARE * self._loan_bytes + self._settings.metadata_bps * self._loan_ns / 8 / SECOND_NS
 
-    def backlog_allowance(self, now_ns: int, *, reserve: float) -> int:
+    def backlog_allowance(self, now_ns: int, *, reserve: float | None) -> int:
         """The line bytes of the backlog that may go now: those that neither base nor stills will need.
 
-        It takes no share of anybody's. ``reserve`` is left free of a window, as a share of what stills have of one.
+        It takes no share of anybody's. ``reserve`` is left free of a window, as a share of what stills have of one;
+        None: all that is free now, for which the frames to come wait.
         A camera that is silent may give its next frame at any moment: its room stays free until `end_base`.
         """
         settings = self._settings
-        free = self._unspent(now_ns)[0][0] if self._base_ended else self._window_allowance(now_ns)
-        reserved = reserve * settings.still_bps * settings.window_ns / 8 / SECOND_NS
+        alone = reserve is None or self._base_ended
+        free = self._unspent(now_ns)[0][0] if alone else self._window_allowance(now_ns)
+        reserved = (reserve or 0.0) * settings.still_bps * settings.window_ns / 8 / SECOND_NS
         return max(0, int(free - reserved))
 
     def keyframe_fits(self, keyframe_bytes: int, *, now_ns: int, awaited: bool = False) -> bool:

@@ -236,7 +236,7 @@ class Transmitter:
         """The round trip of the link; half a second if it is not measured."""
         return SECOND_NS // 2 if self.pacer is None else self.pacer.round_trip_ns
 
-    def backlog_allowance_bytes(self, now_ns: int, *, reserve: float) -> int:
+    def backlog_allowance_bytes(self, now_ns: int, *, reserve: float | None) -> int:
         """Payload that a chunk of the backlog may have now; ``reserve``: see `RollingBudget.backlog_allowance`."""
         with self._lock:
             if self.budget.yielding(now_ns):
@@ -265,7 +265,7 @@ class Transmitter:
         attachment = header.pack(chunk.data)
         with self._lock:
             needed_bytes = self._line_bytes(Channel.BACKLOG, chunk.data, len(attachment))
-            if needed_bytes > self.budget.backlog_allowance(now_ns, reserve=0.0):
+            if not self.budget.fits(needed_bytes, now_ns=now_ns):
                 return 0
             line_bytes = self._count(Channel.BACKLOG, Account.BACKLOG, chunk.data, attachment, at_ns=now_ns)
             self.budget.record_other(line_bytes, now_ns)
