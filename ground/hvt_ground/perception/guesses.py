@@ -117,10 +117,12 @@ class Guesses:
             like = sides[(means >= likely) & (groups == groups[row])]
             larger = sides[row] / np.median(like) if len(like) >= _NEIGHBOURS else np.nan
             surer = boxes[(means > means[row]) & (groups == groups[row])]
-            odd = larger >= _LARGER or _is_on(boxes[row], surer)
+            on = _is_on(boxes[row], surer)
+            odd = larger >= _LARGER or on
             usual = groups[row] != "person" and not odd and larger > 1 / _LARGER
             weak = means[row] < (_LIKELY_ODD if odd else likely[row])
-            if weak and not (usual or self._seen[ids[row]].moved):
+            moved = self._seen[ids[row]].moved and not on  # a car's bonnet moves with the car
+            if weak and not (usual or moved):
                 found.add(ids[row])
         return frozenset(found)
 

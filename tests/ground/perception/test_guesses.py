@@ -69,6 +69,8 @@ def test_a_second_box_on_a_car_has_no_name():
     half: Thing = ("van", 0.6, (125.0, 200.0), 40.0)
     beside: Thing = ("van", 0.6, (125.0, 260.0), 80.0)
     assert guessed([*ROW, beside, half]) == [False] * 6 + [True, False]
+    bonnet: Thing = ("van", 0.6, (80.0, 200.0), 40.0)
+    assert guessed([*ROW, bonnet], moves_px=0.8) == [False] * 5 + [True, False], "a part moves with the whole"
 
 
 def test_a_camera_that_is_followed_a_little_wrongly_moves_nothing():
