@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
@@ -53,6 +54,9 @@ _MOST_SIZE_STEP: Final = 0.1
 """Between detections the velocity of a box's sides halves with each frame, and is at most this share of them."""
 _FLOW_WEIGHT: Final = 0.5
 """Of the motion seen against the velocity before it."""
+
+_MOST_PICTURES: Final = 24
+"""So many are kept while one of them is being searched: what is found there goes through all of them."""
 
 # Box lengths; wider, and neighbours in a queue of cars are taken for each other.
 _MOST_GROWTH: Final = 0.75
@@ -124,17 +128,17 @@ class _Step:
 
     frame_index: int
     affine: Affine | None
-    flow: BoxFlow | None = None
+    flow: BoxFlow | None
+    gray: Gray | None
 
 
 @dataclass(frozen=True, slots=True)
 class _Searched:
-    """What stood before a frame that is being searched, that picture, and the steps to it and to those after it."""
+    """What stood before a frame that is being searched, and the steps to it and to those after it."""
 
     table: TrackTable
     before: int | None
     steps: list[_Step]
-    gray: Gray | None
 
 
 def _check_range(name: str, value: float, low: float, high: float) -> None:
@@ -233,15 +237,13 @@ class ByteTracker:
         if searched is None:
             raise ValueError("no frame is being searched")
         self._table, self._frame_index = searched.table, searched.before
-        first, *later = searched.steps
-        listed = self._update(detections, first)
-        table, then = self._table, self._table.states.copy()
-        for step in later:
-            self._advance(replace(step, flow=None), hold_unconfirmed=False)
-            table.started[:] = False
-        if later and len(table) == len(then):
-            flow = self._flow(searched.gray, then, table.states)
-            self._carry(then, flow, frames=later[-1].frame_index - first.frame_index)
+        listed = self._update(detections, searched.steps[0])
+        for before, step in pairwise(searched.steps):
+            flow = self._flow(
+                before.gray, step.gray, step.affine, frames=step.frame_index - before.frame_index
+            )
+            self._advance(replace(step, flow=flow), hold_unconfirmed=False)
+            self._table.started[:] = False
         return listed
 
     def _update(self, detections: Detections, step: _Step) -> Tracks:
@@ -275,12 +277,14 @@ class ByteTracker:
         self._check_rises(frame_index)
         step = self._step_to(frame_index, image_bgr, mark=searched)
         if searched:
-            self._searched = _Searched(self._table.copy(), self._frame_index, [], self._gray)
+            self._searched = _Searched(self._table.copy(), self._frame_index, [])
         if self._searched is not None:
             steps = self._searched.steps
             steps.append(step)
             if frame_index - steps[0].frame_index > self._longest_frames + 1:
                 del steps[1:-1]  # whatever is found, all tracks will have ended
+            if len(steps) > _MOST_PICTURES:
+                steps[-_MOST_PICTURES] = replace(steps[-_MOST_PICTURES], gray=None)
         self._advance(step, hold_unconfirmed=False)
         self._table.started[:] = False
         return self._listed(frame_index, kalman.boxes_of(self._table.states))
@@ -318,29 +322,29 @@ class ByteTracker:
         if camera is not None and mark:
             camera.mark()
         flow = None
-        if image_bgr is not None and self._frame_index is not None and self.scene_began != frame_index:
+        if image_bgr is not None and self._frame_index is not None:
             self._size = (image_bgr.shape[1], image_bgr.shape[0])
-            states = self._table.states.copy()
-            for _ in range(frame_index - self._frame_index):
-                _coast(states)
-            if self.camera_step is not None:
-                kalman.warp(states, self.camera_step)
-            flow = self._flow(before, self._table.states, states)
-        return _Step(frame_index, self.camera_step, flow)
+            flow = self._flow(before, self._gray, self.camera_step, frames=frame_index - self._frame_index)
+        return _Step(frame_index, self.camera_step, flow, self._gray)
 
-    def _flow(self, before: Gray | None, then: kalman.States, expected: kalman.States) -> BoxFlow | None:
-        # From that picture to the newest, of the tracks that are not lost; None without pictures.
-        now, moving = self._gray, self._table.phase != LOST
+    def _flow(
+        self, before: Gray | None, now: Gray | None, affine: Affine | None, *, frames: int
+    ) -> BoxFlow | None:
+        # From one picture to the other, of the tracks that are not lost; None without pictures.
+        moving = self._table.phase != LOST
         if before is None or now is None or before.shape != now.shape or not moving.any():
             return None
+        then = self._table.states[moving]
+        expected = then.copy()
+        for _ in range(frames):
+            _coast(expected)
+        if affine is not None:
+            kalman.warp(expected, affine)
         shifts = expected[:, kalman.POSITION, :2] - then[:, kalman.POSITION, :2]
-        boxes = kalman.boxes_of(then[moving])
-        return box_flow(before, now, boxes, expected=shifts[moving], size=self._size)
+        return box_flow(before, now, kalman.boxes_of(then), expected=shifts, size=self._size)
 
-    def _carry(self, then: kalman.States, flow: BoxFlow | None, *, frames: int) -> None:
+    def _carry(self, then: kalman.States, flow: BoxFlow, *, frames: int) -> None:
         # Put the tracks to where the picture shows them.
-        if flow is None:
-            return
         states = self._table.states
         rows = (self._table.phase != LOST).nonzero()[0][flow.found]
         seen = then[rows, kalman.POSITION]
@@ -375,7 +379,8 @@ class ByteTracker:
             table.states[moving] = states
         if step.affine is not None:
             kalman.warp(table.states, step.affine)
-        self._carry(then, step.flow, frames=elapsed)
+        if step.flow is not None:
+            self._carry(then, step.flow, frames=elapsed)
 
     def _outdated(self, frame_index: int) -> bool:
         last = self._updated_index

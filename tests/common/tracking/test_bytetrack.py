@@ -485,9 +485,7 @@ def test_what_is_found_late_counts_as_if_it_had_been_found_at_once(late: int) ->
         if k % 5 == late:
             assert waited.update_late(searched).frame_index == k - late
             for name, column in asdict(at_once.extrapolated(frame_index=k)).items():
-                late_column = getattr(waited.extrapolated(frame_index=k), name)
-                # Their way since is measured at one stroke.
-                np.testing.assert_allclose(late_column, column, atol=0.5 if name == "boxes_xyxy_px" else 0)
+                np.testing.assert_array_equal(getattr(waited.extrapolated(frame_index=k), name), column)
             for frames in range(4, 16):
                 due = [one.is_due(frames, every=5, most=15) for one in (waited, at_once)]
                 assert due[0] == due[1]
