@@ -25,6 +25,7 @@ COMMANDS: Final = {
 """One line each for ``hvt-study --help``. A module is imported when its command is given: needs differ."""
 
 _GONE: Final = {
+    "sight": "is called compare",
     "score": "has gone: run and compare score flights, and hvt-ground export --to mot makes a table for TrackEval",
     "track": "has gone: hvt-ground replay runs the tracker over a recording",
 }

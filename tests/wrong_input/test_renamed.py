@@ -9,7 +9,7 @@ import hvt_study.cli
 
 @pytest.mark.parametrize(
     ("words", "today"),
-    [("score a.csv", "export --to mot"), ("track a.txt", "replay")],
+    [("sight clip.mp4", "compare"), ("score a.csv", "export --to mot"), ("track a.txt", "replay")],
 )
 def test_a_study_command_that_has_gone(here, capfd, words, today):
     """A script would say that its command was never there."""
