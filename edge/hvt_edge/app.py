@@ -30,6 +30,7 @@ from hvt_edge.operating import LoopClock
 from hvt_edge.report.state import Heartbeat, lacks
 from hvt_edge.report.status import status_text, summary
 from hvt_edge.source.contract import Source
+from hvt_edge.source.demo import check_truth
 from hvt_edge.source.live import SOURCE_PART, closing_on
 from hvt_edge.wiring import (
     Flight,
@@ -100,6 +101,7 @@ class Edge:
                 stack.callback(pose_source.close)
                 for note in pose_source.notes:
                     logging.getLogger(START_LOGGER).info("pose: %s", note)
+            check_truth(config.truth, source)
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
             say_size(config, source.view)

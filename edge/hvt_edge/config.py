@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from hvt_common.config import (
     AUTO,
@@ -76,10 +76,6 @@ _SOURCE_RARE, _LINK_RARE, _SENT_RARE, _MODELS_RARE, _FILES_RARE = (
 @dataclass(frozen=True, slots=True)
 class EdgeConfig:
     """The settings of ``hvt-edge``. See ``--help-all`` for each."""
-
-    GONE: ClassVar[Mapping[str, str]] = {
-        "truth": "has gone: hvt-study run demo:0 flies the demo and scores it"
-    }
 
     source: str | None = _SOURCE.option(
         TEXT, None, "clip.mp4, folder/, rtsp://…, /dev/video0, demo or demo:codes,4k"
@@ -288,6 +284,7 @@ class EdgeConfig:
     record_base: Path | None = _FILES_RARE.option(
         PATH, None, "also keep the base stream in this Matroska file"
     )
+    truth: Path | None = _FILES_RARE.option(PATH, None, "write the demo's ground truth, MOTChallenge form")
     metrics: str | None = _FILES_RARE.option(
         TEXT,
         None,

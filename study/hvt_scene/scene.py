@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from functools import cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,14 +12,14 @@ import numpy.typing as npt
 
 from hvt_common.geodesy import moved
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Image, Orientation, Pose
+from hvt_common.values import Image, Orientation, Pose, View
 from hvt_scene.appearance import Appearance
 from hvt_scene.drawing.canvas import OUTLINE_POINTS
 from hvt_scene.drawing.codes import RoofCode, draw_code, paint_code
 from hvt_scene.drawing.foliage import Grove
 from hvt_scene.drawing.ground import Ground, paint_ground
 from hvt_scene.drawing.vehicles import CLASS_NAMES, draw_vehicle
-from hvt_scene.truth import CodeInView, Truth
+from hvt_scene.truth import CodeInView, Truth, write_truth
 from hvt_scene.view import (
     Bgra,
     Camera,
@@ -216,6 +217,10 @@ class Scene:
         """X and y in metres of the middle of each object that may be in the picture, by its id in `truth`."""
         _, chosen, places, _ = self._view(t_s)
         return dict(zip((chosen + 1).tolist(), map(tuple, places[:, :2].tolist()), strict=True))
+
+    def write_truth(self, path: Path, *, fps: float, view: View) -> int:
+        """See `hvt_scene.truth.write_truth`."""
+        return write_truth(self, path, fps=fps, view=view)
 
     def _view(
         self, t_s: float, *, without: Collection[int] = ()

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Final
 
-from hvt_common.errors import Parser, UserError, exit_with_sentence, needs_extra
+from hvt_common.errors import Parser, exit_with_sentence, needs_extra
 
 COMMANDS: Final = {
     "plan": "Say how many runs, bytes and hours `hvt-study run` with the same arguments would take.",
@@ -18,17 +18,15 @@ COMMANDS: Final = {
     "run": "Fly every method at every budget on datasets, at matched totals; write results.parquet and a report.",
     "report": "Make report.html, report.md and figures again from a study's results.parquet, or of several joined.",
     "tune": "Search for a method's parameters on some sequences; report what they are worth on others.",
+    "score": "Score the tracks of hvt-ground --tracks against ground truth.",
     "sweep": "Apply the pilot's four selectors to raw detections and print what each keeps.",
     "detect": "Detect on pictures; score labelled ones and show the worst false alarms and misses.",
     "train": "Teach the embedded detector your own objects, from your labelled pictures; needs PyTorch.",
+    "track": "Run ByteTrack over a MOTChallenge file of detections.",
 }
 """One line each for ``hvt-study --help``. A module is imported when its command is given: needs differ."""
 
-_GONE: Final = {
-    "sight": "is called compare",
-    "score": "has gone: run and compare score flights, and hvt-ground export --to mot makes a table for TrackEval",
-    "track": "has gone: hvt-ground replay runs the tracker over a recording",
-}
+RENAMED: Final = {"sight": "compare"}  # the former name works for one release
 _PROGRAM = "hvt-study"
 _INTERRUPTED = 130
 
@@ -47,8 +45,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
-    if words and words[0] in _GONE:
-        raise UserError(f"{words[0]} {_GONE[words[0]]}")
+    if words and words[0] in RENAMED:
+        now = RENAMED[words[0]]
+        print(f"{_PROGRAM}: {words[0]} is called {now} from this release on", file=sys.stderr)
+        words[0] = now
     parser = Parser(prog=_PROGRAM, description="Experiments with the stages of HVT, without a network.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     with needs_extra("'hvt[study]'"):

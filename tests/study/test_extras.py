@@ -65,6 +65,13 @@ def done(tmp_path, module, words, without):
         ),
         ("hvt_study.cli", ("read", "demo:codes", "--out", "out"), ("rapidocr",), "hvt[reading]"),
         ("hvt_train", ("curve", "log.jsonl", "--out", "out.svg"), ("matplotlib",), "hvt[study]"),
+        pytest.param(
+            "hvt_study.cli",
+            ("score", "a.csv", "--truth", "gt.txt"),
+            ("sklearn",),
+            "hvt[study]",
+            marks=pytest.mark.nightly,
+        ),
         ("hvt_ground.cli", ("--connect", "tcp/127.0.0.1:9"), ("rerun",), "hvt[ground]"),
         (
             "hvt_ground.cli",
@@ -85,6 +92,8 @@ def done(tmp_path, module, words, without):
 )
 def test_a_missing_package_is_one_sentence(tmp_path, module, words, without, install):
     """Who installed hvt[edge] would get a traceback that names a package of somebody else."""
+    (tmp_path / "a.csv").write_text("frame,x,y,w,h,class\n1,0,0,9,9,car\n")
+    (tmp_path / "gt.txt").write_text("1,1,0,0,9,9,1,1,1\n")
     found = done(tmp_path, module, words, without)
     assert found.returncode == 2, found.stderr
     assert f"pip install {install}".replace("hvt[", "'hvt[").replace("]", "]'") in found.stderr
@@ -92,6 +101,7 @@ def test_a_missing_package_is_one_sentence(tmp_path, module, words, without, ins
 
 
 def test_what_needs_no_extra_works_without_one(tmp_path):
-    """The selector sweep runs where only the edge is installed."""
-    found = done(tmp_path, "hvt_study.cli", ("sweep", "--help"), (*STUDY, *GROUND))
-    assert found.returncode == 0, found.stderr
+    """The tracker alone and the selector sweep run where only the edge is installed."""
+    for command in ("track", "sweep"):
+        found = done(tmp_path, "hvt_study.cli", (command, "--help"), (*STUDY, *GROUND))
+        assert found.returncode == 0, found.stderr

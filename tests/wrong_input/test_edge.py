@@ -184,7 +184,7 @@ def test_a_value_that_is_not_accepted(edge, flag, value, accepted):
         ),
         *((words, [words.split()[0], "--help"]) for words in ("--bogus", "stray", "--budgit 1M", "--bud 1M")),
         ("--budget", ["--budget"]),
-        ("--truth truth.txt", ["--truth has gone", "hvt-study run demo:0"]),
+        ("--truth truth.txt --summary s.json --record-base b.mkv", ["--truth truth.txt", "demo"]),
         *((f"--zenoh-config {file}", [file]) for file in ("missing.json5", "pictures")),
         *((f"{flag} smoke/x:1", ["'smoke/x:1'", "PROTOCOL/HOST:PORT"]) for flag in ("--connect", "--listen")),
         *((f"--listen tcp/{host}:7999", [host, "--insecure"]) for host in ("0.0.0.0", "[::]")),
@@ -199,7 +199,7 @@ def test_words_that_cannot_be_meant_so(edge, words, told):
 # Files
 
 
-@pytest.mark.parametrize("flag", ["--summary", "--record-base"])
+@pytest.mark.parametrize("flag", ["--summary", "--record-base", "--truth"])
 @pytest.mark.parametrize("path", ["missing/file", "pictures", "/proc/file"])
 def test_a_file_that_cannot_be_written(edge, flag, path):
     """The run would end before its result could be kept."""
@@ -216,7 +216,7 @@ def test_an_input_of_a_disk_that_is_not_mounted_yet_is_tried_again(edge, flag, f
     assert file in edge(flag, file)
 
 
-@pytest.mark.parametrize("flag", ["--summary", "--record-base"])
+@pytest.mark.parametrize("flag", ["--summary", "--record-base", "--truth"])
 @pytest.mark.parametrize("what", ["--source", "--detector", "--pose", "--zenoh-config"])
 def test_an_output_over_what_is_read(edge, here, flag, what):
     """The only copy of a clip would be the summary of its first flight."""

@@ -17,13 +17,14 @@ import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
-from hvt_common.values import Frame, Image, Pose
+from hvt_common.values import Frame, Image, Pose, View
 from hvt_edge.source.contract import Source, SourceSettings
 from hvt_edge.source.resample import Resizer, capture_time_ns
 
@@ -63,6 +64,10 @@ class DrawnScene(Protocol):
 
     def pose(self, t_s: float) -> Pose:
         """The camera's pose at a moment; ``capture_ns`` counts from the scene's beginning."""
+        ...
+
+    def write_truth(self, path: Path, *, fps: float, view: View) -> int:
+        """Write the ground truth of a flight at that rate as MOTChallenge's gt.txt, in base pixels."""
         ...
 
 
@@ -105,6 +110,12 @@ class DemoSource(Source):
             capture_ns = capture_time_ns(index, fps=rate, start_ns=start_ns)
             yield self._resizer.frame(self._picture(), index=index, capture_ns=capture_ns)
         self._drop_pictures()
+
+    def write_truth(self, path: Path, *, fps: float) -> None:
+        """Write the ground truth of a flight at that rate; before the first frame."""
+        self._drop_pictures()
+        self._request("truth", path, fps, self.view)
+        self._answer()
 
     def poses(self) -> list[Pose]:
         """The camera's poses from the scene's beginning to its end; before the first frame."""
@@ -170,10 +181,25 @@ def _draw(seed: int, spec: str) -> None:
             return
         if kind == "image":
             answers.write(scene.image(min(rest[0], scene.duration_s)).data)
-        else:
+        elif kind == "poses":
             count = math.ceil(scene.duration_s * _POSES_PER_S)
             pickle.dump([scene.pose(number / _POSES_PER_S) for number in range(count + 1)], answers)
+        else:
+            path, fps, view = rest
+            pickle.dump(scene.write_truth(path, fps=fps, view=view), answers)
         answers.flush()
+
+
+def check_truth(path: Path | None, source: Source) -> None:
+    """Refuse ``--truth`` for a source without ground truth; `UserError`."""
+    if path is not None and not isinstance(source, DemoSource):
+        raise UserError(f"--truth {path} is for --source demo: no other source knows its truth")
+
+
+def write_truth_of(source: Source, path: Path | None, *, fps: float) -> None:
+    """Write the demo's ground truth, where it is requested."""
+    if path is not None and isinstance(source, DemoSource):
+        source.write_truth(path, fps=fps)
 
 
 if __name__ == "__main__":

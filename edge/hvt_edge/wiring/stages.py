@@ -37,6 +37,7 @@ from hvt_edge.perception.levers import LeverControl
 from hvt_edge.report.state import Heartbeat
 from hvt_edge.report.status import InfoReporter, StatusReporter
 from hvt_edge.source.contract import Source
+from hvt_edge.source.demo import write_truth_of
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser, Gate
@@ -295,6 +296,7 @@ class Stages:
         config, view = flight.config, flight.source.view
         self.link = link = Link(flight)
         # Files come after all that may be refused: a failed start leaves nothing behind.
+        write_truth_of(flight.source, config.truth, fps=config.nominal_fps)
         local_copy = None
         if config.record_base:
             copy = open_local_copy(config.record_base, failures=flight.failures, wait=flight.lockstep)

@@ -24,6 +24,7 @@ def check_files(config: EdgeConfig) -> None:
     reads = [Path(one) for one in given if one is not None]
     files = (
         ("--summary", config.summary),
+        ("--truth", config.truth),
         ("--record-base", config.record_base),
     )
     pictures = Path(os.path.realpath(config.source or ""))  # also of a link to itself

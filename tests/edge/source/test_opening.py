@@ -282,27 +282,30 @@ def test_a_picture_that_goes_while_the_folder_plays_is_skipped(tmp_path):
 # -- demo ------------------------------------------------------------
 
 
-def test_the_demo_is_a_source():
-    """The command `make demo` would have nothing to show."""
+def test_the_demo_is_a_source_with_truth(tmp_path):
+    """The command `make demo` would have nothing to show, or nothing to measure against."""
     with open_source("demo:codes", size=(640, 360), fps=15, seed=2, max_frames=2) as source:
         assert isinstance(source, DemoSource)
         assert not source.live
         assert source.frame_count == 2
         assert source.class_names[:2] == ("car", "van")
         assert source.view.source_size == (1920, 1080)
+        source.write_truth(tmp_path / "gt.txt", fps=2.0)
         first, second = source.frames(start_ns=50)
     assert np.array_equal(second.source_bgr, Scene(2, codes=True).image(1 / 15))
     assert (first.capture_ns, second.capture_ns) == (50, 50 + 66_666_667)
     assert first.base_bgr.shape == (360, 640, 3)
+    assert len((tmp_path / "gt.txt").read_text().splitlines()) > 1000
     with open_source("demo", size=(640, 360), fps=12.5) as source:
         assert source.frame_count == 250
 
 
-def test_the_demo_begins_anew_for_its_next_reader():
-    """A flight whose encoder was tried first would show a picture of the trial."""
+def test_the_demo_begins_anew_for_its_next_reader(tmp_path):
+    """A flight whose encoder was tried first would show a picture of the trial, or fail at its truth."""
     with open_source("demo", size=(640, 360), fps=15, max_frames=4) as source:
         assert isinstance(source, DemoSource)
         first = [next(source.frames(start_ns=0)).base_bgr for _ in range(2)]
+        source.write_truth(tmp_path / "gt.txt", fps=1.0)
         whole = [frame.base_bgr for frame in source.frames(start_ns=0)]
     assert len(whole) == 4
     assert all(np.array_equal(one, whole[0]) for one in first)
