@@ -23,6 +23,8 @@ from hvt_edge.operating import Keyframes
 
 SILENCE_NS = 3 * SECOND_NS // 2
 """Three reports in a row that did not come."""
+_NO_NEWS_NS = 5 * SECOND_NS
+"""Reports come and name no newer picture: small messages pass, or those of one direction, and the video does not."""
 _LEFT_NS = 15 * SECOND_NS
 """Who is silent for so long on a link that Zenoh still has, has left; others may subscribe that never report. As in
 `hvt_edge.link.pacer`."""
@@ -41,7 +43,8 @@ class Outage:
     """Whether the link is down. Time is an argument. ``live``: the source is a camera, which waits for nobody.
 
     It is down if nobody subscribes any more (Zenoh notices that some seconds after the link broke), or if a ground
-    that used to report is silent (it reports twice a second whatever it receives, so this is noticed much sooner).
+    that used to report is silent (it reports twice a second whatever it receives, so this is noticed much sooner), or
+    has no news.
     """
 
     def __init__(self, *, live: bool) -> None:
@@ -49,11 +52,21 @@ class Outage:
         self._subscribed = False
         self._linked = False
         self._reported_ns: int | None = None
+        self._news_ns = 0
+        self._named = -1
         self.reports = False
         """Whether a ground ever reported on this session: without reports nobody knows what has arrived."""
 
-    def reported(self, now_ns: int) -> None:
-        """A ground has reported on this session (any thread)."""
+    def reported(self, now_ns: int, *, named: int = -1, sent: int = -1) -> None:
+        """A ground has reported on this session (any thread): the last base message that came, of those ``sent``.
+
+        Who takes no video names none, and has no news of it.
+        """
+        again = not self.reports_now(now_ns)
+        if again or named < 0 or self._named < named <= sent or named == sent:
+            self._news_ns = now_ns
+        if named <= sent:
+            self._named = max(self._named, named)
         self._reported_ns = now_ns
         self.reports = True
 
@@ -75,7 +88,9 @@ class Outage:
         reported_ns = self._reported_ns
         if reported_ns is not None and now_ns - reported_ns > _LEFT_NS:
             self._reported_ns = reported_ns = None
-        return reported_ns is not None and now_ns - reported_ns > SILENCE_NS
+        if reported_ns is None:
+            return False
+        return now_ns - reported_ns > SILENCE_NS or now_ns - self._news_ns > _NO_NEWS_NS
 
 
 class State(Enum):
@@ -258,7 +273,10 @@ class BacklogStage:
 
     def on_feedback(self, feedback: Feedback, *, now_ns: int) -> None:
         """A ground has reported on this session (any thread)."""
-        self._outage.reported(now_ns)
+        named = feedback.base_sequence
+        # After the last frame nothing could show that one before it was lost.
+        sent = named if self._finishing else self._line.base_sequence
+        self._outage.reported(now_ns, named=named, sent=sent)
         if feedback.backlog:
             self.worker.intake.on_acknowledged(feedback.backlog, receiver_id=feedback.receiver_id)
 

@@ -43,6 +43,23 @@ def test_a_ground_that_falls_silent_is_noticed_long_before_zenoh_does():
     assert not any(states(outage, first=14, last=16, linked=True, reports=0.5)), "one report ends it"
 
 
+def test_a_link_that_passes_small_messages_alone_is_an_outage():
+    """In a black hole of large packets, or on a line of one direction, the flight was neither seen nor kept."""
+    outage = Outage(live=False)
+    for named in range(20):
+        outage.reported(named * S // 2, named=named, sent=named + 2)
+        assert not outage.offline(named * S // 2, linked=True)
+    away = []
+    for number in range(20, 60):
+        outage.reported(number * S // 2, named=19, sent=number)
+        away.append(outage.offline(number * S // 2, linked=True))
+    assert away == [False] * 10 + [True] * 30
+    outage.reported(30 * S, named=50, sent=60)
+    assert not outage.offline(30 * S, linked=True), "one that came ends it"
+    outage.reported(40 * S, named=60, sent=60)
+    assert not outage.offline(40 * S, linked=True), "a camera that gives nothing has no news"
+
+
 def test_a_ground_that_is_gone_is_an_outage_and_its_return_ends_it():
     """Keeping would go on with somebody there, or not begin."""
     outage = Outage(live=False)
