@@ -103,8 +103,6 @@ class CameraMotion:
     """
 
     def __init__(self, *, scale: float | None = 0.5) -> None:
-        if scale is not None and not 0 < scale <= 1:
-            raise ValueError(f"camera motion scale is {scale}, must be above 0 and at most 1")
         self._scale = scale
         self._previous: _Gray | None = None
         self.gray: _Gray | None = None

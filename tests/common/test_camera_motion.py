@@ -122,12 +122,6 @@ def test_a_cut_to_another_scene_is_no_motion() -> None:
         np.testing.assert_array_equal(motion.step(noise), np.eye(2, 3))
 
 
-def test_wrong_settings_are_refused() -> None:
-    """A tracker would follow a camera on a picture of one pixel."""
-    with pytest.raises(ValueError, match="scale is 0"):
-        CameraMotion(scale=0)
-
-
 def test_warp_moves_boxes_as_the_picture_moves() -> None:
     """With a turning and zooming camera, boxes and their velocities would point the wrong way."""
     states = kalman.initiate(np.array([[100.0, 50.0, 0.5, 40.0]]))

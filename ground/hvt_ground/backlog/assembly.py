@@ -66,8 +66,6 @@ class BacklogAssembly:
     def __init__(
         self, *, max_objects: int = 64, max_bytes: int = 4 * MAX_BACKLOG_BYTES, remember: int = 8192
     ) -> None:
-        if max_objects < 1 or max_bytes < MAX_BACKLOG_BYTES or remember < 1:
-            raise ValueError(f"bounds are too small: {max_objects=}, {max_bytes=}, {remember=}")
         self._max_objects = max_objects
         self._max_bytes = max_bytes
         self._open: OrderedDict[ObjectKey, _Open] = OrderedDict()

@@ -37,8 +37,6 @@ class History:
         track_frames: int = 300,
         gap_frames: int = 0,
     ) -> None:
-        if min(max_frames, max_bytes, track_frames) < 1:
-            raise ValueError(f"bounds must be positive: {max_frames=}, {max_bytes=}, {track_frames=}")
         self._max_frames = max_frames
         self._max_bytes = max_bytes
         self._reach_frames = reach_frames

@@ -88,12 +88,6 @@ def test_what_is_no_number_is_a_bug(value):
         LatencyStats().add(value)
 
 
-def test_a_percentile_lies_within_0_and_100():
-    """A mistyped percentile would read as a plausible number."""
-    with pytest.raises(ValueError, match="0…100"):
-        filled([1.0]).percentile(101)
-
-
 @given(st.lists(st.lists(st.integers(0, 40), max_size=5)))
 def test_each_distinct_id_counts_once(groups):
     """The summary would count a track once a frame."""

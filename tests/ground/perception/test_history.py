@@ -136,9 +136,3 @@ def test_a_new_session_begins_with_clear():
     history.add_frame(0, picture(0))
     history.add_tracks(Tracks.none(0))
     assert history.newest_tracked == 0
-
-
-def test_bounds_must_be_positive():
-    """A bound of nothing would show stills without their base crop and say nothing about it."""
-    with pytest.raises(ValueError, match="max_frames=0"):
-        History(max_frames=0)

@@ -99,8 +99,6 @@ class Matcher:
     """
 
     def __init__(self, *, least_iou: float, owned_frames: int) -> None:
-        if not 0 < least_iou <= 1:
-            raise ValueError(f"the IoU threshold lies within 0…1, not {least_iou!r}")
         self._iou = least_iou
         self._owned_frames = owned_frames
         self._ground_of: OrderedDict[int, tuple[int, int]] = (

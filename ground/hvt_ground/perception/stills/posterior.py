@@ -85,7 +85,8 @@ class TrackPosterior:
 
     def newest(self, vocabulary: Vocabulary, *, class_id: int) -> ClassEstimate:
         """The class in the still of the newest frame; the class on the base, if that means the same."""
-        said = self._said()
+        said = self._newest
+        assert said is not None, "update() comes first"
         best = vocabulary.names.index(said.class_name)
         if said.probabilities[class_id] >= said.probabilities[best]:
             best = class_id
@@ -94,8 +95,9 @@ class TrackPosterior:
 
     def fused(self, vocabulary: Vocabulary, *, class_id: int, confidence: float) -> ClassEstimate:
         """All stills together with the detector's present vote (its class and confidence on the base)."""
-        said = self._said()
-        assert self._log_sum is not None
+        said = self._newest
+        assert said is not None, "update() comes first"
+        assert self._log_sum is not None, "set with it"
         logs = self._log_sum / _UNITS_PER_NAT
         logs += BASE_WEIGHT * _base_log_vote(vocabulary, class_id=class_id, confidence=confidence)
         logs -= logs.max()
@@ -107,11 +109,6 @@ class TrackPosterior:
         now = float(probabilities[best])
         sure = self._clear and min(now, float(said.probabilities[best])) > SURE
         return ClassEstimate(best, now, sure=sure)
-
-    def _said(self) -> Posterior:
-        if self._newest is None:
-            raise ValueError("no still has refined this track yet")
-        return self._newest
 
 
 def _base_log_vote(vocabulary: Vocabulary, *, class_id: int, confidence: float) -> _Floats:
