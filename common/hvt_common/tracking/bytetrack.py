@@ -52,6 +52,11 @@ _MOST_SHIFT: Final = 0.1
 _SIZE_DECAY: Final = 0.5
 _MOST_SIZE_STEP: Final = 0.1
 """Between detections the velocity of a box's sides halves with each frame, and is at most this share of them."""
+_MOST_GROWN: Final = 1.6
+"""Times the height that was seen: then it is the road that is followed."""
+_OLD_S: Final = 1.5
+_OLD_GAPS: Final = 2
+"""Tracks not seen for so long, and for so many times the longest of the last gaps, are not listed."""
 _FLOW_WEIGHT: Final = 0.5
 """Of the motion seen against the velocity before it."""
 
@@ -381,6 +386,8 @@ class ByteTracker:
             kalman.warp(table.states, step.affine)
         if step.flow is not None:
             self._carry(then, step.flow, frames=elapsed)
+        heights = table.states[:, kalman.POSITION, 3]
+        np.clip(heights, table.heights / _MOST_GROWN, table.heights * _MOST_GROWN, out=heights)
 
     def _outdated(self, frame_index: int) -> bool:
         last = self._updated_index
@@ -468,6 +475,7 @@ class ByteTracker:
         states = table.states[rows]
         kalman.correct(states, seen.measured[columns], gap=gap)
         table.states[rows] = states
+        table.heights[rows] = states[:, kalman.POSITION, 3]
         phase = table.phase[rows]
         table.overdue[rows] |= (phase == LOST) & (frame_index - table.seen[rows] > self._lost_frames + 1)
         table.started[:] = False
@@ -523,8 +531,9 @@ class ByteTracker:
     def _listed(self, frame_index: int, boxes: _Floats) -> Tracks:
         table = self._table
         area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-        tracked = table.phase[: len(boxes)] == TRACKED
-        rows = (tracked & (area > self._settings.min_box_area_px2)).nonzero()[0]
+        fresh = max(round(_OLD_S * self._fps), _OLD_GAPS * max(self._gaps, default=1))
+        tracked = (table.phase == TRACKED) & (frame_index - table.seen <= fresh)
+        rows = (tracked[: len(boxes)] & (area > self._settings.min_box_area_px2)).nonzero()[0]
         votes = table.votes[rows]
         return Tracks(
             frame_index=frame_index,

@@ -69,6 +69,8 @@ class TrackTable:
     ids: _Indices
     born: _Indices
     seen: _Indices
+    heights: _Floats
+    """Of the boxes when they were last seen."""
     lost_at: _Indices
     """Frame of the update that did not find the track; means something in phase lost only."""
     phase: npt.NDArray[np.int8]
@@ -99,6 +101,7 @@ class TrackTable:
             ids=np.arange(first_id, first_id + count),
             born=np.full(count, frame_index),
             seen=np.full(count, frame_index),
+            heights=seen.measured[:, 3].copy(),
             lost_at=np.full(count, frame_index),
             phase=np.full(count, UNCONFIRMED, np.int8),
             overdue=np.zeros(count, bool),
