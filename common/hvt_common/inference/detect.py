@@ -24,7 +24,7 @@ from hvt_common.inference.labels import (
     read_labels,
 )
 from hvt_common.inference.letterbox import Letterboxer, Preparation, as_bgr, prepared_as
-from hvt_common.inference.nms import MAX_DETECTIONS, averaged, suppress
+from hvt_common.inference.nms import MAX_DETECTIONS, WEAK, averaged, suppress
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
 from hvt_common.inference.store import MOTION, library_part, model_names, needed_part, parts_of, resolve_model
@@ -227,17 +227,19 @@ class OnnxDetector:
         image = as_bgr(image_bgr)
         input_size = self.input_size((image.shape[1], image.shape[0]))
         tensor, letterbox = self._letterboxer.fill(image, input_size)
-        found = self.head.decode(self._run(tensor), confidence=self._confidence, input_size=input_size)
+        least = min(self._confidence, WEAK) if self._averages else self._confidence
+        found = self.head.decode(self._run(tensor), confidence=least, input_size=input_size)
         if self.head.suppresses:
             group_ids = self._group_ids[np.minimum(found.class_ids, len(self._group_ids) - 1)]
             candidates = found.boxes_input_px, found.scores, group_ids
             selected = suppress(*candidates, iou=self._nms_iou, any_class_iou=_TWIN_IOU)
         else:
             selected = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
+        boxes, scores = found.boxes_input_px[selected], found.scores[selected]
         if self.head.suppresses and self._averages:
-            boxes = averaged(*candidates, selected)
-        else:
-            boxes = found.boxes_input_px[selected]
+            boxes, scores = averaged(*candidates, selected, second=found.second)
+            best = np.argsort(-scores, kind="stable")[: np.count_nonzero(scores >= self._confidence)]
+            boxes, scores, selected = boxes[best], scores[best], selected[best]
         boxes = letterbox.to_image(boxes)
         class_ids = found.class_ids[selected]
         named = class_ids < len(self.class_names)
@@ -250,7 +252,7 @@ class OnnxDetector:
                 len(self.class_names) - 1,
             )
         inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & named
-        return Detections(boxes[inside], found.scores[selected][inside], class_ids[inside])
+        return Detections(boxes[inside], scores[inside], class_ids[inside])
 
     def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
         """(width, height) in pixels that the network gets for an image of this (width, height).

@@ -18,6 +18,11 @@ MAX_DETECTIONS = 1000
 """At most so many boxes are returned."""
 _ALIKE = 0.6
 """Chosen on training pictures: of .5 to .7 the one of the best mean overlap with the labels."""
+WEAK = 0.1
+"""From this score on a network's candidate counts for another's."""
+_AGREE_IOU, _AGREED = 0.5, 0.5
+"""The second is of the logit, chosen on the traffic cameras of the training: recall .89 for .86, precision .80 as
+before."""
 
 
 def suppress(
@@ -54,11 +59,15 @@ def averaged(
     scores: npt.NDArray[np.float32],
     class_ids: npt.NDArray[np.int32],
     selected: npt.NDArray[np.intp],
-) -> Boxes:
-    """(K, 4) the ``selected`` boxes, each the mean by scores of all of its class that overlap it by `_ALIKE`.
+    *,
+    second: npt.NDArray[np.bool_] | None = None,
+) -> tuple[Boxes, npt.NDArray[np.float32]]:
+    """(K, 4) boxes and (K,) scores of the ``selected``, by what overlaps each of them of its class.
 
-    A network says an object from several cells: the surest box is not the best one on each of its sides, and from
-    picture to picture another cell is the surest. 0.5 ms for 60 of 900 boxes.
+    A box is the mean by scores of those that overlap it by `_ALIKE`: a network says an object from several cells, the
+    surest box is not the best one on each of its sides, and from picture to picture another cell is the surest. A
+    score rises by `_AGREED` where two networks agree, the candidates in ``second`` being those of one of them. 0.5 ms
+    for 60 of 900 boxes.
     """
     selected_px, all_px = boxes_xyxy[selected].T, boxes_xyxy.T
     near = np.equal.outer(class_ids[selected], class_ids)
@@ -68,11 +77,20 @@ def averaged(
     rows, columns = np.divmod(np.flatnonzero(near), len(scores))
     a, b = selected_px[:, rows], all_px[:, columns]
     shared = np.prod(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), axis=0)
-    areas = np.prod(a[2:] - a[:2], axis=0) + np.prod(b[2:] - b[:2], axis=0)
-    weights = np.where(shared >= _ALIKE * (areas - shared), scores[columns], 0)
+    united = np.prod(a[2:] - a[:2], axis=0) + np.prod(b[2:] - b[:2], axis=0) - shared
+    weights = np.where(shared >= _ALIKE * united, scores[columns], 0)
     sums = [np.bincount(rows, weights * side, len(selected)) for side in (*b, np.ones(len(rows)))]
     known = sums[4] > 0  # a box without an area overlaps nothing, itself neither
-    return np.where(known, np.array(sums[:4]) / np.where(known, sums[4], 1), selected_px).T.astype(np.float32)
+    boxes = np.where(known, np.array(sums[:4]) / np.where(known, sums[4], 1), selected_px).T
+    said = scores[selected].astype(np.float64)
+    if second is not None:
+        agree = (shared >= _AGREE_IOU * united) & (scores[columns] >= WEAK)
+        both = [
+            np.bincount(rows, agree & (second[columns] == one), len(selected)) > 0 for one in (False, True)
+        ]
+        raised = said / (said + (1 - said) * np.exp(-_AGREED))
+        said = np.where(both[0] & both[1], raised, said)
+    return boxes.astype(np.float32), said.astype(np.float32)
 
 
 def _greedy(rects: npt.NDArray[np.float64], iou: float) -> npt.NDArray[np.intp]:

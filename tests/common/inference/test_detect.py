@@ -284,11 +284,42 @@ def test_a_box_of_our_networks_is_the_mean_of_what_several_cells_say(tmp_path: P
     table[0, :, 10] = [36, 20, 20, 10, 0.7, 0.0]  # it is suppressed, and shares too little to be heard
     table[0, :, 11] = [30, 22, 20, 10, 0.0, 0.6]  # another kind of object
     mean = np.array([20, 15, 40, 25]) + np.array([2, 1, 2, 1]) * 0.4 / 1.2
-    for metadata, first in (({"hvt.training_commit": "1a2b3c4"}, mean), ({}, [20, 15, 40, 25])):
+    for metadata, first in (({"hvt.training_commit": "1a2b3c4"}, mean), ({}, np.array([20, 15, 40, 25]))):
         path = constant_model(tmp_path / "m.onnx", table, metadata=metadata)
         found = open_detector(str(path)).detect(np.zeros((64, 64, 3), np.uint8))
-        np.testing.assert_allclose(found.boxes_xyxy_px, [first, [20, 17, 40, 27]], rtol=1e-5)
+        expected = np.stack([first, [20, 17, 40, 27]])
+        np.testing.assert_allclose(found.boxes_xyxy_px, expected, rtol=1e-5)
         np.testing.assert_allclose(found.confidences, [0.8, 0.6], rtol=1e-5)
+
+
+def test_what_both_networks_of_a_file_see_is_surer(tmp_path: Path) -> None:
+    """A car aslant that each of them half believes in would not be shown; two cells of one network are no witness."""
+    strides = (8, 16, 32, 16, 32, 64)
+    grid = cells((64, 64), strides)
+    own, their = 84 - 20, 84
+    assert grid[own].tolist() == [0, 0, 16]
+    assert grid[their].tolist() == [0, 0, 16]
+    raised = 0.35 / (0.35 + 0.65 * np.exp(-0.5))
+    for first, second, expected in (
+        ((own, 0.35), (their, 0.2), [raised]),
+        ((their, 0.35), (own, 0.2), [raised]),
+        ((own, 0.35), (their, 0.08), []),
+        ((own, 0.35), (own + 1, 0.2), []),
+    ):
+        table = empty(len(grid), 7)
+        for row, score in (first, second):
+            x, y, stride = grid[row]
+            table[0, row] = [
+                20 / stride - x,
+                20 / stride - y,
+                *np.log([20 / stride, 10 / stride]),
+                score,
+                1,
+                0,
+            ]
+        path = constant_model(tmp_path / "m.onnx", table, metadata={"hvt.training_commit": "1a2b3c4"})
+        found = open_detector(str(path), confidence=0.4).detect(np.zeros((64, 64, 3), np.uint8))
+        np.testing.assert_allclose(found.confidences, expected, rtol=1e-5)
 
 
 def test_crowds_survive_up_to_the_cap() -> None:

@@ -28,6 +28,8 @@ class HeadOutput:
     scores: Array
     """(N,) 0…1."""
     class_ids: npt.NDArray[np.int32]
+    second: npt.NDArray[np.bool_] | None = None
+    """(N,) which are of the second one of two networks in one file; None where there is one."""
 
 
 class Decoder(Protocol):
@@ -79,11 +81,15 @@ _MOST_CLASSES = 1e6
 class YoloxCells:
     """(1, A, 5+C): x, y relative to the cell and log w, log h in strides; objectness; scores.
 
-    ``strides`` are cell sizes in input pixels, in the order of the output.
+    ``strides`` are cell sizes in input pixels, in the order of the output; from the first that was there before on
+    they are of a second network.
     """
 
     def __init__(self, strides: tuple[int, ...]) -> None:
         self._strides = strides
+        again = (level for level, stride in enumerate(strides) if stride in strides[:level])
+        self._first = strides[: next(again, None)]
+        self._first_cells = 0
         self._grid_size = (0, 0)
         self._grid: Array
         self._stride: Array
@@ -94,6 +100,7 @@ class YoloxCells:
         """Score is objectness times the best class score."""
         if self._grid_size != input_size:
             self._grid, self._stride = cell_grid(input_size, self._strides)
+            self._first_cells = len(cell_grid(input_size, self._first)[0])
             self._grid_size = input_size
         table = rows_of(outputs[0])
         rows = np.flatnonzero(table[:, 4] >= confidence)
@@ -102,7 +109,8 @@ class YoloxCells:
         centres = (picked[:, :2] + grid) * stride
         sides = np.exp(np.minimum(picked[:, 2:4], _MAX_LOG_SIZE)) * stride
         boxes = corners(np.hstack([centres, sides]), "centre")
-        return valid(boxes, scores, class_ids, confidence)
+        second = None if self._first == self._strides else rows >= self._first_cells
+        return valid(boxes, scores, class_ids, confidence, second=second)
 
 
 def rows_of(output: Array) -> Array:
@@ -135,7 +143,14 @@ def corners(boxes: Array, form: Form) -> Boxes:
     return boxes[:, [1, 0, 3, 2]] if form == "corners-yx" else boxes
 
 
-def valid(boxes: Boxes, scores: Array, class_ids: npt.NDArray[Any], confidence: float) -> HeadOutput:
+def valid(
+    boxes: Boxes,
+    scores: Array,
+    class_ids: npt.NDArray[Any],
+    confidence: float,
+    *,
+    second: npt.NDArray[np.bool_] | None = None,
+) -> HeadOutput:
     """Without boxes that are not finite, have no area or too little confidence; a broken number is no detection."""
     valid = np.isfinite(boxes).all(axis=1) & (scores >= confidence) & (scores <= 1.01)
     valid &= np.isfinite(class_ids) & (class_ids >= 0) & (class_ids < _MOST_CLASSES)
@@ -144,4 +159,5 @@ def valid(boxes: Boxes, scores: Array, class_ids: npt.NDArray[Any], confidence: 
         boxes[valid].astype(np.float32, copy=False),
         np.minimum(scores[valid], np.float32(1)),
         np.rint(class_ids[valid]).astype(np.int32),
+        None if second is None else second[valid],
     )
