@@ -253,7 +253,9 @@ class EdgeConfig:
         number(0.01, 1), 0.45, "overlap above which two boxes of a class are one"
     )
     camera_motion: str = _MODELS_RARE.option(
-        choice("off", "flow"), "flow", "how the tracker follows the camera's own motion"
+        choice("off", "flow"),
+        "flow",
+        "how tracks go on between detections: with the picture, or at their own pace",
     )
     threads: int = _MODELS_RARE.option(integer(1, 64), 1, "threads of the detector")
     provider: str = _MODELS.option(

@@ -97,7 +97,9 @@ class GroundConfig:
         number(0.01, 1), 0.45, "overlap above which two boxes of a class are one"
     )
     camera_motion: str = _MODELS_RARE.option(
-        choice("off", "flow"), "flow", "how the tracker follows the camera's own motion"
+        choice("off", "flow"),
+        "flow",
+        "how tracks go on between detections: with the picture, or at their own pace",
     )
     classifier: str | None = _MODELS.option(
         TEXT,
