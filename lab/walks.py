@@ -38,7 +38,7 @@ _WALKS = {
     ("StillStage.send",): ("a still at the edge, from choosing to put", 28),
     ("commands.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
         "a command, from hvt-ground set-budget to the encoder",
-        38,
+        35,
     ),
     ("EdgeSessions.handle",): ("a message at the ground, received", 36),
     ("SessionPerception.pipeline",): ("a session's perception at the ground, made", 26),
