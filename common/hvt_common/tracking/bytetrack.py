@@ -335,8 +335,8 @@ class ByteTracker:
     def _flow(
         self, before: Gray | None, now: Gray | None, affine: Affine | None, *, frames: int
     ) -> BoxFlow | None:
-        # From one picture to the other, of the tracks that are not lost; None without pictures.
-        moving = self._table.phase != LOST
+        # From one picture to the other, of the tracks that were found; None without pictures.
+        moving = self._table.phase == TRACKED
         if before is None or now is None or before.shape != now.shape or not moving.any():
             return None
         then = self._table.states[moving]
@@ -351,7 +351,7 @@ class ByteTracker:
     def _carry(self, then: kalman.States, flow: BoxFlow, *, frames: int) -> None:
         # Put the tracks to where the picture shows them.
         states = self._table.states
-        rows = (self._table.phase != LOST).nonzero()[0][flow.found]
+        rows = (self._table.phase == TRACKED).nonzero()[0][flow.found]
         seen = then[rows, kalman.POSITION]
         seen[:, :2] += flow.shifts[flow.found]
         seen[:, 3] *= flow.zooms[flow.found]

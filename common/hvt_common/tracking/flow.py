@@ -25,6 +25,8 @@ _MOST_APART: Final = 0.15
 _MOST_CHANGED: Final = 30.0
 """Levels: where a point looks so different it is another thing."""
 _MOST_SCALE: Final = 1.1
+_LEAST_PX: Final = 10.0
+"""Of the shorter side in the pictures: of what is smaller the windows see the ground."""
 
 _across = (np.arange(_SIDE) + 0.5) / _SIDE * _MIDDLE + (1 - _MIDDLE) / 2
 _GRID: Final = np.stack(np.meshgrid(_across, _across), axis=-1).reshape(1, _POINTS, 2)
@@ -75,4 +77,5 @@ def box_flow(before: Gray, now: Gray, boxes: _Floats, *, expected: _Floats, size
     growth = np.clip(growth, 1 / _MOST_SCALE - 1, _MOST_SCALE - 1)
     centre = (starts + sides / 2)[:, 0]
     shift += growth[:, None] * (centre - middle)
-    return BoxFlow(shift / ratio, 1 + growth, good.sum(axis=1) >= _LEAST_AGREEING)
+    found = (good.sum(axis=1) >= _LEAST_AGREEING) & (sides.min(axis=2)[:, 0] >= _LEAST_PX)
+    return BoxFlow(shift / ratio, 1 + growth, found)
