@@ -18,6 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from hvt_common.tracking import kalman
 from hvt_common.tracking.association import assign, larger, overlaps
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.flow import box_flow
 from hvt_common.values import Detections, Tracks, iou
 from studies.clear_mot import Frames, score
 
@@ -476,6 +477,17 @@ def test_what_is_found_in_a_picture_of_long_ago_is_not_shown() -> None:
     assert len(tracker.predict(frame_index=40)) == 0
     tracker.update(seen((100, 100, 140, 160)), frame_index=41)
     assert tracker.predict(frame_index=42).ids.tolist() == [1]
+
+
+def test_a_small_box_does_not_go_with_the_ground() -> None:
+    """A walker would be carried along with the field around, and be lost."""
+    before = np.asarray(
+        cv2.blur(np.random.default_rng(2).integers(0, 255, (180, 320), np.uint8), (5, 5)), np.uint8
+    )
+    boxes = np.array([[100.0, 100, 114, 124], [200, 100, 240, 140]])
+    moved = box_flow(before, np.roll(before, 2, axis=1), boxes, expected=np.zeros((2, 2)), size=(640, 360))
+    assert moved.found.tolist() == [False, True]
+    np.testing.assert_allclose(moved.shifts[1], (4, 0), atol=0.2)
 
 
 def test_a_box_that_goes_with_the_road_does_not_grow_with_it() -> None:
