@@ -39,8 +39,6 @@ _MOST_PER_S = 2000
 _MOST_REPORTS_PER_S = 100
 """An edge says each second how it is, in lockstep each second of its clip. What costs all sinks a turn is bounded."""
 _ANSWER_S = 1.0
-_AGAIN_S = 0.12
-"""A request for a keyframe that is not answered so soon was lost, over UDP, or costs nothing twice."""
 _MOST_ANSWERS, _MOST_ERRORS = 4, 16
 _UNANSWERED = 3
 """So many queries on control in a row without an answer are no accident."""
@@ -164,35 +162,18 @@ class EdgePort:
             )
 
     def request_keyframe(self) -> None:
-        """Ask for a keyframe, again where nothing is heard; does not wait for the answer, which is the keyframe."""
-        self._request_keyframe(_AGAIN_S, _ANSWER_S)
-
-    def _request_keyframe(self, timeout_s: float, *again_s: float) -> None:
+        """Ask for a keyframe; does not wait for the answer, which is the keyframe."""
         request = ControlRequest(session_id=0, command=Command.KEYFRAME, arguments={})
         answered = threading.Event()
-
-        def end() -> None:
-            if again_s and not answered.is_set():
-                self._request_keyframe(*again_s)
-            else:
-                self._note_control(answered=answered.is_set())
-
         self._query(
             Channel.CONTROL,
             request.pack(),
             on_answer=lambda _answer: answered.set(),
-            on_end=end,
-            timeout_s=timeout_s,
+            on_end=lambda: self._note_control(answered=answered.is_set()),
         )
 
     def _query(
-        self,
-        row: Channel,
-        question: bytes,
-        *,
-        on_answer: Callable[[bytes], None],
-        on_end: Callable[[], None],
-        timeout_s: float = _ANSWER_S,
+        self, row: Channel, question: bytes, *, on_answer: Callable[[bytes], None], on_end: Callable[[], None]
     ) -> None:
         def take(data: bytes) -> None:
             try:
@@ -206,7 +187,7 @@ class EdgePort:
                 row,
                 keys=self._keys,
                 question=question,
-                timeout_s=timeout_s,
+                timeout_s=_ANSWER_S,
                 on_answer=take,
                 on_end=on_end,
             )

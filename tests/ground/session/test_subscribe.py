@@ -162,22 +162,6 @@ def test_answers_that_are_none_do_not_fill_the_log(monkeypatch, caplog):
     assert [record.args[1] for record in caplog.records] == [2**power for power in range(10)]
 
 
-@pytest.mark.parametrize("lost", [0, 1])
-def test_a_lost_request_for_a_keyframe_is_made_again_at_once(monkeypatch, lost):
-    """Over UDP the screen stayed dark for a third of a second longer."""
-    timeouts = []
-
-    def query_later(*_, on_answer, on_end, timeout_s, **__):
-        timeouts.append(timeout_s)
-        if len(timeouts) > lost:
-            on_answer(b"")
-        on_end()
-
-    monkeypatch.setattr("hvt_ground.session.edge_port.query_later", query_later)
-    EdgePort(None, "uav-1", clock=time.time_ns).request_keyframe()  # type: ignore[arg-type]
-    assert timeouts == [0.12, 1.0][: lost + 1]
-
-
 def test_a_ground_says_which_stills_it_reads(link):
     """The edge would send what nobody here can show."""
     ground, outsider = link
