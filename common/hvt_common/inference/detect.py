@@ -237,7 +237,7 @@ class OnnxDetector:
             selected = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
         boxes, scores = found.boxes_input_px[selected], found.scores[selected]
         if self.head.suppresses and self._averages:
-            boxes, scores = averaged(*candidates, selected, second=found.second)
+            boxes, scores = averaged(*candidates, selected, iou=self._nms_iou, second=found.second)
             best = np.argsort(-scores, kind="stable")[: np.count_nonzero(scores >= self._confidence)]
             boxes, scores, selected = boxes[best], scores[best], selected[best]
         boxes = letterbox.to_image(boxes)

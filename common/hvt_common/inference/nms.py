@@ -60,15 +60,21 @@ def averaged(
     class_ids: npt.NDArray[np.int32],
     selected: npt.NDArray[np.intp],
     *,
+    iou: float,
     second: npt.NDArray[np.bool_] | None = None,
 ) -> tuple[Boxes, npt.NDArray[np.float32]]:
     """(K, 4) boxes and (K,) scores of the ``selected``, by what overlaps each of them of its class.
 
-    A box is the mean by scores of those that overlap it by `_ALIKE`: a network says an object from several cells, the
-    surest box is not the best one on each of its sides, and from picture to picture another cell is the surest. A
-    score rises by `_AGREED` where two networks agree, the candidates in ``second`` being those of one of them. 0.5 ms
-    for 60 of 900 boxes.
+    A box is the mean by scores of those that overlap it by `_ALIKE`, or by ``iou`` where neighbours that overlap so
+    much stay two: a network says an object from several cells, the surest box is not the best on each of its sides,
+    and from picture to picture another cell is the surest. A score rises by `_AGREED` where two networks agree, the
+    candidates in ``second`` being those of one of them. 0.5 ms for 60 of 900 boxes.
     """
+    if len(scores) > MAX_CANDIDATES:
+        best = np.argsort(-scores, kind="stable")[:MAX_CANDIDATES]
+        boxes_xyxy, scores, class_ids = boxes_xyxy[best], scores[best], class_ids[best]
+        selected = np.argsort(best, kind="stable")[np.searchsorted(np.sort(best), selected)]
+        second = second if second is None else second[best]
     selected_px, all_px = boxes_xyxy[selected].T, boxes_xyxy.T
     near = np.equal.outer(class_ids[selected], class_ids)
     for axis in (0, 1):
@@ -78,7 +84,7 @@ def averaged(
     a, b = selected_px[:, rows], all_px[:, columns]
     shared = np.prod(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), axis=0)
     united = np.prod(a[2:] - a[:2], axis=0) + np.prod(b[2:] - b[:2], axis=0) - shared
-    weights = np.where(shared >= _ALIKE * united, scores[columns], 0)
+    weights = np.where(shared >= max(_ALIKE, iou) * united, scores[columns], 0)
     sums = [np.bincount(rows, weights * side, len(selected)) for side in (*b, np.ones(len(rows)))]
     known = sums[4] > 0  # a box without an area overlaps nothing, itself neither
     boxes = np.where(known, np.array(sums[:4]) / np.where(known, sums[4], 1), selected_px).T

@@ -197,10 +197,14 @@ class ByteTracker:
         """Forget everything: as a new tracker, with ids from 1."""
         self._table = TrackTable.empty()
         self._frame_index: int | None = None
+        self._pictured: int | None = None
+        """The frame of the newest image."""
         self._updated_index: int | None = None
         self._gaps: deque[int] = deque(maxlen=_LEAST_DETECTIONS)
         """Frames from one update to the next, of the last ones."""
         self._searched: _Searched | None = None
+        self._late_frames = 0
+        """How long after its frame the last update came."""
         self._next_id = 1
         self._steady = 0
         """So many updates in a row found nearly all as predicted."""
@@ -229,7 +233,7 @@ class ByteTracker:
         ``image_bgr`` is that frame; it is needed only to follow the camera's motion.
         A `ValueError` means that ``frame_index`` does not rise or that the class ids are negative.
         """
-        self._searched = None
+        self._searched, self._late_frames = None, 0
         self._check_rises(frame_index)
         return self._update(detections, self._step_to(frame_index, image_bgr, mark=True))
 
@@ -241,6 +245,7 @@ class ByteTracker:
         searched, self._searched = self._searched, None
         if searched is None:
             raise ValueError("no frame is being searched")
+        self._late_frames = searched.steps[-1].frame_index - searched.steps[0].frame_index
         self._table, self._frame_index = searched.table, searched.before
         listed = self._update(detections, searched.steps[0])
         for before, step in pairwise(searched.steps):
@@ -326,18 +331,22 @@ class ByteTracker:
             self.scene_began = frame_index
         if camera is not None and mark:
             camera.mark()
-        flow = None
-        if image_bgr is not None and self._frame_index is not None:
-            self._size = (image_bgr.shape[1], image_bgr.shape[0])
+        if image_bgr is None:
+            return _Step(frame_index, None, None, None)
+        flow, self._size = None, (image_bgr.shape[1], image_bgr.shape[0])
+        if self._frame_index is not None and self._pictured == self._frame_index:
             flow = self._flow(before, self._gray, self.camera_step, frames=frame_index - self._frame_index)
+        self._pictured = frame_index
         return _Step(frame_index, self.camera_step, flow, self._gray)
 
     def _flow(
         self, before: Gray | None, now: Gray | None, affine: Affine | None, *, frames: int
     ) -> BoxFlow | None:
-        # From one picture to the other, of the tracks that were found; None without pictures.
+        # From one picture to the other, of the tracks that were found; None without both, and after a long time.
         moving = self._table.phase == TRACKED
         if before is None or now is None or before.shape != now.shape or not moving.any():
+            return None
+        if frames > self._longest_frames:
             return None
         then = self._table.states[moving]
         expected = then.copy()
@@ -532,6 +541,8 @@ class ByteTracker:
         table = self._table
         area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
         fresh = max(round(_OLD_S * self._fps), _OLD_GAPS * max(self._gaps, default=1))
+        if len(self._gaps) == 1 and self._late_frames <= fresh:
+            fresh = self._longest_frames  # nobody knows yet when the next update comes
         tracked = (table.phase == TRACKED) & (frame_index - table.seen <= fresh)
         rows = (tracked[: len(boxes)] & (area > self._settings.min_box_area_px2)).nonzero()[0]
         votes = table.votes[rows]

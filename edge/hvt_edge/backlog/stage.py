@@ -18,7 +18,7 @@ from hvt_common.values import AccessUnit
 from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import FIRST_STORED, SEGMENT_NS, Entry
 from hvt_edge.backlog.worker import ChunkAllowance, IntakeStill, StoreWorker
-from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.link.transmitter import LEAST_CHUNK_BYTES, Transmitter
 from hvt_edge.operating import Keyframes
 
 SILENCE_NS = 3 * SECOND_NS // 2
@@ -320,7 +320,7 @@ class BacklogStage:
             return None
         reserve = 0.0 if self._finishing else _RESERVE
         limit_bytes = self._line.backlog_allowance_bytes(now_ns, reserve=reserve)
-        if self._finishing or (limit_bytes >= _TRICKLE_BYTES and not self._stills_pending()):
+        if self._finishing or (limit_bytes >= LEAST_CHUNK_BYTES and not self._stills_pending()):
             return ChunkAllowance(limit_bytes)  # after the last frame no still goes any more
         own_bytes = self._line.backlog_allowance_bytes(now_ns, reserve=None)
         return ChunkAllowance(min(_TRICKLE_BYTES, own_bytes), trickle=True)

@@ -14,6 +14,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
+from hvt_common.protocol.messages import Feedback
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.link.feedback import Report
@@ -27,6 +28,8 @@ _SLACK_NS = 75 * _MS
 _LEAST_HELD_NS, _FIRST_HELD_NS, _MOST_HELD_NS = 50 * _MS, 150 * _MS, 300 * _MS
 _NO_NEWS_NS = 250 * _MS
 """Where the link loses messages and reports name none for so long, a keyframe asks whether those overdue are lost."""
+_PROBES_NS = 1500 * _MS
+"""They go for so long at the most."""
 _GIVEN_UP_NS = SECOND_NS
 """A message so long overdue is lost, if reports come and name none newer for as long."""
 _SILENCE_NS = 2 * SECOND_NS
@@ -230,9 +233,14 @@ class Pacer:
         self._given_up = -1
         """The newest base message that was taken for lost."""
         self._lossy = False
-        """Whether the primary receiver has ever missed a message."""
+        """Whether what is overdue is likely lost: so it was the last time."""
+        self._lost = 0
         self._probed = -1
         """The base message that was overdue when another went out all the same."""
+        self._doubted: int | None = None
+        """The first of those others, until a report tells whether what was overdue is lost."""
+        self._doubt_ns = self._open_ns = 0
+        """When it went, and the last report that did not tell."""
         self._last_sent_ns = self._last_bytes = 0
         self._linked: bool | None = None
         self._reports = True
@@ -289,6 +297,8 @@ class Pacer:
                 self._started_ns = now_ns
             if self._overdue_ns(now_ns) > self._slack_ns and self._flight.oldest is not None:
                 self._probed = self._flight.oldest.sequence
+                if self._doubted is None:
+                    self._doubted, self._doubt_ns = sequence, now_ns
             self._flight.sent_base(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
 
     def sent_still(self, sequence: int, line_bytes: int, *, now_ns: int) -> None:
@@ -314,7 +324,8 @@ class Pacer:
                 self._forget_path()
                 self._progress_ns = now_ns
             silent = self._reported_ns is not None and now_ns - self._reported_ns > _SILENCE_NS
-            self._reported_ns, self._lossy = now_ns, feedback.lost > 0
+            self._reported_ns = now_ns
+            self._note_losses(feedback, now_ns)
             sent = self._flight.acknowledge(feedback.base_sequence, feedback.still_sequence)
             if (
                 silent
@@ -420,11 +431,24 @@ class Pacer:
         backlog_ns = self._flight.backlog_ns(now_ns=now_ns, rate_bps=self.rate_bps)
         return backlog_ns <= most_backlog_ns and self._overdue_ns(now_ns) <= self._slack_ns
 
+    def _note_losses(self, feedback: Feedback, now_ns: int) -> None:
+        # What was overdue and came after all was late: in a queue, which further probes would only make longer.
+        if feedback.lost != self._lost:
+            self._lossy, self._lost = feedback.lost > self._lost, feedback.lost
+            self._doubted = None
+        elif self._doubted is None or feedback.base_sequence < self._doubted:
+            self._open_ns = now_ns
+        elif now_ns - self._open_ns > _NO_NEWS_NS:  # the receiver has given up by now what it misses
+            self._lossy = False
+            self._doubted = None
+
     def _probes(self, now_ns: int) -> bool:
         # Whether a keyframe goes although a message is overdue: if all under way was lost no report can say so, since
         # nothing comes that it could name. The next goes when that one is overdue, too.
         oldest, newest = self._flight.oldest, self._flight.newest
-        if not self._lossy or oldest is None or newest is None or self._overdue_ns(now_ns) <= self._slack_ns:
+        # What a queue holds up would have to wait behind all of them.
+        armed = self._lossy and (self._doubted is None or now_ns - self._doubt_ns < _PROBES_NS)
+        if not armed or oldest is None or newest is None or self._overdue_ns(now_ns) <= self._slack_ns:
             return False
         if oldest.sequence == self._probed:
             return self._late_ns(newest, now_ns) > self._slack_ns

@@ -47,7 +47,7 @@ STILL_ATTACHMENT_BYTES = 60
 `Transmitter.still_allowance_bytes` of one that is counts its own header."""
 BACKLOG_ATTACHMENT_BYTES = 48
 """The largest `BacklogHeader`."""
-_LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
+LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
 _CHUNK_S = 0.05
 """A chunk occupies the link so long at most, so a frame or a live still need not wait for it."""
 _GROWTH_BYTES = 16
@@ -245,7 +245,7 @@ class Transmitter:
         if self.pacer is not None and not self.pacer.admits_still(now_ns):
             return 0
         around = self._around(Channel.BACKLOG, line_bytes, BACKLOG_ATTACHMENT_BYTES)
-        most = min(_MOST_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, round(_CHUNK_S * self.budget.total_bps / 8)))
+        most = min(_MOST_CHUNK_BYTES, max(LEAST_CHUNK_BYTES, round(_CHUNK_S * self.budget.total_bps / 8)))
         return min(most, max(0, line_bytes - around))
 
     def backlog(self, chunk: Chunk, *, now_ns: int) -> int:

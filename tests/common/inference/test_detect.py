@@ -322,6 +322,17 @@ def test_what_both_networks_of_a_file_see_is_surer(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.confidences, expected, rtol=1e-5)
 
 
+def test_neighbours_that_both_stay_have_boxes_of_their_own(tmp_path: Path) -> None:
+    """Two cars side by side would become one box, drawn twice."""
+    table = empty(4 + 2, 84)
+    table[0, :, 3] = [30, 20, 20, 10, 0.8, 0.0]
+    table[0, :, 9] = [34.5, 20, 20, 10, 0.7, 0.0]
+    path = constant_model(tmp_path / "m.onnx", table, metadata={"hvt.training_commit": "1a2b3c4"})
+    found = open_detector(str(path), nms_iou=0.7).detect(np.zeros((64, 64, 3), np.uint8))
+    wanted = np.array([[20, 15, 40, 25], [24.5, 15, 44.5, 25]])
+    np.testing.assert_allclose(found.boxes_xyxy_px, wanted, rtol=1e-5)
+
+
 def test_crowds_survive_up_to_the_cap() -> None:
     """A car park of 600 cars would lose some; a broken model would flood the tracker."""
     x, y = np.meshgrid(np.arange(50.0), np.arange(40.0))

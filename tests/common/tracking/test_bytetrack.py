@@ -468,6 +468,49 @@ def test_between_detections_a_box_goes_with_what_is_in_it(late: int) -> None:
             assert iou(listed.boxes_xyxy_px, np.array([box], np.float32))[0, 0] > 0.7, k
 
 
+def test_boxes_keep_to_their_objects_where_frames_come_without_a_picture() -> None:
+    """An edge that codes each third frame would cut its stills beside the cars."""
+    rng = np.random.default_rng(1)
+    ground, car = (
+        cv2.blur(rng.integers(0, 255, (*size, 3), np.uint8), (5, 5)) for size in ((360, 640), (30, 44))
+    )
+    tracker = ByteTracker(TrackerSettings(camera_motion="flow"), fps=30)
+    for k in range(80):
+        x = 40 + 6 * k
+        image = np.asarray(ground, np.uint8).copy()
+        image[150:180, x : x + 44] = car
+        given = image if k % 3 == 0 else None
+        if k % 9 == 0:
+            listed = tracker.update(seen((x, 150, x + 44, 180)), frame_index=k, image_bgr=given)
+        else:
+            listed = tracker.predict(frame_index=k, image_bgr=given)
+        if k > 27:
+            assert abs(listed.boxes_xyxy_px[-1, 0] - x) < 2, k
+
+
+def test_a_detection_every_four_seconds_has_boxes_between_them_from_the_first_on() -> None:
+    """A slow machine would show nothing for seconds after its first look."""
+    tracker = ByteTracker(fps=15)
+    for k in range(180):
+        if k % 60 == 0:
+            listed = tracker.update(seen((100, 100, 140, 160)), frame_index=k)
+        else:
+            listed = tracker.predict(frame_index=k)
+        assert len(listed) == 1, k
+
+
+def test_a_frame_of_hours_later_costs_no_steps_in_between(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A forged frame number would hold up the ground for hours."""
+    steps = []
+    step = kalman.predict
+    monkeypatch.setattr(kalman, "predict", lambda states: (steps.append(1), step(states)))
+    tracker = ByteTracker(TrackerSettings(camera_motion="flow"), fps=15)
+    image = np.asarray(np.random.default_rng(0).integers(0, 255, (180, 320, 3)), np.uint8)
+    tracker.update(seen((100, 100, 140, 160)), frame_index=0, image_bgr=image)
+    assert len(tracker.predict(frame_index=2**32 - 1, image_bgr=image)) == 0
+    assert len(steps) < 10
+
+
 def test_what_is_found_in_a_picture_of_long_ago_is_not_shown() -> None:
     """A detector that loads for three seconds would put the first picture's boxes on nothing."""
     tracker = ByteTracker(fps=15)

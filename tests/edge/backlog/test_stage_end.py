@@ -245,6 +245,14 @@ def test_in_an_outage_stills_have_the_room_that_the_link_gave_them(tmp_path):
     rig.backlog.close()
 
 
+def test_the_largest_chunk_of_a_small_budget_is_a_whole_one(tmp_path, monkeypatch):
+    """What was stored would come seven times slower than a link of 200 kbps has room for."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 60, reports=True)
+    monkeypatch.setattr(rig.sender, "backlog_allowance_bytes", lambda _now_ns, *, reserve: 1_000)
+    assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(1_000)
+
+
 def test_an_error_in_the_stores_thread_ends_storing_alone(tmp_path):
     """A bug in what is for later would end the video of now."""
 

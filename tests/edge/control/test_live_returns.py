@@ -105,6 +105,32 @@ def test_live_video_is_back_after_all_under_way_was_lost(budget, fps, lasts_s):
         assert flight.longest_hole(11, 17) <= lasts_s + 0.65
 
 
+@pytest.mark.parametrize(
+    ("link", "late_s", "most"),
+    [
+        (((0, 1.3), (6, 0), (6.35, 1.3)), lambda second: 0.6 if second > 10 and second % 3 < 1 else 0.0, 4),
+        (((0, 1.3), (6, 0), (6.35, 1.3), (12, 0.13)), lambda _second: 0.0, 30),
+    ],
+    ids=["late reports", "a queue"],
+)
+def test_what_is_late_is_not_taken_for_lost_again_and_again(link, late_s, most):
+    """After one loss each delay would bring keyframes, for which all else waits."""
+    budget = 300_000
+    stepped = SteppedLink(tuple((at, share * budget) for at, share in link), loses=True)
+    flight = LiveFlight(stepped, size=(640, 360), budget=budget, fps=5, late_s=late_s)
+    keyframes: list[float] = []
+    send = flight.stage.send
+
+    def noted(unit, decision, *, now_ns):
+        if unit.keyframe and flight.second > 10:
+            keyframes.append(flight.second)
+        return send(unit, decision, now_ns=now_ns)
+
+    flight.stage.send = noted
+    flown(flight, 40)
+    assert len(keyframes) <= most
+
+
 @pytest.mark.parametrize("window", [5, 60])
 @pytest.mark.parametrize(("budget", "fps"), [(300_000, 2), (800_000, 15)])
 def test_a_long_window_keeps_live_video_away_no_longer(budget, fps, window):
