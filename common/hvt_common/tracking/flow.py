@@ -18,6 +18,9 @@ _MIDDLE: Final = 0.7
 """Share of a box's sides that the points lie in: beyond it is the ground."""
 _WINDOW_PX: Final = 13
 _LEVELS: Final = 2
+_AROUND_PX: Final = 64
+_ALIGNED: Final = 2**_LEVELS
+"""Of a part of the pictures: wider than the windows of the smallest level, whose pixels are those of the whole."""
 _LEAST_AGREEING: Final = 5
 _MOST_APART_PX: Final = 1.5
 _MOST_APART: Final = 0.15
@@ -50,15 +53,35 @@ def box_flow(before: Gray, now: Gray, boxes: _Floats, *, expected: _Floats, size
     Boxes are in pixels of the full image, whose ``size`` is (width, height); the pictures may be smaller.
     """
     ratio = np.array([now.shape[1] / size[0], now.shape[0] / size[1]])
+    large = ((boxes[:, 2:] - boxes[:, :2]) * ratio).min(axis=1) >= _LEAST_PX
+    flow = BoxFlow(np.zeros((len(boxes), 2)), np.ones(len(boxes)), large.copy())
+    if large.any():
+        flow.shifts[large], flow.zooms[large], flow.found[large] = _of_large(
+            before, now, boxes[large], expected[large], ratio
+        )
+    return flow
+
+
+def _of_large(
+    before: Gray, now: Gray, boxes: _Floats, expected: _Floats, ratio: _Floats
+) -> tuple[_Floats, _Floats, npt.NDArray[np.bool_]]:
     starts, sides = boxes[:, None, :2] * ratio, (boxes[:, None, 2:] - boxes[:, None, :2]) * ratio
     points = starts + sides * _GRID
     first = (points - 0.5).reshape(-1, 1, 2).astype(np.float32)
     guess = first + np.repeat(expected * ratio, _POINTS, axis=0)[:, None].astype(np.float32)
+    # Most of the time goes into the pictures' pyramids: only what lies around the boxes is looked at.
+    ends = np.concatenate((first, guess))[:, 0]
+    low = np.clip(ends.min(axis=0).astype(int) - _AROUND_PX, 0, None) // _ALIGNED * _ALIGNED
+    high = np.minimum(ends.max(axis=0).astype(int) + _AROUND_PX, now.shape[::-1])
+    if not 0 < 2 * np.prod(np.maximum(high - low, 0)) < now.size:  # it would only cost the copies
+        low, high = np.zeros(2, int), np.array(now.shape[::-1])
+    part = np.s_[low[1] : high[1], low[0] : high[0]]
+    origin = low.astype(np.float32)
     moved, status, changed = cv2.calcOpticalFlowPyrLK(
-        before,
-        now,
-        first,
-        guess,
+        np.ascontiguousarray(before[part]),
+        np.ascontiguousarray(now[part]),
+        first - origin,
+        guess - origin,
         winSize=(_WINDOW_PX, _WINDOW_PX),
         maxLevel=_LEVELS,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.05),
@@ -66,7 +89,7 @@ def box_flow(before: Gray, now: Gray, boxes: _Floats, *, expected: _Floats, size
     )
     shape = (len(boxes), _POINTS)
     good = (status.reshape(shape) == 1) & (changed.reshape(shape) < _MOST_CHANGED)
-    shifts = (moved - first).reshape(*shape, 2).astype(np.float64)
+    shifts = (moved + origin - first).reshape(*shape, 2).astype(np.float64)
     apart = np.abs(shifts - np.median(shifts, axis=1, keepdims=True)).max(axis=2)
     good &= apart < np.maximum(_MOST_APART_PX, _MOST_APART * sides.min(axis=2))
     weights = good[:, :, None] / np.maximum(1, good.sum(axis=1))[:, None, None]
@@ -77,5 +100,4 @@ def box_flow(before: Gray, now: Gray, boxes: _Floats, *, expected: _Floats, size
     growth = np.clip(growth, 1 / _MOST_SCALE - 1, _MOST_SCALE - 1)
     centre = (starts + sides / 2)[:, 0]
     shift += growth[:, None] * (centre - middle)
-    found = (good.sum(axis=1) >= _LEAST_AGREEING) & (sides.min(axis=2)[:, 0] >= _LEAST_PX)
-    return BoxFlow(shift / ratio, 1 + growth, found)
+    return shift / ratio, 1 + growth, good.sum(axis=1) >= _LEAST_AGREEING

@@ -533,6 +533,24 @@ def test_a_small_box_does_not_go_with_the_ground() -> None:
     np.testing.assert_allclose(moved.shifts[1], (4, 0), atol=0.2)
 
 
+def test_a_box_alone_goes_as_among_others_and_one_beside_the_picture_nowhere() -> None:
+    """The part of the pictures that is looked at would change what is seen there."""
+    before = np.asarray(
+        cv2.blur(np.random.default_rng(3).integers(0, 255, (360, 640), np.uint8), (5, 5)), np.uint8
+    )
+    now = np.roll(before, (1, 3), axis=(0, 1))
+    boxes = np.array(
+        [[300.0, 200, 360, 250], [20, 20, 80, 80], [1200, 620, 1270, 700], [5000, 100, 5080, 180]]
+    )
+    moved = [
+        box_flow(before, now, boxes[rows], expected=np.zeros((len(rows), 2)), size=(1280, 720))
+        for rows in ([0], [0, 1, 2], [3])
+    ]
+    np.testing.assert_allclose(moved[0].shifts[0], (6, 2), atol=0.1)
+    np.testing.assert_allclose(moved[0].shifts[0], moved[1].shifts[0], atol=0.01)
+    assert [one.found.tolist() for one in moved] == [[True], [True] * 3, [False]]
+
+
 def test_a_box_that_goes_with_the_road_does_not_grow_with_it() -> None:
     """A car has left, and the camera flies on: its box would grow over half of the picture."""
     picture = cv2.blur(np.random.default_rng(1).integers(0, 255, (720, 1280, 3), np.uint8), (7, 7))
