@@ -278,6 +278,8 @@ class RealtimeWorker(_Worker):
             while self._passed:
                 self._pass_over(*self._passed.popleft())
             with self._lock:
+                if not self._pictures:  # those that waited for too long went meanwhile
+                    break
                 picture, came_s = self._pictures.popleft()
                 newer = len(self._pictures) > 0
                 self._wake.clear()

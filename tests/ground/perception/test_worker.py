@@ -105,6 +105,31 @@ def test_pictures_that_waited_for_long_are_passed_over():
     assert rig.finish() == [("picture", 0), ("picture", 4)]
 
 
+def test_pictures_may_be_passed_over_while_one_before_them_is_looked_at():
+    """On a busy machine it ended the session with an error, and its recording broke in two."""
+    begun, go_on, looked, now_s = threading.Event(), threading.Event(), [], [0.0]
+
+    def analyze(one: DecodedFrame, _hurry: object, _news: object) -> None:
+        looked.append(one.frame_index)
+        if one.frame_index == 0:
+            begun.set()
+            assert go_on.wait(timeout=60)
+        if one.frame_index == 1:
+            now_s[0] += 0.7
+            worker.picture(picture(4))
+
+    worker = patient_worker(analyze, lambda *_: None, lambda _stills: None, clock=lambda: now_s[0])
+    worker.picture(picture(0))
+    assert begun.wait(timeout=60)
+    for index in (1, 2, 3):
+        worker.picture(picture(index))
+    go_on.set()
+    eventually(lambda: looked[-1] == 4, what="the newest is looked at")
+    assert worker.close()
+    worker.raise_error()
+    assert (looked, worker.untracked) == ([0, 1, 4], 2)
+
+
 def test_detection_is_for_the_newest_picture():
     """Boxes would be shown late, one detection after the other, on a machine that is a little behind."""
     rig = Rig()
