@@ -8,9 +8,10 @@ import logging
 import os
 import resource
 import signal
+import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,9 @@ from hypothesis import settings
 from hvt_common.runtime import plug_ins
 from hvt_common.runtime.process import STOP_SIGNALS
 from hvt_common.video.still_codecs import still_codec
+
+pytest.register_assert_rewrite("media", "programs", "rigs", "studies")  # a failed assert tells its values
+
 from media.pictures import write_scene
 from media.third_party import install
 from programs.golden import FLIGHTS, once
@@ -78,6 +82,19 @@ def pytest_collection_finish() -> None:
     """Six thousand tests live as long as the process: the collector does not look through them again and again."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Generator[None, None, None]:
+    """A program that ended badly tells why: its exception alone names only command and exit code."""
+    try:
+        return (yield)
+    except subprocess.CalledProcessError as error:
+        error.add_note(f"it said: {error.stderr or error.stdout}")
+        raise
+
+
+pytest_runtest_setup = pytest_runtest_call
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -155,6 +155,6 @@ def test_a_summary_that_cannot_be_written_any_more_is_code_1(free_port: int, tmp
     words += ["--once", "--wait", "1s", "--summary", "/dev/full", "--quiet"]
     command = [sys.executable, "-m", "hvt_ground.cli", *words]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
+    assert done.returncode == 1, done.stderr
     assert done.stderr == "hvt-ground: /dev/full cannot be written (No space left on device)\n"
     assert done.stdout == "hvt-ground: no edge was heard\n", "what is known is told first"

@@ -76,7 +76,7 @@ def test_a_wrong_vector_is_noticed(reader, tmp_path, name, before, after):
     assert before in text
     file.write_text(text.replace(before, after, 1), encoding="utf-8")
     done = run(reader, tmp_path / "vectors")
-    assert done.returncode == 1
+    assert done.returncode == 1, done.stdout + done.stderr
     assert f"{name} " in done.stdout
 
 

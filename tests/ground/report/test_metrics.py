@@ -119,6 +119,6 @@ def test_a_ground_in_service_can_be_watched(tmp_path, long_scene):
 def test_where_no_ground_answers_is_a_sentence():
     """A traceback would say that the command is broken."""
     said = status("--at", f"127.0.0.1:{free_ports(1)[0]}")
-    assert said.returncode == 1
+    assert said.returncode == 1, said.stdout + said.stderr
     assert "no ground answers at" in said.stderr
     assert len(said.stderr.strip().splitlines()) == 1

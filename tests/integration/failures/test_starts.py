@@ -326,7 +326,7 @@ def test_a_whole_ground_waits_and_serves(link, scene):
     for part in ("listener", "web page", "metrics"):
         ground.until(f"{part}: works again")
     edge = link.edge("--source", str(scene), "--max-frames", "20", "--fps", "5", "--detector", "motion")
-    assert edge.wait() == 0
+    assert edge.wait() == 0, edge.said
     ground.kill()
 
 

@@ -20,6 +20,8 @@ from hvt_common.protocol.edge_words import FRAME_GROUPS, FrameAccount
 PATIENT_S = 200.0
 """A machine that is busy is waited for. It is no assertion on speed, only less than what pytest gives a test."""
 _POLL_S = 0.01
+MOST_SAID = 8000
+"""Characters of what a process said, its last, that a test's failure repeats."""
 
 
 class _Ports:
@@ -76,6 +78,21 @@ def eventually(true: Callable[[], object], *, what: str = "that it is so") -> No
         time.sleep(_POLL_S)
 
 
+class Sessions(list[dict[str, Any]]):
+    """The summaries of a ground's sessions; a test that takes them for one fails with what became of each."""
+
+    said = ""
+
+    def __getitem__(self, key: Any) -> Any:
+        ends = (
+            [(one["session"], one["frames"], one["failed"]) for one in self] if isinstance(key, str) else ()
+        )
+        assert not isinstance(key, str), (
+            f"{len(self)} sessions, not one: {ends}; the ground said:\n{self.said}"
+        )
+        return super().__getitem__(key)
+
+
 class Running:
     """One process; its output goes to files, so that it never waits for a reader.
 
@@ -121,7 +138,11 @@ class Running:
             assert text in self.said or self.alive, f"{self.name} ended early:\n{self.said}"
             return text in self.said
 
-        eventually(found, what=f"{self.name} says {text!r}; it said:\n{self.said}")
+        try:
+            eventually(found, what=f"{self.name} says {text!r}")
+        except AssertionError as error:
+            error.add_note(f"it said:\n{self.said[-MOST_SAID:]}")
+            raise
         return time.time()
 
     def wait(self) -> int:
@@ -156,9 +177,12 @@ class Running:
 
     def summary(self) -> Any:
         """The JSON that it left. Of an edge: every source frame is in one group, and the table says the same."""
+        assert self._summary.exists(), f"{self.name} left no summary; it said:\n{self.said}"
         content = json.loads(self._summary.read_text())
-        for session in content if isinstance(content, list) else ():
-            if told := session.get("edge_frames"):
+        if isinstance(content, list):
+            content = Sessions(content)
+            content.said = self.said[-MOST_SAID:]
+            for told in filter(None, (session.get("edge_frames") for session in content)):
                 assert sum(told[name] for name in FRAME_GROUPS) == told["came"], told
         if isinstance(content, dict) and (frames := content.get("frame_account")):
             groups = {name: count for name, count in frames.items() if name in FRAME_GROUPS}
@@ -170,19 +194,23 @@ class Running:
 
 def agree(sent: dict[str, Any], received: dict[str, Any]) -> None:
     """The summaries of an edge and of the ground that had all of its flight."""
-    assert sent["frames"] == received["frames"] > 0
-    assert sent["base_bytes"] == received["base_bytes"] > 0
+    failed = f"at the edge {sent['failed']}, at the ground {received['failed']}"
+    assert sent["frames"] == received["frames"] > 0, failed
+    assert sent["base_bytes"] == received["base_bytes"] > 0, failed
     # On a busy machine a report may be late, and a base frame. A still that is sent again counts once; twice where it
     # has a new number, because it had to do without the base.
     copies = sent["stills"]["reasons"]["sent"].get("again", 0)
-    assert 0 <= sent["stills"]["sent"] - received["stills"]["received"] <= copies
+    assert 0 <= sent["stills"]["sent"] - received["stills"]["received"] <= copies, failed
     # A copy counts at the ground as well, if it comes before the end.
     assert received["roi_bytes"] <= sent["roi_bytes"]
     assert copies or received["roi_bytes"] == sent["roi_bytes"]
 
 
 class Link:
-    """A ground and its edges on ports of their own. A context manager that leaves no process behind."""
+    """A ground and its edges on ports of their own. A context manager that leaves no process behind.
+
+    Whatever fails within it tells what each of them said.
+    """
 
     flights: ClassVar[Collection[str] | None] = None
     """Names of all that may be flown; None: any."""
@@ -228,7 +256,9 @@ class Link:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_error: object) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         for running in self._started:
             if running.alive:
                 running.kill()
+            if error is not None:
+                error.add_note(f"{running.name} said:\n{running.said[-MOST_SAID:]}")
