@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -55,34 +56,38 @@ def test_an_independent_reader_reads_all_of_them(reader):
     ]
 
 
-@pytest.mark.parametrize(
-    ("name", "before", "after"),
-    [
-        ("messages.json", '"sequence is at its bound", "hex": "98', '"sequence is at its bound", "hex": "99'),
-        ("refused.json", '"version": true', '"version": false'),
-        ("objects.json", '"values": [[7, 1000', '"values": [[8, 1000'),
-        ("track-steps.json", '"width": ', '"width": 1'),
-        ("poses.json", '"errors": [1', '"errors": [2'),
-        ("stills.json", '"b": ', '"b": 1'),
-        ("stills.json", '"pixels": "', '"pixels": "0'),
-        ("stills.json", '"payload": "', '"payload": "00'),
-    ],
-)
-def test_a_wrong_vector_is_noticed(reader, tmp_path, name, before, after):
+WRONG = [
+    ("messages.json", '"sequence is at its bound", "hex": "98', '"sequence is at its bound", "hex": "99'),
+    ("refused.json", '"version": true', '"version": false'),
+    ("objects.json", '"values": [[7, 1000', '"values": [[8, 1000'),
+    ("track-steps.json", '"width": ', '"width": 1'),
+    ("poses.json", '"errors": [1', '"errors": [2'),
+    ("stills.json", '"b": ', '"b": 1'),
+    ("stills.json", '"pixels": "', '"pixels": "0'),
+    ("stills.json", '"payload": "', '"payload": "00'),
+]
+
+
+def test_a_wrong_vector_is_noticed(reader, tmp_path):
     """A reader that passes whatever it is given proves nothing."""
     shutil.copytree(FOLDER, tmp_path / "vectors")
-    file = tmp_path / "vectors" / name
-    text = file.read_text(encoding="utf-8")
-    assert before in text
-    file.write_text(text.replace(before, after, 1), encoding="utf-8")
+    expected = set()
+    for name, before, after in WRONG:
+        file = tmp_path / "vectors" / name
+        lines = file.read_text(encoding="utf-8").splitlines()
+        number = next(n for n, line in enumerate(lines) if before in line and (name, n) not in expected)
+        lines[number] = lines[number].replace(before, after, 1)
+        file.write_text("\n".join(lines), encoding="utf-8")
+        expected.add((name, number))
     done = run(reader, tmp_path / "vectors")
     assert done.returncode == 1, done.stdout + done.stderr
-    assert f"{name} " in done.stdout
+    told = re.findall(r"^([\w-]+\.json) (\d+): ", done.stdout, re.MULTILINE)
+    assert {(name, int(number) + 1) for name, number in told} == expected
 
 
 def test_the_vectors_notice_a_broken_reader(reader):
     """Somebody's reader that is wrong at a bound would pass them; `python -m lab.conformance.mutants` tries all."""
-    assert survivors(Path(reader[-1]), MUTANTS[::25]) == []
+    assert survivors(Path(reader[-1]), MUTANTS[::50]) == []
     assert sum(bool(one.harmless) for one in MUTANTS) <= 3
 
 
