@@ -108,7 +108,6 @@ class Parser(argparse.ArgumentParser):
         self.register("type", Path, named_path)
 
     def error(self, message: str) -> NoReturn:
-        """Raise `UserError`."""
         raise UserError(f"{message}; see {self.prog} --help")
 
 

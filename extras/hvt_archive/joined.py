@@ -57,7 +57,6 @@ def _read(path: Path) -> tuple[str, list[Chunk]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="hvt_archive.joined", description="Several recordings as one, beside each other."
     )

@@ -155,7 +155,6 @@ class _MatroskaFile:
         self._count += 1
 
     def close(self) -> None:
-        """Write the index and close the file."""
         try:
             self._container.close()
         finally:

@@ -77,7 +77,6 @@ def _without_menu(png: bytes) -> bytes:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="hvt_archive.screenshot", description="A picture of a recording's screen."
     )

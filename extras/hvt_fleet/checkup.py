@@ -132,7 +132,6 @@ class _Said(logging.Handler):
             which.append(record.getMessage())
 
     def within(self, finding: Finding) -> Finding:
-        """The finding with it."""
         finding = replace(finding, found="; ".join([finding.found, *self._facts]))
         if not self._warnings or finding.state not in ("ok", "unknown"):
             return finding

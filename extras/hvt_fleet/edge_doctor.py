@@ -82,7 +82,6 @@ class _Checks:
 
     @property
     def by_name(self) -> dict[str, Callable[[], Finding]]:
-        """All of them."""
         return {
             "source": self.source,
             "detector": self.detector,

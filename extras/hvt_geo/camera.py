@@ -45,11 +45,9 @@ class FlatGround:
     """A plane ``height_m`` below the camera."""
 
     def usable(self, pose: Pose) -> bool:
-        """Whether the height is known."""
         return pose.height_m is not None and pose.height_m > 0
 
     def meet(self, pose: Pose, rays: Rays) -> Points:
-        """See `Surface.meet`."""
         assert pose.height_m is not None, "else it is not usable"
         falls = rays[:, 2] > np.linalg.norm(rays, axis=1) * math.sin(math.radians(LEAST_DEPRESSION_DEG))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -57,7 +55,6 @@ class FlatGround:
         return np.where(falls[:, None], metres, np.nan)
 
     def below_m(self, pose: Pose, metres: Points) -> npt.NDArray[np.float64]:
-        """See `Surface.below_m`."""
         assert pose.height_m is not None, "else it is not usable"
         return np.full(len(metres), pose.height_m)
 
@@ -215,11 +212,9 @@ class SurfaceLocator(Locator):
     surface: Surface = FLAT_GROUND
 
     def places(self, pose: Pose, boxes_base_px: Boxes, view: View) -> Places | None:
-        """See `places_of_boxes`."""
         return places_of_boxes(pose, boxes_base_px, view=view, surface=self.surface)
 
     def footprint(self, pose: Pose, view: View) -> Footprint | None:
-        """See `footprint`."""
         return footprint(pose, view, surface=self.surface)
 
 

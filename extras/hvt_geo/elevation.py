@@ -66,7 +66,6 @@ class _Area:
         return _Area(self.west_deg + degrees, self.south_deg, self.east_deg + degrees, self.north_deg)
 
     def common(self, other: _Area) -> _Area | None:
-        """The intersection of both."""
         west, east = max(self.west_deg, other.west_deg), min(self.east_deg, other.east_deg)
         south, north = max(self.south_deg, other.south_deg), min(self.north_deg, other.north_deg)
         return _Area(west, south, east, north) if west < east and south < north else None
@@ -81,7 +80,6 @@ class Tile:
 
     @classmethod
     def empty(cls) -> Tile:
-        """Nothing anywhere."""
         return cls(np.full((1, 1), np.nan, np.float32), _Area(-180.0, -90.0, 180.0, 90.0))
 
     def at(self, latitude_deg: Points, longitude_deg: Points) -> npt.NDArray[np.float64]:
@@ -300,7 +298,6 @@ class Terrain:
         return np.where(known[:, None], units[:, :2] * reach[:, None], np.nan)
 
     def below_m(self, pose: Pose, metres: Points) -> npt.NDArray[np.float64]:
-        """See `Surface.below_m`."""
         (altitude_m, _), tile = self._levels_m(pose), self._tile_around(pose)
         if altitude_m is None:
             return np.full(len(metres), np.nan)

@@ -31,7 +31,6 @@ class GeoExtra(Extra[GeoOptions]):
     options = GeoOptions
 
     def reads(self, config: GeoOptions) -> Iterable[Path]:
-        """The elevation model."""
         return [config.terrain] if config.terrain is not None else []
 
     def locators(self, terrain: Path | None) -> Callable[[str], Locator]:

@@ -59,7 +59,6 @@ class ModelEntry(PinnedFile):
 
     @property
     def total_bytes(self) -> int:
-        """The size of all its files."""
         return sum(file.size_bytes for file in self.files.values())
 
 

@@ -43,12 +43,10 @@ class WebExtra(Extra[WebOptions]):
     options = WebOptions
 
     def check(self, config: WebOptions) -> None:
-        """Refuse a proxy without a page."""
         if config.web_proxy is not None and config.web is None:
             raise UserError(f"--web-proxy {config.web_proxy} is given without --web: give --web too")
 
     def checks(self, config: WebOptions) -> Mapping[str, Callable[[], Finding]]:
-        """Whether it could be served."""
         if config.web is None:
             return {}
         return {"page": partial(_found, config.web)}

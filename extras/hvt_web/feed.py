@@ -54,7 +54,6 @@ class SessionFeed(SinkWriter[Event]):
         hub.post(partial(hub.begin, page, session))
 
     def log(self, item: Event) -> None:
-        """Give out one event."""
         match item:
             case VideoSample(stored=False):
                 self._video(item)

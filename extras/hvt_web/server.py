@@ -125,11 +125,9 @@ class WebPage(Service):
         self._thread = threading.Thread(target=self._run, name="hvt-web", daemon=True)
 
     def begin(self, client: EdgeClient) -> None:
-        """Ask edges through it from now on."""
         self._client = client
 
     def sinks(self, flight: Flight) -> Iterable[Opening]:
-        """Show the session."""
         opens = self.feed(flight.info)
 
         def give_way_and_open() -> SessionFeed:

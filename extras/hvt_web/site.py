@@ -64,7 +64,6 @@ class Site:
         return response
 
     async def file(self, request: Request) -> Response:
-        """One of its files."""
         return _file(request.path_params["name"])
 
     async def admits(self, _: Request) -> Response:
@@ -91,7 +90,6 @@ class Site:
         return Response(packed("still", data, edge=edge, **about), media_type="application/octet-stream")
 
     async def keyframe(self, request: Request) -> Response:
-        """Ask for a keyframe."""
         try:
             edge = self._edge(request)
             await run_in_threadpool(self._requests.keyframe, edge)
@@ -100,7 +98,6 @@ class Site:
         return Response(status_code=204)
 
     async def settings(self, request: Request) -> Response:
-        """Set budget or method."""
         try:
             edge, body = self._edge(request), await _json_body(request)
             await run_in_threadpool(self._requests.set, edge, body)

@@ -34,7 +34,6 @@ _MOST_LOADS = 240
 
 
 def text(kind: str, **content: Any) -> str:
-    """A message in words."""
     return json.dumps({"type": kind, **content}, separators=(",", ":"), ensure_ascii=False)
 
 
@@ -182,7 +181,6 @@ class StillPictures:
             self._bytes -= len(self._pictures.popitem(last=False)[1][0])
 
     def get(self, still: str, which: str) -> tuple[bytes, str] | None:
-        """The picture and its media type."""
         return self._pictures.get((still, which))
 
 
@@ -257,13 +255,11 @@ class Hub:
                 viewer.put_video(message, begins=True)
 
     def overlay(self, edge: EdgePage, message: str) -> None:
-        """Boxes at a frame, for those who watch."""
         for viewer in self.viewers:
             if viewer.watches and viewer.watches[0] == edge.edge:
                 viewer.put_video(message, begins=False)
 
     def still(self, edge: EdgePage, message: str, pictures: list[tuple[str, str, bytes, str]]) -> None:
-        """A still that was read, with its pictures."""
         for still, which, picture, media_type in pictures:
             edge.pictures.add(still, which, picture, media_type)
         edge.stills.append(message)
@@ -305,7 +301,6 @@ class Hub:
             viewer.put(self._state)
 
     def leave(self, viewer: Viewer) -> None:
-        """It is gone."""
         self.viewers.discard(viewer)
         self._want_all()
 
@@ -323,7 +318,6 @@ class Hub:
         self._want_all()
 
     def leave_edge(self, viewer: Viewer) -> None:
-        """It looks at no edge."""
         viewer.leave_video()
         self._put_thumbnails(viewer)
         viewer.watches = None

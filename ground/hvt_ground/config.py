@@ -147,7 +147,6 @@ class GroundConfig:
 
     @property
     def written(self) -> list[Written]:
-        """What is written."""
         given = (
             *(("--record", self.record, ".rrd"), ("--tracks", self.tracks, ".csv")),
             *(
@@ -167,7 +166,6 @@ class GroundConfig:
 
     @property
     def link(self) -> LinkSettings:
-        """The ground's end of the link."""
         return LinkSettings(
             role="ground",
             listen=self.listen,

@@ -156,7 +156,6 @@ class RemoteEdge:
         self._requester = requester or Requester()
 
     def info(self) -> Info:
-        """The edge's facts of its session."""
         answer = self._query(Channel.INFO, b"")
         if answer is None:
             raise UserError(self._absent())
@@ -179,11 +178,9 @@ class RemoteEdge:
         ]
 
     def keyframe(self) -> None:
-        """Ask for a keyframe."""
         self.command(Command.KEYFRAME)
 
     def set_budget(self, bps: int) -> None:
-        """Set the total budget, line bits a second."""
         self.command(Command.SET_BUDGET, {"bps": bps})
 
     def set_method(self, method: str) -> None:

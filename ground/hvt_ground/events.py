@@ -114,7 +114,6 @@ class Overlay:
 
     @classmethod
     def none(cls, frame_index: int, capture_ns: int, *, stored: bool = False) -> Overlay:
-        """No tracks."""
         boxes, none = np.empty((0, 4), np.float32), np.empty(0, np.float32)
         return cls(
             frame_index, capture_ns, np.empty(0, np.int64), boxes, (), (), none, _nowhere(), stored=stored
@@ -131,7 +130,6 @@ class Overlay:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """N of `shown_word`."""
         return tuple(map(shown_word, self.classes, self.vague.tolist(), self.doubted.tolist()))
 
     @property
@@ -196,7 +194,6 @@ class Refinement:
 
     @property
     def words(self) -> tuple[str, str]:
-        """`shown_word` of the class before and after."""
         return shown_word(self.class_before, self.vague[0]), shown_word(self.class_after, self.vague[1])
 
 

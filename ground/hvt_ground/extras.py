@@ -96,7 +96,6 @@ class Service:
         """Nothing can be refused any more, the folder of ``--record`` is there, and ``client`` reaches the edges."""
 
     def sinks(self, flight: Flight) -> Iterable[Opening]:  # noqa: ARG002
-        """The sinks of a session."""
         return ()
 
     def still_address(self, info: Info, still: Refinement) -> str:  # noqa: ARG002
@@ -171,7 +170,6 @@ def all_extras() -> tuple[Extra[Any], ...]:
 
 
 def extras_of(config: GroundConfig) -> list[Extra[Any]]:
-    """Those whose settings the configuration has."""
     return [extra for extra in all_extras() if isinstance(config, extra.options)]
 
 
@@ -207,7 +205,6 @@ def checked(config: GroundConfig) -> GroundConfig:
 
 
 def written(config: GroundConfig) -> list[Written]:
-    """What is written, by extras too."""
     return [*config.written, *_written_by(extras_of(config), config)]
 
 

@@ -49,7 +49,6 @@ class PoseTrail:
 
     @property
     def newest(self) -> Pose | None:
-        """The last one that came."""
         poses = self._poses
         return poses[-1] if poses else None
 
@@ -170,14 +169,12 @@ class SessionPoses:
         return None if pose is None or not self._trail.add(pose) else pose
 
     def use(self, pose: Pose) -> None:
-        """Locate by this pose from now on."""
         with self._lock:
             self._used.add(pose)
         self.has_pose = True
 
     @property
     def newest(self) -> Pose | None:
-        """The last pose that came."""
         return self._trail.newest
 
     def turned_stale(self, capture_ns: int) -> bool | None:

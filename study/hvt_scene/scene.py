@@ -219,7 +219,6 @@ class Scene:
         return dict(zip((chosen + 1).tolist(), map(tuple, places[:, :2].tolist()), strict=True))
 
     def write_truth(self, path: Path, *, fps: float, view: View) -> int:
-        """See `hvt_scene.truth.write_truth`."""
         return write_truth(self, path, fps=fps, view=view)
 
     def _view(

@@ -60,9 +60,7 @@ class TruthSource(Protocol):
 
     duration_s: float
 
-    def truth(self, t_s: float) -> Truth:
-        """Ground truth at a moment."""
-        ...
+    def truth(self, t_s: float) -> Truth: ...
 
 
 def frame_times(duration_s: float, fps: float) -> Iterator[tuple[int, float]]:

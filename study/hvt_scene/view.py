@@ -86,7 +86,6 @@ class Camera:
         )
 
     def _on_its_way(self, t_s: float) -> tuple[float, list[float], float]:
-        """Share of the time, place and roll."""
         share = min(1.0, max(0.0, t_s / self.duration_s))
         eased = _ease(share)
         first, last = self.appearance.roll_deg

@@ -172,7 +172,6 @@ class TiledDetector:
         return self._auto[source_size]
 
     def detect_whole(self, image_bgr: Image) -> Detections:
-        """As `detect`, without tiles."""
         return self._detector.detect(image_bgr)
 
     def detect(self, image_bgr: Image) -> Detections:

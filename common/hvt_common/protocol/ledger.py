@@ -188,12 +188,10 @@ class Ledger:
 
     @property
     def base_bytes(self) -> int:
-        """Payload of ``base``."""
         return self._bytes[Account.BASE]
 
     @property
     def roi_bytes(self) -> int:
-        """Payload of ``roi``."""
         return self._bytes[Account.ROI]
 
     @property

@@ -75,7 +75,6 @@ class Failures:
 
     @property
     def now(self) -> tuple[FailedPart, ...]:
-        """Those that do not work now."""
         return tuple(
             FailedPart(one.part, one.reason, one.since_ns)
             for one in self.parts

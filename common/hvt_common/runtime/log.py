@@ -79,7 +79,6 @@ class Log:
         self._held.say_on()
 
     def result(self, content: Any) -> None:
-        """The result of a run, as one JSON line."""
         self._write(logging.INFO, "ended", hvt_content={"summary": content})
 
     @contextmanager

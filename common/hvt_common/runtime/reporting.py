@@ -60,7 +60,6 @@ class StatusLine:
                 self._updates += 1
 
     def note(self, text: str) -> None:
-        """Print a lasting line above the status line."""
         if not self._quiet:
             with _going_on(sys.stderr):
                 self._print(text)
@@ -108,7 +107,6 @@ def say(text: str) -> None:
 
 
 def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Print name and value pairs as a table."""
     table = Table(title=Text(title), show_header=False, title_justify="left", title_style="bold")
     table.add_column(style="cyan", no_wrap=True)
     table.add_column()

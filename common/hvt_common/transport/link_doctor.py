@@ -47,7 +47,6 @@ class Rights:
         )
 
     def knows(self, name: str) -> bool:
-        """Whether any rule is for this name."""
         return not self.enabled or self.default_allow or bool(self._rules_for(name))
 
     def allow(self, name: str, *, flow: str, message: str, key: str) -> bool:

@@ -239,7 +239,6 @@ class Store:
         return self.find((session_id, BacklogKind.INFO, 0))
 
     def find(self, key: ObjectKey) -> Entry | None:
-        """The entry of this name, if it is still here."""
         session_id, kind, number = key
         where = f"{_ENTRY} WHERE session = ? AND kind = ? AND number = ?"
         return next(self._entries(where, f"{session_id:016x}", kind, number), None)

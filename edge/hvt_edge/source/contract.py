@@ -177,6 +177,5 @@ class Notes:
             logging.getLogger(START_LOGGER).info("%s: %s", self._name, sentence)
 
     def taken(self) -> tuple[str, ...]:
-        """All of them so far."""
         self._taken = True
         return tuple(self._said)

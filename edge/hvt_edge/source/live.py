@@ -74,9 +74,7 @@ class Grabber(Protocol):
     name: str
 
     @property
-    def notes(self) -> Notes | None:
-        """The decisions about it."""
-        ...
+    def notes(self) -> Notes | None: ...
 
     def open(self) -> None:
         """Open for the first time: raises UserError where there is nothing."""

@@ -78,7 +78,6 @@ class OutboxStill:
 
     @property
     def track_id(self) -> int:
-        """The track of the candidate that leads it."""
         return (self.coded or self.crop).header.track_id
 
     @property

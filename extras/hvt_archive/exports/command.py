@@ -53,7 +53,6 @@ def write_csv(recorded: Recorded, path: Path) -> None:
 
 
 def write_parquet(recorded: Recorded, path: Path) -> None:
-    """The same as a Parquet file."""
     schema = pa.schema([(name, _TYPES[name]) for name in TRACK_COLUMNS])
     rows = _rows(recorded)
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:

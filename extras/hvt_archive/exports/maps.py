@@ -46,7 +46,6 @@ class Fix:
 
     @property
     def position(self) -> list[float]:
-        """A position for GeoJSON."""
         return [round(self.longitude_deg, _DIGITS), round(self.latitude_deg, _DIGITS)]
 
 
@@ -224,7 +223,6 @@ def _outline(spot: _Spot) -> list[tuple[float, float]]:
 
 
 def _timed_way(parent: ET.Element, way: Sequence[Fix]) -> None:
-    """A track with times."""
     element = ET.SubElement(parent, f"{{{_GX}}}Track")
     _with(element, altitudeMode="clampToGround" if way[0].height_m is None else "relativeToGround")
     for one in way:

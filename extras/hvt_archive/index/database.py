@@ -63,7 +63,6 @@ class Index:
         self._database.close()
 
     def put(self, row: RecordingRow) -> None:
-        """Note a file, in place of its former row."""
         if not self._path.exists():  # what is written would be in no file
             raise sqlite3.OperationalError(f"{self._path} was removed")
         values = [getattr(row, name) for name in _COLUMNS]
@@ -79,14 +78,12 @@ class Index:
             )
 
     def stripped(self, file: str, *, size_bytes: int) -> None:
-        """The file has lost its video."""
         with self._database as transaction:
             transaction.execute(
                 "UPDATE recordings SET video = 0, size_bytes = ? WHERE file = ?", [size_bytes, file]
             )
 
     def forget(self, files: Iterable[str]) -> None:
-        """The files are there no more."""
         with self._database as transaction:
             transaction.executemany("DELETE FROM recordings WHERE file = ?", [(one,) for one in files])
 

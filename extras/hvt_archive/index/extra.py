@@ -65,7 +65,6 @@ class IndexExtra(Extra[IndexOptions]):
                 )
 
     def serve(self, config: IndexOptions, *, clock: Callable[[], int], failures: Failures) -> Service | None:  # noqa: ARG002
-        """Keep the index of a folder of recordings."""
         if config.record_folder is None:
             return None
         from hvt_archive.index.folder import RecordingsFolder  # noqa: PLC0415

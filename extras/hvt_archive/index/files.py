@@ -109,7 +109,6 @@ class _Content:
         """Track and class number of all boxes; the names may come later."""
 
     def add(self, chunk: Chunk) -> None:
-        """Take a chunk."""
         path = chunk.entity_path
         if path == _VIDEO:
             self.video = True
@@ -127,7 +126,6 @@ class _Content:
                     self._account.still(number)
 
     def account(self) -> FileAccount:
-        """All of it."""
         for track, number in self._tracks:
             self._account.track(track, self._names.get(number, "?"))
         return self._account

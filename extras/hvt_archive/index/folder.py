@@ -80,7 +80,6 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
             self._remove_due(now)
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Close the index."""
         self._index.close()
 
     def _pass_time(self) -> Moment:
@@ -179,14 +178,12 @@ class RecordingsFolder(Service):
         self._clock = threading.Thread(target=self._poll, name="hvt-recordings", daemon=True)
 
     def begin(self, client: EdgeClient | None = None) -> None:  # noqa: ARG002 - no edge is asked
-        """Open the index; the folder is there now."""
         self._sink = QueuedSink(
             "recordings index", lambda: IndexWriter(self._folder, self._retention), failures=self._failures
         )
         self._clock.start()
 
     def recorded(self, row: RecordingRow) -> None:
-        """Note the facts of a file."""
         if self._sink is not None:
             self._sink.log(row)
 

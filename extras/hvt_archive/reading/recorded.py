@@ -192,7 +192,6 @@ class _File:
 
     @property
     def first(self) -> int:
-        """The frame that it begins with."""
         return self._begins[0]
 
     @property
@@ -317,7 +316,6 @@ class _StillPlace:
     header: RoiHeader | None
 
     def read(self) -> RecordedStill:
-        """The still."""
         rows, place = self.picture
         frame, capture_ns, jpeg = rows[place]
         base = b"" if self.base is None else self.base[0].value(self.base[1])

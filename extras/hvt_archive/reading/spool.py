@@ -45,7 +45,6 @@ class Spool:
         return at
 
     def get(self, at: int, size: int) -> bytes:
-        """What is there."""
         if at + size > self._written:
             self._flush()
         return os.pread(self._file, size, at)
@@ -76,7 +75,6 @@ class SpooledRows(Sequence[Timed]):
         """Frames, capture times, places and sizes."""
 
     def add(self, frame: int, capture_ns: int, value: Any) -> None:
-        """Append a row."""
         data = value if self._blobs else json.dumps(value, separators=(",", ":")).encode()
         for column, number in zip(
             self._columns, (frame, capture_ns, self._spool.put(data), len(data)), strict=True
@@ -84,7 +82,6 @@ class SpooledRows(Sequence[Timed]):
             column.append(number)
 
     def extend(self, rows: SpooledRows) -> None:
-        """Append those of another, of the same spool."""
         for column, more in zip(self._columns, rows._columns, strict=True):
             column.extend(more)
 
@@ -111,12 +108,10 @@ class SpooledRows(Sequence[Timed]):
 
     @property
     def frames(self) -> Sequence[int]:
-        """Of all rows."""
         return self._columns[0]
 
     @property
     def captures_ns(self) -> Sequence[int]:
-        """Likewise."""
         return self._columns[1]
 
     def latest(self, frame: int) -> int:
@@ -124,7 +119,6 @@ class SpooledRows(Sequence[Timed]):
         return bisect_right(self._columns[0], frame) - 1
 
     def value(self, place: int) -> Any:
-        """Of a row."""
         data = self._spool.get(self._columns[2][place], self._columns[3][place])
         return data if self._blobs else json.loads(data)
 

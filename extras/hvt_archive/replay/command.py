@@ -91,7 +91,6 @@ class _Recorded:
         self._poses = PoseEncoder(session_id=session_id, refresh_ns=_OF_EVERY_POSE)
 
     def pose(self, update: PoseUpdate) -> Received:
-        """A report of a pose."""
         report = self._poses.encode(update.pose)(update.capture_ns)
         return Received(self.keys.key(Channel.POSE), report.pack(), b"", "", update.capture_ns)
 
@@ -266,7 +265,6 @@ class _Replay:
         return self._now_ns
 
     def _paced(self) -> Iterator[Received]:
-        """The messages, each at its time."""
         size = sum(one.size_bytes for one in self._messages())
         with Progress(transient=True, disable=self._config.quiet) as progress:
             task = progress.add_task("replay", total=size)

@@ -44,19 +44,16 @@ class LogExtra(Extra[LogOptions]):
     options = LogOptions
 
     def check(self, config: LogOptions) -> None:
-        """Refuse a log without room for its messages."""
         if config.log_size < LEAST_LOG_BYTES:
             raise UserError(
                 f"--log-size {config.log_size} bytes is not accepted: give at least {LEAST_LOG_BYTES // 10**6}MB"
             )
 
     def writes(self, config: LogOptions) -> Iterable[Written]:
-        """The file that is named."""
         if config.log is not None:
             yield "--log", config.log, ""
 
     def serve(self, config: LogOptions, *, clock: Callable[[], int], failures: Failures) -> Service | None:  # noqa: ARG002
-        """Log all that comes."""
         if config.log is None:
             return None
         return _Logging(config.log, most_bytes=config.log_size, failures=failures)

@@ -102,7 +102,6 @@ class MessageLog(SinkWriter[Received]):
             ) from error
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Close the file."""
         self._file.close()
 
 

@@ -40,7 +40,6 @@ def of_table(
 
 
 def seconds(ms: float | None) -> float | None:
-    """Convert milliseconds."""
     return None if ms is None else ms / 1000
 
 

@@ -44,13 +44,9 @@ class State(Protocol):
     """A program's own state at one moment."""
 
     @property
-    def at_ns(self) -> int:
-        """Unix time."""
-        ...
+    def at_ns(self) -> int: ...
 
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        ...
+    def as_dict(self) -> dict[str, Any]: ...
 
 
 _State = TypeVar("_State", bound=State)

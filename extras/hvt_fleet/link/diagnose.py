@@ -255,21 +255,17 @@ class Doctor(LinkDoctor):
     def check_keys(
         self, config: zenoh.Config, *, listen: Sequence[str], name: str | None, now_s: float
     ) -> None:
-        """See `check_own_keys`."""
         check_own_keys(config, listen=listen, name=name, now_s=now_s)
 
     def check_id(self, settings: LinkSettings, keys: EdgeKeys) -> None:
-        """See `refuse_duplicate_edge`."""
         refuse_duplicate_edge(settings, keys)
 
     def why_no_link(self, config: zenoh.Config) -> list[str]:
-        """See `visit`."""
         return visit(config)
 
     def watch(
         self, session: zenoh.Session, settings: LinkSettings, *, served: Callable[[str], bool]
     ) -> LinkWatch:
-        """See `Watch`."""
         return Watch(session, settings, served=served)
 
 

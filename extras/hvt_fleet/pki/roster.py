@@ -27,7 +27,6 @@ class GroundMember:
     """Which edges it may watch (and command), as ``hvt-ground --edges`` says it."""
 
     def may_watch(self, edge: str) -> bool:
-        """Whether this edge is one of its own."""
         return matches(edge, edges=self.edges)
 
 
@@ -73,7 +72,6 @@ class Roster:
         return cls(edges, grounds, routers)
 
     def write(self, folder: Path) -> None:
-        """Write it into the folder."""
         path = folder / _FILE
         fresh = path.with_name(_FILE + ".new")
         with telling(f"{path} cannot be written (", ")"):
@@ -82,7 +80,6 @@ class Roster:
 
     @property
     def names(self) -> dict[str, str]:
-        """Each name with its kind."""
         return (
             dict.fromkeys(self.edges, "edge")
             | {one.name: "ground" for one in self.grounds}

@@ -94,7 +94,6 @@ def router_file(router: RouterMember, roster: Roster, *, folder: str = KEYS_FOLD
 
 
 def _toward_edge(edge: str, *, command: bool) -> list[_Rule]:
-    """The messages to and from an edge."""
     keys = EdgeKeys(edge)
     requested = [keys.key(Channel.INFO), *([keys.key(Channel.CONTROL)] if command else [])]
     return [
@@ -129,7 +128,6 @@ def _toward_ground(edges: Sequence[str], *, command: bool, label: str) -> list[_
 
 
 def _written(edges: Sequence[str]) -> list[str]:
-    """The keys that edges publish."""
     rows = [row for row in Channel if DELIVERIES[row].direction is Direction.EDGE_TO_GROUND]
     return [EdgeKeys(edge).key(row) for edge in edges for row in rows]
 

@@ -54,7 +54,6 @@ class TypeTable:
         return next(fits, self.platforms[_ANY])
 
     def extended(self, other: TypeTable) -> TypeTable:
-        """With the rows of another before its own."""
         classes = {**self.classes, **other.classes}
         former = {one: kind for one, kind in self.platforms.items() if one not in other.platforms}
         return TypeTable(classes, {**other.platforms, **former})

@@ -60,12 +60,10 @@ class CotExtra(Extra[CotOptions]):
     options = CotOptions
 
     def check(self, config: CotOptions) -> None:
-        """Refuse types without a target."""
         if config.cot_types is not None and not config.cot:
             raise UserError(f"--cot-types {config.cot_types} is given without --cot: give --cot too")
 
     def reads(self, config: CotOptions) -> Iterable[Path]:
-        """The table of types."""
         return [config.cot_types] if config.cot_types is not None else []
 
     def check_outputs(self, config: CotOptions) -> None:
@@ -89,7 +87,6 @@ class CotExtra(Extra[CotOptions]):
         return Finding("ok", f"to {', '.join(config.cot)}; types and certificates can be read")
 
     def start(self, config: CotOptions, outputs: Outputs) -> OpenSinks:
-        """Open the connections."""
         if not config.cot:
             return lambda _flight: ()
         self.check_outputs(config)

@@ -41,7 +41,6 @@ _HOW_PLATFORM, _HOW_TRACK = "m-g", "m-f"
 
 
 def no_address(_still: Refinement) -> str:
-    """Stills are nowhere to be had."""
     return ""
 
 

@@ -35,12 +35,10 @@ class McapExtra(Extra[McapOptions]):
     options = McapOptions
 
     def writes(self, config: McapOptions) -> Iterable[Written]:
-        """What is named."""
         if config.mcap is not None:
             yield "--mcap", config.mcap, ".mcap"
 
     def start(self, config: McapOptions, outputs: Outputs) -> OpenSinks:  # noqa: ARG002
-        """`UserError` where the package is missing."""
         target = config.mcap
         if target is None:
             return lambda _flight: ()

@@ -82,7 +82,6 @@ class McapFile(SinkWriter[Event]):
         self._run.interrupt()
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Write index and footer, and close."""
         if self._file.closed:
             return
         with telling(f"MCAP file {self.path} cannot be finished: "), self._file:

@@ -39,7 +39,6 @@ class Address:
 
     @property
     def scheme(self) -> Literal["udp", "srt"]:
-        """The protocol."""
         return "srt" if self.url.lower().startswith("srt:") else "udp"
 
     @property
@@ -48,7 +47,6 @@ class Address:
         return self.url.partition("?")[0]
 
     def of_edge(self, edge: str) -> Address:
-        """With the edge's id in place."""
         return replace(self, url=self.url.replace("{edge}", edge))
 
     @property
@@ -138,7 +136,6 @@ class Addresses:
             self._users[address.url] = edge
 
     def free(self, address: Address) -> None:
-        """The stream there has ended."""
         with self._lock:
             self._users.pop(address.url, None)
 
@@ -174,7 +171,6 @@ class AsynchronousKlv:
         self._output = output
 
     def write(self, data: bytes) -> int:
-        """As `Output.write`."""
         named = bytearray(data)
         for at in range(0, len(data) - _PACKET_BYTES + 1, _PACKET_BYTES):
             begins, adapts = data[at + 1] & 0x40, data[at + 3] & 0x20
@@ -184,7 +180,6 @@ class AsynchronousKlv:
         return self._output.write(bytes(named))
 
     def close(self) -> None:
-        """As `Output.close`."""
         self._output.close()
 
 
@@ -198,7 +193,6 @@ class StreamFile:
             self._file = os.open(path, flags, 0o644)
 
     def write(self, data: bytes) -> int:
-        """See `Output.write`."""
         left = memoryview(data)
         with telling(f"MPEG-TS file {self._path} cannot be written any further: "):
             check_there(self._file, self._path)
@@ -207,7 +201,6 @@ class StreamFile:
         return len(data)
 
     def close(self) -> None:
-        """See `Output.close`."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
@@ -241,7 +234,6 @@ class Datagrams:
         self._where = where
 
     def write(self, data: bytes) -> int:
-        """See `Output.write`."""
         for begin in range(0, len(data), _DATAGRAM_BYTES):
             try:
                 self._socket.sendto(data[begin : begin + _DATAGRAM_BYTES], self._where)
@@ -255,5 +247,4 @@ class Datagrams:
         return len(data)
 
     def close(self) -> None:
-        """See `Output.close`."""
         self._socket.close()

@@ -43,7 +43,6 @@ class TransportStreamExtra(Extra[TransportStreamOptions]):
     exports = {"ts": _export}  # noqa: RUF012
 
     def writes(self, config: TransportStreamOptions) -> Iterable[Written]:
-        """What is named, unless it is an address."""
         if config.ts is not None and "://" not in config.ts:
             yield "--ts", named_path(config.ts, name="--ts"), ".ts"
 

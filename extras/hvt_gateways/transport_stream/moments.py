@@ -110,7 +110,6 @@ class Timeline:
 
     @property
     def begun(self) -> bool:
-        """Whether there was a picture."""
         return self._zero_ns is not None
 
     def picture(self, capture_ns: int) -> int:

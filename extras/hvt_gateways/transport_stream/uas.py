@@ -41,7 +41,6 @@ def ber_oid(number: int) -> bytes:
 
 
 def item(tag: int, value: bytes) -> bytes:
-    """One item of a local set."""
     return ber_oid(tag) + ber_length(len(value)) + value
 
 

@@ -87,7 +87,6 @@ class MavlinkPose:
 
     @property
     def trouble(self) -> str:
-        """Why there is no pose."""
         known = self._known(fresh=False)
         come = known.get("GLOBAL_POSITION_INT")
         if come is None:
@@ -100,7 +99,6 @@ class MavlinkPose:
         return ""
 
     def at(self, media_ns: int, *, capture_ns: int) -> Pose | None:  # noqa: ARG002 - of now
-        """The newest pose."""
         known = {name: one for name, (_, one) in self._known(fresh=True).items()}
         if not _has_place(known):
             return None
@@ -134,7 +132,6 @@ class MavlinkPose:
         )
 
     def close(self) -> None:
-        """End the thread, which closes the port."""
         self._stop.set()
         self._thread.join(timeout=_JOIN_S)
 

@@ -46,9 +46,7 @@ class Link(Protocol):
         """The bytes of one datagram at most; nothing after `_POLL_S`. Raises `OSError` once it is gone."""
         ...
 
-    def close(self) -> None:
-        """Let go of the port."""
-        ...
+    def close(self) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +62,6 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Raises `UserError` for any other text."""
         said = f"--pose mavlink:{text:.200}"
         kind, _, rest = text.partition(":")
         if kind in _KINDS:
@@ -154,7 +151,6 @@ class Connection:
         return None if self._link is None else self._link.sender
 
     def close(self) -> None:
-        """Let go of the port, if it is open."""
         link, self._link = self._link, None
         if link is not None:
             with suppress(OSError):  # it is gone, which is why it is closed

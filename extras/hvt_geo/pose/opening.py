@@ -28,7 +28,6 @@ def open_mavlink(spec: str, *, hfov_deg: float | None, clock: Callable[[], int])
 
 
 def open_file(spec: str, *, hfov_deg: float | None, clock: Callable[[], int]) -> PoseSource:  # noqa: ARG001 - for all
-    """A file beside the clip."""
     try:
         found, reason = Path(spec).is_file(), ""
     except OSError as error:  # a name that is too long, or a folder that others may not read
@@ -84,7 +83,6 @@ class FixedPose:
         )
 
     def at(self, media_ns: int, *, capture_ns: int) -> Pose | None:  # noqa: ARG002 - at any time
-        """The pose."""
         return replace(self._pose, capture_ns=capture_ns)
 
     def close(self) -> None:

@@ -105,7 +105,6 @@ class MotionDetector:
         )
 
     def reset(self) -> None:
-        """Forget everything seen."""
         self._history.clear()
         self._camera.reset()
 

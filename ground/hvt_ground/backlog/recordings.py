@@ -133,7 +133,6 @@ class BacklogRecordings:
             return recording, wait_s
 
     def close(self) -> None:
-        """Close all that are open."""
         with self._lock:
             self._closed = True
             while self._open:

@@ -45,7 +45,6 @@ class _Evidence:
     """The sum of its confidences by class."""
 
     def mean(self, name: str | None = None) -> float:
-        """Its mean confidence; that of one class."""
         total = sum(self.totals.values()) if name is None else self.totals.get(name, 0.0)
         return total / max(1, self.count)
 

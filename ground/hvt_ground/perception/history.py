@@ -95,7 +95,6 @@ class History:
         return self._frames.get(frame_index)
 
     def frame(self, frame_index: int) -> Image | None:
-        """The same as BGR."""
         picture = self._frames.get(frame_index)
         return None if picture is None else as_bgr(picture)
 
@@ -137,7 +136,6 @@ class History:
 
 
 def as_bgr(picture: Image | YuvPicture) -> Image:
-    """Its pixels."""
     return picture.bgr() if isinstance(picture, YuvPicture) else picture
 
 

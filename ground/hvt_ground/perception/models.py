@@ -151,7 +151,6 @@ class Models:
 
     @property
     def loading(self) -> bool:
-        """Whether they are not open yet."""
         return self._opened.cancelled() or not self._opened.done()
 
     @property

@@ -52,7 +52,6 @@ class SessionPerception:
         self._next_id = FIRST_TRACK_ID
 
     def pipeline(self, emit: Emit) -> Pipeline:
-        """Make the pipeline; waits for the models."""
         config, models, info = self._config, self._models, self._info
         detector, reader = self._taken()
         names, edge_classes = unified_names(detector.class_names, info.class_names)

@@ -79,7 +79,6 @@ class _Worker:
         self._error: BaseException | None = None
 
     def raise_error(self) -> None:
-        """Raise the error that ended the thread."""
         if self._error is not None:
             error, self._error = self._error, None
             raise error
@@ -148,13 +147,11 @@ class RealtimeWorker(_Worker):
 
     @property
     def idle(self) -> bool:
-        """Nothing waits, and nothing is in hand."""
         # In the order that things go: from what waits into the hand, from there to the detector.
         return not (self._has_news() or self._jobs or self._last_jobs or self._in_hand or self._searching)
 
     @property
     def stills_queued(self) -> int:
-        """Stills that are not read yet."""
         return len(self._stills)
 
     @property
@@ -321,7 +318,6 @@ class LockstepWorker(_Worker):
 
     @property
     def idle(self) -> bool:
-        """Nothing waits, and nothing is in hand."""
         return all(future.done() for future in self._pending)
 
     def picture(self, picture: DecodedFrame) -> None:

@@ -65,7 +65,6 @@ class FileAccount:
         self._stills: Newest[int, None] = Newest(_MOST_REMEMBERED)
 
     def note(self, event: Event) -> None:
-        """Count an event."""
         match event:
             case Overlay():
                 rows = zip(event.track_ids.tolist(), event.classes, event.doubted.tolist(), strict=True)
@@ -86,7 +85,6 @@ class FileAccount:
         self.end_ns = at_ns if self.end_ns is None else max(self.end_ns, at_ns)
 
     def track(self, track_id: int, name: str) -> None:
-        """A track is shown as of that class."""
         if self._tracks.put((track_id, name), None):
             self.classes[name] = self.classes.get(name, 0) + 1
 
@@ -129,7 +127,6 @@ class Recorded(ABC):
 
     @cached_property
     def trail(self) -> PoseTrail:
-        """All poses."""
         trail = PoseTrail(most=len(self.poses))
         for one in self.poses:
             trail.add(one.pose)

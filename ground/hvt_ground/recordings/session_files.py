@@ -75,7 +75,6 @@ class SessionFiles(SinkWriter[Event]):
         self._opened(self._recorder.file)
 
     def log(self, item: Event) -> None:
-        """Record an event in the file of its time."""
         if isinstance(item, FrameEvent):
             self._go_on(item)
             item, file = self._placed(item)
@@ -87,7 +86,6 @@ class SessionFiles(SinkWriter[Event]):
                 self._report(file)
 
     def skipped(self, count: int) -> None:
-        """See `Recorder`."""
         self._recorder.skipped(count)
 
     def close(self, hurry: threading.Event | None = None) -> None:

@@ -234,7 +234,6 @@ class GroundState:
     """Models, recordings and other sinks."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
         found = asdict(self)
         for one, made in zip(self.edges, found["edges"], strict=True):
             if one.session is not None and one.session.edge_frames is not None:
@@ -266,7 +265,6 @@ class StateMaker:
         """By edge: session, frames that the link did not carry, and when that last rose."""
 
     def make(self, edges: Iterable[tuple[str, EdgeSessions]]) -> GroundState:
-        """The state now."""
         now_ns = self._clock()
         made = tuple(self._edge(edge, sessions, now_ns) for edge, sessions in edges)
         known = {one.edge for one in made}

@@ -140,7 +140,6 @@ class EdgePort:
         self._errors.append(error)
 
     def raise_error(self) -> None:
-        """Raise the error of a callback, once."""
         if self._errors:
             raise self._errors.popleft()
 
@@ -202,7 +201,6 @@ class EdgePort:
             _log.warning("%s", control_unanswered(self.edge))
 
     def report(self, feedback: Feedback) -> None:
-        """Publish a receiver report."""
         try:
             with self._sending:
                 if self._closed:

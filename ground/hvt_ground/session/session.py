@@ -376,7 +376,6 @@ class GroundSession:
             self.report()
 
     def report(self) -> None:
-        """Report to the edge now."""
         if self._reports is not None:
             self._reports.send(self._feedback)
 

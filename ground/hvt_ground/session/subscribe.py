@@ -128,7 +128,6 @@ class GroundLink:
             return edge in self._ports or edge in self._alive
 
     def put(self, item: Received) -> None:
-        """Take a message from Zenoh's callback."""
         parsed = self._parsed(item.key)
         port = None if parsed is None else self._port(parsed[0])
         if port is not None and parsed is not None:

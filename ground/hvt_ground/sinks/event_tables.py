@@ -62,7 +62,6 @@ class _EventTable(SinkWriter[Event]):
         self._file.log(text.getvalue())
 
     def close(self, hurry: threading.Event | None = None) -> None:
-        """Close the table."""
         self._file.close(hurry)
 
 
@@ -73,7 +72,6 @@ class TrackTable(_EventTable):
         super().__init__(path, TRACK_COLUMNS)
 
     def log(self, item: Event) -> None:
-        """Append the tracks of an overlay."""
         if isinstance(item, Overlay) and len(item.track_ids):
             self._append(*track_rows(item))
 
@@ -200,7 +198,6 @@ class SessionTiming:
                     self._write(self._unread.pop(next(iter(self._unread))), handled_ns=0)
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Write the stills that were never read."""
         with self._lock:
             for still in self._unread.values():
                 self._write(still, handled_ns=0)

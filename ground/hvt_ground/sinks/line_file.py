@@ -63,7 +63,6 @@ class LineFile(SinkWriter[str]):
             raise
 
     def log(self, item: str) -> None:
-        """Append lines."""
         data = item.encode()
         try:
             check_there(self._file, self.path)
@@ -76,7 +75,6 @@ class LineFile(SinkWriter[str]):
         self._size_bytes += len(item.encode())
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
-        """Close the file."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1

@@ -42,7 +42,6 @@ class SinkWriter(Generic[T]):
     """Without one it can show nothing of what came last, and somebody looks: one is asked for, once."""
 
     def log(self, item: T) -> None:
-        """Write an item, or pass it by."""
         raise NotImplementedError
 
     def skipped(self, count: int) -> None:

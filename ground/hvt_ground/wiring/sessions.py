@@ -169,7 +169,6 @@ class SessionFactory:
             self._timing = outputs.open("timing table", partial(self._opened, timing_table, names))
 
     def open_session(self, info: Info, reports: ReceiverReports) -> GroundSession:
-        """A session with its perception and its sinks."""
         config, models, edge = self._config, self._models, info.edge
         stamp = time.strftime("%Y%m%d-%H%M%S")
         settings = self._recorder_settings(info)

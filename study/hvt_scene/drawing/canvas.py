@@ -75,17 +75,14 @@ class Canvas:
         cv2.polylines(self.bgr, [fixed], True, colour, 3, cv2.LINE_8, _SHIFT)
 
     def poly(self, points: Sequence[Sequence[float]] | Points, colour: Colour) -> None:
-        """Fill a polygon on what is there already."""
         cv2.fillPoly(self.bgr, [self._fixed(points)], colour, cv2.LINE_AA, _SHIFT)
 
     def rect(self, x0: float, y0: float, x1: float, y1: float, *, colour: Colour) -> None:
-        """Fill an upright rectangle."""
         self.poly([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], colour)
 
     def line(
         self, start: Sequence[float], end: Sequence[float], *, colour: Colour, wide_m: float = 0.04
     ) -> None:
-        """Draw a straight line."""
         ends = self._fixed([start, end])
         thick = max(1, round(wide_m / SPRITE_M_PER_PX))
         cv2.line(self.bgr, ends[0].tolist(), ends[1].tolist(), colour, thick, cv2.LINE_AA, _SHIFT)

@@ -119,7 +119,6 @@ def draw_code(
 
 
 def paint_code(sprite: Sprite, code: RoofCode) -> Sprite:
-    """The same body with the code's panel on it."""
     bgra = sprite.bgra.copy()
     high, wide = bgra.shape[:2]
     corners = code.panel_m / SPRITE_M_PER_PX + np.array([wide / 2, high / 2])

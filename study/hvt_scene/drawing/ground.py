@@ -86,7 +86,6 @@ class _Painter:
         self._middle = _enlarged(middle, (high, wide), gain=1.0)
 
     def surface(self, kind: str, rect: Rect) -> None:
-        """Cover a rectangle with a material."""
         appearance = self._appearance
         materials: dict[
             str, tuple[Bgr, float, float, float]
@@ -135,27 +134,22 @@ class _Painter:
             self.stroke((rect.x0, y), (rect.x1, y), wide_m=0.05, colour=colour)
 
     def frame(self, rect: Rect, *, wide_m: float, colour: Bgr) -> None:
-        """Draw a rectangle's edge."""
         for start, end in zip(rect.corners, rect.corners[1:] + rect.corners[:1], strict=True):
             self.stroke(start, end, wide_m=wide_m, colour=colour)
 
     def stroke(self, start: Sequence[float], end: Sequence[float], *, wide_m: float, colour: Bgr) -> None:
-        """Draw a horizontal or vertical line."""
         half = wide_m / 2
         x0, x1 = min(start[0], end[0]) - half, max(start[0], end[0]) + half
         y0, y1 = min(start[1], end[1]) - half, max(start[1], end[1]) + half
         self.block(Rect(x0, y0, x1, y1), colour=colour)
 
     def block(self, rect: Rect, *, colour: Bgr) -> None:
-        """Fill a rectangle."""
         self.poly(rect.corners, colour=colour)
 
     def poly(self, points: Sequence[Sequence[float]], *, colour: Bgr) -> None:
-        """Fill a polygon."""
         cv2.fillPoly(self.bgr, [self._fixed(points)], colour, cv2.LINE_AA, _SHIFT)
 
     def disc(self, x: float, y: float, *, radius: float, colour: Bgr) -> None:
-        """Fill a circle."""
         centre = self._fixed([(x, y)])[0]
         cv2.circle(
             self.bgr, centre.tolist(), round(radius / self._m_per_px * 16), colour, -1, cv2.LINE_AA, _SHIFT
@@ -185,7 +179,6 @@ class _Painter:
             )
 
     def canopy(self, tree: Tree, picture: npt.NDArray[np.uint8]) -> None:
-        """Lay a tree's crown over the ground."""
         side = max(3, round(CANOPY_SPAN * tree.r / self._m_per_px))
         small = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
         left, top = (round(at / self._m_per_px - side / 2) for at in (tree.x, tree.y))
@@ -195,7 +188,6 @@ class _Painter:
         ground[:] = (ground * (1 - inside[..., 3:] / 255.0) + inside[..., :3]).astype(np.uint8)
 
     def finish(self) -> Ground:
-        """The painted ground, exposed."""
         if self._appearance.exposure != 1.0:
             self.bgr[:] = cv2.convertScaleAbs(self.bgr, alpha=self._appearance.exposure)
         step = 0.5

@@ -60,7 +60,6 @@ class CachedDetector(OnnxDetector):
         """What the answers out of memory would have cost, less what it took to remember."""
 
     def detect(self, image_bgr: Image) -> Detections:
-        """The network's answer for these pixels."""
         began_s = time.process_time()
         path = self._folder / self._key(image_bgr)
         known = _read(path)

@@ -170,7 +170,6 @@ class ResultCache:
         return found
 
     def put(self, key: str, result: Mapping[str, Any]) -> None:
-        """Keep a result."""
         write_whole(self._path(key), json.dumps(result, separators=(",", ":")).encode())
 
     def known(self, key: str, make: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
@@ -182,7 +181,6 @@ class ResultCache:
         return found
 
     def count(self) -> int:
-        """How many there are."""
         return sum(1 for _ in self._folder.glob("*/*.json"))
 
     def _path(self, key: str) -> Path:

@@ -125,7 +125,6 @@ def option(parser: argparse.ArgumentParser, name: str, **own: Any) -> None:
 
 
 def add_pool_arguments(parser: argparse.ArgumentParser) -> None:
-    """Where it is done."""
     option(parser, "--jobs")
     option(parser, "--dask")
 
@@ -184,7 +183,6 @@ def check_whole(name: str, value: int, low: int, high: int | None = None) -> int
 
 
 def names_of(text: str) -> tuple[str, ...]:
-    """Names between commas."""
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 

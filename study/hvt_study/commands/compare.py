@@ -81,7 +81,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly, print the table, write it and the plot."""
     check_means(arguments)
     plan = _plan(arguments)
     folder: Path = arguments.out
@@ -265,7 +264,6 @@ def _against(chosen: str, value: float, others: Mapping[str, float]) -> str:
 
 
 def _named(row: CompareRow) -> str:
-    """The method, and what of it was chosen."""
     method, fps = str(row["method"]), row["set_fps"]
     size = f"{row['base_width']}x{row['base_height']} and " if method == "M0-best" else ""
     return method if fps is None else f"{method} at {size}{fps:g} frames a second"

@@ -25,7 +25,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print a line a flight, and write the picture."""
     installed = find_spec("rapidocr") is not None
     compared = compare_flown(arguments.folder, arguments.edges, seed=arguments.seed, with_reader=installed)
     write_picture(arguments.picture, compared.panels(), compared.pairs())

@@ -284,7 +284,6 @@ def _print_calibration(sets: Mapping[str, Sequence[Judged]], classes: Sequence[s
 
 
 def print_score(score: dict[str, Any]) -> None:
-    """The table of one score on standard output."""
     heads = ("", "labels", "boxes", "precision", "recall", "F1", "AP50")
     rows = (
         (

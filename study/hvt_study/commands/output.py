@@ -138,7 +138,6 @@ class RunProgress:
                 self.note(f"{self._what}: {done} of {of} in {gone}" + f", {more}" * bool(more))
 
     def note(self, text: str) -> None:
-        """Say something that stays."""
         self._console.print(text, markup=False, soft_wrap=True)
 
     def __enter__(self) -> Self:

@@ -74,7 +74,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def print_result(result: ReadResult) -> None:
-    """One line a method and rate."""
     print_columns(
         f"{len(result.rows[0].codes())} codes, read by {result.reader}",
         _HEADS,

@@ -28,7 +28,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write them; say where."""
     out: Path | None = getattr(arguments, "out", None)
     if out is not None:
         join_studies(arguments.folders, out)

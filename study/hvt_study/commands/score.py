@@ -27,7 +27,6 @@ _ROWS: tuple[tuple[str, Callable[[ClassScore], float]], ...] = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Tables, truth, and what its numbers mean."""
     parser.add_argument(
         "tracks", nargs="+", metavar="[NAME=]TRACKS.csv", help="tables of tracks; NAME heads the column"
     )
@@ -38,7 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print one column a table of tracks."""
     width, height = parse_size(arguments.size, name="--size")
     names = [name.strip() for name in arguments.classes.split(",")]
     if not all(names):

@@ -51,7 +51,6 @@ class SweepRow:
 
 
 def sweep(frames: Mapping[int, RawDetections], *, frame_area_px: float) -> list[SweepRow]:
-    """Apply every selector to every frame."""
     raw = sum(len(found.confidences) for found in frames.values())
     with_raw = sum(1 for found in frames.values() if found.confidences)
     rows = []
@@ -142,7 +141,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the table; write it where ``--out`` says."""
     if arguments.source.suffix.lower() == ".csv":
         frames, area = _from_csv(arguments)
     else:

@@ -189,7 +189,6 @@ _HIGHEST_SEED = 2**32 - 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Those of ``run``, and what to search."""
     add_plan_arguments(parser, methods=False)
     add_pool_arguments(parser)
     parser.add_argument("--method", required=True, help="the one to tune, such as M5")
@@ -203,7 +202,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Search, print, write tune.json."""
     check_whole("--trials", arguments.trials, 1, _MOST_TRIALS)
     check_whole("--seed", arguments.seed, 0, _HIGHEST_SEED)
     parameters = tunable(arguments.method, names_of(arguments.parameters))

@@ -122,7 +122,6 @@ class TableLabels:
     """Number in the files of source frame 0."""
 
     def __call__(self, index: int) -> FrameLabels:
-        """Of one source frame."""
         return self.table().at(self.first_frame + index)
 
     def table(self) -> LabelTable:

@@ -20,12 +20,10 @@ NO_ID = -1
 
 
 def no_boxes() -> Boxes:
-    """(0, 4) float32."""
     return np.empty((0, 4), np.float32)
 
 
 def no_ids() -> npt.NDArray[np.int64]:
-    """(0,) int64."""
     return np.empty(0, np.int64)
 
 
@@ -77,7 +75,6 @@ class LabelDoubts:
     _first_resized: str = ""
 
     def leave_out(self, sentence: str) -> None:
-        """A row that cannot be, named in a sentence."""
         self._first = self._first or sentence
         self._left_out += 1
 
@@ -122,7 +119,6 @@ class LabelDoubts:
         return FrameLabels.plain(found[~passed], judged, ignored=found[passed])
 
     def sentences(self) -> list[str]:
-        """What there is to say."""
         said = []
         if self._clipped:
             px, where = self._worst

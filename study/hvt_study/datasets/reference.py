@@ -38,11 +38,9 @@ class ReferenceLabels:
     """All that the model can say, sorted."""
 
     def __call__(self, index: int) -> FrameLabels:
-        """Of a source frame that a frame shows."""
         return self.frames[index]
 
     def pack(self) -> dict[str, Any]:
-        """As JSON holds it, without loss."""
         frames = {
             str(index): [one.boxes_xyxy_px.tolist(), list(one.class_names)]
             for index, one in self.frames.items()
@@ -51,7 +49,6 @@ class ReferenceLabels:
 
     @classmethod
     def unpack(cls, packed: Mapping[str, Any]) -> ReferenceLabels:
-        """What `pack` gave."""
         frames = {
             int(index): FrameLabels.plain(boxes, names) for index, (boxes, names) in packed["frames"].items()
         }

@@ -49,7 +49,6 @@ class Clip:
     """Of the demo's scene, or of the way of the camera over a picture."""
 
     def images(self) -> Generator[Image, None, None]:
-        """Every picture, in order."""
         if self.pixels is None:
             yield from self._read()
             return

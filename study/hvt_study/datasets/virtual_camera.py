@@ -165,7 +165,6 @@ class VirtualCamera:
 
     @property
     def frame_count(self) -> int:
-        """Of the whole clip."""
         return math.ceil(_DURATION_S * Fraction(self.fps).limit_denominator(1001))
 
     def images(self) -> Iterator[Image]:

@@ -122,7 +122,6 @@ class Legible:
 
     @property
     def every(self) -> frozenset[int]:
-        """Either way."""
         return self.video | self.stills.keys()
 
 

@@ -89,7 +89,6 @@ class FlightReport:
 
     @property
     def duration_s(self) -> float:
-        """Media time."""
         return len(self.lists) / NOMINAL_FPS
 
     def bps(self, *rows: str) -> int:
@@ -224,7 +223,6 @@ class Flight:
         return sum(self.outlet.line_bytes.values())
 
     def report(self, *, saved_cpu_s: float) -> FlightReport:
-        """After `run`."""
         frames, outlet = self.plan.clip.frame_count, self.outlet
         return FlightReport(
             lists=tuple(self.ground.lists[frame_index] for frame_index in range(frames)),

@@ -50,7 +50,6 @@ class InlineExecutor(ThreadPoolExecutor):
         super().__init__(1)
 
     def submit(self, fn: Callable[..., _T], /, *args: Any, **kwargs: Any) -> Future[_T]:
-        """Do it now."""
         future: Future[_T] = Future()
         future.set_result(fn(*args, **kwargs))
         return future
@@ -71,7 +70,6 @@ class SharedModels(Models):
         self.detector_thread = DetectorThread()
 
     def take(self) -> tuple[FailingDetector, Classifier | None]:
-        """The same for every session."""
         return self._shared
 
 
@@ -97,7 +95,6 @@ class _Worker(LockstepWorker):
         self._step(tracks, capture_ns)  # the simulated link leaves no doubt about the order
 
     def read_gathered(self) -> None:
-        """Read what has come since the last time."""
         gathered, self._gathered = self._gathered, []
         if gathered:
             self._read(gathered)

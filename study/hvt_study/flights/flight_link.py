@@ -73,7 +73,6 @@ class SerialLink(Generic[_T]):
     """Takes messages of type ``_T`` with the time at which they are handed over; gives them back as they arrive."""
 
     def __init__(self, *, rate_bps: float) -> None:
-        """``rate_bps``: line bits a second, above 0."""
         if not rate_bps > 0:
             raise ValueError(f"rate_bps is {rate_bps}, must be above 0")
         self._byte_ns = 8 * SECOND_NS / rate_bps
@@ -160,7 +159,6 @@ class FlightInbox(FeedbackInbox):
         return due
 
     def take_up_to(self, sequence: int) -> list[StillResult]:  # noqa: ARG002 - time decides here
-        """The same."""
         return self.take()
 
     def take_detected(self, *, up_to: int | None = None) -> Detected | None:  # noqa: ARG002 - time decides here
@@ -171,11 +169,9 @@ class FlightInbox(FeedbackInbox):
         return newest
 
     def wait_for(self, **_: Any) -> bool:
-        """At once."""
         return True
 
     def wait_for_end(self, **_: Any) -> bool:
-        """At once."""
         return True
 
 
@@ -202,15 +198,12 @@ class FlightOutlet:
         self.last_frame = -1
 
     def has_ground(self) -> bool:
-        """Always."""
         return True
 
     def has_subscriber(self, channel: Channel) -> bool:  # noqa: ARG002
-        """Of every channel."""
         return True
 
     def listen(self, answers: Answers) -> None:
-        """The edge is ready."""
         self._on_listen(answers.info(START_NS))
 
     def put(

@@ -43,7 +43,6 @@ class Watch:
         pipeline._parts = replace(parts, detector=self, refiner=cast("Refiner", self))  # noqa: SLF001
 
     def detect(self, image_bgr: Image) -> Detections | None:
-        """As the detector does."""
         self._found = self._detector.detect(image_bgr)
         return self._found
 
@@ -53,12 +52,10 @@ class Watch:
         return found
 
     def shown(self, tracks: Tracks, **about: Any) -> Overlay:
-        """As the refiner does."""
         self.listed = tracks
         return self._refiner.shown(tracks, **about)
 
     def preview(self, tracks: Tracks, **about: Any) -> Overlay:
-        """As the refiner does."""
         self.listed = tracks
         return self._refiner.preview(tracks, **about)
 
@@ -97,7 +94,6 @@ class FlightRecord:
     # What comes
 
     def still(self, header: RoiHeader, arrival: Arrival[Received]) -> None:
-        """A still has arrived."""
         self._headers[header.sequence] = header
         self._stills.append(
             StillArrival(
@@ -155,7 +151,6 @@ class FlightRecord:
         )
 
     def detected(self, found: Detections, class_names: tuple[str, ...]) -> FrameView:
-        """Plain detections."""
         names = tuple(class_names[kind] for kind in found.class_ids.tolist())
         return FrameView.plain(self._inside(found.boxes_xyxy_px), names, found.confidences)
 

@@ -114,7 +114,6 @@ def spec_of(
     codec: str,
     target: Target | None = None,
 ) -> RunSpec:
-    """One run of the plan."""
     return RunSpec(
         dataset=dataset,
         sequence=sequence,

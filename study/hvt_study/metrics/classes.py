@@ -189,12 +189,10 @@ class FirstCorrect:
 
     @property
     def tracks(self) -> int:
-        """True tracks."""
         return len(self.waits_s)
 
     @property
     def never(self) -> int:
-        """How many of them were censored."""
         return int(self.censored.sum())
 
     def quantile_s(self, share: float) -> float:
@@ -213,12 +211,10 @@ class FirstCorrect:
 
     @property
     def median_s(self) -> float:
-        """See `quantile_s`."""
         return self.quantile_s(0.5)
 
     @property
     def p90_s(self) -> float:
-        """See `quantile_s`."""
         return self.quantile_s(0.9)
 
 

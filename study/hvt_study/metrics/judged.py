@@ -30,7 +30,6 @@ Rows: TypeAlias = npt.NDArray[np.bool_] | npt.NDArray[np.intp]
 
 
 def no_numbers() -> npt.NDArray[np.float32]:
-    """(0,) float32."""
     return np.empty(0, np.float32)
 
 
@@ -66,7 +65,6 @@ class FrameView:
         return len(self.ids)
 
     def rows(self, chosen: Rows) -> FrameView:
-        """Only these rows."""
         return FrameView(
             self.boxes_xyxy_px[chosen],
             self.ids[chosen],
@@ -77,7 +75,6 @@ class FrameView:
 
 
 def rows_of(names: Sequence[str], chosen: Rows) -> tuple[str, ...]:
-    """The names of some rows."""
     indices = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
     return tuple(names[index] for index in indices.tolist())
 
@@ -112,7 +109,6 @@ class Judged:
 
     @property
     def areas_px2(self) -> npt.NDArray[np.float64]:
-        """(N,) source pixels squared."""
         boxes = self.boxes_xyxy_px
         return np.asarray(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None).prod(axis=1))
 

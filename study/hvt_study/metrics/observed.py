@@ -135,12 +135,10 @@ def detected_frames(lists: Sequence[ObservedFrame], labels: Iterable[FrameLabels
 
 
 def arrivals(lists: Iterable[ObservedFrame]) -> list[StillArrival]:
-    """All stills, in order of arrival."""
     return [still for one in lists for still in one.stills]
 
 
 def refined_objects(lists: Iterable[ObservedFrame]) -> list[RefinedObject]:
-    """All objects that stills named, in order."""
     return [done for one in lists for done in one.refined]
 
 

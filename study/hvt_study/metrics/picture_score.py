@@ -122,7 +122,6 @@ def as_one(name: str) -> str:
 
 
 def above(frames: Sequence[LabelledFrame], confidence: float) -> list[LabelledFrame]:
-    """Only boxes at or above a confidence."""
     return [(labels, view.rows(view.confidences >= confidence)) for labels, view in frames]
 
 

@@ -101,7 +101,6 @@ class DdsGround:
         self._tracker = ByteTracker(tracking, fps=NOMINAL_FPS)
 
     def advance(self, now_ns: int) -> None:
-        """Take in what has arrived by now."""
         for arrival in self.line.arrived(now_ns):
             self._at_ns = arrival.arrival_ns
             for unit in arrival.message.units:
@@ -202,7 +201,6 @@ class DdsGround:
         return inside_frame(self.view.to_source(boxes_base_px), self.view.source_size)
 
     def _full(self, picture: Image) -> Image:
-        """Base size, whatever the scale of the first pass."""
         size = self.view.base_size
         if (picture.shape[1], picture.shape[0]) == size:
             return picture

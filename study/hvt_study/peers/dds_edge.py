@@ -121,7 +121,6 @@ class DdsEdge:
         return not self._requested and not self._ready
 
     def first_pass(self, frame: Frame) -> None:
-        """Code and send a frame as it comes."""
         began_s = time.process_time()
         self._store(frame)
         small = replace(frame, base_bgr=self._shrunk(frame))
@@ -134,7 +133,6 @@ class DdsEdge:
         self.cpu_s += time.process_time() - began_s
 
     def on_request(self, payload: bytes) -> None:
-        """What the ground asks for."""
         grid = block_grid(self._size, align_px=self._settings.align_px)
         request = RegionRequest.parse(payload, grid=grid)
         frames = self._segments[request.first_frame]

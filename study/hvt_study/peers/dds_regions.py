@@ -83,7 +83,6 @@ class DdsSettings:
 
     @property
     def segment_frames(self) -> int:
-        """At least one."""
         return max(1, round(self.segment_s * NOMINAL_FPS))
 
     @property
@@ -196,7 +195,6 @@ class RegionRequest:
     """Of every coded frame of the segment in order, 1 to 255; empty masks where nothing is asked."""
 
     def pack(self) -> bytes:
-        """The payload."""
         stack = np.stack(self.frames)
         stack[1:] ^= np.stack(self.frames)[:-1]
         return _HEAD.pack(self.first_frame, len(stack)) + zlib.compress(np.packbits(stack).tobytes(), _LEVEL)

@@ -76,7 +76,6 @@ class ReadRow:
     scenes: tuple[SceneReading, ...]
 
     def codes(self) -> list[Code]:
-        """All codes of all scenes, numbered anew."""
         return [code for code, _ in self._pooled("base")]
 
     def score(self, channel: Channel, *, heights_px: tuple[float, float] = (0.0, 1e6)) -> ChannelScore:

@@ -72,7 +72,6 @@ class CodeObserver:
             self._take(still, at_ns=at_ns)
 
     def stills(self, stills: Sequence[ReceivedStill], *, at_ns: int) -> None:
-        """Read them."""
         for still in stills:
             self._take(still, at_ns=at_ns)
 

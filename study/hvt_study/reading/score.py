@@ -126,7 +126,6 @@ class Evidence:
 
     @property
     def right(self) -> bool:
-        """Whether it was read right."""
         return math.isfinite(self.read_s)
 
     def add(self, reading: Reading, *, code: str, at_s: float) -> None:

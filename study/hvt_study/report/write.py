@@ -32,12 +32,10 @@ _REFERENCE = re.compile(r'(?:xlink:)?href="#([^"]+)"|url\(#([^)]+)\)')
 
 
 def html_page(report: Report) -> str:
-    """The whole page."""
     return _rendered("report.html.j2", report)
 
 
 def markdown_page(report: Report) -> str:
-    """The whole page."""
     return _rendered("report.md.j2", report)
 
 

@@ -111,7 +111,6 @@ def _sequence(dataset: str, name: str) -> tuple[Sequence, str]:
 
 
 def _literal(name: str) -> str:
-    """A pattern that this name alone fits."""
     return "".join(f"[{sign}]" if sign in "*?[" else sign for sign in name)
 
 

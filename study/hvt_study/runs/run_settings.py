@@ -81,7 +81,6 @@ def flight_plan(spec: RunSpec, context: RunContext, *, budget_bps: int, shape: V
 
 
 def flown(spec: RunSpec, context: RunContext, *, budget_bps: int, shape: VideoShape) -> FlightReport:
-    """Fly it."""
     if METHODS[spec.method].kind is Kind.PEER:
         return fly_dds(
             context.sequence.clip,

@@ -48,7 +48,6 @@ def first_budget(total_bps: float) -> int:
 
 
 def within(total_bps: float, target_bps: float) -> bool:
-    """Whether a total counts as equal."""
     return abs(total_bps / target_bps - 1) <= MATCH_TOLERANCE
 
 

@@ -43,7 +43,6 @@ class Targets:
     """(M,) int64; -1 is ignored; below it the set does not tell which of `AMONG` it is."""
 
     def to(self, device: torch.device) -> Targets:
-        """The same there."""
         return Targets(
             *(rows.to(device, non_blocking=True) for rows in (self.pictures, self.boxes_px, self.class_ids))
         )
@@ -228,7 +227,6 @@ class _Views(IterableDataset[View]):
 
 
 def batch_of(views: list[View]) -> Batch:
-    """Put views of one size together."""
     images = np.stack([view.image_bgr.transpose(2, 0, 1) for view in views])
     pictures = np.concatenate([np.full(len(view.boxes_px), i) for i, view in enumerate(views)])
     boxes = np.concatenate([view.boxes_px for view in views]).astype(np.float32)
@@ -240,7 +238,6 @@ def batch_of(views: list[View]) -> Batch:
 
 
 def loss_of(net: nn.Module, batch: Batch) -> Loss:
-    """The loss of a batch."""
     device = next(net.parameters()).device
     images = batch.images.to(device, non_blocking=True).float().contiguous(memory_format=torch.channels_last)
     maps = net(images)

@@ -141,7 +141,6 @@ def _pickup(rng: _Rng) -> Solid:
 
 
 def _load(part: Part, bed: tuple[tuple[float, float], tuple[float, float]], z: float, rng: _Rng) -> None:
-    """Crates, boards or earth on a bed."""
     (x0, x1), (y0, y1) = bed
     kind = int(rng.integers(3))
     if kind == 0:

@@ -87,7 +87,6 @@ def _spot(rng: _Rng, half: float) -> tuple[float, float]:
 
 
 def _stall_solid(rng: _Rng) -> Solid:
-    """What fits a stall."""
     name = str(rng.choice(["car", "van", "truck", "motor", "other"], p=[0.63, 0.15, 0.16, 0.04, 0.02]))
     for _ in range(6):
         solid = make_solid(name, rng)

@@ -38,7 +38,6 @@ class Part:
     def face(
         self, points: Points | list[tuple[float, float, float]], colour: Colour, *, matt: bool = False
     ) -> None:
-        """Add one face."""
         self.points_m.append(np.asarray(points, np.float64))
         self.colours.append(colour)
         self.matt.append(matt)
@@ -200,7 +199,6 @@ def add_bonnet_lines(part: Part, rng: _Rng, *, front: float, length: float, z: f
 
 
 def add_mirrors(part: Part, front: float, width: float, *, z: float, paint: Colour) -> None:
-    """The two outside mirrors."""
     for side in (-1, 1):
         a, b = sorted((side * width * 0.47, side * (width / 2 + 0.16)))
         part.decal((front - 0.35, front - 0.18), (a, b), z + 0.1, paint)

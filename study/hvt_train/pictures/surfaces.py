@@ -40,7 +40,6 @@ class Surface:
     def line(
         self, start: tuple[float, float], end: tuple[float, float], *, wide_m: float, paint: str
     ) -> None:
-        """Draw a line on the ground."""
         self.lines.append((np.array([start, end]), wide_m, paint))
 
     def road(self, middle: float, half_width: float, *, along_x: bool, lanes: int) -> None:
@@ -111,7 +110,6 @@ def _patches(
 
 
 def _crack(image: Image, rng: _Rng, *, px_per_m: float) -> None:
-    """A thin dark line that wanders."""
     steps = int(rng.integers(8, 60))
     heading = rng.uniform(0, 6.28) + np.cumsum(rng.normal(0, 0.35, steps))
     stride = px_per_m * rng.uniform(0.2, 0.6)

@@ -85,7 +85,6 @@ class ViewSource:
         self._settings = settings
 
     def next(self) -> View:
-        """The next view."""
         side = self._settings.side
         if self._rng.random() >= self._settings.tiled:
             return self._view(side, 1.0)
@@ -177,7 +176,6 @@ class ViewSource:
 
 
 def read_picture(path: Path) -> Picture:
-    """Read one file of the pool."""
     with np.load(path) as file:
         return Picture(file["image"], file["boxes"], file["classes"], file["visible"])
 

@@ -151,7 +151,6 @@ class PackedMessage:
         return len(self._body()) + _CRC_BYTES
 
     def pack(self, payload: bytes = b"") -> bytes:
-        """As `Message.pack`."""
         body, message = self._body(), self.message
         if len(body) + _CRC_BYTES > message.MAX_BYTES or len(payload) > message.MAX_PAYLOAD:
             raise ValueError(

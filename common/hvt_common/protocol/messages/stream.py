@@ -126,7 +126,6 @@ class StillWire(Message):
 
     @classmethod
     def of(cls, header: RoiHeader) -> StillWire:
-        """What is sent of a header."""
         x1, y1, x2, y2 = header.crop_source_px
         left, top, right, bottom = (round(_PER_PX * side) for side in header.box_source_px)
         parameters = dict(header.parameters)

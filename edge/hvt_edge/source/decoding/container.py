@@ -250,7 +250,6 @@ class _Reading:
             yield from frames
 
     def faults(self) -> Iterator[str]:
-        """The faults, for the end of the flight."""
         if self._damaged:
             yield f"has {self._damaged} damaged packets, which were skipped"
         if self._shown_damaged:

@@ -34,7 +34,6 @@ class Stamps:
     """A step of more is a jump."""
 
     def timeline(self, stream: Any) -> Timeline:
-        """For one reading of the stream."""
         quantum_s = stream.time_base if self.usable else None
         return Timeline(self.period_s, quantum_s=quantum_s, long_s=self.long_s)
 

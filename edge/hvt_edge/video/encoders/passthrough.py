@@ -32,7 +32,6 @@ class Passthrough:
     mean_qp = math.nan
 
     def encode(self, frame: Frame, *, keyframe: bool = False, regions: Sequence[Region] = ()) -> AccessUnit:
-        """The unit that came with the frame."""
         del keyframe
         assert not regions, "config.check() refuses regions with another encoder than x265"
         return unit_of(frame)

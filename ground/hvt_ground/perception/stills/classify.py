@@ -77,7 +77,6 @@ class NoReader:
     class_names: tuple[str, ...] = ("object",)
 
     def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:  # noqa: ARG002
-        """Nothing."""
         return _silent(stills)
 
 
@@ -92,7 +91,6 @@ class CropReader:
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """The classifier's."""
         return self._classifier.class_names
 
     def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:  # noqa: ARG002
@@ -124,7 +122,6 @@ class Redetection:
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """The detector's."""
         return self._detector.class_names
 
     def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:

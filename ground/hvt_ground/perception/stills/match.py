@@ -83,7 +83,6 @@ class StillSeen:
 
     @property
     def key(self) -> tuple[int, int]:
-        """Sequence and part."""
         return self.event.still_sequence, self.part
 
 

@@ -131,12 +131,10 @@ class LiveRecording:
         self._recording.send_chunks(chunks)
 
     def write(self, chunks: Sequence[Chunk]) -> None:
-        """Send."""
         self._check()
         self._recording.send_chunks(chunks)
 
     def show(self, screen: rrb.Blueprint) -> None:
-        """Show another screen from now on."""
         send_blueprint(self._recording, self._id, screen)
 
     def compact(self, chunks: Sequence[Chunk]) -> None:

@@ -115,7 +115,6 @@ class OverlayEncoder:
 
     @property
     def screen(self) -> list[LayerUpdate]:
-        """All that is on the screen, whole."""
         return [LayerUpdate(layer, components) for layer, components in self._written.items()]
 
     def earn(self, received_bytes: int) -> None:

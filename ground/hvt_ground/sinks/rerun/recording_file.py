@@ -46,7 +46,6 @@ class RecordingFile:
         return self._output.size_bytes
 
     def count(self, frame_index: int, *, stored: bool) -> None:
-        """Count an access unit."""
         self.frames += 1
         if stored:
             return
@@ -56,7 +55,6 @@ class RecordingFile:
         self.samples += 1
 
     def write(self, rows: Sequence[TableRow | Chunk]) -> None:
-        """Append rows and static values."""
         chunks = [one if isinstance(one, Chunk) else self._add(one) for one in rows]
         try:
             if chunks:

@@ -26,7 +26,6 @@ class Conditions:
     refine: str = "fuse"
 
     def unusual(self) -> Iterator[str]:
-        """What is not as usual, in words."""
         if self.size != USUAL.size:
             yield f"base of {self.size[0]}x{self.size[1]}"
         if self.detect_every != USUAL.detect_every:
@@ -184,11 +183,9 @@ class Setting:
 
     @property
     def accounting(self) -> str:
-        """What rates are divided by."""
         return str(self.rows[0]["accounting"])
 
     def budget_bps(self, regime: str) -> int:
-        """B_tot of a regime."""
         return max(row["budget_bps"] or 0 for row in self.rows if row["regime"] == regime)
 
     def arms(self, regime: str) -> list[Arm]:
@@ -202,7 +199,6 @@ class Setting:
 
     @property
     def all_arms(self) -> list[Arm]:
-        """Those of every regime, in the order of tables."""
         return [arm for regime in self.regimes for arm in self.arms(regime)]
 
     @property
@@ -219,7 +215,6 @@ class Setting:
         return sorted({row["method"] for row in self.rows if row["matched_to"]}, key=_order)
 
     def runs(self, arm: Arm) -> BySequence:
-        """Those of an arm that count."""
         found = self._counted.get((arm.regime, arm.method, arm.still_codec, "", ""), {})
         return {name: rows[0] for name, rows in found.items()}
 
@@ -244,7 +239,6 @@ def counts(row: RunRow) -> bool:
 
 
 def is_video(method: str) -> bool:
-    """Whether a method spends all on video."""
     return method in METHODS and METHODS[method].kind is Kind.VIDEO
 
 

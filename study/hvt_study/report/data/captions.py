@@ -82,7 +82,6 @@ _NAMED = 4
 
 
 def under(setting: Setting) -> str:
-    """The end of a caption."""
     n = setting.sequences
     parts = [f"{n} sequence{'' if n == 1 else 's'}{_datasets(setting)}"]
     parts += [f"labels: {_LABELS.get(setting.labels, setting.labels)}", str(setting.models)]
@@ -101,7 +100,6 @@ def same_sequences(setting: Setting) -> str:
 
 
 def time_of(accounting: Accounting | str) -> str:
-    """What bytes are divided by."""
     return "length of the whole clip" if accounting == "pilot" else "processed span"
 
 

@@ -21,7 +21,6 @@ class Head:
 
 
 def words(*texts: str) -> tuple[Head, ...]:
-    """Heads of columns of words."""
     return tuple(Head(text, number=False) for text in texts)
 
 
@@ -36,7 +35,6 @@ class Cell:
 
 
 def cells(*contents: object) -> tuple[Cell, ...]:
-    """Plain cells of a row."""
     return tuple(Cell(str(one)) for one in contents)
 
 

@@ -31,7 +31,6 @@ class Pair:
 
     @property
     def names(self) -> list[str]:
-        """Sequences of which both sides count."""
         return sorted(self.runs.keys() & self.matched.keys())
 
     def gaps(self, column: str) -> dict[str, float]:

@@ -247,7 +247,6 @@ def enlarged(png: bytes, *, least_px: int) -> bytes:
 
 
 def png_of(image_bgr: Image) -> bytes:
-    """The picture as a file."""
     done, data = cv2.imencode(".png", image_bgr)
     assert done, "it has pixels"
     return data.tobytes()

@@ -18,7 +18,6 @@ _LEAST_PX = 360
 
 
 def crop_pictures(example: Example) -> Pictures:
-    """Source, base and still side by side."""
     return Pictures(
         caption=(
             f"Crop comparison, {example.title}: {_which(example)} (luma, still less base, both against the source). "
