@@ -92,11 +92,13 @@ def _path(rest: str, *, hidden: bool) -> str:
 
 
 def _is_usual(part: str) -> bool:
-    # Whether a part of a path has nothing but the words and short numbers of cameras: ``h264Preview_01_main``.
+    # Whether a part of a path has nothing but the words and short numbers of cameras: ``h264Preview_01_main``. Many
+    # digits with lone letters between may be a key in base 16.
     runs = re.findall(r"[A-Za-z]+|[0-9]+|.", part, re.DOTALL)
     numbers, usual = [one for one in runs if one.isdigit()], _STREAM_WORDS.split()
+    lone = sum(len(one) == 1 and one.isalpha() for one in runs)
     return (
-        sum(map(len, numbers)) <= _MOST_DIGITS
+        sum(map(len, numbers)) <= (_MOST_DIGITS if lone < 2 else _MOST_DIGITS_TOGETHER)
         and max(map(len, numbers), default=0) <= _MOST_DIGITS_TOGETHER
         and all(one in "._-" or one.isdigit() or one.lower() in usual for one in runs)
     )

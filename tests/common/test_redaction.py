@@ -7,7 +7,7 @@ import logging
 import sys
 
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from hvt_common.errors import UserError, exit_with_sentence
@@ -92,6 +92,8 @@ def test_nor_in_what_libraries_say_of_it(address, words):
         )
 
 
+@example("rtsp", "10.0.0.5", "/{}", "0000c00c")
+@example("rtsp", "10.0.0.5", "/cam_{}", "c0000c00")
 @given(
     st.sampled_from(["rtsp", "rtsps", "http", "https", "rtmp", "srt", "udp", "tcp", "rtp"]),
     HOSTS,

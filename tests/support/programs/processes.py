@@ -96,7 +96,8 @@ class Sessions(list[dict[str, Any]]):
 class Running:
     """One process; its output goes to files, so that it never waits for a reader.
 
-    ``within`` goes before its command, such as ``ip netns exec NAME``.
+    ``within`` goes before its command, such as ``ip netns exec NAME``. ``HVT_TEST_SLEEPS``, a share, has it sleep at
+    so many of its calls (`sleeping`).
     """
 
     def __init__(
@@ -105,7 +106,9 @@ class Running:
         self.name = name
         self._summary = folder / f"{name}.json"
         self._out, self._err = folder / f"{name}.out", folder / f"{name}.err"
-        command = [*within, sys.executable, "-m", module, "--summary", str(self._summary), *arguments]
+        share = os.environ.get("HVT_TEST_SLEEPS")
+        begins = ["-m"] if share is None else [str(Path(__file__).with_name("sleeping.py")), share]
+        command = [*within, sys.executable, *begins, module, "--summary", str(self._summary), *arguments]
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self.process = subprocess.Popen(
                 command,
