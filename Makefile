@@ -48,10 +48,11 @@ nightly: setup   ## an hour: the nightly tests, training, every scenario at full
 		test -z "$$failed" || { echo "failed$$failed"; exit 1; }
 
 nightly-tests: JOBS := $(CORES)
-nightly-tests: setup ## the tests that `make test` leaves out: JOBS at once, then alone those that a busy machine would spoil; flights whose threads sleep at random
+nightly-tests: setup ## the tests that `make test` leaves out: JOBS at once, then alone those that a busy machine would spoil; flights whose threads sleep at random; other examples of properties
 	@$(BIN)/python -m pytest --nightly -m 'nightly and not realtime' $(AT_ONCE); together=$$?; \
 		$(BIN)/python -m pytest --nightly -m realtime; alone=$$?; \
-		HVT_TEST_SLEEPS=0.0005 $(BIN)/python -m pytest tests/integration $(AT_ONCE) && test $$together$$alone = 00
+		HVT_TEST_SLEEPS=0.0005 $(BIN)/python -m pytest tests/integration $(AT_ONCE); busy=$$?; \
+		$(BIN)/python -m pytest -m hypothesis --hypothesis-profile=search $(AT_ONCE) && test $$together$$alone$$busy = 000
 
 training: setup  ## the tests of training, in an environment of their own, for PyTorch is large; TORCH=
 	@test -x build/training/bin/python || $(PYTHON) -m venv build/training

@@ -36,7 +36,9 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # Hypothesis' own 200 ms for an example are an assertion on speed: a machine that stops the process for so long would
 # break a property that holds. Here and not in a fixture: `@settings` takes what is loaded when its module is read.
-settings.register_profile("hvt", deadline=None)
+# The same examples each time, so that a commit which passed once passes again; `make nightly` searches for others.
+settings.register_profile("search", deadline=None)
+settings.register_profile("hvt", settings.get_profile("search"), derandomize=True)
 settings.load_profile("hvt")
 
 # Containers often forbid bytecode; each start of a program would then compile all that it imports, a second and more.
