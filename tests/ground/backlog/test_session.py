@@ -908,9 +908,10 @@ def test_a_stored_thing_that_cannot_be_worked_off_ends_nothing_else(flight, tmp_
         session = rig.session
         (tmp_path / "backlog-0.rrd").mkdir()  # no file can be made there
         rig.put(*chunks(former.session_id, "info", 0, info_object(former)))
-        rig.put(*chunks(former.session_id, "still", 0, still_object(former, 12, 0)))
-        still = [one for one in rig.acknowledged_ranges() if one.kind == "still"]
-        assert all(one.acknowledged_bytes == 0 for one in still), "it is to come again"
+        still = still_object(former, 12, 0)
+        rig.put(*chunks(former.session_id, "still", 0, still))
+        said = [one.acknowledged_bytes for one in rig.acknowledged_ranges() if one.kind == "still"]
+        assert max(said, default=0) < len(still), "it is to come again"
         rig.base(*range(5, 25))
         assert rig.receiver.session is session
         assert session.frames_decoded == 25
