@@ -80,8 +80,15 @@ class CountingWorld(World):
         return super().open_detector(config)
 
 
-@pytest.mark.parametrize(("settings", "opened"), [({}, 0), ({"send_tracks": True}, 1), ({"method": "M2"}, 1)])
-@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+@pytest.mark.parametrize(
+    ("settings", "opened", "pace"),
+    [
+        ({}, 0, "lockstep"),
+        ({}, 0, "realtime"),
+        ({"send_tracks": True}, 1, "realtime"),
+        ({"method": "M2"}, 1, "lockstep"),
+    ],
+)
 def test_video_alone_opens_no_detector(tmp_path, pace, settings, opened):
     """A third of the processor would go to tracks that nobody is sent."""
     write_scene(tmp_path, frames=10)

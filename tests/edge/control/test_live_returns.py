@@ -50,9 +50,17 @@ def flown(flight: LiveFlight, seconds: float) -> LiveFlight:
 
 
 @pytest.mark.parametrize("store", [False, True])
-@pytest.mark.parametrize("silent_s", [2.5, 4, 12])
+@pytest.mark.parametrize("silent_s", [2.5, pytest.param(4, marks=pytest.mark.nightly), 12])
 @pytest.mark.parametrize(
-    ("budget", "fps"), [(300_000, 2), (600_000, 5), (1_800_000, 15), (8_000_000, 30), (400_000, 1)]
+    ("budget", "fps"),
+    [
+        (300_000, 2),
+        (1_800_000, 15),
+        *(
+            pytest.param(*one, marks=pytest.mark.nightly)
+            for one in ((600_000, 5), (8_000_000, 30), (400_000, 1))
+        ),
+    ],
 )
 def test_live_video_is_back_after_a_silence(tmp_path, budget, fps, silent_s, store):
     """After a hiccup of some seconds no frame would ever be sent again, however good the link is."""
@@ -92,8 +100,10 @@ def test_live_video_is_back_after_a_fall_of_the_link(budget, fps, falls_to):
     assert flight.longest_hole(known + 10, 60) <= 1.5
 
 
-@pytest.mark.parametrize("lasts_s", [0.4, 0.6, 0.8])
-@pytest.mark.parametrize(("budget", "fps"), [(300_000, 5), (800_000, 15), (2_000_000, 30)])
+@pytest.mark.parametrize("lasts_s", [0.4, pytest.param(0.6, marks=pytest.mark.nightly), 0.8])
+@pytest.mark.parametrize(
+    ("budget", "fps"), [(300_000, 5), (800_000, 15), pytest.param(2_000_000, 30, marks=pytest.mark.nightly)]
+)
 def test_live_video_is_back_after_all_under_way_was_lost(budget, fps, lasts_s):
     """On UDP each fade of a third of a second took the picture for 1.5 s: the edge waited for what was lost."""
     for second in (12, 12.04, 12.11):

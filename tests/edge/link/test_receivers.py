@@ -51,9 +51,11 @@ def test_another_takes_over_when_the_first_is_silent_or_has_no_news():
         assert judged(primary, 2, tenth, now_ns=tenth * S // 10) == "ignored"
 
 
-@pytest.mark.parametrize("fps", [0.5, 1.0, 2.0, 3.0, 15.0])
+@pytest.mark.parametrize(
+    "fps", [1.0, 15.0, *(pytest.param(fps, marks=pytest.mark.nightly) for fps in (0.5, 2.0, 3.0))]
+)
 @pytest.mark.parametrize(("held", "lost"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.03)])
-@pytest.mark.parametrize("delay_s", [0.03, 0.4, 1.3])
+@pytest.mark.parametrize("delay_s", [0.03, pytest.param(0.4, marks=pytest.mark.nightly), 1.3])
 def test_of_two_healthy_grounds_one_steers(fps, held, lost, delay_s):
     """At a frame a second they took turns, and each turn threw away what was known of the path."""
     rng, primary, changes = random.Random(1), PrimaryReceiver(), 0

@@ -148,8 +148,8 @@ def link(*, away: tuple[float, float] = (0.0, 0.0), carries_bps: int = 0):
     return lambda second: carries_bps if away[0] <= second < away[1] else 10_000_000
 
 
-@pytest.mark.parametrize("share", [1.0, 0.85])
-@pytest.mark.parametrize("every_s", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("share", [1.0, pytest.param(0.85, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("every_s", [1.0, pytest.param(2.0, marks=pytest.mark.nightly), 4.0])
 @pytest.mark.parametrize(
     ("surveyed_bytes", "key_bytes"), [(15_000, 15_000), (15_000, 45_000), (8_000, 70_000)]
 )

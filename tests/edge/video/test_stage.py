@@ -277,8 +277,10 @@ def test_what_has_room_nowhere_is_left_out_said_and_followed_by_a_keyframe():
     assert rig.failures.parts[0].working
 
 
-@pytest.mark.parametrize("size", [(160, 128), (320, 192), (640, 360)])
-@pytest.mark.parametrize("fps", [2, 5, 15])
+@pytest.mark.parametrize(
+    "size", [(160, 128), (320, 192), pytest.param((640, 360), marks=pytest.mark.nightly)]
+)
+@pytest.mark.parametrize("fps", [2, pytest.param(5, marks=pytest.mark.nightly), 15])
 @pytest.mark.parametrize("above", [1.0, 1.5])
 def test_the_least_budget_that_is_accepted_holds_in_every_second_to_the_byte(size, fps, above):
     """A thin link would get twice what it carries with each keyframe."""
