@@ -106,7 +106,8 @@ def free_path(
 ) -> Path:
     """The first that is free of the names and of the last one with a number from ``number`` on; it is taken.
 
-    With ``claim`` it is an empty file then, unless it is ``may_exist``: two grounds may share a folder.
+    With ``claim`` it is an empty file then, unless it is ``may_exist``: two grounds may share a folder. Such a file
+    shows by itself that it is taken.
     """
     is_free = claim_name if claim else lambda one: not one.exists()
     last = names[-1]
@@ -114,7 +115,8 @@ def free_path(
     path = next(
         one for one in chain(names, numbered) if one not in taken and (one == may_exist or is_free(one))
     )
-    taken.add(path)
+    if path == may_exist or not claim:
+        taken.add(path)
     return path
 
 
@@ -156,7 +158,7 @@ class SessionFactory:
         self.records = program is None or config.record is not None
         """Whether there are recordings: a program takes their place unless they are requested."""
         self._paths: set[Path] = set()
-        """Taken by this process."""
+        """Taken by this process, where no file shows it."""
         self._naming = threading.Lock()
         self._locator_of = locators(getattr(config, "terrain", None))
         self._extras = [

@@ -228,7 +228,7 @@ def _video(
             y_range=[0, base_size[1] + points(LEGEND_POINTS, base_size[0])],
         ),
         defaults=[rr.EncodedImage.from_fields(media_type="image/jpeg")],
-        overrides={f"{root}{bare}": style} if bare is not None else None,
+        overrides={f"{root}{bare}": style.visualizer()} if bare is not None else None,
     )
 
 
