@@ -239,8 +239,11 @@ class _Reading:
                 self._ended = f"it breaks off ({cause_of(packet)})"
             else:
                 self._count += bool(packet.size)  # what an edit list hides is there too
-                if packet.dts is not None:
-                    self._end_s = _seconds(packet.dts + (packet.duration or 0), packet.time_base)
+                # By its own time: of decoding, the last of B-frames lies whole frames before it.
+                stamp = packet.dts if packet.pts is None else packet.pts
+                if stamp is not None:
+                    end_s = Fraction(stamp + (packet.duration or 0)) * (packet.time_base or 0)
+                    self._end_s = max(end_s, self._end_s or end_s)
             try:
                 frames = _decode(self._stream, packet)
             except av.error.FFmpegError:

@@ -409,6 +409,16 @@ def test_a_cut_clip_says_that_it_is_unfinished(tmp_path, caplog, name, options):
     assert f"{name} is unfinished: " in caplog.text
 
 
+def test_a_slow_clip_with_b_frames_is_whole(tmp_path, caplog):
+    """Each time-lapse would be called unfinished: the last to be decoded is two pictures before the end."""
+    times = [5_000 * one for one in range(30)]
+    options = {"x264-params": "b-adapt=0"}
+    clip = write_numbered(tmp_path / "a.mp4", 30, times_ms=times, bf="3", **options)
+    _, pictures = play(clip, fps=0.2)
+    assert numbers(pictures) == list(range(30))
+    assert "unfinished" not in caplog.text
+
+
 def test_a_file_that_grows_is_followed(tmp_path, monkeypatch):
     """Who flies what is still recorded would get its first second; or sit before its end for a minute."""
     whole = write_numbered(tmp_path / "whole.ts", 90, g="10", bf="0").read_bytes()
