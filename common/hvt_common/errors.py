@@ -25,6 +25,7 @@ _MAY_COME = frozenset(
         *(errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM),
     }
 )
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 _NEVER_SEEN = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP)
 
 
@@ -155,23 +156,48 @@ def exit_with_sentence(
 
     Neither that nor a traceback has the secrets of an address in ``argv``.
 
-    Standard output that nobody reads any more, as after ``| head``, ends the program with 1 and no word.
+    Standard output that nobody reads any more, as after ``| head``, ends the program with 1 and no word; a full disk
+    with 1. Standard streams that were closed are /dev/null.
     """
+    _open_standard_streams()
     redaction = Redaction(sys.argv[1:] if argv is None else argv)
     sys.excepthook = _traceback_without(redaction)
     try:
         _check_folder()
         code = run(argv)
-        print(end="", flush=True)  # no error where there is no standard output at all
+        print(end="", flush=True)
     except (UserError, FlightError) as error:
         if not error.said:
             print(f"{program}: {redaction.text(str(error))}", file=sys.stderr)
         return 2 if isinstance(error, UserError) and not isinstance(error, NotYetError) else 1
     except BrokenPipeError:
-        if sys.stdout is None or not _reader_left():
+        if not _reader_left():
             raise
         return 1
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        _discard_output()
+        print(
+            f"{program}: a disk that it writes to is full ({error.strerror}): make room there",
+            file=sys.stderr,
+        )
+        return 1
     return code
+
+
+def _open_standard_streams() -> None:
+    # Else the next file that is opened has such a number: a recording, into which libjpeg writes its warnings.
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)
+            if opened != number:
+                os.dup2(opened, number)
+                os.close(opened)
+            if getattr(sys, name) is None:
+                setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))  # noqa: SIM115
 
 
 def _check_folder() -> None:
@@ -198,8 +224,12 @@ def _reader_left() -> bool:
     output.register(sys.stdout.fileno(), 0)
     if not output.poll(0):
         return False
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    _discard_output()
     return True
+
+
+def _discard_output() -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -91,3 +93,38 @@ def test_bytes_that_are_no_text_are_an_error_of_the_file(tmp_path):
     file.write_bytes(b"car\xff")
     with pytest.raises(OSError, match="not UTF-8 text at byte 3"):
         read_text(file)
+
+
+_PROGRAM = """
+import sys
+from hvt_common.errors import exit_with_sentence
+from hvt_common.runtime.process import leave
+def run(argv):
+    with open(argv[0], "wb"):
+        pass
+    first = open(argv[0], "wb")
+    print("said", file=sys.stderr, flush=True)
+    print(first.fileno())
+    return 0
+leave(exit_with_sentence(run, program="it", argv=sys.argv[1:]))
+"""
+
+
+def test_streams_that_were_closed_take_no_files(tmp_path):
+    """A ground started by a daemon wrote a decoder's warnings into its recording, and ended with 1 after a flight."""
+    words = [sys.executable, "-c", _PROGRAM, str(tmp_path / "recording")]
+    for closed in ("<&-", ">&-", "2>&-", "<&- >&- 2>&-"):
+        done = subprocess.run(["sh", "-c", f'"$@" {closed}', "sh", *words], capture_output=True, check=True)
+        assert int(done.stdout or 3) > 2, f"with {closed} a file has the number of a standard stream"
+    assert (tmp_path / "recording").read_bytes() == b""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_output_for_which_there_is_no_room_is_a_sentence(tmp_path):
+    """Settings or a report sent to a file on a full disk ended in a traceback."""
+    words = [sys.executable, "-c", _PROGRAM, str(tmp_path / "recording")]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    says = "it: a disk that it writes to is full (No space left on device): make room there"
+    assert done.stderr.splitlines() == ["said", says]
