@@ -17,7 +17,7 @@ from typing import Any
 from rerun.chunk import Chunk
 
 from hvt_ground.recordings.row import FileAccount, RecordingRow
-from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages, drop_footer, id_of, open_rrd
+from hvt_ground.sinks.rerun.rrd_file import copy_readable, drop_footer, id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 from hvt_ground.sinks.rerun.stills import still_of_event
 
@@ -62,7 +62,7 @@ def described(path: Path) -> RecordingRow | None:
         return found
     with tempfile.TemporaryDirectory() as folder, suppress(OSError):
         whole = Path(folder) / path.name
-        if copy_whole_messages(path, whole):  # it breaks off: what comes before counts
+        if copy_readable(path, whole):
             found = _described(whole)
             state = path.stat()
             return found and replace(found, written_ns=state.st_mtime_ns, size_bytes=state.st_size)

@@ -41,7 +41,7 @@ from hvt_ground.sinks.rerun.blueprint import (
     VIDEO,
 )
 from hvt_ground.sinks.rerun.map_rows import pose_of
-from hvt_ground.sinks.rerun.rrd_file import copy_whole_messages, id_of, open_rrd
+from hvt_ground.sinks.rerun.rrd_file import copy_readable, id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId
 
 _log = logging.getLogger(__name__)
@@ -234,12 +234,12 @@ def _opened(path: Path, spool: Spool, number: int) -> _File:
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / "whole.rrd"
         try:
-            if not copy_whole_messages(path, whole):
+            if not copy_readable(path, whole):
                 raise UserError(refused)
             file = _read(whole, spool, number)
         except _ODD:
             raise UserError(refused) from None
-    _log.warning("%s breaks off: what comes before is exported", path)
+    _log.warning("%s is damaged or breaks off: what can be read is exported", path)
     return file
 
 

@@ -36,7 +36,8 @@ _log = logging.getLogger(__name__)
 
 _STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
 _MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
-_END = 0
+_END, _STORE_INFO = 0, 1
+_UNREADABLE = (OSError, RuntimeError, ValueError, LookupError, TypeError, OverflowError)
 _SPARE_BYTES = 2 * 2**20
 _COPY_BYTES = 2**20
 _FLUSH_S = 10.0
@@ -186,21 +187,36 @@ def _messages(stream: bytes) -> bytes:
     return stream[_STREAM_HEADER_BYTES:end]
 
 
-def copy_whole_messages(path: Path, out: Path) -> bool:
-    """Copy a recording up to its last whole message: the SDK refuses a file that breaks off in one.
+def copy_readable(path: Path, out: Path) -> bool:
+    """Copy the messages of a recording that can be read: the SDK refuses it for one that is damaged or breaks off.
 
-    False where nothing would be left out, or nothing be left.
+    After a power cut its end may be zeros. False where nothing would be left out, or nothing be left.
     """
     with path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        at = max((end for _, end in _whole_messages(file.fileno())), default=size)
-        if at == size:
-            return False
-        with out.open("wb") as copy:
-            while at > 0 and (data := file.read(min(at, _COPY_BYTES))):
-                copy.write(data)
-                at -= len(data)
-    return True
+        ends = list(_whole_messages(file.fileno()))
+        starts = [_STREAM_HEADER_BYTES, *(end for _, end in ends)]
+        messages = [(kind, start, end) for (kind, end), start in zip(ends, starts, strict=False)]
+        first = [one for one in messages if one[0] == _STORE_INFO]
+
+        def copied(chosen: Sequence[tuple[int, int, int]]) -> bool:
+            with out.open("wb") as copy:
+                copy.write(os.pread(file.fileno(), _STREAM_HEADER_BYTES, 0))
+                for _, start, end in chosen:
+                    copy.write(os.pread(file.fileno(), end - start, start))
+            try:
+                return sum(1 for _ in open_rrd(out).stream()) > 0
+            except _UNREADABLE:
+                return False
+
+        def readable(chosen: Sequence[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+            if not chosen or copied([*first, *chosen]):
+                return list(chosen)
+            half = len(chosen) // 2
+            return readable(chosen[:half]) + readable(chosen[half:]) if half else []
+
+        found = readable([one for one in messages if one[0] not in (_STORE_INFO, _END)])
+        whole = len(first) + len(found) == len(messages) and starts[-1] == os.fstat(file.fileno()).st_size
+        return bool(found) and not whole and copied([*first, *found])
 
 
 def drop_footer(path: Path) -> None:
@@ -210,12 +226,12 @@ def drop_footer(path: Path) -> None:
 
 
 def _whole_messages(file: int) -> Iterator[tuple[int, int]]:
-    # The kind of each message, and where it ends; not of one that breaks off.
+    # The kind of each message, and where it ends; up to the end of all, or one that breaks off.
     at, size = _STREAM_HEADER_BYTES, os.fstat(file).st_size
     while len(head := os.pread(file, _MESSAGE_HEADER.size, at)) == _MESSAGE_HEADER.size:
         kind, length = _MESSAGE_HEADER.unpack(head)
         at += _MESSAGE_HEADER.size + length
-        if at > size:
+        if at > size or (kind, length) == (_END, 0):
             return
         yield kind, at
 

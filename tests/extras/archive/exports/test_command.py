@@ -286,6 +286,30 @@ def test_a_recording_that_breaks_off_is_exported_so_far(recording, tmp_path, los
         assert sum(1 for _ in video.decode(video=0)) > FRAMES / 2
 
 
+def _zeros_at_the_end(data: bytes) -> bytes:
+    return data[:-3000] + bytes(3000)
+
+
+def _damaged_boxes(data: bytes) -> bytes:
+    # The header of each message is its kind and its length.
+    at, boxes = 12, 0
+    while not boxes:
+        length = int.from_bytes(data[at + 8 : at + 16], "little")
+        boxes = b"Boxes2D:half_sizes" in data[at : at + length] and at + 16
+        at += 16 + length
+    return data[:boxes] + b"\xff" * 40 + data[boxes + 40 :]
+
+
+@pytest.mark.parametrize("damaged", [_zeros_at_the_end, _damaged_boxes])
+def test_of_a_damaged_recording_the_rest_is_exported(recording, tmp_path, caplog, damaged):
+    """After a power cut a file may end in zeros, and cards lose bits: the whole flight was called no recording."""
+    broken = tmp_path / "broken.rrd"
+    broken.write_bytes(damaged(recording.read_bytes()))
+    with av.open(str(export(broken, tmp_path / "broken.mp4"))) as video:
+        assert sum(1 for _ in video.decode(video=0)) == FRAMES
+    assert f"{broken} is damaged or breaks off: what can be read is exported" in caplog.text
+
+
 def test_a_split_session_is_exported_as_one(recording, events, tmp_path):
     """A video would end where a file did."""
     settings = RecorderSettings(tmp_path / "part.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
