@@ -73,6 +73,8 @@ class PushedEdge:
         another array or time, and `UserError` or `FlightError` once the edge has ended for that.
         """
         taken_ns = self._clock() if capture_ns is None else _nanoseconds(capture_ns)
+        if not isinstance(frame_bgr, np.ndarray):
+            raise ValueError(f"{frame_bgr!r:.40} is no frame: an array of uint8, (height, width, 3), is")  # noqa: TRY004
         if (
             frame_bgr.dtype != np.uint8
             or frame_bgr.ndim != 3

@@ -118,6 +118,8 @@ def test_what_is_wrong_is_raised_where_the_program_can_see_it(tmp_path, monkeypa
     edge = hvt_edge.open(connect="tcp/127.0.0.1:9", detector=tmp_path / "absent.onnx")
     with pytest.raises(ValueError, match=r"float64 \(4, 4\) is not accepted"):
         edge.push(cast("Any", np.zeros((4, 4))))
+    with pytest.raises(ValueError, match="None is no frame"):  # as of `cv2.VideoCapture.read` at its end
+        edge.push(cast("Any", None))
     for wrong in cast("tuple[int, ...]", (1.5e18, "now", -1, 1 << 63)):
         with pytest.raises(ValueError, match="whole nanoseconds of Unix time are"):
             edge.push(np.zeros((4, 4, 3), np.uint8), capture_ns=wrong)
