@@ -273,14 +273,16 @@ class Keyframes:
             self._add(now_ns)
 
     def report_losses(self, receiver_id: int, count: int) -> None:
-        """A receiver reports so many lost or damaged messages in all; its next request is free."""
+        """A receiver reports so many lost or damaged messages in all; its next request is free.
+
+        It counts from 0 again after it has taken the link for lost.
+        """
         with self._lock:
-            if count <= self._losses.get(receiver_id, 0):
-                return
+            before = self._losses.get(receiver_id, 0)
             if receiver_id not in self._losses and len(self._losses) >= _MOST_RECEIVERS:
                 del self._losses[next(iter(self._losses))]
             self._losses[receiver_id] = count
-            self._lossy = True
+            self._lossy |= count > before
 
     def note_round_trip(self, round_trip_ns: int) -> None:
         """The link's round trip; a request that comes later than that after a keyframe says that it was lost."""

@@ -194,6 +194,19 @@ def test_a_reported_loss_is_a_reason_once():
     assert plan.request(22_000 * MS) is None, "another ground has its own losses"
 
 
+def test_a_receiver_that_counts_anew_has_losses_again():
+    """After an outage of a lossy link each keyframe would be refused until as many were lost as before it."""
+    plan = Keyframes(KeyframeSettings(interval_ns=0, burst=1))
+    plan.report_losses(1, 500)
+    plan.done(0)
+    plan.note_cost(3_500 * MS)
+    assert plan.request(20_000 * MS) is None
+    plan.done(20_000 * MS)
+    plan.report_losses(1, 0)
+    plan.report_losses(1, 2)
+    assert plan.request(21_000 * MS) is None
+
+
 def test_the_edges_own_requests_come_from_any_thread_and_cost_nothing():
     """A change of rate, or a link that comes back, would wait for the schedule; or be refused."""
     both = Keyframes(KeyframeSettings(interval_ns=0, burst=1))
