@@ -354,7 +354,7 @@ time.sleep(60)
 """
 
 
-@pytest.mark.parametrize("after", [1, 40, 120])
+@pytest.mark.parametrize("after", [1, pytest.param(40, marks=pytest.mark.nightly), 120])
 def test_after_a_kill_all_but_the_last_moment_is_there(tmp_path, after):
     """A crash is when one wants to know what was seen."""
     program = textwrap.dedent(_WRITER).format(tests=str(TESTS), path=str(tmp_path))

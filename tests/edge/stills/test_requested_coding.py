@@ -167,7 +167,7 @@ def test_the_video_lends_what_is_requested_within_every_window_and_goes_on(
 FLIGHTS = [
     pytest.param({"method": "M0", "fps": "auto"}, 100_000, marks=pytest.mark.nightly),
     ({"profile": "auto"}, 100_000),
-    ({"method": "M0"}, 300_000),
+    pytest.param({"method": "M0"}, 300_000, marks=pytest.mark.nightly),
     ({"profile": "paper"}, 300_000),
     pytest.param({"profile": "thin"}, 300_000, marks=pytest.mark.nightly),
     pytest.param({"profile": "auto", "video_share": 1.0}, 300_000, marks=pytest.mark.nightly),

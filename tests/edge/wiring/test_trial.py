@@ -47,7 +47,7 @@ def moving(folder: Path, *, coarse: int, frames: int) -> Path:
         (60, 15, (), 1),
         (3, 15, (), 3),
         (60, 5, (), 3),  # too short to tell: by the bits for each pixel
-        (60, 15, ("--fps", "15"), 1),
+        pytest.param(60, 15, ("--fps", "15"), 1, marks=pytest.mark.nightly),
         (3, 15, ("--fps", "15"), 1),
     ],
 )
@@ -77,7 +77,7 @@ def test_auto_begins_with_what_the_base_hides():
     assert seen["100kbps"].hidden > 2 * seen["8000kbps"].hidden
 
 
-@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+@pytest.mark.parametrize("pace", [pytest.param("lockstep", marks=pytest.mark.nightly), "realtime"])
 def test_a_scene_without_objects_keeps_the_bits_for_video(tmp_path, monkeypatch, pace):
     """Tracks and stills of nothing would take a tenth of the budget.
 

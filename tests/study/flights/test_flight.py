@@ -81,7 +81,9 @@ AUTO = (
 )
 
 
-@pytest.mark.parametrize("flags", [("--method", "M5"), AUTO], ids=["M5", "auto"])
+@pytest.mark.parametrize(
+    "flags", [pytest.param(("--method", "M5"), marks=pytest.mark.nightly), AUTO], ids=["M5", "auto"]
+)
 def test_the_same_flight_twice(clip, flags):
     """A table that changes from run to run proves nothing."""
     first, second = flown(clip, *flags), flown(clip, *flags)

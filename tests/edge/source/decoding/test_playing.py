@@ -300,7 +300,7 @@ def test_missing_numbers_of_a_folder_are_said(tmp_path):
     assert "3 numbers are missing, the first after f0005.png" in " ".join(source.notes)
 
 
-@pytest.mark.parametrize("transfer", ["smpte2084", "arib-std-b67"])
+@pytest.mark.parametrize("transfer", ["smpte2084", pytest.param("arib-std-b67", marks=pytest.mark.nightly)])
 def test_hdr_is_as_bright_as_its_white(tmp_path, transfer):
     """Everything would be grey."""
     clip = tmp_path / "a.mp4"
