@@ -105,7 +105,7 @@ def _number(part: rrb.Container | rrb.View, place: str) -> None:
         return
     for path, shown in part.visualizer_overrides.items():
         if isinstance(shown, rrb.Visualizer):
-            shown.id = uuid.uuid5(part.id, path)
+            shown.id = uuid.uuid5(part.id, str(path))
 
 
 @contextmanager
