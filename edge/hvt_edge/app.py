@@ -106,25 +106,7 @@ class Edge:
             check_rate(config, source.view.base_size)
             say_size(config, source.view)
             headroom = qualify_encoder(config, source, clock=world.clock, stop=self._stop)
-            background = (lambda call: call()) if self._lockstep else with_lower_priority
-            # Not kept beside the one that is opened in its place once it has failed: it holds 100 MB.
-            ready = [
-                background(
-                    lambda: open_for_flight(
-                        config,
-                        lambda: world.open_detector(config),
-                        lambda detector: world.warm_up(config, detector, source),
-                    )
-                )
-            ]
-            detector: FailingDetector = ready[0]
-            if not self._lockstep:  # whose result would be of something else
-                detector = RetriedDetector(
-                    lambda: ready.pop() if ready else world.open_detector(config),
-                    "detector",
-                    self._failures,
-                    clock=world.clock,
-                )
+            detector = self._open_detector(config, source)
             beginning = try_scene(config, source, detector=detector, clock=world.clock, stop=self._stop)
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             link = world.open_link(stack, config)
@@ -257,6 +239,29 @@ class Edge:
         if source is None:
             raise FlightError(f"stopped before the source was there: {awaited.error}")
         return source
+
+    def _open_detector(self, config: EdgeConfig, source: Source) -> FailingDetector:
+        # In real time one that fails is opened anew; `FlightError` where we are stopped before it is open.
+        world = self._world
+        opened = partial(
+            open_for_flight,
+            config,
+            lambda: world.open_detector(config),
+            lambda detector: world.warm_up(config, detector, source),
+        )
+        if self._lockstep:  # one that was opened anew would make its result one of something else
+            return opened()
+        first = with_lower_priority(opened, stop=self._stop)
+        if first is None:
+            raise FlightError("stopped before the detector was open")
+        # Not kept beside the one that is opened in its place once it has failed: it holds 100 MB.
+        ready = [first]
+        return RetriedDetector(
+            lambda: ready.pop() if ready else world.open_detector(config),
+            "detector",
+            self._failures,
+            clock=world.clock,
+        )
 
     def _health_server(self, address: str) -> AbstractContextManager[object]:
         return health_server(

@@ -7,10 +7,12 @@ import threading
 import time
 import weakref
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
 
+from hvt_common.errors import FlightError
 from hvt_common.inference.detect import Detector
 from hvt_common.values import Detections, Frame, Image
 from hvt_edge.app import Edge
@@ -176,3 +178,36 @@ def test_a_detector_that_failed_does_not_stay_beside_its_successor(tmp_path):
     Edge(check(config), stop=world.stop, world=world).run()
     assert world.second is not None, "it was opened again"
     assert world.second.alone
+
+
+class CompilingWorld(World):
+    """Its detector is open once somebody says so."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.go_on = threading.Event(), threading.Event()
+
+    def open_detector(self, config: EdgeConfig) -> Detector:
+        """See there."""
+        self.begun.set()
+        assert self.go_on.wait(timeout=200)
+        return super().open_detector(config)
+
+
+def test_an_edge_can_be_stopped_while_a_runtime_compiles(tmp_path):
+    """Ctrl-C did nothing for as long as that takes, minutes for some networks and boards."""
+    write_scene(tmp_path, frames=2)
+    config = EdgeConfig(
+        source=str(tmp_path), source_fps=10.0, fps=10, size="320x192", preset="ultrafast", method="M2",
+        detector="motion", connect=("tcp/127.0.0.1:9",), wait=0.0, quiet=True, store=0,
+    )  # fmt: skip
+    world, stop = CompilingWorld(), threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        flight = pool.submit(Edge(check(config), stop=stop, world=world).run)
+        try:
+            assert world.begun.wait(timeout=200)
+            stop.set()
+            with pytest.raises(FlightError, match="stopped before the detector was open"):
+                flight.result(timeout=100)
+        finally:
+            world.go_on.set()

@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, wait
 from typing import NoReturn, TypeVar
 
 T = TypeVar("T")
@@ -30,6 +30,7 @@ _SWITCH_S = 0.0005
 _ZENOH_CALLBACK = "(pyo3-closure)"
 """Zenoh's Python package runs each callback in a thread of such a name, and joins none."""
 _JOIN_WITHIN_S = 30.0
+_LOOK_AGAIN_S = 0.1
 
 # Parameters of mallopt, glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
@@ -126,10 +127,25 @@ def put_video_first() -> None:
     cv2.setNumThreads(1)
 
 
-def with_lower_priority(call: Callable[[], T]) -> T:
-    """Run it in a thread of lower priority; threads that it starts, such as a network's, have that too."""
-    with ThreadPoolExecutor(1, initializer=lower_priority) as pool:
-        return pool.submit(call).result()
+def with_lower_priority(call: Callable[[], T], *, stop: threading.Event) -> T | None:
+    """Run it in a thread of lower priority; threads that it starts, such as a network's, have that too.
+
+    None where ``stop`` is set before it is done: a runtime may compile for minutes, and nobody can interrupt it.
+    """
+    done: Future[T] = Future()
+
+    def run() -> None:
+        lower_priority()
+        try:
+            done.set_result(call())
+        except BaseException as error:  # noqa: BLE001 - raised where it is waited for
+            done.set_exception(error)
+
+    threading.Thread(target=run, name="hvt-opening", daemon=True).start()
+    while not wait([done], timeout=_LOOK_AGAIN_S).done:
+        if stop.is_set():
+            return None
+    return done.result()
 
 
 def share_zenoh_threads() -> None:

@@ -47,8 +47,10 @@ def test_a_network_runs_below_everything_else(tmp_path: Path, threads: int) -> N
     others = {one.name for one in Path("/proc/self/task").iterdir()}
     own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     path = colour_detector(tmp_path / "m.onnx", "yolox", size=None)
-    model = with_lower_priority(lambda: open_model(path, settings=ModelSettings(threads=threads)))
-    with_lower_priority(lambda: model.run(np.zeros((1, 3, 64, 64), np.float32)))
+    never = threading.Event()
+    model = with_lower_priority(lambda: open_model(path, settings=ModelSettings(threads=threads)), stop=never)
+    assert model is not None
+    with_lower_priority(lambda: model.run(np.zeros((1, 3, 64, 64), np.float32)), stop=never)
     started = {one.name for one in Path("/proc/self/task").iterdir()} - others
     levels = set()
     for one in started:
