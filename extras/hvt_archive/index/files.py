@@ -60,7 +60,7 @@ def described(path: Path) -> RecordingRow | None:
     found = _described(path)
     if found is not None:
         return found
-    with tempfile.TemporaryDirectory() as folder, suppress(OSError):
+    with suppress(OSError), tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / path.name
         if copy_readable(path, whole):
             found = _described(whole)

@@ -60,9 +60,12 @@ class Spool:
 
 
 def _no_space(error: OSError) -> UserError:
+    # None as long as no folder was found, as where all disks are mounted read-only.
+    where = tempfile.tempdir
+    takes = "no folder takes" if where is None else f"{where} does not take ({error.strerror})"
     return UserError(
-        f"what is read is kept in a temporary file as large as the recording, which {tempfile.gettempdir()} does not "
-        f"take ({error.strerror}): set TMPDIR to a folder with room"
+        f"what is read is kept in a temporary file as large as the recording, which {takes}: set TMPDIR to a folder "
+        "with room"
     )
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 import platform
+import tempfile
 import weakref
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import av
@@ -180,9 +180,9 @@ def _staged(clip: Clip) -> tuple[Clip, object]:
     Where the system allows it the file has no name any more: it is gone with the process, however that ends.
     """
     try:
-        folder = TemporaryDirectory(prefix="hvt-study-")
+        folder = tempfile.TemporaryDirectory(prefix="hvt-study-")
     except OSError as error:
-        where = gettempdir()
+        where = tempfile.tempdir or "no folder for temporary files"  # None where each refuses
         raise UserError(
             f"{where} takes no files ({error.strerror}): make room, or name another with TMPDIR"
         ) from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import gc
 import os
+import tempfile
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -73,3 +74,16 @@ def test_a_full_folder_for_temporary_files_names_the_remedy(monkeypatch: pytest.
     with pytest.raises(UserError, match="set TMPDIR to a folder with room"):
         spool.put(bytes(2**20))
     monkeypatch.undo()
+
+
+def test_where_no_folder_takes_temporary_files_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a board whose disks are all mounted read-only an export ended in a traceback."""
+
+    def refuses(*_: object) -> int:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with monkeypatch.context() as here:
+        here.setattr(tempfile, "tempdir", None)
+        here.setattr("tempfile._os.open", refuses)
+        with pytest.raises(UserError, match="which no folder takes: set TMPDIR to a folder with room"):
+            Spool()
