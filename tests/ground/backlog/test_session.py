@@ -919,6 +919,6 @@ def test_a_stored_thing_that_cannot_be_worked_off_ends_nothing_else(flight, tmp_
         (tmp_path / "backlog-0.rrd").rmdir()
         eventually(lambda: rig.failures.parts[0].working)
         rig.put(*chunks(former.session_id, "still", 0, still_object(former, 12, 0)))
-        still = [one for one in rig.acknowledged_ranges() if one.kind == "still"]
-        assert any(one.acknowledged_bytes > 0 for one in still), "now it can be written"
+        later = [one for one in rig.acknowledged_ranges() if one.kind == "still"]
+        assert any(one.acknowledged_bytes > 0 for one in later), "now it can be written"
     assert len(Recording(tmp_path / "backlog-0.rrd").stills()) == 1
