@@ -30,7 +30,7 @@ _SWITCH_S = 0.0005
 _ZENOH_CALLBACK = "(pyo3-closure)"
 """Zenoh's Python package runs each callback in a thread of such a name, and joins none."""
 _JOIN_WITHIN_S = 30.0
-_LOOK_AGAIN_S = 0.1
+_CHECK_EVERY_S = 0.1
 
 # Parameters of mallopt, glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
@@ -142,7 +142,7 @@ def with_lower_priority(call: Callable[[], T], *, stop: threading.Event) -> T | 
             done.set_exception(error)
 
     threading.Thread(target=run, name="hvt-opening", daemon=True).start()
-    while not wait([done], timeout=_LOOK_AGAIN_S).done:
+    while not wait([done], timeout=_CHECK_EVERY_S).done:
         if stop.is_set():
             return None
     return done.result()
