@@ -6,9 +6,10 @@ each unit once. Everything else is skipped and counted, and `Reassembler.wants_k
 
 Three things are decided here:
 
-*Reordering.* Zenoh keeps the order of a key on one link; on UDP or several links a unit may come late. A hole
-is given `REORDER_WAIT_NS`, and at most `REORDER_UNITS` units wait behind it, before it counts as lost. A
-keyframe never waits: what is missing before it no longer matters.
+*Reordering.* Zenoh keeps the order of a key on one link; on several links a unit may come late. A hole counts as lost
+when it is twice as old as any was whose unit came late: at once where none of `ORDERLY_UNITS` was. At most
+`REORDER_WAIT_NS`, and `REORDER_UNITS` units, are waited for. A keyframe never waits: what is missing before it no
+longer matters.
 
 *Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
 the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
@@ -31,6 +32,7 @@ from typing import Generic, Literal, TypeVar
 
 from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.statistics import Newest
+from hvt_common.units import SECOND_NS
 
 T = TypeVar("T")
 Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
@@ -40,6 +42,7 @@ its numbers cannot be true."""
 
 REORDER_UNITS = 2
 REORDER_WAIT_NS = 100_000_000
+ORDERLY_UNITS = 30
 SILENCE_NS = 500_000_000
 ADOPTION_INTERVAL_NS = 1_000_000_000
 DUPLICATE_AFTER_NS = 1_000_000_000
@@ -50,7 +53,9 @@ SEQUENCE_SLACK = 64
 FRAME_SLACK = 4096  # after an outage a backlog comes at once, with holes for the frames that the edge dropped
 _WINDOW_MASK = (1 << SEQUENCE_SLACK) - 1
 _REMEMBERED_SESSIONS = 16
-_REQUEST_INTERVALS_NS = (300_000_000, 300_000_000, 600_000_000, 1_000_000_000)
+_REQUEST_INTERVALS_NS = (300_000_000, 300_000_000, 300_000_000, 600_000_000, 1_000_000_000)
+_FRESH_NS = 100_000_000
+"""An edge takes a request that comes so soon behind a keyframe for answered by it (`KeyframeSettings.coding_ns`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +119,13 @@ class Reassembler(Generic[T]):
         self._progress_ns = 0
         self._interval_ns = 0  # about the time between two units of the present session
         self._unshown = False  # something came since the last progress that could not be used
-        self._requested_ns: int | None = None
+        self._hole_ns = 0  # when the newest hole that was given up was first seen
+        self._late_ns = 0  # how old a hole ever was when its unit came
+        self._taken = 0
+        self._quiet_until_ns = 0  # no request goes before
+        self._requested_ns = self._answer_ns = (
+            0  # when the first one of this gap went, and how long answers take
+        )
         self._requests_in_gap = 0
 
     def accept(self, header: BaseHeader, message: T, *, now_ns: int) -> list[Arrival[T]]:
@@ -131,6 +142,7 @@ class Reassembler(Generic[T]):
                 patience_ns=DUPLICATE_SILENCE_NS if duplicate else min(patience_ns, DUPLICATE_SILENCE_NS),
                 duplicate=duplicate,
             )
+        self._note_late(header.sequence, now_ns)
         if self._first <= header.sequence < self._next or header.sequence in self._held:
             if now_ns - self._progress_ns < RESTART_SILENCE_NS or self._has_been(header.sequence):
                 return [self._judged(unit, "duplicate" if self._has_been(header.sequence) else "stale")]
@@ -160,15 +172,14 @@ class Reassembler(Generic[T]):
         """Whether to ask the edge for a keyframe now: something comes, and nothing can be shown of it.
 
         Before anything has come it is False: an edge starts with a keyframe anyway. The requests of one gap
-        are 0.3 s, 0.6 s and then 1 s apart; `keyframe_requested` notes each.
+        are 0.3 s apart, from the fourth on 0.6 and 1 s, but an answer's usual time at the least; `keyframe_requested`
+        notes each.
         """
-        if self._requested_ns is not None:
-            interval_ns = _REQUEST_INTERVALS_NS[min(self._requests_in_gap, len(_REQUEST_INTERVALS_NS) - 1)]
-            if now_ns - self._requested_ns < interval_ns:
-                return False
+        if now_ns < self._quiet_until_ns:
+            return False
         if self._adopted_ns is None:
             return self._unshown
-        if not self._synced or self._hole_overdue(now_ns):
+        if not self._synced or (self._held and self._hole_age_ns(now_ns) >= self._patience_ns):
             return True
         return self._unshown and now_ns - self._progress_ns >= SILENCE_NS
 
@@ -176,7 +187,10 @@ class Reassembler(Generic[T]):
         """Note that a request went out."""
         self.counters.keyframe_requests += 1
         self._requests_in_gap += 1
-        self._requested_ns = now_ns
+        if self._requests_in_gap == 1:
+            self._requested_ns = now_ns
+        interval_ns = _REQUEST_INTERVALS_NS[min(self._requests_in_gap, len(_REQUEST_INTERVALS_NS) - 1)]
+        self._quiet_until_ns = now_ns + max(interval_ns, 5 * self._answer_ns // 4)
 
     # Within the session: a hole waits, then is given up.
 
@@ -196,16 +210,17 @@ class Reassembler(Generic[T]):
                 lost
                 and first > keyframe
                 and len(self._held) <= REORDER_UNITS
-                and not self._hole_overdue(now_ns)
+                and self._hole_age_ns(now_ns) < self._patience_ns
             ):
                 break
             if lost:
-                self._give_up(lost)
+                self._give_up(lost, now_ns)
             verdict = self._take(unit := self._held.pop(first), now_ns)
             released.append(self._judged(unit, verdict, lost_before=lost))
         return released
 
-    def _give_up(self, lost: int) -> None:
+    def _give_up(self, lost: int, now_ns: int) -> None:
+        self._hole_ns = now_ns - self._hole_age_ns(now_ns)
         self.counters.gaps += 1
         self.counters.lost += lost
         self._recent = self._recent << min(lost, SEQUENCE_SLACK) & _WINDOW_MASK
@@ -216,6 +231,7 @@ class Reassembler(Generic[T]):
         header = unit.header
         self._recent = (self._recent << 1 | 1) & _WINDOW_MASK
         self._next = header.sequence + 1
+        self._taken += 1
         if header.frame_index <= self._last_frame:  # two units that waited contradict each other
             self._synced = False
             return "implausible"
@@ -237,8 +253,24 @@ class Reassembler(Generic[T]):
         steps = header.sequence - self._next, header.frame_index - self._last_frame
         return 0 <= steps[0] <= SEQUENCE_SLACK + ahead and 0 < steps[1] <= FRAME_SLACK + ahead
 
-    def _hole_overdue(self, now_ns: int) -> bool:
-        return any(now_ns - unit.received_ns >= REORDER_WAIT_NS for unit in self._held.values())
+    def _hole_age_ns(self, now_ns: int) -> int:
+        return max((now_ns - unit.received_ns for unit in self._held.values()), default=0)
+
+    @property
+    def _patience_ns(self) -> int:
+        return REORDER_WAIT_NS if self._taken < ORDERLY_UNITS else min(REORDER_WAIT_NS, 2 * self._late_ns)
+
+    def _note_late(self, sequence: int, now_ns: int) -> None:
+        # The unit of a hole comes after all, before or after that was given up.
+        if self._held and self._next <= sequence < max(self._held) and sequence not in self._held:
+            late_ns = self._hole_age_ns(now_ns)
+        elif max(self._first, self._next - SEQUENCE_SLACK) <= sequence < self._next and not self._has_been(
+            sequence
+        ):
+            late_ns = now_ns - self._hole_ns
+        else:
+            return
+        self._late_ns = max(self._late_ns, late_ns)
 
     # Between sessions.
 
@@ -301,6 +333,11 @@ class Reassembler(Generic[T]):
         self.counters.replayed += verdict == "stale"
         starts_run = verdict == "decode" and not self._synced
         if verdict == "decode":
+            if starts_run and self._requests_in_gap:
+                self._quiet_until_ns = unit.received_ns + _FRESH_NS
+                answer_ns = min(unit.received_ns - self._requested_ns, SECOND_NS)
+                more_ns = answer_ns - self._answer_ns  # more, too, where a request was lost, and seldom
+                self._answer_ns += more_ns // 4 if more_ns > 0 and self._answer_ns else more_ns
             self._synced = True
             self._requests_in_gap = 0
         return replace(

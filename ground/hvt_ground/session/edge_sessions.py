@@ -144,6 +144,8 @@ class EdgeSessions:
             self._route(packet)
         session, now_ns = self.session, time.monotonic_ns()
         if self._pause.due(now_ns) and self.receiver.take_keyframe_request(pending=pending):
+            if session is not None:
+                session.report()  # a request is free where losses are known
             self.port.request_keyframe()
             if session is not None:
                 session.note("warning", "the ground has asked for a keyframe")

@@ -12,6 +12,7 @@ from hvt_ground.link.reassemble import (
     ADOPTION_INTERVAL_NS,
     DUPLICATE_AFTER_NS,
     DUPLICATE_SILENCE_NS,
+    ORDERLY_UNITS,
     REORDER_UNITS,
     REORDER_WAIT_NS,
     RESTART_SILENCE_NS,
@@ -171,6 +172,49 @@ def test_what_waits_behind_a_hole_is_settled_though_nothing_more_comes(running):
     assert running.wants()
 
 
+def test_a_hole_is_lost_at_once_where_nothing_ever_came_late(running):
+    """After each loss the screen was dark for a tenth of a second more, on links that keep the order."""
+    for sequence in range(4, ORDERLY_UNITS):
+        running.send(sequence)
+    assert running.send(31) == [("skip", 31)]
+    assert running.wants()
+    running.core.keyframe_requested(running.now_ns)
+    assert running.send(30, after_ns=20 * MS) == [("stale", 30)]
+    running.send(32, key=True, after_ns=100 * MS)
+    assert running.send(34, after_ns=400 * MS) == []
+    running.now_ns += 39 * MS
+    assert not running.wants(), "it may come late, as that one"
+    running.now_ns += MS
+    assert running.wants()
+    assert running.send(33, after_ns=0) == [("decode", 33), ("decode", 34)]
+    running.send(36)
+    running.now_ns += 79 * MS
+    assert not running.wants(), "that one was 40 ms late"
+    running.now_ns += MS
+    assert running.wants()
+
+
+def test_a_request_is_not_made_again_before_it_can_be_answered(running):
+    """On a link of 0.2 s each way an edge would be asked twice for each loss, and some made two keyframes."""
+
+    def asked(*, until_ms):
+        times = []
+        for ms in range(0, until_ms, 10):
+            if running.core.wants_keyframe(running.now_ns + ms * MS):
+                running.core.keyframe_requested(running.now_ns + ms * MS)
+                times.append(ms)
+        running.now_ns += until_ms * MS
+        return times
+
+    running.core.decoder_failed()
+    assert asked(until_ms=480) == [0, 300], "how long an answer takes is not known"
+    running.send(4, key=True, after_ns=0)
+    running.now_ns += 400 * MS
+    running.core.decoder_failed()
+    assert asked(until_ms=590) == [0]
+    assert asked(until_ms=60) == [10]
+
+
 def test_a_keyframe_does_not_wait_behind_a_hole(running):
     """After a loss the picture would come back later than the link allows."""
     running.send(5, after_ns=MS)
@@ -189,14 +233,13 @@ def test_requests_for_one_gap_back_off(running):
         if running.core.wants_keyframe(now_ns):
             running.core.keyframe_requested(now_ns)
             asked_ms.append(step_ms)
-    assert asked_ms == [0, 300, 900, 1900, 2900, 3900]
-    running.now_ns += 5000 * MS
-    running.send(11, key=True)
+    assert asked_ms == [0, 300, 600, 1200, 2200, 3200]
     running.core.keyframe_requested(running.now_ns)
-    running.send(13, after_ns=REORDER_WAIT_NS)
-    running.now_ns += 100 * MS
-    assert not running.wants(), "a new gap waits 0.3 s after the last request all the same"
-    running.now_ns += 100 * MS
+    running.send(11, key=True, after_ns=50 * MS)
+    running.core.decoder_failed()
+    running.now_ns += 99 * MS
+    assert not running.wants(), "the edge would take it for answered by that keyframe"
+    running.now_ns += MS
     assert running.wants()
 
 
