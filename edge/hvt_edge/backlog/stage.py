@@ -25,6 +25,8 @@ SILENCE_NS = 3 * SECOND_NS // 2
 """Three reports in a row that did not come."""
 _NO_NEWS_NS = 5 * SECOND_NS
 """Reports come and name no newer picture: small messages pass, or those of one direction, and the video does not."""
+_PAUSE_NS = 2 * SECOND_NS
+"""Nothing has gone out for so long: what is not named says nothing more than it did."""
 _LEFT_NS = 15 * SECOND_NS
 """Who is silent for so long on a link that Zenoh still has, has left; others may subscribe that never report. As in
 `hvt_edge.link.pacer`."""
@@ -52,17 +54,23 @@ class Outage:
         self._subscribed = False
         self._linked = False
         self._reported_ns: int | None = None
-        self._news_ns = 0
-        self._named = -1
+        self._news_ns = self._grew_ns = 0
+        self._named = self._sent = -1
         self.reports = False
         """Whether a ground ever reported on this session: without reports nobody knows what has arrived."""
 
     def reported(self, now_ns: int, *, named: int = -1, sent: int = -1) -> None:
         """A ground has reported on this session (any thread): the last base message that came, of those ``sent``.
 
-        Who takes no video names none, and has no news of it.
+        Who takes no video names none, and has no news of it; beside somebody who does it says nothing of the link.
         """
+        if named < 0 <= self._named:
+            return
         again = not self.reports_now(now_ns)
+        if sent > self._sent:
+            self._sent, self._grew_ns = sent, now_ns
+        elif self._reported_ns is not None and now_ns - self._grew_ns > _PAUSE_NS:
+            self._news_ns += now_ns - self._reported_ns
         if again or named < 0 or self._named < named <= sent or named == sent:
             self._news_ns = now_ns
         if named <= sent:
@@ -84,10 +92,11 @@ class Outage:
             return self._subscribed or self._live
         if not self._linked:  # a new path: the silence of before says nothing about it
             self._linked = self._subscribed = True
-            self._reported_ns = None
+            self._reported_ns, self._named = None, -1
         reported_ns = self._reported_ns
         if reported_ns is not None and now_ns - reported_ns > _LEFT_NS:
             self._reported_ns = reported_ns = None
+            self._named = -1
         if reported_ns is None:
             return False
         return now_ns - reported_ns > SILENCE_NS or now_ns - self._news_ns > _NO_NEWS_NS

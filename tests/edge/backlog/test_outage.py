@@ -60,6 +60,28 @@ def test_a_link_that_passes_small_messages_alone_is_an_outage():
     assert not outage.offline(40 * S, linked=True), "a camera that gives nothing has no news"
 
 
+def test_a_pause_of_the_camera_is_no_outage_whatever_was_lost_before_it():
+    """After a pause the first frames would be stored, not seen: the last one before it was lost."""
+    outage = Outage(live=True)
+    for number in range(60):
+        sent = number if number < 20 or number > 40 else 20
+        outage.reported(number * S // 2, named=min(sent, 19) if number < 41 else sent, sent=sent)
+        assert not outage.offline(number * S // 2, linked=True)
+
+
+def test_a_ground_without_video_hides_no_outage_of_the_one_that_has_it():
+    """A program that takes tracks alone would keep an edge sending into a dead link, and nothing would be stored."""
+    outage, away = Outage(live=True), []
+    for number in range(40):
+        if number < 20:
+            outage.reported(number * S // 2, named=number, sent=number)
+        outage.reported(number * S // 2, sent=number)
+        away.append(outage.offline(number * S // 2, linked=True))
+    assert away == [False] * 23 + [True] * 17
+    alone = Outage(live=True)
+    assert not any(states(alone, first=0, last=30, linked=True, reports=0.5)), "alone it has no outage"
+
+
 def test_a_ground_that_is_gone_is_an_outage_and_its_return_ends_it():
     """Keeping would go on with somebody there, or not begin."""
     outage = Outage(live=False)
