@@ -43,6 +43,8 @@ _BACKLOG_PAUSE_NS = 3 * SECOND_NS
 """After so long without another chunk the recording says how much of the backlog came."""
 _CLOCK_EVERY_NS = 20 * SECOND_NS
 """Time between two queries of the edge's clock."""
+_UNSEEN_NS, _UNSEEN = 5 * SECOND_NS, 3
+"""An edge that says for so long that it sends pictures, and so many of them, of which none comes."""
 _BURST, _EVERY_NS = 30, 5 * SECOND_NS
 """So many sessions begin at once, then one in so long: each is a file, and has a log of its own."""
 
@@ -106,7 +108,9 @@ class EdgeSessions:
         """The one that is open."""
         self.ended = 0
         """Sessions that have ended."""
-        self._part = f"session of {port.edge}"
+        self._part, self._video = f"session of {port.edge}", f"video of {port.edge}"
+        self._unseen: tuple[int, int, int] | None = None
+        """Of the first report since a picture came: its session, how many were sent by then, and when it came."""
 
     @property
     def idle(self) -> bool:
@@ -201,6 +205,8 @@ class EdgeSessions:
 
     def _route(self, packet: Arrival[Received] | Packet) -> None:
         if isinstance(packet, Arrival):
+            self._unseen = None
+            self.failures.works(self._video)
             self._base(packet)
             return
         session, header, item = self.session, packet.header, packet.item
@@ -217,12 +223,25 @@ class EdgeSessions:
                 self._take(session, header, item)
             elif isinstance(header, Status) or (isinstance(header, RoiHeader) and session is None):
                 self.receiver.hold(packet)
+                if isinstance(header, Status) and session is None:
+                    self._note_unseen(header, item.received_ns)
             elif isinstance(header, TrackStep) and session is None:
                 pass  # who joins between two keyframes gets some; the next ones say all of it again
             else:
                 self.receiver.skip_stranger(row, header.session_id)
         except WireError as error:
             self.receiver.skip(row, error)
+
+    def _note_unseen(self, status: Status, now_ns: int) -> None:
+        first = self._unseen
+        if first is None or first[0] != status.session_id:
+            self._unseen = status.session_id, status.base_messages, now_ns
+        elif now_ns - first[2] >= _UNSEEN_NS and status.base_messages - first[1] >= _UNSEEN:
+            self.failures.failed(
+                self._video,
+                "the edge sends pictures, and only small messages come: something on the way drops large packets; "
+                "lower the MTU of the tunnel (docs/deployment.md)",
+            )
 
     def _take(self, session: GroundSession, header: RoiHeader | TrackStep | Status, item: Received) -> None:
         match header:

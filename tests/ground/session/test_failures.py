@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -112,6 +113,27 @@ class Rig:
 def flight() -> Flight:
     """Keyframes at 10, 20, 30 and 36."""
     return Flight(40, keyframes=(10, 20, 30, 36))
+
+
+@pytest.mark.parametrize("sends", [True, False])
+def test_an_edge_of_which_all_but_the_pictures_comes_is_named(flight, tmp_path, sends):
+    """In a tunnel that drops large packets the pilot would look at "waiting for a keyframe" for ever."""
+    rig = Rig(flight, Consumer(tmp_path))
+
+    def said() -> str:
+        return status_text(StateMaker(time.time_ns).make([("uav-1", rig.sessions)]))
+
+    began_ns = time.time_ns()
+    for second in range(6):
+        assert "FAILED" not in said()
+        status = flight.status(base=15 * second * sends, roi=0, state="running")
+        rig.inbox.put(replace(status, received_ns=began_ns + second * SECOND_NS))
+        eventually(lambda: rig.inbox.handled, what="it is handled")
+    assert ("video of uav-1 FAILED at" in said()) == sends, "a camera that gives nothing is no black hole"
+    assert all("only small messages come" in one.reason for one in rig.sessions.failures.now)
+    rig.put(0, 1)
+    assert "FAILED" not in said()
+    assert rig.thread.close()
 
 
 CAUSES = {
