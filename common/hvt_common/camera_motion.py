@@ -130,20 +130,20 @@ class CameraMotion:
         moved = np.abs(corners @ self._since[:2].T - corners[:, :2]).max(axis=0) / (width, height)
         return float(moved.sum())
 
-    def step(self, image_bgr: Image) -> Affine:
+    def step(self, image: Image) -> Affine:
         """The map from the image of the last call to this one, (2, 3) float64 in pixels of the full image.
 
-        The identity at the first call, after a change of size, and where no motion can be estimated.
+        Images are BGR or gray. The identity at the first call, after a change of size, and where no motion is found.
         """
-        full_size = (image_bgr.shape[1], image_bgr.shape[0])
+        full_size = (image.shape[1], image.shape[0])
         scale = min(1.0, _WORKING_SIDE_PX / max(full_size)) if self._scale is None else self._scale
         small_size = (max(1, round(full_size[0] * scale)), max(1, round(full_size[1] * scale)))
         half = (
             max(1, full_size[0] // 2),
             max(1, full_size[1] // 2),
         )  # first: a third of the time of all at once
-        pixels = cv2.resize(image_bgr, half, interpolation=cv2.INTER_AREA) if 2 * scale <= 1 else image_bgr
-        gray = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+        pixels = cv2.resize(image, half, interpolation=cv2.INTER_AREA) if 2 * scale <= 1 else image
+        gray = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
         self.gray = np.asarray(gray, np.uint8)
         current = np.asarray(cv2.resize(gray, small_size, interpolation=cv2.INTER_AREA), np.uint8)
         previous, self._previous = self._previous, current

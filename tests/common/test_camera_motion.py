@@ -149,9 +149,9 @@ def follow(ground: np.ndarray, *, camera_motion: Any, every: int) -> list[list[i
         boxes = np.hstack((centre - half, centre + half)).astype(np.float32)
         seen = Detections(boxes, np.full(6, 0.9, np.float32), np.zeros(6, np.int32))
         if k % every == 0:
-            tracks = tracker.update(seen, frame_index=k, image_bgr=image)
+            tracks = tracker.update(seen, frame_index=k, image=image)
         else:
-            tracks = tracker.predict(frame_index=k, image_bgr=image)
+            tracks = tracker.predict(frame_index=k, image=image)
         listed.append(tracks.ids.tolist())
     return listed
 
@@ -181,7 +181,7 @@ def test_where_another_scene_begins_all_tracks_end() -> None:
         image = np.clip(3 * (scene.astype(float) - 110) + rng.normal(0, 2, scene.shape), 0, 255).astype(
             np.uint8
         )
-        known: dict[str, Any] = {"frame_index": k, "image_bgr": image}
+        known: dict[str, Any] = {"frame_index": k, "image": image}
         tracks = tracker.update(seen, **known) if searched else tracker.predict(**known)
         listed.append(tracks.ids.tolist())
     assert listed == [[1]] * 6 + [[]] * 2 + [[2]] * 4
@@ -236,7 +236,7 @@ def test_while_the_camera_turns_what_comes_into_view_is_searched_soon() -> None:
         found: list[int] = []
         for k in range(46):
             left = speed_px * k
-            known: dict[str, Any] = {"frame_index": k, "image_bgr": ground[:, left : left + 320]}
+            known: dict[str, Any] = {"frame_index": k, "image": ground[:, left : left + 320]}
             if found and not tracker.is_due(k - found[-1], every=5, most=15):
                 tracker.predict(**known)
                 continue

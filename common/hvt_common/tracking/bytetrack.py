@@ -227,15 +227,15 @@ class ByteTracker:
             return True
         return frames >= (1 + min(2, self._steady)) * every and (camera is None or not camera.still())
 
-    def update(self, detections: Detections, *, frame_index: int, image_bgr: Image | None = None) -> Tracks:
+    def update(self, detections: Detections, *, frame_index: int, image: Image | None = None) -> Tracks:
         """The tracks at a frame that a detector has searched; boxes in base pixels.
 
-        ``image_bgr`` is that frame; it is needed only to follow the camera's motion.
+        ``image`` is that frame, BGR or gray; it is needed only to follow the camera's motion.
         A `ValueError` means that ``frame_index`` does not rise or that the class ids are negative.
         """
         self._searched, self._late_frames = None, 0
         self._check_rises(frame_index)
-        return self._update(detections, self._step_to(frame_index, image_bgr, mark=True))
+        return self._update(detections, self._step_to(frame_index, image, mark=True))
 
     def update_late(self, detections: Detections) -> Tracks:
         """The tracks at the frame that `predict` last took as ``searched``, where this was found meanwhile.
@@ -279,13 +279,13 @@ class ByteTracker:
             boxes = boxes[retained]
         return self._listed(frame_index, boxes)
 
-    def predict(self, *, frame_index: int, image_bgr: Image | None = None, searched: bool = False) -> Tracks:
+    def predict(self, *, frame_index: int, image: Image | None = None, searched: bool = False) -> Tracks:
         """The tracks at a frame without detection: those of the last update, moved on by the Kalman filter.
 
         ``searched``: that frame is being searched, in place of one that was before.
         """
         self._check_rises(frame_index)
-        step = self._step_to(frame_index, image_bgr, mark=searched)
+        step = self._step_to(frame_index, image, mark=searched)
         if searched:
             self._searched = _Searched(self._table.copy(), self._frame_index, [])
         if self._searched is not None:
@@ -323,17 +323,17 @@ class ByteTracker:
     def _gray(self) -> Gray | None:
         return None if self._camera is None else self._camera.gray
 
-    def _step_to(self, frame_index: int, image_bgr: Image | None, *, mark: bool) -> _Step:
+    def _step_to(self, frame_index: int, image: Image | None, *, mark: bool) -> _Step:
         # The step to this image; with ``mark`` `still` compares with it from now on.
         camera, before = self._camera, self._gray
-        self.camera_step = None if camera is None or image_bgr is None else camera.step(image_bgr)
-        if camera is not None and image_bgr is not None and camera.new_scene:
+        self.camera_step = None if camera is None or image is None else camera.step(image)
+        if camera is not None and image is not None and camera.new_scene:
             self.scene_began = frame_index
         if camera is not None and mark:
             camera.mark()
-        if image_bgr is None:
+        if image is None:
             return _Step(frame_index, None, None, None)
-        flow, self._size = None, (image_bgr.shape[1], image_bgr.shape[0])
+        flow, self._size = None, (image.shape[1], image.shape[0])
         if self._frame_index is not None and self._pictured == self._frame_index:
             flow = self._flow(before, self._gray, self.camera_step, frames=frame_index - self._frame_index)
         self._pictured = frame_index

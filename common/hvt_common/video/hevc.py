@@ -10,6 +10,7 @@ from typing import cast
 
 import av
 import av.error
+import cv2
 import numpy as np
 import numpy.typing as npt
 from av.video.codeccontext import VideoCodecContext
@@ -32,6 +33,8 @@ MAX_PICTURE_PX = 35_651_584
 """The luma samples of a picture of level 6.2 (ITU-T H.265, table A.8): 8192x4352."""
 _BLOCK_PX = 64
 _YUV420 = ("yuv420p", "yuvj420p")
+_FULL_RANGE = np.clip(np.rint((np.arange(256) - 16) * 255 / 219), 0, 255).astype(np.uint8)
+"""Of the luma of ITU-T H.273, 16 to 235."""
 Plane = npt.NDArray[np.uint8]
 """A coded picture is filled up to whole blocks, and libavcodec's rows to as much."""
 
@@ -65,6 +68,13 @@ class YuvPicture:
             for plane, side in zip(whole, ((width, height), half, half), strict=True)
         )
         return luma, first, second
+
+    def gray(self) -> Image:
+        """Uint8 (H, W), 0 to 255, for a tenth of the time of `bgr`."""
+        planes = self.planes
+        if planes is None:
+            return np.asarray(cv2.cvtColor(self.bgr(), cv2.COLOR_BGR2GRAY), np.uint8)
+        return np.asarray(cv2.LUT(planes[0], _FULL_RANGE), np.uint8)
 
     def bgr(self) -> Image:
         """Uint8 (H, W, 3), the same at every call."""

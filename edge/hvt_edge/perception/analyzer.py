@@ -150,25 +150,26 @@ class Analyzer:
 
     def _analyze(self, frame: Frame, unit: AccessUnit | None) -> AnalyzedFrame:
         picture = None if unit is None else self._decode(frame.index, unit)
-        bgr = [picture.bgr()] if picture is not None and self._candidates == "decoded" else []
-        pixels = bgr[0] if bgr else None
-        if self._candidates == "source":
-            pixels = frame.base_bgr
+        pixels: Image | None = frame.base_bgr
+        if self._candidates == "decoded":
+            pixels = None if picture is None else picture.gray()
         due = self.cpu_budget.admits_detection(
             frame.capture_ns, due=self._due(frame.index, coded=unit is not None)
         )
-        detections = None
+        detections, bgr = None, list[Image]()
         if due:
+            if picture is not None and self._candidates == "decoded":
+                bgr.append(picture.bgr())
             with self.cpu_budget.spending("detect"):
                 detections = self._detect(frame, bgr)
         if detections is None:
             with self.cpu_budget.spending("track"):
-                tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
+                tracks = self._tracker.predict(frame_index=frame.index, image=pixels)
         else:
             if self._trust is not None:
                 self._trust.take(detections)
             self._detected_index, self.detected_ns = frame.index, frame.capture_ns
-            tracks = self._tracker.update(detections, frame_index=frame.index, image_bgr=pixels)
+            tracks = self._tracker.update(detections, frame_index=frame.index, image=pixels)
         detected, scene_began = detections is not None, self._tracker.scene_began
         return AnalyzedFrame(frame, picture, tracks, detected=detected, scene_began=scene_began, _bgr=bgr)
 

@@ -227,8 +227,7 @@ class Pipeline:
         """
         index = picture.frame_index
         self._history.add_frame(index, picture.picture)
-        image = as_bgr(picture.picture)
-        own = self._own = self._track(picture, image, hurry=hurry, news=news)
+        own = self._own = self._track(picture, hurry=hurry, news=news)
         self._picture_ns = picture.capture_ns
         ahead = self._now.frame_index > index
         shown_at = (self._now.frame_index, self._now.capture_ns) if ahead else (index, picture.capture_ns)
@@ -314,14 +313,12 @@ class Pipeline:
 
     # The base stream
 
-    def _track(
-        self, picture: DecodedFrame, image: Image, *, hurry: bool, news: threading.Event | None
-    ) -> Tracks:
+    def _track(self, picture: DecodedFrame, *, hurry: bool, news: threading.Event | None) -> Tracks:
         parts, index = self._parts, picture.frame_index
         if self._detection is not None and not self.searching:
             self._take_found(self._detection)
-        begins = self._submits(picture, image, hurry=hurry)
-        own = parts.tracker.predict(frame_index=index, image_bgr=image, searched=begins)
+        begins = self._submits(picture, hurry=hurry)
+        own = parts.tracker.predict(frame_index=index, image=_gray(picture.picture), searched=begins)
         if parts.tracker.scene_began == index:
             parts.fusion.end_scene(index)
         before, affine = self._now.picture_index, parts.tracker.camera_step
@@ -331,11 +328,11 @@ class Pipeline:
             return self._take_found(self._detection)
         return own
 
-    def _submits(self, picture: DecodedFrame, image: Image, *, hurry: bool) -> bool:
+    def _submits(self, picture: DecodedFrame, *, hurry: bool) -> bool:
         # Whether this picture is searched: begun here, or in place of one that has waited until now.
         parts, last, index = self._parts, self._detected_frame, picture.frame_index
         if self._detection is not None:
-            if not self._detection.replace(image):
+            if not self._detection.queued or not self._detection.replace(as_bgr(picture.picture)):
                 return False
             self._detected_frame = index
             return True
@@ -349,7 +346,7 @@ class Pipeline:
         if due:
             self._detected_frame = index
             self._due_ns = picture.capture_ns
-            self._detection = parts.detector_thread.submit(image, self._detect)
+            self._detection = parts.detector_thread.submit(as_bgr(picture.picture), self._detect)
         return due
 
     def _is_found(self, detection: Detection, news: threading.Event | None) -> bool:
@@ -445,6 +442,11 @@ class Pipeline:
         for survivor_id, merged_id in self._parts.fusion.take_merged():
             self._parts.refiner.merge(survivor_id, merged_id)
             self._history.rename_track(survivor_id, merged_id)
+
+
+def _gray(picture: Image | YuvPicture) -> Image:
+    # What it takes to follow the camera. Only pictures that are searched are converted to BGR.
+    return picture.gray() if isinstance(picture, YuvPicture) else picture
 
 
 def _areas(boxes: Boxes) -> npt.NDArray[np.float32]:

@@ -100,10 +100,10 @@ class SessionPerception:
                 detected = frame_index
                 found = detector.detect(image_bgr) or Detections.none()
                 self._trust.take(found)
-                tracks = tracker.update(found, frame_index=frame_index, image_bgr=image_bgr)
+                tracks = tracker.update(found, frame_index=frame_index, image=image_bgr)
                 self.tilt.take(tracks, detector.class_names, height_px=image_bgr.shape[0])
             else:
-                tracks = tracker.predict(frame_index=frame_index, image_bgr=image_bgr)
+                tracks = tracker.predict(frame_index=frame_index, image=image_bgr)
             ids = tracks.ids + before
             self._next_id = max(self._next_id, int(ids.max(initial=0)) + 1)
             names = tuple(detector.class_names[class_id] for class_id in tracks.class_ids)

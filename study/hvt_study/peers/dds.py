@@ -164,7 +164,7 @@ class DdsGround:
                 return
             del self._held[one.frame_index]
             self._list_between(one.frame_index)
-            tracks = self._tracker.update(one.found, frame_index=one.frame_index, image_bgr=one.picture_bgr)
+            tracks = self._tracker.update(one.found, frame_index=one.frame_index, image=one.picture_bgr)
             self.lists[one.frame_index] = self._seen(tracks, found=one.found)
             self.delays_ns.append(self._at_ns - one.capture_ns)
             self._listed_to = one.frame_index + 1

@@ -459,7 +459,7 @@ def test_between_detections_a_box_goes_with_what_is_in_it(late: int) -> None:
         image[round(y) : round(y) + shown.shape[0], round(x) : round(x) + shown.shape[1]] = shown
         box = (round(x), round(y), round(x) + shown.shape[1], round(y) + shown.shape[0])
         begins = k % 5 == 0 and k <= 10
-        listed = tracker.predict(frame_index=k, image_bgr=image, searched=begins)
+        listed = tracker.predict(frame_index=k, image=image, searched=begins)
         if begins:
             found = seen(box)
         if k % 5 == late and k - late <= 10:
@@ -481,9 +481,9 @@ def test_boxes_keep_to_their_objects_where_frames_come_without_a_picture() -> No
         image[150:180, x : x + 44] = car
         given = image if k % 3 == 0 else None
         if k % 9 == 0:
-            listed = tracker.update(seen((x, 150, x + 44, 180)), frame_index=k, image_bgr=given)
+            listed = tracker.update(seen((x, 150, x + 44, 180)), frame_index=k, image=given)
         else:
-            listed = tracker.predict(frame_index=k, image_bgr=given)
+            listed = tracker.predict(frame_index=k, image=given)
         if k > 27:
             assert abs(listed.boxes_xyxy_px[-1, 0] - x) < 2, k
 
@@ -506,8 +506,8 @@ def test_a_frame_of_hours_later_costs_no_steps_in_between(monkeypatch: pytest.Mo
     monkeypatch.setattr(kalman, "predict", lambda states: (steps.append(1), step(states)))
     tracker = ByteTracker(TrackerSettings(camera_motion="flow"), fps=15)
     image = np.asarray(np.random.default_rng(0).integers(0, 255, (180, 320, 3)), np.uint8)
-    tracker.update(seen((100, 100, 140, 160)), frame_index=0, image_bgr=image)
-    assert len(tracker.predict(frame_index=2**32 - 1, image_bgr=image)) == 0
+    tracker.update(seen((100, 100, 140, 160)), frame_index=0, image=image)
+    assert len(tracker.predict(frame_index=2**32 - 1, image=image)) == 0
     assert len(steps) < 10
 
 
@@ -560,9 +560,9 @@ def test_a_box_that_goes_with_the_road_does_not_grow_with_it() -> None:
         affine = cv2.getRotationMatrix2D((640, 360), 0, 1.06**k)
         image = np.asarray(cv2.warpAffine(picture, affine, (1280, 720)), np.uint8)
         if k == 0:
-            tracker.update(seen(box), frame_index=k, image_bgr=image)
+            tracker.update(seen(box), frame_index=k, image=image)
         else:
-            listed = tracker.predict(frame_index=k, image_bgr=image)
+            listed = tracker.predict(frame_index=k, image=image)
     assert 1.5 < float(np.diff(listed.boxes_xyxy_px[0, ::2])[0]) / 80 < 1.65
 
 
@@ -574,10 +574,10 @@ def test_what_is_found_late_counts_as_if_it_had_been_found_at_once(late: int) ->
     for k, found in enumerate(scene(late, frames=20)):
         image = np.roll(picture, 3 * k, axis=1)  # the camera pans
         if k % 5 == 0:
-            at_once.update(found, frame_index=k, image_bgr=image)
+            at_once.update(found, frame_index=k, image=image)
         else:
-            at_once.predict(frame_index=k, image_bgr=image)
-        waited.predict(frame_index=k, image_bgr=image, searched=k % 5 == 0)
+            at_once.predict(frame_index=k, image=image)
+        waited.predict(frame_index=k, image=image, searched=k % 5 == 0)
         if k % 5 == 0:
             searched = found
         if k % 5 == late:

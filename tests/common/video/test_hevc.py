@@ -49,6 +49,16 @@ def test_colours_come_back_without_a_shift():
     assert 10 * np.log10(255**2 / (error**2).mean()) > 36
 
 
+def test_gray_is_the_luma_of_the_colours():
+    """The ground would follow a camera by a flatter picture than an edge."""
+    decoder = BaseDecoder()
+    for data in coded(2):
+        picture = decoder.decode_yuv(data)
+        expected = picture.bgr() @ np.array([0.0722, 0.7152, 0.2126])
+        assert picture.gray().dtype == np.uint8
+        assert np.abs(picture.gray() - expected).mean() < 1
+
+
 def test_garbage_gives_nothing_and_a_keyframe_mends_it():
     """One bad message would end the ground or freeze its picture for the rest of the flight."""
     units = coded(8, keyframes=(4,))

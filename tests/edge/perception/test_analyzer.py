@@ -125,6 +125,16 @@ def test_a_picture_is_converted_where_somebody_looks_at_it(monkeypatch):
     assert len(converted) == 6
 
 
+def test_of_the_decoded_stream_only_what_is_searched_is_converted(monkeypatch):
+    """A conversion takes longer than decoding."""
+    converted = []
+    convert = YuvPicture.bgr
+    monkeypatch.setattr(YuvPicture, "bgr", lambda self: converted.append(1) or convert(self))
+    analyzer = make(detect_every=5)
+    seen = [analyzer.analyze(frame, unit) for frame, unit in zip(FRAMES, UNITS, strict=True)]
+    assert len(converted) == sum(one.detected for one in seen) == 6
+
+
 def test_in_a_hurry_detection_is_put_off_and_made_up_for():
     """A slow detector would fall behind more and more; or a busy second would leave it blind for another."""
     analyzer = make(detect_every=5)
@@ -263,9 +273,9 @@ def test_with_candidates_of_the_source_the_camera_is_followed_on_the_source():
     given: list[bool] = []
 
     class Watched(ByteTracker):
-        def predict(self, *, frame_index, image_bgr=None):
-            given.append(image_bgr is FRAMES[frame_index].base_bgr)
-            return super().predict(frame_index=frame_index, image_bgr=image_bgr)
+        def predict(self, *, frame_index, image=None):
+            given.append(image is FRAMES[frame_index].base_bgr)
+            return super().predict(frame_index=frame_index, image=image)
 
     for candidates, primary in (("source", True), ("decoded", False)):
         tracker = Watched(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)

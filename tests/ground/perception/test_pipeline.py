@@ -15,7 +15,7 @@ from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import AlsoShown, RoiHeader
 from hvt_common.values import Detections, View
 from hvt_common.video.base_crop import base_crop
-from hvt_common.video.hevc import BaseDecoder
+from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import still_codec
 from hvt_ground.events import Notice, Overlay, Refinement
 from hvt_ground.perception.guesses import Guesses
@@ -108,6 +108,19 @@ def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures
         assert one.track_ids.tolist() == [1]
         np.testing.assert_allclose(one.boxes_base_px[0], square_box(one.frame_index), atol=6)
         assert (one.classes, one.refined.tolist()) == (("car",), [False])
+
+
+def test_only_pictures_that_are_searched_are_converted(flight, monkeypatch):
+    """Converting each would take a ground longer than decoding it."""
+    converted = []
+    convert = YuvPicture.bgr
+    monkeypatch.setattr(YuvPicture, "bgr", lambda self: converted.append(1) or convert(self))
+    rig, decoder = Rig(detect_every=5), BaseDecoder()
+    for unit in flight.units:
+        picture = decoder.decode_yuv(unit.data)
+        rig.pipeline.analyze(DecodedFrame(unit.frame_index, unit.capture_ns, None, picture), hurry=False)
+    assert len(converted) == rig.pipeline.detections_run == 6
+    assert [one.track_ids.tolist() for one in rig.of(Overlay)[6:]] == [[1]] * 24
 
 
 def test_a_slow_detector_holds_no_list_up_and_its_boxes_lie_where_objects_are_now(pictures):
