@@ -16,7 +16,7 @@ _SIDE: Final = 3
 _POINTS: Final = _SIDE * _SIDE
 _MIDDLE: Final = 0.7
 """Share of a box's sides that the points lie in: beyond it is the ground."""
-_WINDOW_PX: Final = 13
+_WINDOW_PX: Final = 9
 _LEVELS: Final = 2
 _AROUND_PX: Final = 64
 _ALIGNED: Final = 2**_LEVELS

@@ -533,6 +533,44 @@ def test_a_small_box_does_not_go_with_the_ground() -> None:
     np.testing.assert_allclose(moved.shifts[1], (4, 0), atol=0.2)
 
 
+def test_a_small_car_goes_its_own_way_and_not_the_grounds() -> None:
+    """Its box would stay behind until the detector looks again: a window that is wider than the car sees the road."""
+    right = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        ground, car = (
+            cv2.blur(rng.integers(0, 255, size, np.uint8), (side, side))
+            for size, side in (((180, 320), 5), ((12, 16), 3))
+        )
+        before, now = (np.roll(np.asarray(ground, np.uint8), by, axis=1) for by in (0, -2))
+        before[80:92, 100:116] = now[80:92, 103:119] = car
+        box = np.array([[200.0, 160, 232, 184]])
+        moved = box_flow(before, now, box, expected=np.zeros((1, 2)), size=(640, 360))
+        right += bool(moved.found[0] and np.abs(moved.shifts[0] - (6, 0)).max() < 1.5)
+    assert right >= 34
+
+
+def test_a_frame_costs_a_bounded_number_of_pixels_to_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixty cars would take twice the processor, which video needs."""
+    pixels = []
+    follow = cv2.calcOpticalFlowPyrLK
+
+    def counted(before: Any, now: Any, points: Any, guess: Any, **settings: Any) -> Any:
+        pixels.append(len(points) * np.prod(settings["winSize"]) * (settings["maxLevel"] + 1))
+        return follow(before, now, points, guess, **settings)
+
+    monkeypatch.setattr(cv2, "calcOpticalFlowPyrLK", counted)
+    rng = np.random.default_rng(4)
+    picture = cv2.blur(rng.integers(0, 255, (720, 1280, 3), np.uint8), (9, 9))
+    corners = rng.uniform((20, 20), (1200, 640), (60, 2))
+    boxes = np.hstack((corners, corners + 40))
+    tracker = ByteTracker(TrackerSettings(camera_motion="flow"), fps=15)
+    tracker.update(seen(*boxes), frame_index=0, image=np.asarray(picture, np.uint8))
+    tracker.predict(frame_index=1, image=np.roll(np.asarray(picture, np.uint8), 3, axis=1))
+    assert len(pixels) == 2  # the camera, and the boxes
+    assert sum(pixels) <= 360_000
+
+
 def test_a_box_alone_goes_as_among_others_and_one_beside_the_picture_nowhere() -> None:
     """The part of the pictures that is looked at would change what is seen there."""
     before = np.asarray(
