@@ -101,6 +101,8 @@ class EdgeSessions:
         self._ended_ns: int | None = None
         """When the edge said that the open session has ended."""
         self._ended_id: int | None = None
+        self._lost_id: int | None = None
+        """Of a session that ended since its edge was gone: it may come back with nothing but what it has stored."""
         self._backlog_ns: int | None = None
         """When the last chunk of it came that nothing has been said of."""
         self._next_clock_ns = 0
@@ -168,6 +170,7 @@ class EdgeSessions:
             gone = self._ended_ns is None
             self._end_session()
             if gone:
+                self._lost_id = session.info.session_id
                 self.receiver.stream.decoder_failed()  # should it come back, it starts with a keyframe
 
     def _refresh_clock(self, session: GroundSession, now_ns: int) -> None:
@@ -285,6 +288,12 @@ class EdgeSessions:
         return header.frame_index > session.reception.newest_index
 
     def _backlog(self, header: BacklogHeader, item: Received) -> None:
+        if (
+            self.session is None
+            and header.session_id == self._lost_id
+            and self._pause.due(time.monotonic_ns())
+        ):
+            self._begin_session(header.session_id)
         session = self.session
         if session is None:
             raise WireError("it was stored, and no session is open to take it")

@@ -90,6 +90,7 @@ class Rig:
         detector_of=RedSquares,
         timing=None,
         most_files=32,
+        patience_s=5.0,
         ended_patience_s=2.0,
         worker_of=patient_worker,
         **recorder,
@@ -117,6 +118,7 @@ class Rig:
             open_session=self._open,
             on_ended=self.ended.append,
             recordings=self.recordings,
+            patience_s=patience_s,
             ended_patience_s=ended_patience_s,
         )
         self.thread = EdgeThread(self.receiver, drain_s=PATIENT_S)
@@ -898,6 +900,22 @@ def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path):
     assert len(Recording(tmp_path / "0.rrd").video()) == 30 + 25
     (last,) = [one for report in rig.port.reports for one in report.backlog if one.acknowledged_bytes][-1:]
     assert last.kind == "base"
+
+
+def test_an_edge_that_comes_back_without_video_hands_over_what_it_stored(flight, tmp_path):
+    """After a clip's last frame, or while its camera is away, it sent the same again for ever."""
+    with Rig(tmp_path, flight, patience_s=0.2) as rig:
+        rig.base(*range(5))
+        rig.port.present.clear()
+        eventually(lambda: len(rig.ended) == 1)
+        rig.port.present.set()
+        still = still_object(flight, 12, 0)
+        rig.put(*backlog(flight, "still", 0, still))
+        assert full(flight, "still", 0, still) in rig.acknowledged_ranges()
+        rig.base(*range(40, 45))
+        assert len(rig.opened) == 2, "the video that comes later is of the same session"
+        assert rig.session.frames_decoded == 5
+    assert len(Recording(tmp_path / "1.rrd").stills()) == 1
 
 
 def test_a_stored_thing_that_cannot_be_worked_off_ends_nothing_else(flight, tmp_path, caplog):
