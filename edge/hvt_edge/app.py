@@ -43,6 +43,7 @@ from hvt_edge.wiring import (
     qualify_encoder,
     say_size,
     try_scene,
+    unopened,
 )
 from hvt_edge.world import World
 
@@ -241,7 +242,7 @@ class Edge:
         return source
 
     def _open_detector(self, config: EdgeConfig, source: Source) -> FailingDetector:
-        # In real time one that fails is opened anew; `FlightError` where we are stopped before it is open.
+        # In real time one that fails is opened anew.
         world = self._world
         opened = partial(
             open_for_flight,
@@ -252,8 +253,8 @@ class Edge:
         if self._lockstep:  # one that was opened anew would make its result one of something else
             return opened()
         first = with_lower_priority(opened, stop=self._stop)
-        if first is None:
-            raise FlightError("stopped before the detector was open")
+        if first is None:  # stopped before it is open
+            return unopened(config, lambda: world.open_detector(config))
         # Not kept beside the one that is opened in its place once it has failed: it holds 100 MB.
         ready = [first]
         return RetriedDetector(

@@ -43,6 +43,7 @@ from hvt_edge.stills.scheduler import Suppression
 
 _log = logging.getLogger(__name__)
 
+_UNKNOWN = ("object",)
 _TRIAL_PX = 48
 _LEAST_STILL_BYTES = 400
 _DETAIL = "detail_weight"
@@ -81,6 +82,11 @@ def open_for_flight(
     detector = open_detector()
     warm_up(detector)
     return detector
+
+
+def unopened(config: EdgeConfig, open_detector: Callable[[], Detector]) -> Detector:
+    """In place of one that is still being opened when the flight ends: nothing is searched any more."""
+    return _OpenedOnUse(open_detector, declared_class_names(config.detector) or _UNKNOWN)
 
 
 def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
