@@ -43,8 +43,9 @@ _BACKLOG_PAUSE_NS = 3 * SECOND_NS
 """After so long without another chunk the recording says how much of the backlog came."""
 _CLOCK_EVERY_NS = 20 * SECOND_NS
 """Time between two queries of the edge's clock."""
-_UNSEEN_NS, _UNSEEN = 5 * SECOND_NS, 3
-"""An edge that says for so long that it sends pictures, and so many of them, of which none comes."""
+_UNSEEN_NS, _UNSEEN = 15 * SECOND_NS, 3
+"""An edge that says for so long that it sends pictures, and so many of them, of which none comes. A keyframe is coded
+for less than a second of the rate: it takes so long on a link of a fifteenth of that."""
 _BURST, _EVERY_NS = 30, 5 * SECOND_NS
 """So many sessions begin at once, then one in so long: each is a file, and has a log of its own."""
 
@@ -111,8 +112,10 @@ class EdgeSessions:
         self.ended = 0
         """Sessions that have ended."""
         self._part, self._video = f"session of {port.edge}", f"video of {port.edge}"
-        self._unseen: tuple[int, int, int] | None = None
-        """Of the first report since a picture came: its session, how many were sent by then, and when it came."""
+        self._unseen: tuple[tuple[int, int], int, int] | None = None
+        """Of the first report since a picture came: its session and how many had come damaged, how many were sent by
+        then, and when it came."""
+        self._unseen_failure = 0
 
     @property
     def idle(self) -> bool:
@@ -156,6 +159,7 @@ class EdgeSessions:
             if session is not None:
                 session.note("warning", "the ground has asked for a keyframe")
         if session is None:
+            self._end_unseen(silent=True)
             return
         if session.take_resumed():
             self.port.request_keyframe()
@@ -210,6 +214,7 @@ class EdgeSessions:
         if isinstance(packet, Arrival):
             self._unseen = None
             self.failures.works(self._video)
+            self._unseen_failure = 0
             self._base(packet)
             return
         session, header, item = self.session, packet.header, packet.item
@@ -236,15 +241,27 @@ class EdgeSessions:
             self.receiver.skip(row, error)
 
     def _note_unseen(self, status: Status, now_ns: int) -> None:
-        first = self._unseen
-        if first is None or first[0] != status.session_id:
-            self._unseen = status.session_id, status.base_messages, now_ns
-        elif now_ns - first[2] >= _UNSEEN_NS and status.base_messages - first[1] >= _UNSEEN:
-            self.failures.failed(
+        of = status.session_id, self.receiver.stream.counters.corrupt
+        if status.state == "ended" or (self._unseen is not None and self._unseen[0] != of):
+            self._end_unseen()
+        if self._unseen is None:
+            self._unseen = of, status.base_messages, now_ns
+        _, sent, since_ns = self._unseen
+        unseen = now_ns - since_ns >= _UNSEEN_NS and status.base_messages - sent >= _UNSEEN
+        if unseen and not self._unseen_failure:
+            self._unseen_failure = self.failures.failed(
                 self._video,
-                "the edge sends pictures, and only small messages come: something on the way drops large packets; "
-                "lower the MTU of the tunnel (docs/deployment.md)",
+                "the edge sends pictures, and only small messages come: something on the way drops large packets "
+                "(lower the MTU of the tunnel, docs/deployment.md), or the link is too slow for a picture",
             )
+
+    def _end_unseen(self, *, silent: bool = False) -> None:
+        # ``silent``: only if nothing comes at all.
+        if silent and self.receiver.silent_ns <= self._patience_ns:
+            return
+        self._unseen = None
+        self.failures.over(self._video, self._unseen_failure)
+        self._unseen_failure = 0
 
     def _take(self, session: GroundSession, header: RoiHeader | TrackStep | Status, item: Received) -> None:
         match header:
