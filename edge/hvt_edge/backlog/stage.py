@@ -56,22 +56,25 @@ class Outage:
         self._reported_ns: int | None = None
         self._news_ns = self._grew_ns = 0
         self._named = self._sent = -1
+        self._named_ns = -SILENCE_NS
+        """When somebody named a message."""
         self.reports = False
         """Whether a ground ever reported on this session: without reports nobody knows what has arrived."""
 
     def reported(self, now_ns: int, *, named: int = -1, sent: int = -1) -> None:
         """A ground has reported on this session (any thread): the last base message that came, of those ``sent``.
 
-        Who takes no video names none, and has no news of it; beside somebody who does it says nothing of the link.
+        Who takes no video names none, and has no news of it; beside somebody who reports some it is none.
         """
-        if named < 0 <= self._named:
-            return
         again = not self.reports_now(now_ns)
         if sent > self._sent:
             self._sent, self._grew_ns = sent, now_ns
         elif self._reported_ns is not None and now_ns - self._grew_ns > _PAUSE_NS:
             self._news_ns += now_ns - self._reported_ns
-        if again or named < 0 or self._named < named <= sent or named == sent:
+        if named >= 0:
+            self._named_ns = now_ns
+        alone = now_ns - self._named_ns >= SILENCE_NS
+        if again or alone or self._named < named <= sent or named == sent:
             self._news_ns = now_ns
         if named <= sent:
             self._named = max(self._named, named)
@@ -92,11 +95,10 @@ class Outage:
             return self._subscribed or self._live
         if not self._linked:  # a new path: the silence of before says nothing about it
             self._linked = self._subscribed = True
-            self._reported_ns, self._named = None, -1
+            self._reported_ns = None
         reported_ns = self._reported_ns
         if reported_ns is not None and now_ns - reported_ns > _LEFT_NS:
             self._reported_ns = reported_ns = None
-            self._named = -1
         if reported_ns is None:
             return False
         return now_ns - reported_ns > SILENCE_NS or now_ns - self._news_ns > _NO_NEWS_NS

@@ -73,13 +73,22 @@ def test_a_ground_without_video_hides_no_outage_of_the_one_that_has_it():
     """A program that takes tracks alone would keep an edge sending into a dead link, and nothing would be stored."""
     outage, away = Outage(live=True), []
     for number in range(40):
+        outage.reported(number * S // 2, named=min(number, 19), sent=number)
+        outage.reported(number * S // 2, sent=number)
+        away.append(outage.offline(number * S // 2, linked=True))
+    assert away == [False] * 30 + [True] * 10
+    alone = Outage(live=True)
+    assert not any(states(alone, first=0, last=30, linked=True, reports=0.5)), "alone it has no outage"
+
+
+def test_a_ground_with_video_that_leaves_is_no_outage_for_a_program_that_stays():
+    """The program would get no still for 13 s."""
+    outage = Outage(live=True)
+    for number in range(80):
         if number < 20:
             outage.reported(number * S // 2, named=number, sent=number)
         outage.reported(number * S // 2, sent=number)
-        away.append(outage.offline(number * S // 2, linked=True))
-    assert away == [False] * 23 + [True] * 17
-    alone = Outage(live=True)
-    assert not any(states(alone, first=0, last=30, linked=True, reports=0.5)), "alone it has no outage"
+        assert not any(outage.offline(number * S // 2 + late, linked=True) for late in (0, S // 3))
 
 
 def test_a_ground_that_is_gone_is_an_outage_and_its_return_ends_it():
