@@ -26,7 +26,8 @@ SILENCE_NS = 3 * SECOND_NS // 2
 _NO_NEWS_NS = 5 * SECOND_NS
 """Reports come and name no newer picture: small messages pass, or those of one direction, and the video does not."""
 _PAUSE_NS = 2 * SECOND_NS
-"""Nothing has gone out for so long: what is not named says nothing more than it did."""
+"""Nothing has gone out for so long, nor for 1.5 of the time between the last two: what is not named is no news of the
+link."""
 _LEFT_NS = 15 * SECOND_NS
 """Who is silent for so long on a link that Zenoh still has, has left; others may subscribe that never report. As in
 `hvt_edge.link.pacer`."""
@@ -54,7 +55,7 @@ class Outage:
         self._subscribed = False
         self._linked = False
         self._reported_ns: int | None = None
-        self._news_ns = self._grew_ns = 0
+        self._news_ns = self._grew_ns = self._each_ns = 0
         self._named = self._sent = -1
         self._named_ns = -SILENCE_NS
         """When somebody named a message."""
@@ -68,8 +69,11 @@ class Outage:
         """
         again = not self.reports_now(now_ns)
         if sent > self._sent:
+            self._each_ns = now_ns - self._grew_ns if self._sent >= 0 else 0
             self._sent, self._grew_ns = sent, now_ns
-        elif self._reported_ns is not None and now_ns - self._grew_ns > _PAUSE_NS:
+        elif self._reported_ns is not None and now_ns - self._grew_ns > max(
+            _PAUSE_NS, 3 * self._each_ns // 2
+        ):
             self._news_ns += now_ns - self._reported_ns
         if named >= 0:
             self._named_ns = now_ns

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
+import pytest
+
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.stage import Outage
 from hvt_edge.link.pacer import BaseInFlight
@@ -67,6 +69,18 @@ def test_a_pause_of_the_camera_is_no_outage_whatever_was_lost_before_it():
         sent = number if number < 20 or number > 40 else 20
         outage.reported(number * S // 2, named=min(sent, 19) if number < 41 else sent, sent=sent)
         assert not outage.offline(number * S // 2, linked=True)
+
+
+@pytest.mark.parametrize("each_s", [1, 3, 5, 8, 10])
+def test_few_frames_are_no_pause(each_s):
+    """At a frame in 8 s an outage of the video was noticed after 18 s."""
+    outage = Outage(live=True)
+    for number in range(160):
+        if number % (2 * each_s) == 0 and outage.offline(number * S // 2, linked=True):
+            break
+        sent = number // (2 * each_s)
+        outage.reported(number * S // 2, named=min(sent, 3), sent=sent)
+    assert number // 2 - 4 * each_s == next(late for late in range(each_s, 100, each_s) if late >= 5)
 
 
 def test_a_ground_without_video_hides_no_outage_of_the_one_that_has_it():
