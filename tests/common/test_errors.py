@@ -119,6 +119,23 @@ def test_streams_that_were_closed_take_no_files(tmp_path):
     assert (tmp_path / "recording").read_bytes() == b""
 
 
+_PARENT = """
+import subprocess, sys
+from hvt_common.errors import exit_with_sentence
+def run(argv):
+    child = "import os; [os.fstat(number) for number in range(3)]"
+    return subprocess.run([sys.executable, "-c", child]).returncode
+sys.exit(exit_with_sentence(run, program="it", argv=[]))
+"""
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_programs_that_it_starts_have_the_streams_too(closed):
+    """A file of theirs would have the number of a stream."""
+    words = ["sh", "-c", f'"$@" {closed}', "sh", sys.executable, "-c", _PARENT]
+    assert subprocess.run(words, capture_output=True, check=False).returncode == 0
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
 def test_output_for_which_there_is_no_room_is_a_sentence(tmp_path):
     """Settings or a report sent to a file on a full disk ended in a traceback."""
