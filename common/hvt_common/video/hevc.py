@@ -74,6 +74,8 @@ class YuvPicture:
         planes = self.planes
         if planes is None:
             return np.asarray(cv2.cvtColor(self.bgr(), cv2.COLOR_BGR2GRAY), np.uint8)
+        if self._picture.color_range == ColorRange.JPEG:
+            return planes[0].copy()
         return np.asarray(cv2.LUT(planes[0], _FULL_RANGE), np.uint8)
 
     def bgr(self) -> Image:

@@ -7,10 +7,11 @@ from fractions import Fraction
 import av
 import numpy as np
 import pytest
+from av.video.reformatter import ColorRange, VideoReformatter
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hvt_common.video.hevc import MAX_SIDE_PX, BaseDecoder
+from hvt_common.video.hevc import MAX_SIDE_PX, BaseDecoder, YuvPicture
 from hvt_edge.video.encoder import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import framed, smooth_pictures
@@ -57,6 +58,18 @@ def test_gray_is_the_luma_of_the_colours():
         expected = picture.bgr() @ np.array([0.0722, 0.7152, 0.2126])
         assert picture.gray().dtype == np.uint8
         assert np.abs(picture.gray() - expected).mean() < 1
+
+
+def test_gray_of_a_camera_of_full_range_is_not_stretched():
+    """Below 16 and above 235 it would show nothing."""
+    ramp = np.tile(np.arange(256, dtype=np.uint8), (16, 1))
+    frame = av.VideoFrame.from_ndarray(
+        np.concatenate((ramp, np.full((8, 256), 128, np.uint8))), format="yuvj420p"
+    )
+    frame.color_range = ColorRange.JPEG
+    picture = YuvPicture(frame, VideoReformatter())
+    assert np.array_equal(picture.gray(), ramp)
+    assert np.abs(picture.bgr()[..., 1].astype(int) - picture.gray()).max() <= 2, "as the colours"
 
 
 def test_garbage_gives_nothing_and_a_keyframe_mends_it():
