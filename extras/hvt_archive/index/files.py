@@ -17,7 +17,8 @@ from typing import Any
 from rerun.chunk import Chunk
 
 from hvt_ground.recordings.row import FileAccount, RecordingRow
-from hvt_ground.sinks.rerun.rrd_file import copy_readable, drop_footer, id_of, open_rrd
+from hvt_ground.sinks.rerun.readable import readable
+from hvt_ground.sinks.rerun.rrd_file import drop_footer, id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 from hvt_ground.sinks.rerun.stills import still_of_event
 
@@ -57,15 +58,10 @@ def is_claimed(path: Path) -> bool:
 
 def described(path: Path) -> RecordingRow | None:
     """Read a file's description of itself; None if it is no recording of ours."""
-    found = _described(path)
-    if found is not None:
-        return found
     with suppress(OSError), tempfile.TemporaryDirectory() as folder:
-        whole = Path(folder) / path.name
-        if copy_readable(path, whole):
-            found = _described(whole)
-            state = path.stat()
-            return found and replace(found, written_ns=state.st_mtime_ns, size_bytes=state.st_size)
+        found = readable(path, Path(folder) / path.name)
+        row, state = _described(found) if found else None, path.stat()
+        return row and replace(row, written_ns=state.st_mtime_ns, size_bytes=state.st_size)
     return None
 
 
@@ -149,13 +145,26 @@ def remove_video(path: Path) -> None:
     if shutil.disk_usage(path.parent).free < state.st_size + _SPARE_BYTES:
         raise OSError(None, "the disk has no room for a copy without video", str(path))
     try:
-        # By Rerun's own program: it keeps screen and footer, and what it takes in memory is not the ground's.
-        command = [
-            *map(str, (viewer_program(), "rrd", "filter", "--drop-entity", _VIDEO, path, "-o", scratch))
-        ]
-        subprocess.run(  # noqa: S603
-            command, check=True, capture_output=True, timeout=_PATIENCE_S, env=viewer_environment()
-        )
+        with tempfile.TemporaryDirectory() as folder:
+            source = readable(path, Path(folder) / path.name)
+            # By Rerun's own program: it keeps screen and footer, and what it takes in memory is not the ground's.
+            command = [
+                viewer_program(),
+                "rrd",
+                "filter",
+                "--drop-entity",
+                _VIDEO,
+                source or path,
+                "-o",
+                scratch,
+            ]
+            subprocess.run(  # noqa: S603
+                [str(word) for word in command],
+                check=True,
+                capture_output=True,
+                timeout=_PATIENCE_S,
+                env=viewer_environment(),
+            )
         if scratch.stat().st_size >= state.st_size:
             drop_footer(scratch)
         os.utime(scratch, ns=(state.st_atime_ns, state.st_mtime_ns))

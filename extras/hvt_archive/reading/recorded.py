@@ -41,7 +41,8 @@ from hvt_ground.sinks.rerun.blueprint import (
     VIDEO,
 )
 from hvt_ground.sinks.rerun.map_rows import pose_of
-from hvt_ground.sinks.rerun.rrd_file import copy_readable, id_of, open_rrd
+from hvt_ground.sinks.rerun.readable import readable
+from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
 from hvt_ground.sinks.rerun.sdk import RecordingId
 
 _log = logging.getLogger(__name__)
@@ -227,19 +228,17 @@ def _hashes(rows: Iterable[Timed]) -> set[int]:
 
 
 def _opened(path: Path, spool: Spool, number: int) -> _File:
-    try:
-        return _read(path, spool, number)
-    except _ODD as error:
-        refused = f"{path} is no recording ({error}): give .rrd files of hvt-ground"
     with tempfile.TemporaryDirectory() as folder:
-        whole = Path(folder) / "whole.rrd"
         try:
-            if not copy_readable(path, whole):
-                raise UserError(refused)
-            file = _read(whole, spool, number)
-        except _ODD:
-            raise UserError(refused) from None
-    _log.warning("%s is damaged or breaks off: what can be read is exported", path)
+            with path.open("rb"):
+                found = readable(path, Path(folder) / "readable.rrd")
+            if found is None:
+                raise ValueError("nothing in it can be read")
+            file = _read(found, spool, number)
+        except _ODD as error:
+            raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
+    if found != path:
+        _log.warning("%s is damaged or breaks off: what can be read is exported", path)
     return file
 
 

@@ -32,6 +32,20 @@ class ReadBox:
     """What the viewer calls it."""
 
 
+def damaged(data: bytes, word: bytes, *, at: int = 0, by: bytes = b"\xff" * 40) -> bytes:
+    """A file with other bytes in its first message that has the word."""
+    # The header of each message is its kind and its length.
+    end = begin = 12
+    while word not in data[begin:end]:
+        begin, end = end + 16, end + 16 + int.from_bytes(data[end + 8 : end + 16], "little")
+    return data[: begin + at] + by + data[begin + at + len(by) :]
+
+
+def ends_its_reader(data: bytes) -> bytes:
+    """A file with one other byte, on which the SDK does not raise: it ends its process."""
+    return damaged(data, b"Boxes2D:half_sizes", at=68, by=b"\0")
+
+
 class Recording:
     """All rows of an .rrd file, by entity and component."""
 

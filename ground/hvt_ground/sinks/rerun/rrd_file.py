@@ -34,12 +34,10 @@ from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_rec
 
 _log = logging.getLogger(__name__)
 
-_STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
+STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
 _MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
-_END, _STORE_INFO = 0, 1
-_UNREADABLE = (OSError, RuntimeError, ValueError, LookupError, TypeError, OverflowError)
+_END = 0
 _SPARE_BYTES = 2 * 2**20
-_COPY_BYTES = 2**20
 _FLUSH_S = 10.0
 _LOCK_TRIES, _LOCK_PAUSE_S = 50, 0.02
 _filters = threading.Lock()
@@ -70,7 +68,7 @@ class RrdFile:
             send_blueprint(self._recording, recording_id, screen)
             self._recording.send_chunks(chunks)
             stream = self._stream.read() or b""
-            self._write(stream[:_STREAM_HEADER_BYTES] + _messages(stream), at=0)
+            self._write(stream[:STREAM_HEADER_BYTES] + _messages(stream), at=0)
         except UserError:
             self._release()
             os.close(self._file)
@@ -177,57 +175,25 @@ def id_of(reader: RrdReader) -> RecordingId:
 
 
 def _messages(stream: bytes) -> bytes:
-    end = at = _STREAM_HEADER_BYTES
+    end = at = STREAM_HEADER_BYTES
     while at < len(stream):
         kind, length = _MESSAGE_HEADER.unpack_from(stream, at)
         if kind == _END:
             break
         at += _MESSAGE_HEADER.size + length
         end = at
-    return stream[_STREAM_HEADER_BYTES:end]
-
-
-def copy_readable(path: Path, out: Path) -> bool:
-    """Copy the messages of a recording that can be read: the SDK refuses it for one that is damaged or breaks off.
-
-    After a power cut its end may be zeros. False where nothing would be left out, or nothing be left.
-    """
-    with path.open("rb") as file:
-        ends = list(_whole_messages(file.fileno()))
-        starts = [_STREAM_HEADER_BYTES, *(end for _, end in ends)]
-        messages = [(kind, start, end) for (kind, end), start in zip(ends, starts, strict=False)]
-        first = [one for one in messages if one[0] == _STORE_INFO]
-
-        def copied(chosen: Sequence[tuple[int, int, int]]) -> bool:
-            with out.open("wb") as copy:
-                copy.write(os.pread(file.fileno(), _STREAM_HEADER_BYTES, 0))
-                for _, start, end in chosen:
-                    copy.write(os.pread(file.fileno(), end - start, start))
-            try:
-                return sum(1 for _ in open_rrd(out).stream()) > 0
-            except _UNREADABLE:
-                return False
-
-        def readable(chosen: Sequence[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
-            if not chosen or copied([*first, *chosen]):
-                return list(chosen)
-            half = len(chosen) // 2
-            return readable(chosen[:half]) + readable(chosen[half:]) if half else []
-
-        found = readable([one for one in messages if one[0] not in (_STORE_INFO, _END)])
-        whole = len(first) + len(found) == len(messages) and starts[-1] == os.fstat(file.fileno()).st_size
-        return bool(found) and not whole and copied([*first, *found])
+    return stream[STREAM_HEADER_BYTES:end]
 
 
 def drop_footer(path: Path) -> None:
     """Take the footer off a recording: it has a row for each chunk, and a small one is mostly that."""
     with path.open("r+b") as file:
-        file.truncate(max(end for kind, end in _whole_messages(file.fileno()) if kind != _END))
+        file.truncate(max(end for kind, end in whole_messages(file.fileno()) if kind != _END))
 
 
-def _whole_messages(file: int) -> Iterator[tuple[int, int]]:
-    # The kind of each message, and where it ends; up to the end of all, or one that breaks off.
-    at, size = _STREAM_HEADER_BYTES, os.fstat(file).st_size
+def whole_messages(file: int) -> Iterator[tuple[int, int]]:
+    """The kind of each message, and where it ends; up to the end of all, or one that breaks off."""
+    at, size = STREAM_HEADER_BYTES, os.fstat(file).st_size
     while len(head := os.pread(file, _MESSAGE_HEADER.size, at)) == _MESSAGE_HEADER.size:
         kind, length = _MESSAGE_HEADER.unpack(head)
         at += _MESSAGE_HEADER.size + length

@@ -6,6 +6,9 @@ import csv
 import json
 import os
 import shutil
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -34,7 +37,7 @@ from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.sinks.palette import GREY, SKY
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
-from programs.rrd import Recording
+from programs.rrd import Recording, damaged, ends_its_reader
 from programs.small_disk import small_disk
 
 FRAMES, SIZE, TRACKS = 60, (320, 192), 6
@@ -291,23 +294,33 @@ def _zeros_at_the_end(data: bytes) -> bytes:
 
 
 def _damaged_boxes(data: bytes) -> bytes:
-    # The header of each message is its kind and its length.
-    at, boxes = 12, 0
-    while not boxes:
-        length = int.from_bytes(data[at + 8 : at + 16], "little")
-        boxes = b"Boxes2D:half_sizes" in data[at : at + length] and at + 16
-        at += 16 + length
-    return data[:boxes] + b"\xff" * 40 + data[boxes + 40 :]
+    return damaged(data, b"Boxes2D:half_sizes")
 
 
-@pytest.mark.parametrize("damaged", [_zeros_at_the_end, _damaged_boxes])
-def test_of_a_damaged_recording_the_rest_is_exported(recording, tmp_path, caplog, damaged):
+@pytest.mark.parametrize("damage", [_zeros_at_the_end, _damaged_boxes])
+def test_of_a_damaged_recording_the_rest_is_exported(recording, tmp_path, caplog, damage):
     """After a power cut a file may end in zeros, and cards lose bits: the whole flight was called no recording."""
     broken = tmp_path / "broken.rrd"
-    broken.write_bytes(damaged(recording.read_bytes()))
+    broken.write_bytes(damage(recording.read_bytes()))
     with av.open(str(export(broken, tmp_path / "broken.mp4"))) as video:
         assert sum(1 for _ in video.decode(video=0)) == FRAMES
     assert f"{broken} is damaged or breaks off: what can be read is exported" in caplog.text
+
+
+def test_a_recording_that_ends_the_process_of_its_reader_is_exported(recording, tmp_path):
+    """The export ended with a signal, and a panic of the SDK's on the terminal."""
+    broken = tmp_path / "broken.rrd"
+    broken.write_bytes(ends_its_reader(recording.read_bytes()))
+    reads = f"from rerun.chunk import RrdReader; list(RrdReader({str(broken)!r}).stream())"
+    read = subprocess.run([sys.executable, "-c", reads], check=False, capture_output=True)
+    assert read.returncode == -signal.SIGABRT
+    words = ["export", broken, "--out", tmp_path / "broken.mp4"]
+    done = subprocess.run(
+        [sys.executable, "-m", "hvt_ground.cli", *words], check=False, capture_output=True, text=True
+    )
+    assert (done.returncode, "panicked" in done.stderr) == (0, False), done.stderr
+    with av.open(str(tmp_path / "broken.mp4")) as video:
+        assert sum(1 for _ in video.decode(video=0)) == FRAMES
 
 
 def test_a_split_session_is_exported_as_one(recording, events, tmp_path):

@@ -36,7 +36,7 @@ from hvt_ground.sinks.rerun.live_view import viewer_program
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs.processes import eventually
-from programs.rrd import Recording
+from programs.rrd import Recording, ends_its_reader
 
 FRAMES = 60
 SPLIT = Limit(seconds=2.0)
@@ -381,6 +381,35 @@ def test_a_file_that_breaks_off_is_smaller_without_its_video(tmp_path, flown):
     assert first.size_bytes == path.stat().st_size
     assert Recording(path).video() == []
     assert Recording(path).blueprints == 1
+
+
+def test_a_damaged_file_is_stripped_too(tmp_path, flown):
+    """Rerun's own program refuses it, so its video stayed, and each minute it was tried again."""
+    copytree(flown, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / NAMES[0]
+    path.write_bytes(ends_its_reader(path.read_bytes()))
+    rows = look(tmp_path, Retention(video_age=Limit(seconds=86_400)), later_s=90_000, times=2)
+    assert [one.video for one in rows] == [False, False]
+    assert Recording(path).video() == []
+    assert Recording(path).boxes(20)
+
+
+def test_a_file_that_ends_the_process_of_its_reader_ends_no_ground(tmp_path, flown):
+    """On some damage the SDK does not raise: the ground was gone, at each start."""
+    copytree(flown, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / NAMES[0]
+    path.write_bytes(ends_its_reader(path.read_bytes()))
+    before, _ = read_index(tmp_path)
+    (tmp_path / INDEX).unlink()
+    script = f"""
+from pathlib import Path
+from hvt_archive.index.folder import IndexWriter
+from hvt_archive.index.retention import Retention
+IndexWriter(Path({str(tmp_path)!r}), Retention()).close()
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)
+    after, _ = read_index(tmp_path)
+    assert (after.frames, after.begin_ns, after.end_ns) == (before.frames, before.begin_ns, before.end_ns)
 
 
 def test_a_file_that_cannot_be_stripped_holds_up_no_other(tmp_path, events, caplog):

@@ -1,0 +1,71 @@
+"""What of a recording can be read: the SDK is asked as seldom as may be, for it may never answer."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import rerun as rr
+
+from hvt_ground.sinks.rerun.readable import main, readable
+from programs.rrd import damaged
+
+ROWS = 300
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> bytes:
+    """Of a recording with a chunk for each row, and a footer."""
+    path = tmp_path_factory.mktemp("whole") / "whole.rrd"
+    with rr.RecordingStream("hvt-uav-1", recording_id="uav-1-00ff") as stream:
+        stream.save(path)
+        for row in range(ROWS):
+            stream.set_time("frame", sequence=row)
+            stream.log("/row", rr.AnyValues(number=row))
+            stream.flush()
+    return path.read_bytes()
+
+
+def _whole(data: bytes) -> bytes:
+    return data
+
+
+def _cut(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
+def _hole(data: bytes) -> bytes:
+    return damaged(data, b"/row")
+
+
+def _nobodys(data: bytes) -> bytes:
+    return data[:28] + b"\xff" * 40 + data[68:]
+
+
+def _all_bad(data: bytes) -> bytes:
+    while b"/row" in data[:-20_000]:
+        data = data.replace(b"/row", b"\xff\xff\xff\xff")
+    return data
+
+
+@pytest.mark.parametrize(
+    ("damage", "read", "most"),
+    [
+        (_whole, "whole", 1),
+        (_cut, "copy", 3),
+        (_hole, "copy", 30),
+        (_nobodys, None, 2),
+        (_all_bad, None, 103),
+    ],
+)
+def test_the_sdk_is_asked_seldom(data, tmp_path, monkeypatch, damage, read, most):
+    """A store info that was damaged cost six thousand tries, and a file that was merely cut was read twice."""
+    path, out = tmp_path / "whole.rrd", tmp_path / "copy.rrd"
+    path.write_bytes(damage(data))
+    tries = []
+    fork = os.fork
+    monkeypatch.setattr(os, "fork", lambda: tries.append(1) or fork())
+    code = main(path, out)
+    assert len(tries) <= most
+    assert {0: "whole", 10: "copy", 11: None}[code] == read
+    assert readable(path, out) == {"whole": path, "copy": out, None: None}[read]
