@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ from hvt_ground.sinks.rerun.blueprint import (
 )
 from hvt_ground.sinks.rerun.map_rows import pose_of
 from hvt_ground.sinks.rerun.readable import readable
-from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd
+from hvt_ground.sinks.rerun.rrd_file import id_of, open_rrd, whole_messages
 from hvt_ground.sinks.rerun.sdk import RecordingId
 
 _log = logging.getLogger(__name__)
@@ -219,6 +220,22 @@ class _File:
                     if where[0] == layer and former and isinstance(former, SpooledRows):
                         self.rows[where] = former.begun(*self._begins, [], then=self.rows.get(where))
 
+    def drop_after_holes(self) -> int:
+        """Take out samples after lost ones, up to the next keyframe; how many."""
+        samples = self.rows.get((VIDEO, _SAMPLE))
+        if not isinstance(samples, SpooledRows):
+            return 0
+        steps = [0, *(after - before for before, after in pairwise(samples.frames))]
+        stays, waits = list[bool](), False
+        for place, step in enumerate(steps):
+            # Longer than those around it; where the rate changes, those after it are as long.
+            near = steps[max(place - 1, 1) : place] + steps[place + 1 : place + 6]
+            waits |= bool(near) and step > steps[place - 1] and step > min(near)
+            waits = waits and not is_keyframe(samples.value(place))
+            stays.append(not waits)
+        samples.keep(stays.__getitem__)
+        return stays.count(False)
+
     def _is_new(self, found: SpooledRows, known: set[int], place: int) -> bool:
         return found.frames[place] > self.first or hash(found.value(place)) not in known
 
@@ -235,11 +252,21 @@ def _opened(path: Path, spool: Spool, number: int) -> _File:
             if found is None:
                 raise ValueError("nothing in it can be read")
             file = _read(found, spool, number)
+            lost = file.drop_after_holes() if found != path and _has_holes(path, found) else 0
         except _ODD as error:
             raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
     if found != path:
         _log.warning("%s is damaged or breaks off: what can be read is exported", path)
+    if lost:
+        _log.warning("%s: %d pictures after a hole are left out: they need one that is lost", path, lost)
     return file
+
+
+def _has_holes(path: Path, copy: Path) -> bool:
+    # Not where it merely breaks off.
+    with path.open("rb") as file:
+        ends = [end for kind, end in whole_messages(file.fileno()) if kind]
+    return copy.stat().st_size < max(ends, default=0)
 
 
 def _read(path: Path, spool: Spool, number: int) -> _File:

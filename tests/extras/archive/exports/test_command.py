@@ -307,6 +307,22 @@ def test_of_a_damaged_recording_the_rest_is_exported(recording, tmp_path, caplog
     assert f"{broken} is damaged or breaks off: what can be read is exported" in caplog.text
 
 
+def test_pictures_that_need_a_lost_one_are_not_exported(tmp_path, caplog):
+    """They counted as exported, and players showed smears or nothing."""
+    path, live = tmp_path / "flight.rrd", tmp_path / "live.rrd"
+    drawn = drawn_frames(FRAMES, SIZE)
+    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
+        for frame, (unit, _) in enumerate(coded(drawn, kbps=200, keyint=20)):
+            recorder.log(VideoSample(frame, START_NS + frame * STEP_NS, unit, keyframe=frame % 20 == 0))
+        shutil.copy(path, live)
+    _, _, unit = Recording(live).video()[25]
+    live.write_bytes(damaged(live.read_bytes(), unit[40:60]))
+    with av.open(str(export(live, tmp_path / "out.mp4"))) as video:
+        shown = [round(one.time * 15) for one in video.decode(video=0)]
+    assert shown == [*range(25), *range(40, FRAMES)]
+    assert "14 pictures after a hole are left out" in caplog.text
+
+
 def test_a_recording_that_ends_the_process_of_its_reader_is_exported(recording, tmp_path):
     """The export ended with a signal, and a panic of the SDK's on the terminal."""
     broken = tmp_path / "broken.rrd"
