@@ -30,12 +30,12 @@ endif
 demo: setup      ## three edges and one ground on the drawn scene: a table, demo.png, demo.rrd
 	@$(BIN)/python deploy/demo.py
 
-# Three workers more than there are processors, for a worker often waits for the programs that it started. At night, where
+# Two workers more than there are processors, for a worker often waits for the programs that it started. At night, where
 # flights in real time are most of it, as many. Nothing has a second chance. All tests of a file run in one process, so
 # what a module flies is flown once; xdist 3.8 does not see its own groups with pytest 9.2. A worker that dies ends the
 # run, which names its test: where xdist starts another, it may wait for ever.
 CORES := $(shell getconf _NPROCESSORS_ONLN)
-JOBS ?= $(shell expr $(CORES) + 3)
+JOBS ?= $(shell expr $(CORES) + 2)
 AT_ONCE = $(if $(CORE),--ignore=tests/extras) --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS= CORE=1
