@@ -86,6 +86,8 @@ class RealtimePace:
         """When the last frame was sent; how late a clip is because the link took its time, not yet made up."""
         self._bound: FrameGroup = "processor"
         """The slowest step of the last frame: coding it, the budget's window, or the link."""
+        self._sending_ns = 0
+        """How long the last frame waited for the budget's window and the link."""
         self._worker = StillWorker(
             self.stills,
             results=self.inbox.take,
@@ -107,7 +109,7 @@ class RealtimePace:
             self._missed = missed
         newly_missed, self._missed = missed - self._missed, missed
         self.counts.drop(self._bound, newly_missed)
-        behind = newly_missed > 0
+        behind = newly_missed > 0 and self._bound == "processor"
         if not self.live:
             frame = self._by_clip_clock(frame)
             # A camera's own unit is never left out: all that follow build on it. The clip is played slower.
@@ -118,7 +120,8 @@ class RealtimePace:
                 self.counts.drop(self._bound)
                 return
             self._must_code_ns = frame.capture_ns + _MOST_GAP_NS
-            behind = self.clock() - frame.capture_ns > _BEHIND_SHARE * SECOND_NS / self.fps
+            late_ns = self.clock() - frame.capture_ns - self._sending_ns
+            behind = late_ns > _BEHIND_SHARE * SECOND_NS / self.fps
         unit = self.send(frame)
         self._hand_over(frame, unit, behind=behind)
 
@@ -136,17 +139,18 @@ class RealtimePace:
             taken = self.base.send(unit, decision, now_ns=encoded_ns)
         self.counts.settle(decision, coded=unit is not None, taken=taken, has_viewer=self.has_viewer())
         self._sent_ns = self.clock()
-        sending_ns = decided_ns - began_ns + self._sent_ns - encoded_ns
-        self._link_late_ns = min(_MOST_LINK_LATE_NS, self._link_late_ns + sending_ns)
+        self._sending_ns = decided_ns - began_ns + self._sent_ns - encoded_ns
+        self._link_late_ns = min(_MOST_LINK_LATE_NS, self._link_late_ns + self._sending_ns)
         self._bound = "processor"
-        if sending_ns > max(encoded_ns - decided_ns, _LINK_BOUND_NS):
-            for_budget = 2 * (self.base.budget_waited_ns - budget_ns) > sending_ns
+        if self._sending_ns > max(encoded_ns - decided_ns, _LINK_BOUND_NS):
+            for_budget = 2 * (self.base.budget_waited_ns - budget_ns) > self._sending_ns
             self._bound = self.base.holder(self._sent_ns) if for_budget else "link"
         return unit
 
     def _hand_over(self, frame: Frame, unit: AccessUnit | None, *, behind: bool) -> None:
-        # Video goes first: perception gets no frame while the loop is late, and fewer for a while after it lost one.
-        # Where nobody uses it, it takes no time.
+        # Video goes first: perception gets no frame while the loop is late for want of processor, and fewer for a
+        # while after it lost one. Where each frame waits for its room in the budget, all are late, and nothing is
+        # scarce. Where nobody uses it, perception takes no time.
         used = self.stills.is_used(frame.capture_ns)
         cpu_budget, lost = self.stills.analyzer.cpu_budget, self.counts.dropped_cpu
         keyframe_due = self.base.keyframes.due(self._sent_ns + _BEFORE_KEYFRAME_NS)

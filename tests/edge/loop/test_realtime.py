@@ -131,7 +131,7 @@ def test_frames_missed_count_for_the_link_or_for_the_machine():
         pace.step(frames[3], missed=12)
         assert (counts.groups["link"], counts.dropped_cpu) == (5, 3)
         assert counts.captured == 4 + 8
-        assert counts.unanalyzed == 2, "perception gave way where video was late"
+        assert counts.unanalyzed == 1, "perception gave way where video was late, and not where the link was"
 
 
 class SteppedTime(threading.Event):
@@ -261,6 +261,35 @@ def test_the_detector_does_not_begin_just_before_a_keyframe():
 def test_a_keyframe_that_waits_for_its_room_does_not_keep_the_detector_for_long():
     """It may wait for two seconds: boxes were three seconds old."""
     assert keyframes_soon(frames=60, due_from_s=1.0) == list(range(11, 19))
+
+
+class AskedBudget(CpuBudget):
+    """Keeps whether the loop was late."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.late: list[bool] = []
+
+    def admits_frame(self, at_ns, *, lost, late):
+        """Whether perception gets it."""
+        self.late.append(late)
+        return super().admits_frame(at_ns, lost=lost, late=late)
+
+
+@pytest.mark.parametrize(("waits_s", "reading_s", "late"), [(1 / 15, 0.0, False), (0.0, 1 / 15, True)])
+def test_perception_gives_way_to_a_slow_machine_alone(waits_s, reading_s, late):
+    """Where video took all of the budget, each frame waited for its room: an idle machine had no boxes for good."""
+    out, stills = TimedOut(SteppedTime(), lambda count: waits_s if count else 0.12), BlockedStills()
+    stills.released.set()
+    stills.analyzer.cpu_budget = budget = AskedBudget()
+    with RealtimePace(
+        base_stage(out), stills, inbox=FeedbackInbox(), clock=out.time, fps=15, live=False, counts=FrameCounts(),
+        stop=out.time, failures=Failures(out.time),
+    ) as pace:  # fmt: skip
+        for frame in framed(smooth_pictures(1, size=SIZE) * 60):
+            out.time.pass_s(reading_s)
+            pace.step(frame)
+    assert set(budget.late[5:]) == {late}
 
 
 def test_a_clip_behind_a_link_that_stood_still_catches_up():
