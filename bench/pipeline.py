@@ -27,7 +27,7 @@ from hvt_edge.video.encoder import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.config import GroundConfig
 from hvt_ground.link.reassemble import Arrival
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.sdk import leave_out_pandas
@@ -117,7 +117,7 @@ def _ground(units: list[AccessUnit]) -> float:
             failures=Failures(time.time_ns),
             wait_s=10.0,
         )
-        session = GroundSession(
+        session = Session(
             info,
             sinks=[sink],
             pipeline_of=SessionPerception(config, models, info).pipeline,

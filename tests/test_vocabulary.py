@@ -28,7 +28,7 @@ renew renewal reopen reopening rival rivals room scales sealed see sees settled 
 swallowed tick ticks told unchanging waiting weigh weighed whereabouts wish wished wishes workshop
 """
 _NO_NAME = frozenset(_ONCE_NAMES.split())
-_NO_CLASS = frozenset({"Early", "Reception", "Row", "Seen"})
+_NO_CLASS = frozenset({"Early", "Row", "Seen"})
 _OF_LIBRARIES = """
 on_tick
 ask haveImageWriter in_waiting keep_blank_values keep_trailing_newline

@@ -31,7 +31,7 @@ from hvt_ground.report.state import GroundState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary
 from hvt_ground.session.edge_port import EdgePort
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
@@ -240,7 +240,7 @@ class Ground:
             )
         )
 
-    def _note_ended(self, session: GroundSession) -> None:
+    def _note_ended(self, session: Session) -> None:
         # In the thread of its edge: forget the session and remember the numbers of the last ones.
         self._ended[session.info.edge].append((summary(session), session.sinks))
 

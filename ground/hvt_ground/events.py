@@ -27,6 +27,8 @@ def _nowhere() -> npt.NDArray[np.bool_]:
     return np.zeros(0, np.bool_)
 
 
+Level = Literal["info", "warning", "error"]
+
 Origin = Literal["base", "edge", "edge+base", "still"]
 """Who knows of a track: the ground's own tracker on the base stream, the edge's report, both, or (``still``) nobody
 but a still in which it was found."""
@@ -222,7 +224,7 @@ class Notice:
 
     frame_index: int
     capture_ns: int
-    level: Literal["info", "warning", "error"]
+    level: Level
     text: str
 
 

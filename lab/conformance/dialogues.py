@@ -8,12 +8,13 @@ from typing import Any
 
 from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.messages import BacklogHeader, BacklogKind, WireError
+from hvt_common.transport.inbox import Received
 from hvt_common.values import View
 from hvt_common.video.still_codecs import StillError
 from hvt_ground.backlog.assembly import BacklogAssembly
-from hvt_ground.link.reception import ReceptionStatistics
+from hvt_ground.link.reception import Reception
 from hvt_ground.perception.stills.decode import coded_size
-from rigs.messages import BASE, INFO, ROI
+from rigs.messages import BACKLOG, BASE, INFO, ROI
 
 _SESSION = 2**63 + 9
 _SOURCE = (4000, 3000)
@@ -126,19 +127,21 @@ _TRACES: tuple[tuple[str, tuple[tuple[str, int, int, float | None], ...]], ...] 
 )
 """What came, its number, when in ms, its delay."""
 _OTHERS: Any = dict.fromkeys(("receiver_id", "sequence", "clock_offset_ns"), 0)
-_OTHERS |= dict.fromkeys(("clock_error_ns", "last_frame_index"), -1) | {"stills": (), "backlog": ()}
+_OTHERS |= {"clock_error_ns": -1, "backlog": ()}
 """Fields of a report that others fill."""
 
 
 def report_traces() -> Iterator[dict[str, Any]]:
     """What came and when, and the fields of the reports between."""
     for name, events in _TRACES:
-        counted = ReceptionStatistics(INFO, clock=int, edge_clock=ClockOffset(), emit=lambda _event: None)
+        timed = any(delay_ms is not None for *_, delay_ms in events)
+        info = replace(INFO, pace="realtime" if timed else "lockstep")  # in which no delay is known
+        counted = Reception(info, clock=int, edge_clock=ClockOffset(), emit=lambda _event: None)
         steps: list[dict[str, Any]] = []
         for kind, number, at_ms, delay_ms in events:
             at_ns = at_ms * 1_000_000
             if kind == _REPORT:
-                said = counted.feedback(at_ns, **_OTHERS)
+                said = counted.feedback(send_ns=at_ns, **_OTHERS)
                 steps.append(
                     {
                         "report_at_ms": at_ms,
@@ -153,13 +156,15 @@ def report_traces() -> Iterator[dict[str, Any]]:
             steps.append(
                 {kind: number, "at_ms": at_ms} | ({} if delay_ms is None else {"delay_ms": delay_ms})
             )
+            item = Received("", b"", b"", "", at_ns)
             if kind == "base":
-                header = replace(BASE, sequence=number)
-                counted.base(header, size_bytes=1, arrived_ns=at_ns, delay_ms=delay_ms)
+                captured_ns = at_ns - round(1_000_000 * (delay_ms or 0.0))
+                counted.base(replace(BASE, sequence=number, capture_ns=captured_ns), item)
             elif kind == "still":
-                counted.still(number, size_bytes=1, arrived_ns=at_ns)
+                counted.still(replace(ROI, sequence=number), item)
             else:
-                counted.stored_still(number)
+                header = replace(BACKLOG, session_id=INFO.session_id, number=number)
+                counted.backlog(header, item, delivered=True)
         yield {"session": name, "steps": steps}
 
 

@@ -13,7 +13,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from lab.fuzz.contract import Target, scratch
@@ -54,7 +54,7 @@ _flight = cache(_new_flight)
 """What the edge answers, and its first access units: nothing of it changes with use."""
 
 
-def _opened(info: Info, reports: ReceiverReports) -> GroundSession:
+def _opened(info: Info, reports: ReceiverReports) -> Session:
     settings = RecorderSettings(
         path=scratch() / "flight.rrd",
         edge_id="uav-1",
@@ -63,7 +63,7 @@ def _opened(info: Info, reports: ReceiverReports) -> GroundSession:
         fps=info.fps,
         budget_bps=info.budget_bps,
     )
-    return GroundSession(
+    return Session(
         info,
         sinks=[_sinks.open("recording", lambda: Recorder(settings))],
         pipeline_of=pipeline_of,
@@ -76,7 +76,7 @@ def _session(data: bytes) -> None:
     pace, *messages = parted(data, least=1)
     port = Port()
     flight = port.flight = _flight(_PACES[len(pace) % len(_PACES)])
-    ended: list[GroundSession] = []
+    ended: list[Session] = []
     edge = EdgeSessions(port, open_session=_opened, on_ended=ended.append)  # type: ignore[arg-type]
     for index in range(_UNHARMED):
         edge.handle(flight.base(index))
@@ -89,7 +89,7 @@ def _session(data: bytes) -> None:
     _sinks.close(within_s=0.0)  # without footers
     assert ended, "the unharmed messages alone are a session"
     assert not edge.failures.parts
-    assert all(len(session.take_results(10_000)) < 5000 for session in ended)
+    assert all(len(session.reception.take_results(10_000)) < 5000 for session in ended)
 
 
 def _changed(data: bytes, rng: Random, raw: Bytes) -> bytes:

@@ -12,7 +12,7 @@ from hvt_common.protocol.messages import Info
 from hvt_ground.events import Event, Overlay, VideoSample
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from programs.processes import eventually
 from rigs.flight import Flight, Port, pipeline_of
 
@@ -62,8 +62,8 @@ def test_a_frame_walks_through_few_files(walk: Walk) -> None:
     flight, port, sink = Flight(8), Port(), Events()
     port.flight = flight
 
-    def open_session(info: Info, reports: ReceiverReports) -> GroundSession:
-        return GroundSession(info, sinks=[sink], pipeline_of=pipeline_of, clock=time.time_ns, reports=reports)
+    def open_session(info: Info, reports: ReceiverReports) -> Session:
+        return Session(info, sinks=[sink], pipeline_of=pipeline_of, clock=time.time_ns, reports=reports)
 
     edge = EdgeSessions(port, open_session=open_session)  # type: ignore[arg-type]
     for index in range(7):

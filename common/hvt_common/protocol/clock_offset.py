@@ -1,4 +1,4 @@
-"""The offset of a remote clock, from the four times of a request and its answer. Pure."""
+"""The offset of a remote clock, from the four times of a request and its answer; times of a camera by ours. Pure."""
 
 from __future__ import annotations
 
@@ -6,10 +6,15 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
+from hvt_common.units import SECOND_NS
+
 _DRIFT_PPM = 500
 """The most that two clocks drift apart (RFC 5905: NTP corrects 500 ppm)."""
 _ROUNDING_NS = 1_000_000
 _MOST_SAMPLES = 64
+_LONGEST_TRIP_NS = 60 * SECOND_NS
+_EARLY_NS = 5 * SECOND_NS
+"""More than half the round trip of any link that carries video."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +75,39 @@ class ClockOffset:
     def to_local_ns(self, remote_ns: int) -> int:
         """A time of the remote clock as ours would have shown it; unchanged before the first exchange."""
         return remote_ns - self.offset_ns
+
+
+class CaptureClock:
+    """The times of one camera by this ground's clock.
+
+    A camera's clock may be years off, and an edge may say what it likes. A picture that came before it was captured,
+    or a minute after, counts from its arrival, and so do those after it, as long as that can be.
+    """
+
+    def __init__(self, edge_clock: ClockOffset) -> None:
+        self._edge_clock = edge_clock
+        self._own_offset_ns: int | None = None
+
+    def note(self, capture_ns: int, *, received_ns: int) -> None:
+        """Take the time of something that has just come."""
+        if -_EARLY_NS <= received_ns - self._edge_clock.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:
+            self._own_offset_ns = None
+        elif self.is_sound or not 0 <= received_ns - self.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:
+            self._own_offset_ns = capture_ns - received_ns
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the offset is that of the edge's clock, and not one from the arrival."""
+        return self._own_offset_ns is None
+
+    @property
+    def offset_ns(self) -> int:
+        """The camera's clock minus ours."""
+        return self._edge_clock.offset_ns if self._own_offset_ns is None else self._own_offset_ns
+
+    def to_local_ns(self, capture_ns: int) -> int:
+        """A time of the camera as our clock would have shown it."""
+        return capture_ns - self.offset_ns
 
 
 def _agree(one: _Sample, other: _Sample) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections import OrderedDict
 from collections.abc import Iterable
 from typing import TypeVar
@@ -14,6 +15,10 @@ _HIGHEST_MS = 1e6
 _LOG_RATIO = math.log(1.01)
 _BINS = math.ceil(math.log(_HIGHEST_MS / _LOWEST_MS) / _LOG_RATIO) + 1
 _PAGE_BITS = 12
+_MOST_SENT = 512
+"""Stills whose second copy is still known for one: those of the last seconds."""
+_NEVER_NS = -(2**64)
+"""When a still was sent that has come with the backlog only."""
 
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
@@ -129,6 +134,42 @@ class SequenceWindow:
     def __contains__(self, number: int) -> bool:
         """Whether it has been, as far as is remembered."""
         return bool(self._pages.get(number >> _PAGE_BITS, 0) >> (number & (1 << _PAGE_BITS) - 1) & 1)
+
+
+class StillSequenceWindow:
+    """The received stills: each is shown once, and counted as often as it crossed. Safe for threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._seen = SequenceWindow()
+        self._sent_ns: Newest[int, int] = Newest(_MOST_SENT)
+        """Sequence → when a still was sent of which no second copy has come."""
+
+    def is_new(self, sequence: int, *, send_ns: int = _NEVER_NS) -> bool:
+        """Whether a still on ``roi``, or without a time one of the backlog, has not come before."""
+        with self._lock:
+            if not self._seen.add([sequence]):
+                return False
+            self._sent_ns[sequence] = send_ns
+            return True
+
+    def is_copy(self, sequence: int, *, send_ns: int) -> bool:
+        """Whether one that is not new is the copy that the edge sent for want of an acknowledgement; once.
+
+        What bears the time of the first is a replay. Of one that came with the backlog, the first on ``roi`` is such
+        a copy.
+        """
+        with self._lock:
+            if send_ns <= self._sent_ns.get(sequence, send_ns):
+                return False
+            del self._sent_ns[sequence]
+            return True
+
+    def forget(self, sequence: int) -> None:
+        """One was lost on its way into a file: it is new when it comes again."""
+        with self._lock:
+            self._seen.discard(sequence)
+            self._sent_ns.pop(sequence, None)
 
 
 def _bin(latency_ms: float) -> int:

@@ -48,7 +48,7 @@ from hvt_ground.recordings.row import Recorded, RecordedStill
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import InfoAnswer
 from hvt_ground.session.edge_sessions import EdgeSessions
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.wiring import SessionFactory, check_outputs, make_folders
@@ -231,7 +231,7 @@ class _Replay:
         make_folders(self._config)
         models = Models(self._config)
         models.wait()  # the log waits for them
-        ended: list[tuple[dict[str, Any], GroundSession]] = []
+        ended: list[tuple[dict[str, Any], Session]] = []
         edges: dict[str, EdgeSessions] = {}
         with ExitStack() as stack:
             outputs = Outputs(models.failures)

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from hvt_common.protocol.messages import BacklogUnit, Info
-from hvt_common.runtime.statistics import Newest, SequenceWindow
+from hvt_common.runtime.statistics import Newest, SequenceWindow, StillSequenceWindow
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image, iou
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
-from hvt_ground.link.reception import StillSequenceWindow
 from hvt_ground.perception.session import SessionPerception
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import ViewTilt
@@ -149,7 +148,7 @@ class SessionBacklog:
 
     def is_new_still(self, sequence: int) -> bool:
         """Note the number of a still; whether none of it has come before, on whichever way."""
-        return self._stills.is_new_stored(sequence)
+        return self._stills.is_new(sequence)
 
     def read_still(self, still: ReceivedStill) -> None:
         """Read and count a still; whatever goes wrong, it is new when it comes again."""

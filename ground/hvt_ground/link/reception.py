@@ -1,4 +1,4 @@
-"""What came of a session, and the figures of the receiver report: the newest message of each stream, stills missing.
+"""What came of a session: bytes, order, clocks, counts; and the figures of the receiver report.
 
 Reports cost the way back: they come so often that together they take `_SHARE` of what arrives, within bounds, and
 only when something new has arrived; in a pause the usual ones, twice a second, go on.
@@ -9,33 +9,39 @@ from __future__ import annotations
 import statistics
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
-from hvt_common.protocol.clock_offset import ClockOffset
+from hvt_common.protocol.clock_offset import CaptureClock, ClockOffset
+from hvt_common.protocol.edge_words import lever_decisions, lever_sentences
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import (
     MAX_MISSING_STILLS,
+    MAX_STILL_RESULTS,
     BacklogHeader,
+    BacklogKind,
     BaseHeader,
     Feedback,
+    Health,
     Info,
     PoseReport,
     RoiHeader,
     Status,
+    StillResult,
     TrackStep,
+    TrackStepDecoder,
 )
-from hvt_common.runtime.statistics import LatencyStats, Newest, SequenceWindow
+from hvt_common.runtime.statistics import LatencyStats, Newest, StillSequenceWindow
 from hvt_common.transport.inbox import Received
-from hvt_common.units import SECOND_NS
-from hvt_ground.events import Event, MessageTiming, Traffic
+from hvt_common.units import SECOND_NS, bitrate_text
+from hvt_common.values import Tracks
+from hvt_ground.events import Event, Level, MessageTiming, Traffic
 from hvt_ground.link.reassemble import StreamCounters
 
+Message = BaseHeader | RoiHeader | TrackStep | PoseReport | Status | BacklogHeader
+
 _MS = 1_000_000
-_LONGEST_TRIP_NS = 60 * SECOND_NS
-_EARLY_NS = 5 * SECOND_NS
-"""More than half the round trip of any link that carries video."""
 REPORT_LINE_BYTES = 180
 """Line bytes of a report without results."""
 _SHARE = 0.03
@@ -44,31 +50,43 @@ _RATE_OVER_NS = 2 * SECOND_NS
 _MOST_DELAYS, _MOST_DELAY_MS = 256, 3_600_000.0
 _ACCOUNTS = {Channel.BASE: Account.BASE, Channel.ROI: Account.ROI, Channel.BACKLOG: Account.BACKLOG}
 _HELD_US = 2**32 - 1
-_MOST_SENT = 512
-"""Stills whose second copy is still known for one: those of the last seconds."""
-_NEVER_NS = -(2**64)
-"""When a still was sent that has come with the backlog only."""
 _NEAR_STILLS = 256
 """A still that is further from the highest number may be forged: it counts once another follows it."""
 _MISSED_NS = 6 * SECOND_NS
 """A still that has not come for so long does not come any more: reports need not name it for ever."""
+_ANEW_NS = 5 * SECOND_NS
+"""What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""
+_LATELY_NS, _FRAMES_LATELY = 3 * SECOND_NS, 4
+"""What came longer ago, and so many frames, says nothing of now."""
+_MOST_OBJECTS = 65_535
+_MOST_RESULTS = 4096
+"""Reports take 32 each; in a flood the newest count."""
 
 
-class ReceptionStatistics:
-    """What came of one session: bytes, order, gaps and ages, and the figures of the receiver report.
+class Reception:
+    """All that is received and counted of one session, what it amounts to, and what is to be reported of it.
 
-    ``clock`` is Unix nanoseconds without steps, the ``now_ns`` and ``arrived_ns`` of all calls; ``emit`` takes the
-    events. Safe for threads: messages come in one, and a still that was read in another is reported at once.
+    ``clock`` is Unix nanoseconds without steps, like the ``now_ns`` and ``received_ns`` of all calls; ``emit`` takes
+    the events, ``note`` a line for the recording's log. Messages are for one thread; another may report, and add
+    results.
     """
 
     def __init__(
-        self, info: Info, *, clock: Callable[[], int], edge_clock: ClockOffset, emit: Callable[[Event], None]
+        self,
+        info: Info,
+        *,
+        clock: Callable[[], int],
+        edge_clock: ClockOffset,
+        emit: Callable[[Event], None],
+        note: Callable[[Level, str], None] = lambda _level, _text: None,
     ) -> None:
         self.lockstep = info.pace == "lockstep"
-        self.budget_bps = info.budget_bps
-        """As it is now, some seconds late."""
+        self.budget_bps, self.method = info.budget_bps, info.method
+        """As they are now, some seconds late."""
         self.ledger = Ledger(window_ns=info.window_ns)
         self.receive_latency, self.overlay_latency = LatencyStats(), LatencyStats()
+        self.clock_offset = edge_clock
+        """Of the edge's clock."""
         self.capture_clock, self.pose_clock = CaptureClock(edge_clock), CaptureClock(edge_clock)
         """Of the camera and of the source of poses."""
         self.counters = StreamCounters()
@@ -80,15 +98,25 @@ class ReceptionStatistics:
         """Frame index of the newest access unit; -1 before the first."""
         self.newest_capture_ns = 0
         """Its capture time, the edge's clock; 0 before the first."""
+        self.last_status: Status | None = None
+        self.levers = ""
+        """What the edge last said that it sends beside the video, and why."""
+        self.edge_failing: Mapping[str, int] = {}
+        """Since when each part of the edge fails, by its clock: a report has the newest try."""
+        self.analyzed = (-1, -1)
+        """The last frame that was analyzed, and what was detected by then: reports want both of one moment."""
         self._first_capture_ns: int | None = None
         self._info = info
         self._keys = EdgeKeys(info.edge)
-        self._clock = clock
-        self._emit = emit
+        self._clock, self._emit, self._note = clock, emit, note
+        self._step_decoder = TrackStepDecoder()
+        self._last_step = -1
+        self._stepped_ns = self._status_ns = self._base_ns = 0
+        """When the newest report of tracks came, the newest status, and the newest access unit."""
         self._next_traffic_ns = 0
-        self.last_traffic: Traffic | None = None
-        """The present measurement."""
+        self._traffic: Traffic | None = None
         self._lock = threading.Lock()
+        """Of all below."""
         self._base_sequence = self._still_sequence = self._last_still = -1
         self._from_start = False
         self._missing: Newest[int, int] = Newest(MAX_MISSING_STILLS)
@@ -97,8 +125,172 @@ class ReceptionStatistics:
         self._sizes: deque[tuple[int, int]] = deque()
         self._size_bytes = 0
         self._delays_ms: deque[float] = deque(maxlen=_MOST_DELAYS)
+        self._results: deque[StillResult] = deque(maxlen=_MOST_RESULTS)
         self._news = False
         self._reported_ns: int | None = None
+
+    # What the receiving thread brings
+
+    def base(self, header: BaseHeader, item: Received) -> None:
+        """An access unit has its turn."""
+        at_ns = item.received_ns  # its own, also where it waited behind a hole
+        self._time_capture(header.capture_ns, at_ns)
+        self.count(Channel.BASE, item, at_ns=header.send_ns)
+        self.frames += 1
+        if self._first_capture_ns is None:
+            self._first_capture_ns = header.capture_ns
+        self.newest_index, self.newest_capture_ns = header.frame_index, header.capture_ns
+        self._base_ns = self._clock()
+        with self._lock:
+            if header.sequence > self._base_sequence:
+                self._base_sequence, self._arrived_ns = header.sequence, at_ns
+            self._from_start |= header.sequence == 0
+            if self.knows_delay:
+                self._delays_ms.append(
+                    max(0.0, (at_ns - self.capture_clock.to_local_ns(header.capture_ns)) / _MS)
+                )
+            self._arrive(item)
+
+    def still(self, header: RoiHeader, item: Received) -> bool:
+        """Whether a still is to be shown; a second one of the same number is but counted, a third ignored."""
+        sequence, at_ns = header.sequence, header.send_ns
+        with self._lock:
+            self._missing.pop(sequence, None)
+            if self._still_sequence < 0 or abs(sequence - self._still_sequence) <= _NEAR_STILLS:
+                if sequence > self._still_sequence:
+                    self._miss(self._still_sequence + 1, sequence, at_ns=item.received_ns)
+                    self._still_sequence = sequence
+            elif 0 < sequence - self._last_still <= _NEAR_STILLS:
+                self._still_sequence = sequence
+                self._missing.clear()
+            self._last_still = sequence
+            self._arrive(item)
+        new = self.sequences.is_new(sequence, send_ns=at_ns)
+        if new or self.sequences.is_copy(sequence, send_ns=at_ns):
+            self.count(Channel.ROI, item, at_ns=at_ns)
+        if new:
+            self.time(Channel.ROI, item, header, handled=None)
+            self.stills += 1
+            self.ledger.record_outcome("received", header.reason)
+        return new
+
+    def tracks(self, step: TrackStep, item: Received) -> Tracks | None:
+        """The edge's tracks of a newer step; `WireError` where its boxes make no sense."""
+        now_ns = self._clock()
+        if step.sequence <= self._last_step:
+            if step.reference >= 0 or now_ns - self._stepped_ns < _ANEW_NS:
+                return None
+            self._step_decoder = TrackStepDecoder()
+        self._last_step, self._stepped_ns = step.sequence, now_ns
+        self.count(Channel.TRACKS, item, at_ns=step.send_ns)
+        self.steps += 1
+        tracks = self._step_decoder.decode(step)
+        self.time(Channel.TRACKS, item, step, handled=tracks is not None)
+        return tracks
+
+    def status(self, status: Status, item: Received) -> bool:
+        """Whether the edge's report is newer than the last; another is ignored."""
+        now_ns = self._clock()
+        old = self.last_status is not None and status.sequence <= self.last_status.sequence
+        if old and now_ns - self._status_ns < _ANEW_NS:
+            return False
+        self._status_ns = now_ns
+        self.count(Channel.STATUS, item, at_ns=status.send_ns)
+        self.time(Channel.STATUS, item, status, handled=True)
+        since = self.edge_failing
+        self.edge_failing = {
+            one.part: since.get(one.part, one.failed_ns) for one in status.failed if not one.working
+        }
+        self.last_status = status
+        before, now = ([one for one, _ in lever_decisions(says)] for says in (self.levers, status.levers))
+        self.levers = status.levers or self.levers
+        if status.levers and now != before:  # numbers alone change each second: they are in the state
+            self._note("info", " ".join(lever_sentences(status.levers)))
+        return True
+
+    def backlog(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
+        """A chunk, of whichever session; ``delivered``: with it an object was whole, and is of use."""
+        own_still = header.kind == BacklogKind.STILL and header.session_id == self._info.session_id
+        with self._lock:
+            self._arrive(item)
+            if delivered and own_still:  # it never came on ``roi``
+                self._missing.pop(header.number, None)
+        self.count(Channel.BACKLOG, item, at_ns=header.send_ns)
+        self.time(f"{Channel.BACKLOG}-{header.kind}", item, header, handled=delivered)
+
+    def learn(self, info: Info) -> None:
+        """Take the session's present `Info`: budget and method may have changed."""
+        if (info.budget_bps, info.method) != (self.budget_bps, self.method):
+            budget = bitrate_text(info.budget_bps)
+            self._note("info", f"from now on the budget is {budget}, and the method {info.method}")
+        self.budget_bps, self.method = info.budget_bps, info.method
+
+    def time(self, kind: str, item: Received, header: Message, *, handled: bool | None) -> None:
+        """Give out when a message came; ``handled``: something was made of it, None is said later."""
+        size, extra = len(item.payload), len(item.attachment)
+        frame_index, capture_ns = -1, 0
+        if isinstance(header, BaseHeader | RoiHeader | TrackStep):
+            frame_index, capture_ns = header.frame_index, header.capture_ns
+        self._emit(
+            MessageTiming(
+                kind=kind,
+                sequence=header.number if isinstance(header, BacklogHeader | PoseReport) else header.sequence,
+                frame_index=frame_index,
+                capture_ns=capture_ns,
+                send_ns=header.send_ns,
+                received_ns=item.received_ns,
+                handled_ns=None if handled is None else self._clock() if handled else 0,
+                line_bytes=size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding),
+                clock_offset_ns=self.capture_clock.offset_ns,
+            )
+        )
+
+    def measure(self, header: BaseHeader, *, tracks: int, tracks_refined: int) -> None:
+        """Give out how full the link was and how old the picture is, twice a second of the stream."""
+        at_ns, ledger = header.send_ns, self.ledger
+        if 0 < self._next_traffic_ns - at_ns <= SECOND_NS // 2:  # more: its time was set back
+            return
+        self._next_traffic_ns = at_ns + SECOND_NS // 2
+        to_bps = 8 * SECOND_NS / self._info.window_ns
+        self._traffic = Traffic(
+            frame_index=header.frame_index,
+            capture_ns=header.capture_ns,
+            base_bps=ledger.window_bytes(Account.BASE, at_ns) * to_bps,
+            roi_bps=ledger.window_bytes(Account.ROI, at_ns) * to_bps,
+            total_bps=ledger.window_bytes(None, at_ns) * to_bps,
+            budget_bps=self.budget_bps,
+            receive_latency_ms=self.receive_latency.percentile(50) if self.knows_delay else None,
+            overlay_latency_ms=self.overlay_latency.percentile(50) if self.knows_delay else None,
+            tracks=tracks,
+            tracks_refined=tracks_refined,
+        )
+        self._emit(self._traffic)
+
+    def count(self, row: Channel, item: Received, *, at_ns: int) -> None:
+        """Take the bytes of a message on the line."""
+        size, extra = len(item.payload), len(item.attachment)
+        self.ledger.count(
+            _ACCOUNTS.get(row, Account.META),
+            payload_bytes=size,
+            attachment_bytes=extra,
+            overhead_bytes=overhead_bytes(size, extra, key=self._keys.key(row), encoding=item.encoding),
+            at_ns=at_ns,
+        )
+
+    def _time_capture(self, capture_ns: int, received_ns: int) -> None:
+        if self.lockstep:
+            return
+        was_sound = self.capture_clock.is_sound
+        self.capture_clock.note(capture_ns, received_ns=received_ns)
+        if was_sound and not self.capture_clock.is_sound:
+            off_s = abs(received_ns - self.clock_offset.to_local_ns(capture_ns)) // SECOND_NS
+            self._note(
+                "warning",
+                f"the camera's clock is {off_s} s off: ages count from the arrival of pictures, and delays are not "
+                "known",
+            )
+
+    # What is known of it
 
     @property
     def knows_delay(self) -> bool:
@@ -120,133 +312,58 @@ class ReceptionStatistics:
         span_ns = max(0, self.newest_capture_ns - self._first_capture_ns)
         return span_ns / SECOND_NS + 1 / self._info.fps
 
-    def frame(self, header: BaseHeader) -> None:
-        """An access unit has its turn."""
-        self.frames += 1
-        if self._first_capture_ns is None:
-            self._first_capture_ns = header.capture_ns
-        self.newest_index, self.newest_capture_ns = header.frame_index, header.capture_ns
+    @property
+    def not_sent(self) -> Mapping[str, int]:
+        """Why candidates have no still: the edge's counts, by reason."""
+        return {} if self.last_status is None else self.last_status.outcomes
 
-    def delay_ms(self, capture_ns: int, at_ns: int) -> float | None:
-        """From capture until then; None where clocks do not tell."""
-        if not self.knows_delay:
+    @property
+    def is_whole(self) -> bool:
+        """Whether all has come that the edge counted in its newest report."""
+        last, messages = self.last_status, self.ledger.messages
+        return last is not None and (
+            self.frames >= last.base_messages
+            and messages(Account.ROI) >= last.roi_messages
+            and messages(Account.BACKLOG) >= last.backlog_messages
+            and messages(Account.META) > last.meta_messages  # a report does not count itself
+        )
+
+    def traffic(self, now_ns: int) -> Traffic | None:
+        """The link's load; None before the first access unit, and where none has come lately."""
+        fps = self._info.fps if self.last_status is None else self.last_status.coded_fps or self._info.fps
+        lately_ns = max(_LATELY_NS, round(_FRAMES_LATELY * SECOND_NS / fps))
+        return None if now_ns - self._base_ns > lately_ns else self._traffic
+
+    def health(self, now_ns: int) -> Health | None:
+        """The edge's health; None before its first report, and where none has come lately."""
+        if self.last_status is None or now_ns - self._status_ns > _LATELY_NS:
             return None
-        return max(0.0, (at_ns - self.capture_clock.to_local_ns(capture_ns)) / _MS)
+        return self.last_status.health
 
-    def count(self, row: Channel, item: Received, *, at_ns: int) -> None:
-        """Take the bytes of a message on the line."""
-        size, extra = len(item.payload), len(item.attachment)
-        self.ledger.count(
-            _ACCOUNTS.get(row, Account.META),
-            payload_bytes=size,
-            attachment_bytes=extra,
-            overhead_bytes=overhead_bytes(size, extra, key=self._keys.key(row), encoding=item.encoding),
-            at_ns=at_ns,
-        )
+    # What is to be reported
 
-    def time(
-        self,
-        kind: str,
-        item: Received,
-        header: BaseHeader | RoiHeader | TrackStep | PoseReport | Status | BacklogHeader,
-        *,
-        handled: bool | None,
-    ) -> None:
-        """Give out when a message came; ``handled``: something was made of it, None is said later."""
-        size, extra = len(item.payload), len(item.attachment)
-        frame_index, capture_ns = -1, 0
-        if isinstance(header, BaseHeader | RoiHeader | TrackStep):
-            frame_index, capture_ns = header.frame_index, header.capture_ns
-        self._emit(
-            MessageTiming(
-                kind=kind,
-                sequence=header.number if isinstance(header, BacklogHeader | PoseReport) else header.sequence,
-                frame_index=frame_index,
-                capture_ns=capture_ns,
-                send_ns=header.send_ns,
-                received_ns=item.received_ns,
-                handled_ns=None if handled is None else self._clock() if handled else 0,
-                line_bytes=size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding),
-                clock_offset_ns=self.capture_clock.offset_ns,
-            )
-        )
-
-    def traffic(self, header: BaseHeader, *, tracks: int, tracks_refined: int) -> None:
-        """Give out how full the link was and how old the picture is, twice a second of the stream."""
-        at_ns, ledger = header.send_ns, self.ledger
-        if 0 < self._next_traffic_ns - at_ns <= SECOND_NS // 2:  # more: its time was set back
-            return
-        self._next_traffic_ns = at_ns + SECOND_NS // 2
-        to_bps = 8 * SECOND_NS / self._info.window_ns
-        self.last_traffic = Traffic(
-            frame_index=header.frame_index,
-            capture_ns=header.capture_ns,
-            base_bps=ledger.window_bytes(Account.BASE, at_ns) * to_bps,
-            roi_bps=ledger.window_bytes(Account.ROI, at_ns) * to_bps,
-            total_bps=ledger.window_bytes(None, at_ns) * to_bps,
-            budget_bps=self.budget_bps,
-            receive_latency_ms=self.receive_latency.percentile(50) if self.knows_delay else None,
-            overlay_latency_ms=self.overlay_latency.percentile(50) if self.knows_delay else None,
-            tracks=tracks,
-            tracks_refined=tracks_refined,
-        )
-        self._emit(self.last_traffic)
-
-    def base(
-        self, header: BaseHeader, *, size_bytes: int, arrived_ns: int, delay_ms: float | None = None
-    ) -> None:
-        """An access unit of this session has arrived; ``delay_ms`` from capture, where clocks allow to say."""
+    def add_results(self, results: Iterable[StillResult]) -> None:
+        """Of stills that were read."""
         with self._lock:
-            if header.sequence > self._base_sequence:
-                self._base_sequence, self._arrived_ns = header.sequence, arrived_ns
-            self._from_start |= header.sequence == 0
-            if delay_ms is not None:
-                self._delays_ms.append(delay_ms)
-            self._note(size_bytes, arrived_ns)
+            self._results.extend(results)
 
-    def still(self, sequence: int, *, size_bytes: int, arrived_ns: int) -> None:
-        """A still of this session has arrived."""
+    def take_results(self, most: int) -> tuple[StillResult, ...]:
+        """Return and forget up to ``most`` results that the edge has not been sent yet."""
         with self._lock:
-            self._missing.pop(sequence, None)
-            if self._still_sequence < 0 or abs(sequence - self._still_sequence) <= _NEAR_STILLS:
-                if sequence > self._still_sequence:
-                    self._miss(self._still_sequence + 1, sequence, at_ns=arrived_ns)
-                    self._still_sequence = sequence
-            elif 0 < sequence - self._last_still <= _NEAR_STILLS:
-                self._still_sequence = sequence
-                self._missing.clear()
-            self._last_still = sequence
-            self._note(size_bytes, arrived_ns)
-
-    def backlog(self, *, size_bytes: int, arrived_ns: int) -> None:
-        """A chunk of the backlog has arrived."""
-        with self._lock:
-            self._note(size_bytes, arrived_ns)
-
-    def stored_still(self, sequence: int) -> None:
-        """A still that never came on ``roi`` came afterwards, with the backlog."""
-        with self._lock:
-            self._missing.pop(sequence, None)
+            return tuple(self._results.popleft() for _ in range(min(most, len(self._results))))
 
     def due(self, now_ns: int) -> bool:
-        """Whether a report should go out."""
+        """Whether a report should go out: as often as what has arrived is worth it."""
         with self._lock:
             if self._reported_ns is None:
                 return True
             since_ns = now_ns - self._reported_ns
             return since_ns >= _MOST_NS or (self._news and since_ns >= self._interval_ns(now_ns))
 
-    def _interval_ns(self, now_ns: int) -> int:
-        if self.lockstep:
-            return _MOST_NS
-        self._forget(now_ns)
-        arriving = self._size_bytes / _RATE_OVER_NS
-        if arriving <= 0:
-            return _MOST_NS
-        return min(_MOST_NS, max(_LEAST_NS, round(REPORT_LINE_BYTES / (_SHARE * arriving))))
-
-    def feedback(self, send_ns: int, **of_others: Any) -> Feedback:
-        """The report of now, with what others know; delays begin anew."""
+    def feedback(self, *, send_ns: int, **of_receiver: Any) -> Feedback:
+        """The report of now, with what is of all sessions; delays begin anew."""
+        last_frame_index, objects_detected = self.analyzed
+        results = self.take_results(MAX_STILL_RESULTS)
         with self._lock:
             delays = list(self._delays_ms)
             self._delays_ms.clear()
@@ -258,6 +375,8 @@ class ReceptionStatistics:
             return Feedback(
                 session_id=self._info.session_id,
                 send_ns=send_ns,
+                last_frame_index=last_frame_index,
+                objects_detected=min(objects_detected, _MOST_OBJECTS),
                 base_messages=self.frames,
                 base_bytes=self.ledger.base_bytes,
                 roi_messages=self.stills,
@@ -268,9 +387,19 @@ class ReceptionStatistics:
                 base_held_us=min(held_us, _HELD_US),
                 still_sequence=self._still_sequence,
                 missing_stills=tuple(self._missing),
+                stills=results,
                 delay_p50_ms=min(statistics.median(delays), _MOST_DELAY_MS) if delays else -1.0,
-                **of_others,
+                **of_receiver,
             )
+
+    def _interval_ns(self, now_ns: int) -> int:
+        if self.lockstep:
+            return _MOST_NS
+        self._forget(now_ns)
+        arriving = self._size_bytes / _RATE_OVER_NS
+        if arriving <= 0:
+            return _MOST_NS
+        return min(_MOST_NS, max(_LEAST_NS, round(REPORT_LINE_BYTES / (_SHARE * arriving))))
 
     def _miss(self, first: int, end: int, *, at_ns: int) -> None:
         # Of many, the newest count; what was sent before this ground was there is not missed.
@@ -279,85 +408,12 @@ class ReceptionStatistics:
         for one in range(max(first, end - MAX_MISSING_STILLS), end):
             self._missing[one] = at_ns
 
-    def _note(self, size_bytes: int, arrived_ns: int) -> None:
-        self._sizes.append((arrived_ns, size_bytes))
-        self._size_bytes += size_bytes
+    def _arrive(self, item: Received) -> None:
+        self._sizes.append((item.received_ns, item.size_bytes))
+        self._size_bytes += item.size_bytes
         self._news = True
-        self._forget(arrived_ns)
+        self._forget(item.received_ns)
 
     def _forget(self, now_ns: int) -> None:
         while self._sizes and (self._sizes[0][0] <= now_ns - _RATE_OVER_NS or len(self._sizes) > 4096):
             self._size_bytes -= self._sizes.popleft()[1]
-
-
-class StillSequenceWindow:
-    """The received stills: each is shown once, and counted as often as it crossed. Safe for threads."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._seen = SequenceWindow()
-        self._sent_ns: Newest[int, int] = Newest(_MOST_SENT)
-        """Sequence → when a still was sent of which no second copy has come."""
-
-    def is_new(self, sequence: int, *, send_ns: int) -> bool:
-        """Whether a still on ``roi`` has not come before."""
-        with self._lock:
-            if not self._seen.add([sequence]):
-                return False
-            self._sent_ns[sequence] = send_ns
-            return True
-
-    def is_copy(self, sequence: int, *, send_ns: int) -> bool:
-        """Whether one that is not new is the copy that the edge sent for want of an acknowledgement; once.
-
-        What bears the time of the first is a replay. Of one that came with the backlog, the first on ``roi`` is such
-        a copy.
-        """
-        with self._lock:
-            if send_ns <= self._sent_ns.get(sequence, send_ns):
-                return False
-            del self._sent_ns[sequence]
-            return True
-
-    def is_new_stored(self, sequence: int) -> bool:
-        """Whether a still of the backlog has not come before."""
-        return self.is_new(sequence, send_ns=_NEVER_NS)
-
-    def forget(self, sequence: int) -> None:
-        """One was lost on its way into a file: it is new when it comes again."""
-        with self._lock:
-            self._seen.discard(sequence)
-            self._sent_ns.pop(sequence, None)
-
-
-class CaptureClock:
-    """The times of one camera by this ground's clock.
-
-    A camera's clock may be years off, and an edge may say what it likes. A picture that came before it was captured,
-    or a minute after, counts from its arrival, and so do those after it, as long as that can be.
-    """
-
-    def __init__(self, edge_clock: ClockOffset) -> None:
-        self._edge_clock = edge_clock
-        self._own_offset_ns: int | None = None
-
-    def note(self, capture_ns: int, *, received_ns: int) -> None:
-        """Take the time of something that has just come."""
-        if -_EARLY_NS <= received_ns - self._edge_clock.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:
-            self._own_offset_ns = None
-        elif self.is_sound or not 0 <= received_ns - self.to_local_ns(capture_ns) <= _LONGEST_TRIP_NS:
-            self._own_offset_ns = capture_ns - received_ns
-
-    @property
-    def is_sound(self) -> bool:
-        """Whether the offset is that of the edge's clock, and not one from the arrival."""
-        return self._own_offset_ns is None
-
-    @property
-    def offset_ns(self) -> int:
-        """The camera's clock minus ours."""
-        return self._edge_clock.offset_ns if self._own_offset_ns is None else self._own_offset_ns
-
-    def to_local_ns(self, capture_ns: int) -> int:
-        """A time of the camera as our clock would have shown it."""
-        return capture_ns - self.offset_ns

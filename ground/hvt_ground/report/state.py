@@ -19,7 +19,7 @@ from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.events import Traffic
 from hvt_ground.link.group import Elsewhere, GroundGroup
 from hvt_ground.session.edge_sessions import EdgeSessions
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 
 LinkState = Literal["waiting", "up", "thin", "lost", "ended"]
 """``waiting`` for a keyframe to begin with; ``up``; ``thin``: the edge leaves frames out that the link does not
@@ -45,7 +45,7 @@ class PoseState:
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    session: GroundSession
+    session: Session
     backlog: EdgeBacklog
     now_ns: int
     traffic: Traffic | None
@@ -61,7 +61,7 @@ def _of(read: Callable[[_Moment], Any]) -> Any:
     return field(metadata={"read": read})
 
 
-def _live(read: Callable[[GroundSession, Traffic], Any]) -> Any:
+def _live(read: Callable[[Session, Traffic], Any]) -> Any:
     return _of(lambda at: None if at.traffic is None else read(at.session, at.traffic))
 
 
@@ -74,7 +74,7 @@ def _counted(read: Callable[[Status], Any]) -> Any:
 
 
 def _delay_ms(percent: int) -> Any:
-    def read(session: GroundSession, _: Traffic) -> float | None:
+    def read(session: Session, _: Traffic) -> float | None:
         came = session.reception
         return came.overlay_latency.percentile(percent) if came.knows_delay else None
 
@@ -99,8 +99,8 @@ def _pose(at: _Moment) -> PoseState | None:
 
 def _failed_at_edge(at: _Moment) -> tuple[FailedPart, ...]:
     since = {
-        one: at.session.clock_offset.to_local_ns(since_ns)
-        for one, since_ns in at.session.edge_failing.items()
+        one: at.session.reception.clock_offset.to_local_ns(since_ns)
+        for one, since_ns in at.session.reception.edge_failing.items()
     }
     failed = () if at.status is None else (one for one in at.status.failed if one.part in since)
     return tuple(FailedPart(one.part, one.reason, min(at.now_ns, since[one.part])) for one in failed)
@@ -114,8 +114,8 @@ class SessionState:
     """Its id, hexadecimal."""
     software: str = _of(lambda at: at.session.info.software)
     """The edge's."""
-    method: str = _of(lambda at: at.session.method)
-    levers: str = _of(lambda at: at.session.levers)
+    method: str = _of(lambda at: at.session.reception.method)
+    levers: str = _of(lambda at: at.session.reception.levers)
     """What ``--profile auto`` sends beside the video and why; empty without."""
     lockstep: bool = _of(lambda at: at.session.lockstep)
     duration_s: float = _of(lambda at: at.session.reception.duration_s)
@@ -160,7 +160,7 @@ class SessionState:
     """For their turn or their base frame."""
     still_outcomes: Mapping[str, int] = _of(lambda at: dict(at.session.perceived.outcomes))
     """What became of the objects in them."""
-    stills_not_sent: Mapping[str, int] = _of(lambda at: dict(at.session.not_sent))
+    stills_not_sent: Mapping[str, int] = _of(lambda at: dict(at.session.reception.not_sent))
     """Why candidates have no still: the edge's counts, by reason."""
     tracks: int = _of(lambda at: at.session.perceived.tracks)
     tracks_refined: int = _of(lambda at: at.session.perceived.refined)
@@ -306,14 +306,12 @@ class StateMaker:
             failed=sessions.failures.now,
         )
 
-    def _link(
-        self, edge: str, sessions: EdgeSessions, session: GroundSession | None, now_ns: int
-    ) -> LinkState:
+    def _link(self, edge: str, sessions: EdgeSessions, session: Session | None, now_ns: int) -> LinkState:
         if session is None:
             return "ended" if sessions.ended else "waiting"
         if sessions.receiver.silent_ns > LOST_NS and not session.lockstep:
             return "lost"
-        left_out = _left_out(session.last_status)
+        left_out = _left_out(session.reception.last_status)
         key = f"{session.info.session_id:016x}"
         known_key, known, rose_ns = self._left_out.get(edge, (key, left_out, 0))
         if known_key != key or left_out < known:
@@ -329,8 +327,8 @@ def _left_out(status: Status | None) -> int:
     return 0 if status is None else status.frame_account.groups.get("link", 0)
 
 
-def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState, now_ns: int) -> SessionState:
-    traffic = None if link == "lost" else session.traffic(now_ns)
-    status, health = session.last_status, session.health(now_ns)
+def _session(session: Session, sessions: EdgeSessions, *, link: LinkState, now_ns: int) -> SessionState:
+    traffic = None if link == "lost" else session.reception.traffic(now_ns)
+    status, health = session.reception.last_status, session.reception.health(now_ns)
     at = _Moment(session, sessions.backlog, now_ns, traffic, health, status)
     return SessionState(**{one.name: one.metadata["read"](at) for one in fields(SessionState)})

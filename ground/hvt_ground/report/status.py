@@ -11,7 +11,7 @@ from hvt_common.units import bitrate_text, utc_text
 from hvt_ground.events import Event
 from hvt_ground.report.state import EdgeState, GroundState
 from hvt_ground.session.edge_sessions import EdgeSessions
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.sinks import QueuedSink, Sink
 
 
@@ -45,11 +45,11 @@ def _edge_text(one: EdgeState) -> str:
     return "  ".join([said, *map(failed_text, one.failed)])
 
 
-def summary(session: GroundSession) -> dict[str, Any]:
+def summary(session: Session) -> dict[str, Any]:
     """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do."""
     info, pipeline, reception = session.info, session.perceived, session.reception
     counters, account = reception.counters, reception.ledger.summary(reception.duration_s)
-    status = session.last_status
+    status = session.reception.last_status
     unread = pipeline.outcomes.get("unread", 0)
     backlog = session.backlog.totals
     return {
@@ -73,7 +73,7 @@ def summary(session: GroundSession) -> dict[str, Any]:
                 "received": account.outcomes["received"],
                 "dropped": dict(session.stills_dropped),
                 "outcomes": dict(pipeline.outcomes),
-                "not_sent": dict(session.not_sent),
+                "not_sent": dict(session.reception.not_sent),
             },
             "mean_bytes": round(account.roi_bytes / reception.stills) if reception.stills else 0,
         },

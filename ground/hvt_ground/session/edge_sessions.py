@@ -32,7 +32,7 @@ from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.link.reassemble import Arrival, StreamCounters
 from hvt_ground.link.receiver import Packet, Receiver
 from hvt_ground.session.edge_port import EdgePort, InfoAnswer, ReceiverReports
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 
 _BASE_CODECS = (BASE_CODEC, "hevc")
 """The second is the name in version 4."""
@@ -73,8 +73,8 @@ class EdgeSessions:
         self,
         port: EdgePort,
         *,
-        open_session: Callable[[Info, ReceiverReports], GroundSession],
-        on_ended: Callable[[GroundSession], None] = lambda _session: None,
+        open_session: Callable[[Info, ReceiverReports], Session],
+        on_ended: Callable[[Session], None] = lambda _session: None,
         clock: Callable[[], int] | None = None,
         recordings: BacklogRecordings | None = None,
         patience_s: float = 5.0,
@@ -107,7 +107,7 @@ class EdgeSessions:
         self._backlog_ns: int | None = None
         """When the last chunk of it came that nothing has been said of."""
         self._next_clock_ns = 0
-        self.session: GroundSession | None = None
+        self.session: Session | None = None
         """The one that is open."""
         self.ended = 0
         """Sessions that have ended."""
@@ -177,12 +177,12 @@ class EdgeSessions:
                 self._lost_id = session.info.session_id
                 self.receiver.stream.decoder_failed()  # should it come back, it starts with a keyframe
 
-    def _refresh_clock(self, session: GroundSession, now_ns: int) -> None:
+    def _refresh_clock(self, session: Session, now_ns: int) -> None:
         # Ask the edge for its time now and then; nothing waits for the answer.
         while (answer := self.port.take_info()) is not None:
             info = self._learn(answer)
             if info is not None and info.session_id == session.info.session_id:
-                session.learn(info)
+                session.reception.learn(info)
         if now_ns >= self._next_clock_ns and self.port.present.is_set():
             self._next_clock_ns = now_ns + _CLOCK_EVERY_NS
             self.port.request_info(session.info.session_id)
@@ -222,15 +222,14 @@ class EdgeSessions:
         try:
             if isinstance(header, BacklogHeader):
                 self._backlog(header, item)
-            elif isinstance(header, PoseReport):
-                if session is not None and header.is_of(session.info.session_id):
-                    session.pose(header, item)
-                else:  # it may overtake the first keyframe of its session
-                    self.receiver.hold(packet)
-            elif session is not None and header.session_id == session.info.session_id:
-                self._take(session, header, item)
-            elif isinstance(header, Status) or (isinstance(header, RoiHeader) and session is None):
-                self.receiver.hold(packet)
+            elif session is not None and _is_of(header, session.info.session_id):
+                session.take(header, item)
+                if isinstance(header, Status) and header.state == "ended":
+                    self._ended_ns = time.monotonic_ns()
+            elif isinstance(header, PoseReport | Status) or (
+                isinstance(header, RoiHeader) and session is None
+            ):
+                self.receiver.hold(packet)  # it may overtake the first keyframe of its session
                 if isinstance(header, Status) and session is None:
                     self._note_unseen(header, item.received_ns)
             elif isinstance(header, TrackStep) and session is None:
@@ -262,17 +261,6 @@ class EdgeSessions:
         self._unseen = None
         self.failures.over(self._video, self._unseen_failure)
         self._unseen_failure = 0
-
-    def _take(self, session: GroundSession, header: RoiHeader | TrackStep | Status, item: Received) -> None:
-        match header:
-            case RoiHeader():
-                session.still(header, item)
-            case TrackStep():
-                session.tracks(header, item)
-            case Status():
-                session.status(header, item)
-                if header.state == "ended":
-                    self._ended_ns = time.monotonic_ns()
 
     def _base(self, arrival: Arrival[Received]) -> None:
         session_id = arrival.header.session_id
@@ -319,7 +307,7 @@ class EdgeSessions:
         try:
             delivered = self.backlog.chunk(header, item.payload, own=session.backlog, worker=session.worker)
         finally:
-            session.backlog_chunk(header, item, delivered=delivered)
+            session.reception.backlog(header, item, delivered=delivered)
 
     # Sessions
 
@@ -370,7 +358,7 @@ class EdgeSessions:
         self.port.used.clear()
         log_fields(session="")
 
-    def _report_end(self, session: GroundSession) -> None:
+    def _report_end(self, session: Session) -> None:
         session.report()
         while self.backlog.unreported:  # one report names a few
             session.report()
@@ -383,7 +371,7 @@ class EdgeSessions:
         self._end_session()
         self.receiver.stream.decoder_failed()
 
-    def _say_failed(self, error: Exception, session: GroundSession | None) -> None:
+    def _say_failed(self, error: Exception, session: Session | None) -> None:
         if session is not None:
             if session.failure:
                 return  # one fault may come to light in several places
@@ -391,11 +379,15 @@ class EdgeSessions:
         _log.debug("%s", self._part, exc_info=error)
         self.failures.failed(self._part, reason_of(error))
 
-    def _is_over(self, session: GroundSession, now_ns: int) -> bool:
+    def _is_over(self, session: Session, now_ns: int) -> bool:
         if self._ended_ns is None:
             return not self.port.present.is_set() and self.receiver.silent_ns > self._patience_ns
-        whole = session.is_whole and not self.backlog.working
+        whole = session.reception.is_whole and not self.backlog.working
         return whole or now_ns - self._ended_ns > self._ended_patience_ns
+
+
+def _is_of(header: RoiHeader | TrackStep | PoseReport | Status, session_id: int) -> bool:
+    return header.is_of(session_id) if isinstance(header, PoseReport) else header.session_id == session_id
 
 
 class EdgeThread:

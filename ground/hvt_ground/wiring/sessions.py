@@ -26,7 +26,7 @@ from hvt_ground.perception.session import SessionPerception
 from hvt_ground.recordings.row import RecordingRow
 from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.session.edge_port import ReceiverReports
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
 from hvt_ground.sinks.event_tables import SessionTiming, StillFiles, TrackTable, picture_of, timing_table
 from hvt_ground.sinks.line_file import claim_name, has_nothing
@@ -170,7 +170,7 @@ class SessionFactory:
             names = partial(free_path, [config.timing], number=2, may_exist=config.timing)
             self._timing = outputs.open("timing table", partial(self._opened, timing_table, names))
 
-    def open_session(self, info: Info, reports: ReceiverReports) -> GroundSession:
+    def open_session(self, info: Info, reports: ReceiverReports) -> Session:
         config, models, edge = self._config, self._models, info.edge
         stamp = time.strftime("%Y%m%d-%H%M%S")
         settings = self._recorder_settings(info)
@@ -213,7 +213,7 @@ class SessionFactory:
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
         perception = SessionPerception(config, models, info)
-        return GroundSession(
+        return Session(
             info,
             sinks=sinks,
             pipeline_of=perception.pipeline,

@@ -1,7 +1,7 @@
 """A whole flight in one process: the very edge and ground that fly, a simulated serial link between them, no clock.
 
 The edge is `hvt_edge.app.Edge` in another world: where frames come from (`FrameSource`), where messages go
-(`SerialLink`), and when feedback comes back. The ground is `GroundSession`. Media time is the only
+(`SerialLink`), and when feedback comes back. The ground is `Session`. Media time is the only
 time: a message acts at the ground when the link has delivered it and not before, and what the ground says of a still
 is heard at the edge as much later as that still took to cross. The same input gives the same flight, always.
 

@@ -31,7 +31,7 @@ from hvt_ground.link.reassemble import Arrival as AccessUnitArrival
 from hvt_ground.perception.models import DetectorThread, ModelFacts
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.wiring import Models, SessionPerception
 from hvt_study.flights.flight_link import Arrival, SerialLink
 from hvt_study.flights.flight_record import FlightRecord, Watch
@@ -120,7 +120,7 @@ class GroundSide:
         self.now_ns = info.started_ns
         detector, classifier = models.take()
         perception = SessionPerception(config, SharedModels(detector, classifier, config=config), info)
-        self._session = GroundSession(
+        self._session = Session(
             info,
             pipeline_of=lambda emit: perception.pipeline(self._observed_by(emit)),
             clock=lambda: self.now_ns,
@@ -191,23 +191,23 @@ class GroundSide:
             header = RoiHeader.parse(item.attachment, item.payload)
             header = self._captures.filled(header, otherwise_ns=arrival.arrival_ns - header.send_delay_ns)
             self._record.still(header, arrival)
-            self._session.still(header, item)
+            self._session.take(header, item)
         elif row is Channel.TRACKS:
-            self._session.tracks(TrackStep.parse(item.payload), item)
+            self._session.take(TrackStep.parse(item.payload), item)
         elif row is Channel.STATUS:
-            self._session.status(Status.parse(item.payload), item)
+            self._session.take(Status.parse(item.payload), item)
 
     def _answer(self, last: Arrival[Received]) -> None:
         """What the ground has to say goes back in the time that the newest message took to come."""
         back_ns = self.now_ns + (last.arrival_ns - last.enter_ns)
-        results = self._session.take_results(_MOST_RESULTS)
+        results = self._session.reception.take_results(_MOST_RESULTS)
         self._record.answers(results)
         for first in range(0, len(results), MAX_STILL_RESULTS):
             self.back_bytes += self._weight(results[first : first + MAX_STILL_RESULTS])
         self.results.extend((back_ns, one) for one in results)
         objects = self._session.pipeline.objects_detected
         if objects >= 0:
-            self.detected.append((back_ns, Detected(_RECEIVER, self._session.last_frame_index, objects)))
+            self.detected.append((back_ns, Detected(_RECEIVER, self._session.reception.analyzed[0], objects)))
 
     def _weight(self, results: tuple[StillResult, ...]) -> int:
         """Line bytes of a report with these, as `hvt_ground.session.edge_port` would send it."""
@@ -217,7 +217,7 @@ class GroundSide:
             receiver_id=_RECEIVER,
             sequence=frames,
             send_ns=self.now_ns,
-            last_frame_index=self._session.last_frame_index,
+            last_frame_index=self._session.reception.analyzed[0],
             base_messages=frames,
             base_bytes=self._session.reception.ledger.base_bytes,
             roi_messages=stills,

@@ -38,7 +38,7 @@ from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.event_tables import SessionTiming, timing_table
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -108,8 +108,8 @@ class Rig:
         self.port.inbox = self.inbox = WatchedInbox()
         self.port.flight = flight
         self.flight = flight
-        self.opened: list[GroundSession] = []
-        self.ended: list[GroundSession] = []
+        self.opened: list[Session] = []
+        self.ended: list[Session] = []
         self._backlog_numbers = itertools.count()
         self.live: list[Received] = []
         self.recordings = BacklogRecordings(self._open_backlog, most_files=most_files, open_s=20)
@@ -128,12 +128,12 @@ class Rig:
         sid = former.session_id
         self.put(*chunks(sid, "info", 0, info_object(former)), *chunks(sid, "still", 0, still))
 
-    def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
+    def _open(self, info: Info, reports: ReceiverReports) -> Session:
         path = self.folder / f"{len(self.opened)}.rrd"
         sinks: list[Sink] = [self._sink(info, path)]
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=info.edge, session_id=info.session_id))
-        session = GroundSession(
+        session = Session(
             info,
             sinks=sinks,
             pipeline_of=self._pipeline,
@@ -187,7 +187,7 @@ class Rig:
         return self.port.reports[-1]
 
     @property
-    def session(self) -> GroundSession:
+    def session(self) -> Session:
         """The one that is open."""
         assert self.receiver.session is not None
         return self.receiver.session
@@ -242,7 +242,7 @@ def test_the_hole_of_an_outage_is_filled(flight, tmp_path):
             rig.acknowledged_ranges()
         )
         assert (rig.session.perceived.tracks, rig.session.perceived.detections_run) == (tracks, detections)
-        assert rig.session.last_frame_index == 74
+        assert rig.session.reception.analyzed[0] == 74
         for index in range(75, 80):  # one by one: a burst would leave out detections
             rig.base(index)
         assert rig.session.perceived.tracks == tracks, "the tracker of now went on undisturbed"

@@ -11,7 +11,7 @@ from hvt_common.protocol.messages import BaseHeader, RoiHeader, Status, TrackSte
 from hvt_ground.events import MessageTiming, Notice
 from hvt_ground.link.reassemble import Arrival
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from rigs.flight import Flight, patient_worker, pipeline_of
 
 BOX = {1: (30.0, 60.0, 62.0, 96.0)}
@@ -39,7 +39,7 @@ class Rig:
     def __init__(self, flight: Flight) -> None:
         self.events = Events()
         self.now_ns = 1_790_000_000 * SECOND_NS
-        self.session = GroundSession(
+        self.session = Session(
             flight.info(), sinks=[self.events], pipeline_of=pipeline_of, clock=lambda: self.now_ns
         )
         for index in range(3):
@@ -50,7 +50,7 @@ class Rig:
 
     def step(self, item, **lies) -> int:
         """Take a report of tracks; how many there have been."""
-        self.session.tracks(replace(TrackStep.parse(item.payload), **lies), item)
+        self.session.take(replace(TrackStep.parse(item.payload), **lies), item)
         return self.session.reception.steps
 
 
@@ -66,13 +66,13 @@ def test_a_forged_status_number_does_not_silence_the_edge_for_good(rig, flight):
     """The ground would never hear that the session has ended, nor what the edge has dropped."""
     item = flight.status(base=3)
     real = Status.parse(item.payload)
-    rig.session.status(replace(real, sequence=2**32 - 1), item)
+    rig.session.take(replace(real, sequence=2**32 - 1), item)
     rig.now_ns += SECOND_NS
-    rig.session.status(replace(real, sequence=real.sequence + 1), item)
-    assert rig.session.last_status.sequence == 2**32 - 1, "late ones are left out as ever"
+    rig.session.take(replace(real, sequence=real.sequence + 1), item)
+    assert rig.session.reception.last_status.sequence == 2**32 - 1, "late ones are left out as ever"
     rig.now_ns += 5 * SECOND_NS
-    rig.session.status(replace(real, sequence=real.sequence + 6, state="ended"), item)
-    assert rig.session.last_status.state == "ended"
+    rig.session.take(replace(real, sequence=real.sequence + 6, state="ended"), item)
+    assert rig.session.reception.last_status.state == "ended"
 
 
 def test_an_edge_that_reports_without_end_does_not_talk_to_all_viewers(rig, flight):
@@ -81,7 +81,7 @@ def test_an_edge_that_reports_without_end_does_not_talk_to_all_viewers(rig, flig
     real = Status.parse(item.payload)
     for number in range(1, 2000):
         rig.now_ns += SECOND_NS // 1000
-        rig.session.status(replace(real, sequence=real.sequence + number, levers=f"report {number}"), item)
+        rig.session.take(replace(real, sequence=real.sequence + number, levers=f"report {number}"), item)
     rig.session.close()
     said = [one.text for one in rig.events if isinstance(one, Notice)]
     assert len([one for one in said if one.startswith("Report")]) == 61
@@ -101,8 +101,8 @@ def test_numbers_alone_are_no_event(rig, flight):
         "tracks: the video hides 8 objects; stills paused: they name 1 of 40 otherwise",
     ]
     for number, levers in enumerate(said):
-        rig.session.status(replace(real, sequence=real.sequence + 1 + number, levers=levers), item)
-    assert rig.session.levers == said[-1]
+        rig.session.take(replace(real, sequence=real.sequence + 1 + number, levers=levers), item)
+    assert rig.session.reception.levers == said[-1]
     assert [one.text for one in rig.events if isinstance(one, Notice)] == [
         "The edge sends no tracks: not measured yet. Stills are sent: no answer yet.",
         (
@@ -135,8 +135,8 @@ def test_results_that_nobody_fetches_do_not_pile_up(rig, flight):
     for sequence in range(5000):
         item = flight.still(1, sequence, data=b"no picture")
         header = RoiHeader.parse(item.attachment, item.payload)
-        rig.session.still(header, item)
-    assert len(rig.session.take_results(100_000)) <= 4096
+        rig.session.take(header, item)
+    assert len(rig.session.reception.take_results(100_000)) <= 4096
     assert rig.session.stills_dropped["undecodable"] > 4900
 
 
@@ -144,7 +144,7 @@ def test_broken_stills_are_not_all_looked_into(rig, flight):
     """Each costs a line in the recording and one on stderr; a few thousand a second would fill both."""
     for sequence in range(200):
         item = flight.still(1, sequence, data=b"no picture")
-        rig.session.still(RoiHeader.parse(item.attachment, item.payload), item)
+        rig.session.take(RoiHeader.parse(item.attachment, item.payload), item)
     rig.session.close()
     assert sum("is damaged" in getattr(one, "text", "") for one in rig.events) == 32
 

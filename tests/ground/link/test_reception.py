@@ -7,28 +7,29 @@ from dataclasses import replace
 
 import pytest
 
-from hvt_common.protocol.clock_offset import ClockOffset
+from hvt_common.protocol.clock_offset import CaptureClock, ClockOffset
 from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader, Feedback
+from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_ground.link.receiver import Uptime
-from hvt_ground.link.reception import REPORT_LINE_BYTES, CaptureClock, ReceptionStatistics
+from hvt_ground.link.reception import REPORT_LINE_BYTES, Reception
 from rigs.footprint import footprint_bytes
-from rigs.messages import INFO
+from rigs.messages import BACKLOG, INFO, ROI
 
 MS = 1_000_000
 S = 1_000_000_000
 
 
-def begun(**changes) -> ReceptionStatistics:
+def begun(**changes) -> Reception:
     """A session of which nothing has come."""
     info = replace(INFO, **changes)
-    return ReceptionStatistics(info, clock=lambda: 0, edge_clock=ClockOffset(), emit=lambda _event: None)
+    return Reception(info, clock=lambda: 0, edge_clock=ClockOffset(), emit=lambda _event: None)
 
 
-def report(reception: ReceptionStatistics, now_ns: int) -> Feedback:
+def report(reception: Reception, now_ns: int) -> Feedback:
     """What the edge is told."""
     others = {"receiver_id": 1, "sequence": 0, "clock_offset_ns": 0, "clock_error_ns": -1, "backlog": ()}
-    return reception.feedback(now_ns, last_frame_index=-1, stills=(), **others)
+    return reception.feedback(send_ns=now_ns, **others)
 
 
 def header(sequence: int) -> BaseHeader:
@@ -38,14 +39,36 @@ def header(sequence: int) -> BaseHeader:
     )
 
 
+def base(reception: Reception, sequence: int, *, arrived_ns: int, size_bytes=500, delay_ms=0.0) -> None:
+    """A base message comes, so long after its capture."""
+    one = replace(header(sequence), capture_ns=arrived_ns - round(delay_ms * MS))
+    reception.base(one, message("base", size_bytes, arrived_ns))
+
+
+def still(reception: Reception, sequence: int, *, arrived_ns: int) -> None:
+    """A still comes."""
+    reception.still(replace(ROI, sequence=sequence), message("roi", 900, arrived_ns))
+
+
+def chunk(reception: Reception, *, arrived_ns: int, still: int | None = None) -> None:
+    """A chunk of the backlog comes; with it that still is whole, if it is named."""
+    one = replace(BACKLOG, number=still or 0, session_id=INFO.session_id)
+    reception.backlog(one, message("backlog", 1000, arrived_ns), delivered=still is not None)
+
+
+def message(channel: str, size_bytes: int, arrived_ns: int) -> Received:
+    """So many bytes."""
+    return Received(f"hvt/uav-1/{channel}", bytes(size_bytes), b"", "", arrived_ns)
+
+
 def test_the_newest_message_and_its_time_are_reported():
     """The edge would take the delay of one message for that of another."""
     reception = begun()
-    reception.base(header(4), size_bytes=5_000, arrived_ns=10 * MS, delay_ms=40.0)
-    reception.base(header(5), size_bytes=5_000, arrived_ns=70 * MS, delay_ms=60.0)
-    reception.base(header(3), size_bytes=5_000, arrived_ns=90 * MS, delay_ms=900.0)  # overtaken
-    reception.still(9, size_bytes=900, arrived_ns=95 * MS)
-    reception.still(8, size_bytes=900, arrived_ns=96 * MS)
+    base(reception, 4, size_bytes=5_000, arrived_ns=10 * MS, delay_ms=40.0)
+    base(reception, 5, size_bytes=5_000, arrived_ns=70 * MS, delay_ms=60.0)
+    base(reception, 3, size_bytes=5_000, arrived_ns=90 * MS, delay_ms=900.0)  # overtaken
+    still(reception, 9, arrived_ns=95 * MS)
+    still(reception, 8, arrived_ns=96 * MS)
     measured = report(reception, 100 * MS)
     assert (measured.base_sequence, measured.base_held_us, measured.still_sequence) == (5, 30_000, 9)
     assert measured.delay_p50_ms == 60.0
@@ -66,7 +89,7 @@ def test_reports_take_a_small_share_of_the_way_back(rate_bps, least_s, most_s):
     reception, now_ns, reports = begun(), 0, []
     for sequence in range(150):
         now_ns += S // 15
-        reception.base(header(sequence), size_bytes=round(rate_bps / 8 / 15), arrived_ns=now_ns)
+        base(reception, sequence, size_bytes=round(rate_bps / 8 / 15), arrived_ns=now_ns)
         if reception.due(now_ns):
             report(reception, now_ns)
             reports.append(now_ns)
@@ -80,11 +103,11 @@ def test_reports_take_a_small_share_of_the_way_back(rate_bps, least_s, most_s):
 def test_without_news_reports_are_rare():
     """A paused edge would hear ten reports a second that say nothing."""
     reception = begun()
-    reception.base(header(0), size_bytes=100_000, arrived_ns=0)
+    base(reception, 0, size_bytes=100_000, arrived_ns=0)
     report(reception, 0)
     assert not reception.due(400 * MS)
     assert reception.due(500 * MS)
-    reception.base(header(1), size_bytes=100_000, arrived_ns=100 * MS)
+    base(reception, 1, size_bytes=100_000, arrived_ns=100 * MS)
     assert reception.due(101 * MS)
 
 
@@ -93,7 +116,7 @@ def test_lockstep_reports_do_not_hang_on_the_clock_of_arrival():
     reception = begun(pace="lockstep")
     report(reception, 0)
     for sequence in range(6):
-        reception.base(header(sequence), size_bytes=50_000, arrived_ns=sequence * 10 * MS)
+        base(reception, sequence, size_bytes=50_000, arrived_ns=sequence * 10 * MS)
     assert not reception.due(400 * MS)
     assert reception.due(500 * MS)
 
@@ -103,13 +126,13 @@ def test_memory_is_bounded():
     reception = begun()
     sizes = []
     for sequence in range(20_000):
-        reception.base(header(sequence), size_bytes=10, arrived_ns=sequence, delay_ms=1.0)
+        base(reception, sequence, size_bytes=10, arrived_ns=sequence * MS, delay_ms=1.0)
         if sequence % 5000 == 4999:
             sizes.append(footprint_bytes(reception))
     assert sizes[-1] < 1.1 * sizes[0]
 
 
-def missing(reception: ReceptionStatistics, *, now_s: float = 1.0) -> tuple[int, ...]:
+def missing(reception: Reception, *, now_s: float = 1.0) -> tuple[int, ...]:
     """What a report would name."""
     return report(reception, round(now_s * S)).missing_stills
 
@@ -117,12 +140,12 @@ def missing(reception: ReceptionStatistics, *, now_s: float = 1.0) -> tuple[int,
 def test_stills_that_never_came_are_named_until_they_come():
     """The edge would take them for received, and never send them again."""
     reception = begun()
-    reception.base(header(0), size_bytes=500, arrived_ns=0)
-    reception.still(1, size_bytes=900, arrived_ns=S // 2)
-    reception.still(4, size_bytes=900, arrived_ns=S)
+    base(reception, 0, arrived_ns=0)
+    still(reception, 1, arrived_ns=S // 2)
+    still(reception, 4, arrived_ns=S)
     assert missing(reception) == (0, 2, 3)
-    reception.still(2, size_bytes=900, arrived_ns=S)
-    reception.still(2, size_bytes=900, arrived_ns=S)
+    still(reception, 2, arrived_ns=S)
+    still(reception, 2, arrived_ns=S)
     assert missing(reception) == (0, 3)
     assert missing(reception, now_s=6.9) == (3,)
     assert missing(reception, now_s=7.1) == ()
@@ -131,10 +154,10 @@ def test_stills_that_never_came_are_named_until_they_come():
 def test_a_still_that_comes_with_what_was_kept_is_missed_no_more():
     """The edge would send it a second time, on the way that is for now."""
     reception = begun()
-    reception.base(header(0), size_bytes=500, arrived_ns=0)
-    reception.still(2, size_bytes=900, arrived_ns=0)
-    reception.stored_still(1)
-    reception.stored_still(7)
+    base(reception, 0, arrived_ns=0)
+    still(reception, 2, arrived_ns=0)
+    chunk(reception, still=1, arrived_ns=0)
+    chunk(reception, still=7, arrived_ns=0)
     measured = report(reception, S)
     assert (measured.missing_stills, measured.still_sequence) == ((0,), 2)
 
@@ -143,45 +166,45 @@ def test_pieces_of_the_past_are_reported_on_as_often_as_anything():
     """An edge that hears nothing of its chunks sends them again."""
     reception = begun()
     for number in range(100):
-        reception.backlog(size_bytes=1_000, arrived_ns=number * 10 * MS)
+        chunk(reception, arrived_ns=number * 10 * MS)
     report(reception, S)
-    reception.backlog(size_bytes=1_000, arrived_ns=S + 10 * MS)
+    chunk(reception, arrived_ns=S + 10 * MS)
     assert reception.due(S + 150 * MS)
 
 
 def test_a_ground_that_joins_late_misses_nothing_of_before():
     """It would ask for stills of a past that nobody there has seen, on the thin link."""
     reception = begun()
-    reception.base(header(700), size_bytes=500, arrived_ns=0)
-    reception.still(90, size_bytes=900, arrived_ns=0)
+    base(reception, 700, arrived_ns=0)
+    still(reception, 90, arrived_ns=0)
     assert missing(reception) == ()
-    reception.still(92, size_bytes=900, arrived_ns=0)
+    still(reception, 92, arrived_ns=0)
     assert missing(reception) == (91,)
 
 
 def test_what_is_missing_is_bounded():
     """A forged number would make reports too long to be sent, or the ground grow."""
     reception = begun()
-    reception.base(header(0), size_bytes=500, arrived_ns=0)
-    reception.still(2**32 - 2, size_bytes=900, arrived_ns=0)
+    base(reception, 0, arrived_ns=0)
+    still(reception, 2**32 - 2, arrived_ns=0)
     assert missing(reception) == tuple(range(2**32 - 2 - MAX_MISSING_STILLS, 2**32 - 2))
-    reception.still(2**32 - 1, size_bytes=900, arrived_ns=0)
+    still(reception, 2**32 - 1, arrived_ns=0)
     assert len(missing(reception)) == MAX_MISSING_STILLS
 
 
 def test_a_forged_number_of_a_still_hides_no_true_one():
     """Reports would name for ever what the edge never sent: it would take none of its stills for received."""
     reception = begun()
-    reception.base(header(0), size_bytes=500, arrived_ns=0)
+    base(reception, 0, arrived_ns=0)
     for sequence in (0, 1, 4, 2**32 - 9, 5, 2):
-        reception.still(sequence, size_bytes=900, arrived_ns=0)
+        still(reception, sequence, arrived_ns=0)
     measured = report(reception, S)
     assert (measured.still_sequence, measured.missing_stills) == (5, (3,))
     for sequence in (2**32 - 8, 2**32 - 7):  # two that follow each other are believed, as after a long hole
-        reception.still(sequence, size_bytes=900, arrived_ns=S)
+        still(reception, sequence, arrived_ns=S)
     assert report(reception, S).still_sequence == 2**32 - 7
     for sequence in (6, 8):
-        reception.still(sequence, size_bytes=900, arrived_ns=2 * S)
+        still(reception, sequence, arrived_ns=2 * S)
     measured = report(reception, 2 * S)
     assert (measured.still_sequence, measured.missing_stills) == (8, ())
 
@@ -189,15 +212,15 @@ def test_a_forged_number_of_a_still_hides_no_true_one():
 class Progress(int):
     """A time that somebody reckons with just when a still comes in another thread."""
 
-    reception: ReceptionStatistics
+    reception: Reception
     threads: list[threading.Thread]
 
     def __sub__(self, other):
         sequence = 100 + 2 * len(self.threads)
         came = threading.Thread(
-            target=self.reception.still,
-            args=(sequence,),
-            kwargs={"size_bytes": 1, "arrived_ns": S},
+            target=still,
+            args=(self.reception, sequence),
+            kwargs={"arrived_ns": S},
         )
         came.start()
         came.join(0.1)  # it has to wait its turn
@@ -208,8 +231,8 @@ class Progress(int):
 def test_a_still_may_come_while_a_report_is_made():
     """Stills are read in a thread of their own, which reports them at once: the ground would end with an error."""
     reception = begun()
-    reception.base(header(0), size_bytes=500, arrived_ns=0)
-    reception.still(4, size_bytes=900, arrived_ns=0)
+    base(reception, 0, arrived_ns=0)
+    still(reception, 4, arrived_ns=0)
     now = Progress(S)
     now.reception, now.threads = reception, []
     assert report(reception, now).missing_stills == (0, 1, 2, 3)
@@ -222,11 +245,11 @@ def test_a_still_may_come_while_a_report_is_made():
 def test_a_time_of_the_future_does_not_stop_the_measurement():
     """One forged frame would leave the numbers of the link as they were for the rest of the flight."""
     given, due = [], []
-    reception = ReceptionStatistics(INFO, clock=lambda: 0, edge_clock=ClockOffset(), emit=given.append)
+    reception = Reception(INFO, clock=lambda: 0, edge_clock=ClockOffset(), emit=given.append)
     for at_ns in (0, 100 * MS, 500 * MS, 10**6 * S, 600 * MS, 900 * MS, 1100 * MS):
         one = replace(header(0), capture_ns=at_ns)
         before = len(given)
-        reception.traffic(one, tracks=0, tracks_refined=0)
+        reception.measure(one, tracks=0, tracks_refined=0)
         due.append(len(given) > before)
     assert due == [True, False, True, True, True, False, True]
 

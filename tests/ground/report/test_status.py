@@ -24,7 +24,7 @@ from hvt_ground.report.state import SessionState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_web.feed import SessionFeed, state_message
@@ -45,11 +45,11 @@ class Ground:
         self.clock = clock
         self.maker = StateMaker(clock, failures=self.failures)
         self.outputs = Outputs(self.failures)
-        self.opened: list[GroundSession] = []
-        self.ended: list[GroundSession] = []
+        self.opened: list[Session] = []
+        self.ended: list[Session] = []
         self.sessions = EdgeSessions(self.port, open_session=self.open_one, on_ended=self.ended.append)
 
-    def open_one(self, info: Info, reports: ReceiverReports) -> GroundSession:
+    def open_one(self, info: Info, reports: ReceiverReports) -> Session:
         """A session with recordings."""
         settings = RecorderSettings(self.path, info.edge, "1", info.base_size, info.fps, info.budget_bps)
         gone = replace(settings, path=self.path / "no" / "folder.rrd")
@@ -59,7 +59,7 @@ class Ground:
             self.outputs.open("recording of uav-10", lambda: Recorder(gone)),
         ]
         self.opened.append(
-            GroundSession(info, sinks=sinks, pipeline_of=pipeline_of, clock=self.clock, reports=reports)
+            Session(info, sinks=sinks, pipeline_of=pipeline_of, clock=self.clock, reports=reports)
         )
         return self.opened[-1]
 
@@ -191,7 +191,7 @@ def test_a_camera_whose_clock_is_wrong_is_as_old_as_its_arrival(tmp_path):
     for index in range(5):
         now_ns[0] += SECOND_NS // 15
         ground.sessions.handle(replace(flight.base(index), received_ns=now_ns[0]))
-    traffic = ground.sessions.session.traffic(now_ns[0])
+    traffic = ground.sessions.session.reception.traffic(now_ns[0])
     assert (traffic.receive_latency_ms, traffic.overlay_latency_ms) == (None, None), "a recording plots them"
     now_ns[0] += 4 * SECOND_NS
     (edge,) = ground.maker.make([("uav-1", ground.sessions)]).edges
@@ -302,11 +302,13 @@ def test_a_part_of_the_edge_fails_since_it_stopped(ground):
         report = replace(Status.parse(item.payload), sequence=9 + number, failed=(source,))
         ground.sessions.handle(replace(item, payload=report.pack()))
         if number == 1:
-            assert ground.sessions.session.edge_failing == {"source": at_ns}
-    assert ground.sessions.session.edge_failing == {"source": at_ns + 3 * SECOND_NS}
+            assert ground.sessions.session.reception.edge_failing == {"source": at_ns}
+    assert ground.sessions.session.reception.edge_failing == {"source": at_ns + 3 * SECOND_NS}
     session = ground.sessions.session
     (edge,) = ground.maker.make([("uav-1", ground.sessions)]).edges
-    assert edge.session.edge_failed[0].since_ns == session.clock_offset.to_local_ns(at_ns + 3 * SECOND_NS)
+    assert edge.session.edge_failed[0].since_ns == session.reception.clock_offset.to_local_ns(
+        at_ns + 3 * SECOND_NS
+    )
 
 
 def test_words_of_an_edge_do_not_become_series_without_end(ground):

@@ -25,7 +25,7 @@ from hvt_ground.config import GroundConfig, check
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import status_text, summary
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs
 from hvt_ground.wiring import Models, SessionFactory
@@ -117,7 +117,7 @@ def served(link: GroundLink, folder: Path, ended: list[str], clock: Clock) -> It
     outputs, models = Outputs(Failures(time.time_ns)), Models(config)
     factory = SessionFactory(config, models, clock=clock, outputs=outputs, view=None)
 
-    def note(session: GroundSession) -> None:
+    def note(session: Session) -> None:
         assert summary(session)["frames_decoded"] == FRAMES, summary(session)
         ended.append(session.failure)
 
@@ -168,7 +168,7 @@ def test_two_hundred_sessions_leave_nothing_behind(free_port: int, tmp_path: Pat
                 eventually(lambda: is_open(sessions, edge), what=f"{number} has begun")
                 edge.end(crashes=crashes)
                 if crashes:
-                    eventually(lambda: sessions.session.is_whole, what=f"{number} has come")
+                    eventually(lambda: sessions.session.reception.is_whole, what=f"{number} has come")
                 else:
                     eventually(lambda before=number: len(ended) > before, what=f"{number} has ended")
                 clock.now_ns += 7 * SECOND_NS
@@ -184,7 +184,7 @@ def test_two_hundred_sessions_leave_nothing_behind(free_port: int, tmp_path: Pat
             watching.set()
             watcher.join()
         # Not before: a tuple that another thread is still making must not be seen.
-        alive = sum(isinstance(one, GroundSession) for one in gc.get_objects())
+        alive = sum(isinstance(one, Session) for one in gc.get_objects())
     assert len(ended) == SESSIONS
     assert not any(ended)
     assert len(list(tmp_path.glob("*.rrd"))) == SESSIONS

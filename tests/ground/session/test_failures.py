@@ -18,7 +18,7 @@ from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from programs.processes import eventually
@@ -33,7 +33,7 @@ class Consumer:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.broken = ""
-        self.sessions: list[GroundSession] = []
+        self.sessions: list[Session] = []
         self.tried = 0
 
     def clock(self) -> int:
@@ -52,7 +52,7 @@ class Consumer:
 
         return take
 
-    def open(self, info: Info, reports: ReceiverReports) -> GroundSession:
+    def open(self, info: Info, reports: ReceiverReports) -> Session:
         """A session with a recording."""
         self.tried += 1
         if self.broken == "opening":
@@ -67,7 +67,7 @@ class Consumer:
             budget_bps=info.budget_bps,
         )
         sink = QueuedSink("recording", lambda: Recorder(settings), failures=Failures(time.time_ns))
-        session = GroundSession(
+        session = Session(
             info,
             sinks=[sink],
             pipeline_of=lambda emit: pipeline_of(self.taken_by(emit)),

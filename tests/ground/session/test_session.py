@@ -22,7 +22,7 @@ from hvt_ground.perception.worker import LockstepWorker
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 from programs.processes import PATIENT_S, eventually
 from rigs.flight import Flight, Port, RedSquares, SameAnswer, patient_worker, pipeline_of, square_box
 from rigs.handled import WatchedInbox, check, end
@@ -38,16 +38,16 @@ class Rig:
         self.port.inbox = self.inbox = WatchedInbox()
         self.reader = reader or SameAnswer()
         self.detector, self.detector_thread = detector, thread
-        self.opened: list[GroundSession] = []
-        self.ended: list[GroundSession] = []
+        self.opened: list[Session] = []
+        self.ended: list[Session] = []
         self.worker_of = worker_of
         self.receiver = EdgeSessions(
             self.port, open_session=self._open, on_ended=self.ended.append, clock=clock, **patience
         )
         self.thread = EdgeThread(self.receiver, drain_s=PATIENT_S)
 
-    def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
-        session = GroundSession(
+    def _open(self, info: Info, reports: ReceiverReports) -> Session:
+        session = Session(
             info,
             pipeline_of=lambda emit: pipeline_of(
                 emit, detector=self.detector, detector_thread=self.detector_thread, reader=self.reader
@@ -104,7 +104,7 @@ def test_a_unit_that_waited_behind_a_hole_is_reported_as_soon_as_it_is_given_out
 
     sessions = EdgeSessions(
         port,
-        open_session=lambda info, reports: GroundSession(
+        open_session=lambda info, reports: Session(
             info, pipeline_of=pipeline_of, clock=clock, reports=reports, worker_of=patient_worker
         ),
         clock=clock,
@@ -197,7 +197,7 @@ def test_tracks_that_make_no_sense_are_counted_and_skipped():
         assert rig.receiver.receiver.unusable == 3
         rig.put(*bases(flight, *range(4, 10)), flight.status(base=10))
         rig.settle()
-        assert session.last_frame_index == 9
+        assert session.reception.analyzed[0] == 9
 
 
 def test_the_end_waits_for_the_last_tracks():
@@ -228,7 +228,7 @@ def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
         rig.settle()
         assert session.frames_decoded == 3 + 10
         assert session.reception.frames == 28
-        assert session.last_frame_index == 29
+        assert session.reception.analyzed[0] == 29
         requested = rig.port.keyframe_requests
         time.sleep(0.4)
         assert rig.port.keyframe_requests == requested, "what is shown again is not asked for"
@@ -367,7 +367,11 @@ def test_a_second_edge_of_one_id_is_told_of_and_not_shown(flight, caplog):
             now_ns += 66_000_000
         assert rig.opened == [session := rig.receiver.session]
         assert session.info.session_id == flight.session_id
-        assert (session.frames_decoded, session.reception.stills, session.last_status) == (30, 0, None)
+        assert (session.frames_decoded, session.reception.stills, session.reception.last_status) == (
+            30,
+            0,
+            None,
+        )
         assert rig.port.keyframe_requests == 0
     said = [one.getMessage() for one in caplog.records if text in one.getMessage()]
     assert len(said) == 1
@@ -566,7 +570,7 @@ def test_slow_detection_never_holds_up_decoding(flight):
         assert rig.opened[0].perceived.detections_run <= 2 + (time.monotonic() - began) / 0.3
         rig.settle()
     (session,) = rig.ended
-    assert session.last_frame_index == 29, "the newest is tracked, whatever is left out"
+    assert session.reception.analyzed[0] == 29, "the newest is tracked, whatever is left out"
     assert session.worker.untracked
 
 
@@ -658,7 +662,7 @@ def test_another_picture_size_under_the_same_session_is_not_shown(flight):
         eventually(lambda: rig.port.keyframe_requests >= 1)
         rig.put(*bases(flight, *range(4, 30)))
         rig.settle()
-        assert rig.receiver.session.last_frame_index == 29
+        assert rig.receiver.session.reception.analyzed[0] == 29
 
 
 def test_closing_keeps_what_has_arrived_and_ends(flight):
@@ -671,7 +675,7 @@ def test_closing_keeps_what_has_arrived_and_ends(flight):
     assert rig.thread.close(timeout_s=60)
     (session,) = rig.ended
     assert session.frames_decoded == 30
-    assert session.last_frame_index == 29
+    assert session.reception.analyzed[0] == 29
 
 
 def test_the_summary_can_be_written_and_read():

@@ -60,10 +60,10 @@ from dataclasses import replace
 from rigs.flight import Flight, pipeline_of
 from hvt_common.protocol.messages import BaseHeader
 from hvt_ground.link.reassemble import Arrival
-from hvt_ground.session.session import GroundSession
+from hvt_ground.session.session import Session
 (bomb,) = pickle.load(sys.stdin.buffer)
 flight = Flight(2)
-session = GroundSession(flight.info(), pipeline_of=pipeline_of, clock=time.time_ns)
+session = Session(flight.info(), pipeline_of=pipeline_of, clock=time.time_ns)
 def take(header, item):
     unit = Arrival("decode", header, item, item.received_ns, starts_run=True)
     return session.base(unit)
