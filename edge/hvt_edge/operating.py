@@ -24,6 +24,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 
 _MOST_RECEIVERS = 16
@@ -207,7 +208,7 @@ class Keyframes:
         """The cost of a keyframe, as time of the budget."""
         self._crosses_ns = self.settings.rest_ns
         """After a keyframe, a request of so long may be from before it came."""
-        self._losses: dict[int, int] = {}
+        self._losses: Newest[int, int] = Newest(_MOST_RECEIVERS)
         """Losses by receiver, as of its last report."""
         self._lossy = False
         """Whether somebody has lost more since the last keyframe."""
@@ -279,8 +280,6 @@ class Keyframes:
         """
         with self._lock:
             before = self._losses.get(receiver_id, 0)
-            if receiver_id not in self._losses and len(self._losses) >= _MOST_RECEIVERS:
-                del self._losses[next(iter(self._losses))]
             self._losses[receiver_id] = count
             self._lossy |= count > before
 

@@ -9,7 +9,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -148,10 +148,11 @@ def check_link(settings: LinkSettings, find_peer: Callable[[zenoh.Session], str]
     Raises `UserError` for endpoints, keys and ports that cannot be used.
     """
     with open_session(settings) as session:
-        for _ in _until(_PEER_S):
-            found = find_peer(session)
-            if found:
+        end_s = time.monotonic() + _PEER_S
+        while time.monotonic() < end_s:
+            if found := find_peer(session):
                 return Finding("ok", found)
+            time.sleep(_SAMPLE_S)
         linked = bool(session.info.links())
     if linked:
         return Finding("warning", f"there is a link, and no {other} on it", f"start the {other}")
@@ -163,10 +164,3 @@ def check_link(settings: LinkSettings, find_peer: Callable[[zenoh.Session], str]
     return Finding(
         "warning", f"listens on {where}; no {other} came within {_PEER_S:.0f} s", f"start the {other}"
     )
-
-
-def _until(seconds: float) -> Iterator[None]:
-    end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s:
-        yield
-        time.sleep(_SAMPLE_S)

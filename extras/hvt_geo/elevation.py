@@ -99,6 +99,12 @@ class Tile:
         lower = self.metres[low, left] * (1 - across) + self.metres[low, right] * across
         return np.where(inside, upper * (1 - down) + lower * down, np.nan)
 
+    def beside(self, pose: Pose, metres: Points) -> npt.NDArray[np.float64]:
+        """Elevation so many metres north and east of a pose, (…, 2 or 3)."""
+        north_m, east_m = metres_per_degree(pose.latitude_deg)
+        longitude_deg = pose.longitude_deg + metres[..., 1] / max(east_m, 1e-6)
+        return self.at(pose.latitude_deg + metres[..., 0] / north_m, longitude_deg)
+
 
 class ElevationModel:
     """A file, opened anew for each tile. For any thread.
@@ -278,13 +284,8 @@ class Terrain:
         with np.errstate(invalid="ignore"):
             units = rays / length
         along = np.concatenate(([0.0], np.geomspace(_FIRST_M, _REACH_M, _STEPS)))
-        north_m, east_m = metres_per_degree(pose.latitude_deg)
         places = units[:, None, :] * along[None, :, None]
-        ground = tile.at(
-            pose.latitude_deg + places[..., 0] / north_m,
-            pose.longitude_deg + places[..., 1] / max(east_m, 1e-6),
-        )
-        above = altitude_m - places[..., 2] - ground
+        above = altitude_m - places[..., 2] - tile.beside(pose, places)
         below = above <= 0
         hit = below.argmax(axis=1)
         rows, last = np.arange(len(rays)), np.maximum(hit - 1, 0)
@@ -301,11 +302,7 @@ class Terrain:
         (altitude_m, _), tile = self._levels_m(pose), self._tile_around(pose)
         if altitude_m is None:
             return np.full(len(metres), np.nan)
-        north_m, east_m = metres_per_degree(pose.latitude_deg)
-        return altitude_m - tile.at(
-            pose.latitude_deg + metres[:, 0] / north_m,
-            pose.longitude_deg + metres[:, 1] / max(east_m, 1e-6),
-        )
+        return altitude_m - tile.beside(pose, metres)
 
     def _levels_m(self, pose: Pose) -> tuple[float | None, float]:
         # Above the sea: the camera, None where nothing tells, and the ground below it, NaN where there is none.

@@ -97,7 +97,7 @@ def _fitted(
         classifier = OnnxClassifier(model, labels=labels)
         return (
             "classifier",
-            _classifier_text(classifier),
+            f"one row of scores a crop; {classifier.preparation} ({classifier.why}), stretched",
             classifier.class_names,
             lambda: classifier.classify([noise[:200, :200]]),
             "one crop",
@@ -110,10 +110,6 @@ def _fitted(
 def _detector_text(detector: OnnxDetector) -> str:
     head = detector.head
     return f"head {head.name} ({KINDS[head.name].text}): {head.why}; {detector.pixels}"
-
-
-def _classifier_text(classifier: OnnxClassifier) -> str:
-    return f"one row of scores a crop; {classifier.preparation} ({classifier.why}), stretched"
 
 
 def _short(error: UserError) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.providers import OpenVinoCpu
+from hvt_common.runtime.statistics import Newest
 
 _MAX_SHAPES = 4
 _Port = tuple[str, tuple[int | None, ...], np.dtype[Any] | None]
@@ -58,7 +58,8 @@ class OpenVinoRunner:
             self._model = _core().read_model(path)
         except RuntimeError as error:
             raise UserError(f"model {path} cannot be read by openvino: {_reason(error)}") from error
-        self._requests: OrderedDict[tuple[int, ...], Any] = OrderedDict()
+        self.compiled: Newest[tuple[int, ...], Any] = Newest(_MAX_SHAPES)
+        """By input shape without the batch."""
 
     find = staticmethod(find_openvino)
 
@@ -84,22 +85,15 @@ class OpenVinoRunner:
                 " (--provider cpu may)"
             ) from error
 
-    @property
-    def compiled_shapes(self) -> tuple[tuple[int, ...], ...]:
-        """The input shapes without the batch for which the network is compiled now."""
-        return tuple(self._requests)
-
     def _request(self, shape: tuple[int, ...]) -> Any:
         key = shape[1:]
-        if key not in self._requests:
-            if len(self._requests) == _MAX_SHAPES:
-                self._requests.popitem(last=False)
+        if key not in self.compiled:
             model = self._model.clone()
             batch = self._model.input(0).get_partial_shape()[0]
             model.reshape({0: [batch.get_length() if batch.is_static else -1, *key]})
-            self._requests[key] = _core().compile_model(model, "CPU", self._settings).create_infer_request()
-        self._requests.move_to_end(key)
-        return self._requests[key]
+            self.compiled[key] = _core().compile_model(model, "CPU", self._settings).create_infer_request()
+        self.compiled.move_to_end(key)
+        return self.compiled[key]
 
 
 @functools.cache

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -27,7 +28,6 @@ from hvt_models.manifest import (
     parse_manifest,
 )
 
-_CHUNK_BYTES = 1 << 20
 _ADDED = "added.toml"
 
 
@@ -235,7 +235,7 @@ class Store:
 
         with self._lock(_ADDED):  # which no model is called
             entries = {**self._added(), entry.name: entry}
-            tables = {name: _table(one) for name, one in entries.items()}
+            tables = {name: _plain(asdict(one) | {"name": ""}) for name, one in entries.items()}
             scratch = file.with_name(f"{_ADDED}.part")
             with telling(f"{file} cannot be written (", ")"):
                 scratch.write_text(tomli_w.dumps(tables), encoding="utf-8")
@@ -312,13 +312,8 @@ def _from_address(
 
 
 def _copy_file(source: Path, target: Path) -> None:
-    with (
-        telling(f"{source} cannot be copied to {target} (", ")"),
-        source.open("rb") as read,
-        target.open("wb") as write,
-    ):
-        while chunk := read.read(_CHUNK_BYTES):
-            write.write(chunk)
+    with telling(f"{source} cannot be copied to {target} (", ")"):
+        shutil.copyfile(source, target)
 
 
 def _put_in_place(part: Path, path: Path) -> None:
@@ -327,11 +322,6 @@ def _put_in_place(part: Path, path: Path) -> None:
         with part.open("rb") as file:
             os.fsync(file.fileno())
         part.replace(path)
-
-
-def _table(entry: ModelEntry) -> dict[str, Any]:
-    # The entry as TOML knows it: without its name and without empty values.
-    return {key: value for key, value in _plain(asdict(entry)).items() if key != "name"}
 
 
 def _plain(table: dict[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -73,16 +74,14 @@ class EdgeRequests:
                 raise BadRequestError("give kbps, from 1 on, or method, such as M5")
 
 
-class _one_of:  # noqa: N801 - reads as a word
-    def __init__(self, free: threading.BoundedSemaphore) -> None:
-        self._free = free
-
-    def __enter__(self) -> None:
-        if not self._free.acquire(blocking=False):
-            raise BusyError(f"{_MOST_AT_ONCE} requests are under way: wait for one of them")
-
-    def __exit__(self, *_: object) -> None:
-        self._free.release()
+@contextmanager
+def _one_of(free: threading.BoundedSemaphore) -> Iterator[None]:
+    if not free.acquire(blocking=False):
+        raise BusyError(f"{_MOST_AT_ONCE} requests are under way: wait for one of them")
+    try:
+        yield
+    finally:
+        free.release()
 
 
 def source_place(box_base_px: tuple[float, float, float, float], info: Info) -> tuple[int, int, int, int]:

@@ -13,6 +13,7 @@ from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route, WebSocketRoute
@@ -82,27 +83,17 @@ class Site:
 
     async def request_still(self, request: Request) -> Response:
         """A still of a box: JPEG behind a head, as over the WebSocket."""
-        try:
-            edge, body = self._edge(request), await _json_body(request)
-            data, about = await run_in_threadpool(self._requests.request_still, edge, body)
-        except UserError as error:
-            return _refusal(error)
+        edge, body = self._edge(request), await _json_body(request)
+        data, about = await run_in_threadpool(self._requests.request_still, edge, body)
         return Response(packed("still", data, edge=edge, **about), media_type="application/octet-stream")
 
     async def keyframe(self, request: Request) -> Response:
-        try:
-            edge = self._edge(request)
-            await run_in_threadpool(self._requests.keyframe, edge)
-        except UserError as error:
-            return _refusal(error)
+        await run_in_threadpool(self._requests.keyframe, self._edge(request))
         return Response(status_code=204)
 
     async def settings(self, request: Request) -> Response:
-        try:
-            edge, body = self._edge(request), await _json_body(request)
-            await run_in_threadpool(self._requests.set, edge, body)
-        except UserError as error:
-            return _refusal(error)
+        edge, body = self._edge(request), await _json_body(request)
+        await run_in_threadpool(self._requests.set, edge, body)
         return Response(status_code=204)
 
     def _edge(self, request: Request) -> str:
@@ -201,7 +192,7 @@ async def _json_body(request: Request) -> dict[str, Any]:
     return found
 
 
-def _refusal(error: UserError) -> Response:
+async def _refusal(_: Request, error: Exception) -> Response:
     status = 400 if isinstance(error, BadRequestError) else 429 if isinstance(error, BusyError) else 409
     return PlainTextResponse(str(error), status)
 
@@ -224,10 +215,10 @@ class _Guard:
             return
 
         async def guarded(message: Any) -> None:
-            if message["type"].endswith("http.response.start") or message["type"] == "http.response.start":
-                known = {name for name, _ in message["headers"]}
-                extra = [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
-                message["headers"] = [*message["headers"], *(one for one in extra if one[0] not in known)]
+            if message["type"].endswith("http.response.start"):
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
             await send(message)
 
         refusal = self._refusal(scope)
@@ -239,11 +230,8 @@ class _Guard:
             await WebSocket(scope, receive, guarded).send_denial_response(refusal)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        headers: dict[str, str] = {}
-        for name, value in scope["headers"]:  # one given twice is a list (RFC 9110, 5.3)
-            before = headers.get(name.decode("latin-1"))
-            said = value.decode("latin-1")
-            headers[name.decode("latin-1")] = said if before is None else f"{before}, {said}"
+        said = Headers(scope=scope)
+        headers = {name: ", ".join(said.getlist(name)) for name in said}  # as RFC 9110, 5.3, has it
         token = None
         if scope["type"] == "http" and scope["path"] == "/":
             token = Request(scope).query_params.get("token")
@@ -274,4 +262,4 @@ def make_site(
         WebSocketRoute(_SOCKET, site.socket),
         Route(_SOCKET, site.admits, methods=["POST"]),
     ]
-    return _Guard(Starlette(routes=routes), access)
+    return _Guard(Starlette(routes=routes, exception_handlers={UserError: _refusal}), access)

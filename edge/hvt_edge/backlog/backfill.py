@@ -57,8 +57,9 @@ class Backfill:
         self._store = store
         self._session_id = session_id
         self._on_done = on_done
-        self._line: OrderedDict[ObjectKey, _Transfer] = OrderedDict()
-        self._data: tuple[ObjectKey, bytes] | None = None
+        self.line: OrderedDict[ObjectKey, _Transfer] = OrderedDict()
+        self.data: tuple[ObjectKey, bytes] | None = None
+        """The object in memory."""
         self._in_hand: ObjectKey | None = None
         """The object whose chunks were made last."""
         self._informed: set[int] = set()
@@ -79,17 +80,9 @@ class Backfill:
         """Objects that were put aside because a ground did not take them."""
 
     @property
-    def in_flight(self) -> int:
-        return len(self._line)
-
-    @property
     def unacknowledged_bytes(self) -> int:
         """Bytes under way; for any thread."""
-        return sum(one.sent_bytes - one.acknowledged_bytes for one in tuple(self._line.values()))
-
-    @property
-    def cached_bytes(self) -> int:
-        return 0 if self._data is None else len(self._data[1])
+        return sum(one.sent_bytes - one.acknowledged_bytes for one in tuple(self.line.values()))
 
     # What comes back
 
@@ -106,7 +99,7 @@ class Backfill:
             self._acknowledged.clear()
         self._reported_ns = now_ns
         for one in acknowledged_ranges:
-            transfer = self._line.get(one.key)
+            transfer = self.line.get(one.key)
             if transfer is not None:
                 self._advance(transfer, one.acknowledged_bytes, now_ns)
             elif one.key in self._refused:
@@ -126,16 +119,16 @@ class Backfill:
 
     def interrupt(self) -> None:
         """The link is down: objects under way are begun again later, from the acknowledged bytes on."""
-        self._line.clear()
-        self._data = None
+        self.line.clear()
+        self.data = None
         self._forget()
 
     def put_aside(self) -> None:
         """Making or sending chunks has failed: the object in hand waits for another ground or the next start."""
         if self._in_hand is not None:
             self._refused.add(self._in_hand)
-        self._line.clear()
-        self._data = None
+        self.line.clear()
+        self.data = None
 
     def _forget(self) -> None:
         self._refused = {key for key in self._refused if self._store.find(key) is not None}
@@ -173,9 +166,9 @@ class Backfill:
         self._on_done(entry)
 
     def _leave(self, key: ObjectKey) -> None:
-        self._line.pop(key, None)
-        if self._data is not None and self._data[0] == key:
-            self._data = None
+        self.line.pop(key, None)
+        if self.data is not None and self.data[0] == key:
+            self.data = None
 
     # What goes out
 
@@ -198,12 +191,12 @@ class Backfill:
 
     def take_back(self, chunk: Chunk) -> None:
         """This chunk has not been sent after all."""
-        transfer = self._line.get(chunk.key)
+        transfer = self.line.get(chunk.key)
         if transfer is not None:
             transfer.sent_bytes = min(transfer.sent_bytes, chunk.offset)
 
     def _begin_again(self, before_ns: int, now_ns: int) -> None:
-        for key, transfer in list(self._line.items()):
+        for key, transfer in list(self.line.items()):
             if self._store.find(key) is None:  # evicted meanwhile
                 self._leave(key)
             elif transfer.since_ns < before_ns and transfer.sent_bytes > transfer.acknowledged_bytes:
@@ -232,19 +225,19 @@ class Backfill:
 
     def _current(self, now_ns: int) -> _Transfer | None:
         # The object of which chunks are made now: one that is not all on its way, or the next one.
-        for transfer in self._line.values():
+        for transfer in self.line.values():
             if transfer.sent_bytes < transfer.total_bytes:
                 self._in_hand = transfer.entry.key
                 ahead = transfer.sent_bytes - transfer.acknowledged_bytes
                 return transfer if ahead < _MOST_AHEAD_BYTES else None
-        if len(self._line) >= _MOST_OBJECTS:
+        if len(self.line) >= _MOST_OBJECTS:
             return None
         while (entry := next(self._open_entries(), None)) is not None:
             self._in_hand = entry.key
             data = self._store.read(entry)
             if data is not None:
-                self._data = (entry.key, data)
-                transfer = self._line[entry.key] = _Transfer(entry, len(data), now_ns)
+                self.data = (entry.key, data)
+                transfer = self.line[entry.key] = _Transfer(entry, len(data), now_ns)
                 return transfer
         return None
 
@@ -253,27 +246,27 @@ class Backfill:
             info = self._store.info_of(session_id)
             if info is None:
                 self._requested.discard(session_id)
-            elif info.key not in self._line:
+            elif info.key not in self.line:
                 yield info
         stills, video = self._store.best_stills(), self._store.newest_segments()
         if self.video_first and not self._store.segments:
             self.video_first = False
         for entry in chain(video, stills) if self.video_first else chain(stills, video):
-            if entry.key in self._line or entry.key in self._refused:
+            if entry.key in self.line or entry.key in self._refused:
                 continue
             info = self._store.info_of(entry.session_id)
             if entry.session_id == self._session_id or entry.session_id in self._informed or info is None:
                 yield entry
-            elif info.key not in self._line:
+            elif info.key not in self.line:
                 yield info
 
     def _bytes_of(self, transfer: _Transfer) -> bytes | None:
         # The object's bytes, read again where another was read since; None where they are gone.
         key = transfer.entry.key
-        if self._data is None or self._data[0] != key:
+        if self.data is None or self.data[0] != key:
             data = self._store.read(transfer.entry)
             if data is None or len(data) != transfer.total_bytes:
                 self._leave(key)
                 return None
-            self._data = (key, data)
-        return self._data[1]
+            self.data = (key, data)
+        return self.data[1]

@@ -14,6 +14,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -26,6 +27,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.runtime.process import lower_priority
+from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Backfill
@@ -64,7 +66,9 @@ class News:
     """The link went: nothing is under way."""
     video_first: bool = False
     """A ground requested the video."""
-    acknowledged: dict[tuple[int, ObjectKey], AcknowledgedRange] = field(default_factory=dict)
+    acknowledged: Newest[tuple[int, ObjectKey], AcknowledgedRange] = field(
+        default_factory=partial(Newest, _MOST_ACKNOWLEDGED_RANGES)
+    )
     """Acknowledged bytes, by receiver id and object."""
 
 
@@ -129,13 +133,8 @@ class Intake:
     def on_acknowledged(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
         """A ground acknowledges bytes; the newest report counts, and a lost one comes again."""
         with self._changed:
-            known = self._news.acknowledged
             for one in acknowledged_ranges:
-                key = (receiver_id, one.key)
-                known.pop(key, None)
-                known[key] = one
-            while len(known) > _MOST_ACKNOWLEDGED_RANGES:
-                del known[next(iter(known))]
+                self._news.acknowledged.put((receiver_id, one.key), one)
             self._wake()
 
     def _wake(self) -> None:

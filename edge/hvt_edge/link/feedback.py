@@ -7,6 +7,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 from hvt_common.protocol.messages import Feedback, StillResult
+from hvt_common.runtime.statistics import Newest
 from hvt_edge.perception.shadow import Detected
 
 _OTHER_RECEIVER_NS = 1_000_000_000
@@ -114,10 +115,11 @@ class FeedbackInbox:
         self._changed = threading.Condition()
         self._results: deque[StillResult] = deque(maxlen=_MAX_RESULTS)
         self._last_frame_index = -1
-        self._answered: dict[int, None] = {}  # in the order in which they came
-        self._known: dict[tuple[int, int, bool], None] = {}
+        # In the order in which they came; a ground may answer what was never asked.
+        self._answered: Newest[int, None] = Newest(2 * _MAX_RESULTS)
+        self._known: Newest[tuple[int, int, bool], None] = Newest(2 * _MAX_RESULTS)
         self._done_sequence = -1
-        self._detected: dict[int, Detected] = {}
+        self._detected: Newest[int, Detected] = Newest(_MAX_RESULTS)
         """Reports by frame, in the order in which they came."""
         self._base_messages = 0
         self._roi_messages = 0
@@ -137,13 +139,6 @@ class FeedbackInbox:
             if report.primary and feedback.objects_detected >= 0:
                 index = feedback.last_frame_index
                 self._detected[index] = Detected(feedback.receiver_id, index, feedback.objects_detected)
-                if len(self._detected) > _MAX_RESULTS:
-                    del self._detected[next(iter(self._detected))]
-            # A ground may answer what was never asked.
-            while len(self._answered) > 2 * _MAX_RESULTS:
-                del self._answered[next(iter(self._answered))]
-            while len(self._known) > 2 * _MAX_RESULTS:
-                del self._known[next(iter(self._known))]
             self._changed.notify_all()
 
     def _note(self, result: StillResult) -> None:
@@ -165,8 +160,10 @@ class FeedbackInbox:
         """Return and forget the results of stills up to this one, in their order; more for these come too late."""
         with self._changed:
             self._done_sequence = max(self._done_sequence, sequence)
-            self._answered = dict.fromkeys(one for one in self._answered if one > self._done_sequence)
-            self._known = dict.fromkeys(one for one in self._known if one[0] > self._done_sequence)
+            for answered in [one for one in self._answered if one <= self._done_sequence]:
+                del self._answered[answered]
+            for known in [one for one in self._known if one[0] <= self._done_sequence]:
+                del self._known[known]
             ready = sorted(
                 (one for one in self._results if one.still_sequence <= sequence),
                 key=lambda one: (one.still_sequence, one.again, one.track_id),

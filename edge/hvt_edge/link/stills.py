@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from hvt_common.protocol.messages import BASE_CODEC, AlsoShown, InfoRequest, RoiHeader
+from hvt_common.runtime.statistics import Newest
 from hvt_common.values import Image, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import YuvPicture
@@ -77,8 +78,7 @@ class Alternative:
 
     def loses_to(self, still: Image, *, crop: Image) -> bool:
         """Whether the still is closer to the source: colour and luma, over the crop and over each box."""
-        errors = _errors(still, crop, self.places)
-        return all(mine < limit for mine, limit in zip(errors, self.limits, strict=True))
+        return self.gain_db(still, crop=crop) > 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,12 +202,6 @@ def _errors(image: Image, crop: Image, places: tuple[Place, ...]) -> tuple[float
     return tuple(cv2.norm(one, cv2.NORM_L2SQR) for one in (colour, luma, *parts))
 
 
-@dataclass(frozen=True, slots=True)
-class _Reader:
-    codecs: frozenset[str]
-    requested_ns: int
-
-
 class StillReaders:
     """The still codecs that each ground reads, by its `InfoRequest`; a ground that named none reads all. Thread-safe.
 
@@ -217,8 +211,8 @@ class StillReaders:
     def __init__(self, clock: Callable[[], int]) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._readers: dict[int, _Reader] = {}
-        """Codecs by requester, in the order of the last request; a stranger's numbers cost a place each."""
+        self._readers: Newest[int, tuple[frozenset[str], int]] = Newest(_MOST_READERS)
+        """Codecs by requester, and when it asked last; a stranger's numbers cost a place each."""
         self._said: set[str] = set()
         self._video_said = False
 
@@ -231,16 +225,15 @@ class StillReaders:
                 BASE_CODEC,
             )
         with self._lock:
-            self._readers.pop(request.requester_id, None)
-            if len(self._readers) >= _MOST_READERS:
-                del self._readers[next(iter(self._readers))]
-            self._readers[request.requester_id] = _Reader(frozenset(request.still_codecs), self._clock())
+            self._readers.put(request.requester_id, (frozenset(request.still_codecs), self._clock()))
 
     def read(self, codec: str) -> bool:
         """Whether every ground that said what it reads, within the last minute, reads this codec."""
         since_ns = self._clock() - _FORGET_NS
         with self._lock:
-            good = all(codec in one.codecs for one in self._readers.values() if one.requested_ns >= since_ns)
+            good = all(
+                codec in read for read, requested_ns in self._readers.values() if requested_ns >= since_ns
+            )
             news = not good and codec not in self._said and len(self._said) < _MOST_SAID
             if news:
                 self._said.add(codec)

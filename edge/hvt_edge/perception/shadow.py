@@ -86,10 +86,7 @@ class GroundDifference:
     Compared are counts of about the same frame, so that a scene which fills or empties is no difference.
     """
 
-    def __init__(self, *, memory_s: float, grace_ns: int) -> None:
-        self._memory_s = memory_s
-        self._grace_ns = grace_ns
-        """The start of a ground or a scene does not count: the first picture is coarser than others."""
+    def __init__(self) -> None:
         self._receiver_id: int | None = None
         self.forget()
 
@@ -122,14 +119,14 @@ class GroundDifference:
             return
         if self._first_ns is None:
             self._first_ns = covered.capture_ns
-        if covered.capture_ns - self._first_ns < self._grace_ns:
-            return
+        if covered.capture_ns - self._first_ns < _REST_NS:
+            return  # the first picture of a ground or a scene is coarser than others
         self._worth += 1
         self._mean += (report.objects - covered.objects - self._mean) / self._worth
 
     def _fade(self, now_ns: int) -> None:
         if self._worth_ns is not None:
-            self._worth *= math.exp(-max(0, now_ns - self._worth_ns) / SECOND_NS / self._memory_s)
+            self._worth *= math.exp(-max(0, now_ns - self._worth_ns) / SECOND_NS / _MEMORY_S)
         self._worth_ns = now_ns
 
 
@@ -194,12 +191,7 @@ class Shadow:
             shown_p=self.shown_p + moved_p,
             hidden=self.hidden - moved,
             hidden_p=self.hidden_p - moved_p,
-            misnamed=self.misnamed * left,
-            misnamed_p=self.misnamed_p * left,
-            false=self.false * left,
-            false_p=self.false_p * left,
-            suppressed=self.suppressed * left,
-            suppressed_p=self.suppressed_p * left,
+            **{name: getattr(self, name) * left for name in _SHOWN_OR_FALSE},
         )
 
     @property
@@ -227,6 +219,9 @@ class Shadow:
         sent_p = self.shown_p + self.false_p - suppressed_p + hidden_p - _BASE_NAMES * misnamed_p
         listed = self.shown + self.false
         return 2 * sent_p / (listed + hidden - suppressed + true) - 2 * named_p / (listed + true)
+
+
+_SHOWN_OR_FALSE = ("misnamed", "misnamed_p", "false", "false_p", "suppressed", "suppressed_p")
 
 
 def _per(total: float, count: float) -> float:
@@ -270,7 +265,7 @@ class ShadowGround:
         """The share of the base's sure objects that the source shows too."""
         self.now = before
         """For a ground with the edge's detector."""
-        self._difference = GroundDifference(memory_s=_MEMORY_S, grace_ns=_REST_NS)
+        self._difference = GroundDifference()
 
     @property
     def measured(self) -> Measured:

@@ -9,7 +9,6 @@ left out (`hvt_edge.link.budget`), whatever share of the budget stills have. Whi
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from hvt_common.protocol.messages import MAX_TRACKS_NOW, TrackNow
 from hvt_common.runtime.failures import reason_of
+from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Boxes, Image, View
 from hvt_common.video.base_crop import MAX_REQUESTED_SIDE_PX, coded_size
@@ -208,7 +208,7 @@ class OnDemand:
             self.maker, fidelity_db=0.0
         )  # of crops without a base: never one that builds on it
         self._lock = threading.Lock()
-        self._outcomes: OrderedDict[int, tuple[str, str]] = OrderedDict()
+        self._outcomes: Newest[int, tuple[str, str]] = Newest(_OUTCOMES)
         """Number → (why it was given up, what else is to be said of it), both empty at first; of the last ones."""
         self._next_number = 0
         self._last: OnDemandStill | None = None
@@ -387,5 +387,3 @@ class OnDemand:
 
     def _note(self, number: int, *, refusal: str = "", note: str = "") -> None:
         self._outcomes[number] = refusal, note
-        while len(self._outcomes) > _OUTCOMES:
-            self._outcomes.popitem(last=False)

@@ -124,7 +124,7 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         found = due(
             [row for name, row in rows.items() if name in there],
             retention,
-            in_use=_InUse(self._folder),
+            in_use=lambda name: is_claimed(self._folder / name),  # looked up for those in question alone
             now_ns=now.unix_ns,
         )
         for name in found.remove:
@@ -198,16 +198,6 @@ class RecordingsFolder(Service):
         # Files grow old while nobody flies, too.
         while self._sink is not None and not self._stop.wait(_POLL_S):
             self._sink.log(None)
-
-
-class _InUse:
-    # Which files of a folder are written to: looked up for those in question alone.
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def __contains__(self, name: object) -> bool:
-        return is_claimed(self._folder / str(name))
 
 
 def _is_plain(name: str) -> bool:

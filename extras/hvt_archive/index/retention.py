@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS, Limit
@@ -50,7 +50,9 @@ class Due:
     """These lose their video, one by one."""
 
 
-def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Container[str], now_ns: int) -> Due:
+def due(
+    rows: Sequence[RecordingRow], retention: Retention, *, in_use: Callable[[str], bool], now_ns: int
+) -> Due:
     """The due removals, the oldest first.
 
     | a file | is |
@@ -67,7 +69,7 @@ def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Container
         row.file
         for limit in retention.ages
         for row in ordered
-        if _older(row, limit, now_ns) and row.file not in in_use
+        if _older(row, limit, now_ns) and not in_use(row.file)
     )
     removed: dict[str, None] = {}
     for limit in retention.limits:
@@ -82,12 +84,14 @@ def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Container
         and row.file not in outdated
         and row.file not in removed
         and _older(row, video, now_ns)
-        and row.file not in in_use
+        and not in_use(row.file)
     )
     return Due(tuple(removed), tuple(outdated), stripped)
 
 
-def _surplus(ordered: Sequence[RecordingRow], most_bytes: int, in_use: Container[str]) -> Iterator[str]:
+def _surplus(
+    ordered: Sequence[RecordingRow], most_bytes: int, in_use: Callable[[str], bool]
+) -> Iterator[str]:
     # An edge below its share never gets above it here, so one pass finds them; only files in use may be left over.
     held = Counter[str]()
     for row in ordered:
@@ -98,7 +102,7 @@ def _surplus(ordered: Sequence[RecordingRow], most_bytes: int, in_use: Container
         for row in ordered if fair else spared:
             if excess <= 0:
                 return
-            if row.file in in_use:
+            if in_use(row.file):
                 continue
             if fair and held[row.edge] <= share:
                 spared.append(row)

@@ -8,7 +8,6 @@ that has had a link it is taken for one of its own that broke off, as in an outa
 from __future__ import annotations
 
 import re
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -50,9 +49,9 @@ class Strangers:
         """Connections that are no links, or not yet."""
         self._known: Newest[str, None] = Newest(_MOST_HOSTS)
         """Hosts that have had a link, the last ones."""
-        self._refused: OrderedDict[str, list[float]] = OrderedDict()
+        self._refused: Newest[str, list[float]] = Newest(_MOST_HOSTS)
         """Host → when its connections ended, the last ones."""
-        self._said_s: dict[str, float] = {}
+        self._said_s: Newest[str, float] = Newest(_MOST_HOSTS)
 
     def note_links(self, far_ends: Iterable[str]) -> None:
         """These have a link, or had one a moment ago, however short: `check` may see neither."""
@@ -83,14 +82,12 @@ class Strangers:
         return [host for host in hosts if self._note(host, now_s)]
 
     def _note(self, host: str, now_s: float) -> bool:
-        times = self._refused.setdefault(host, [])
-        self._refused.move_to_end(host)
-        if len(self._refused) > _MOST_HOSTS:
-            self._said_s.pop(self._refused.popitem(last=False)[0], None)
-        times[:] = [*(one for one in times if now_s - one < _WITHIN_S), now_s][-_TIMES:]
+        before = (one for one in self._refused.get(host, ()) if now_s - one < _WITHIN_S)
+        times = [*before, now_s][-_TIMES:]
+        self._refused.put(host, times)
         if len(times) < _TIMES or now_s - self._said_s.get(host, -_AGAIN_S) < _AGAIN_S:
             return False
-        self._said_s[host] = now_s
+        self._said_s.put(host, now_s)
         return True
 
 

@@ -6,12 +6,13 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Info
+from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Pose, View
 from hvt_gateways.cot.event import CotEvent, CotMessage, Motion, Parent, Point, Sensor, TypeTable
@@ -20,8 +21,6 @@ from hvt_ground.events import Event, MessageTiming, Overlay, PoseUpdate, Refinem
 from hvt_ground.sinks import Sink, SinkWriter
 
 _log = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 StillAddress = Callable[[Refinement], str]
 """The address of a still's picture: a URL, or a file of this machine; empty without one."""
@@ -72,8 +71,8 @@ class SessionReporter(SinkWriter[Event]):
         """With the session's id: a track of the next session is another object."""
         self._offset_ns = 0
         self._schedule = TrackSchedule()
-        self._motions: dict[int, MotionTrail] = {}
-        self._stills: dict[int, str] = {}
+        self._motions: Newest[int, MotionTrail] = Newest(_MOST_TRACKS)
+        self._stills: Newest[int, str] = Newest(_MOST_TRACKS)
         """The address of the newest still by track."""
         self._platform_trail = MotionTrail()
         self._platform_ns: int | None = None
@@ -97,7 +96,7 @@ class SessionReporter(SinkWriter[Event]):
             case Refinement(stored=False, track_id=int(track_id)):
                 address = self._still_address(item)
                 if address:
-                    _put(self._stills, track_id, address)
+                    self._stills.put(track_id, address)
 
     def _age_ns(self, capture_ns: int) -> int:
         """The age since capture. In lockstep capture is media time: there everything is from now."""
@@ -140,7 +139,7 @@ class SessionReporter(SinkWriter[Event]):
         made_ns = self._wall_ns()
         for track in self._schedule.due(tracks, now_ns=self._clock()):
             trail = self._motions.get(track.track_id) or MotionTrail()
-            _put(self._motions, track.track_id, trail)
+            self._motions.put(track.track_id, trail)
             motion = trail.add(overlay.capture_ns, track.place, error_m=track.error_m)
             self._send(self._event_of(track, motion, made_ns=made_ns, age_ns=age_ns))
 
@@ -274,11 +273,3 @@ def _track_remarks(track: PlacedTrack, *, still: str) -> str:
     if still:
         words.append(f"still {still}")
     return "; ".join(words)
-
-
-def _put(table: dict[int, T], track_id: int, value: T) -> None:
-    """The newest ones are at the end, and those at the front make room."""
-    table.pop(track_id, None)
-    table[track_id] = value
-    if len(table) > _MOST_TRACKS:
-        del table[next(iter(table))]

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from hvt_common.geodesy import metres_per_degree, turned_deg
+from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 from hvt_gateways.cot.event import Motion
 
@@ -62,7 +63,7 @@ class TrackSchedule:
         self._most = most_a_second
         self._tokens = float(most_a_second)
         self._refilled_ns: int | None = None
-        self._reported: dict[int, Reported] = {}
+        self._reported: Newest[int, Reported] = Newest(_MOST_TRACKS)
 
     def due(self, tracks: Sequence[PlacedTrack], *, now_ns: int) -> list[PlacedTrack]:
         """Those to report now, the best first; they count as reported."""
@@ -73,9 +74,9 @@ class TrackSchedule:
         )[: int(self._tokens)]
         self._tokens -= len(due)
         for one in due:
-            self._reported.pop(one.track_id, None)  # so that the oldest ones are in front
-            self._reported[one.track_id] = Reported(now_ns, one.place, one.name)
-        self._forget(now_ns)
+            self._reported.put(one.track_id, Reported(now_ns, one.place, one.name))
+        while self._reported and now_ns - next(iter(self._reported.values())).at_ns > _FORGOTTEN_NS:
+            self._reported.popitem(last=False)
         return due
 
     def _refill(self, now_ns: int) -> None:
@@ -94,12 +95,6 @@ class TrackSchedule:
         moved_m = math.hypot(*metres_between(before.place, track.place))
         changed = moved_m > _LEAST_MOVE * track.error_m or before.name != track.name
         return changed or since_ns >= _UNMOVED_NS
-
-    def _forget(self, now_ns: int) -> None:
-        for track_id, one in list(self._reported.items()):
-            if now_ns - one.at_ns <= _FORGOTTEN_NS and len(self._reported) <= _MOST_TRACKS:
-                return
-            del self._reported[track_id]
 
 
 _WINDOW_NS: Final = 10 * SECOND_NS

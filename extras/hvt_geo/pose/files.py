@@ -10,7 +10,7 @@ import csv
 import logging
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -138,12 +138,7 @@ def _good(rows: Iterable[_Values | UserError], path: Path) -> list[Pose]:
     begin_s = min((row["utc_s"] for row in here if "utc_s" in row), default=0.0)
     placed = [row for row in here if max(abs(row["latitude_deg"]), abs(row["longitude_deg"])) >= _NOWHERE]
     if len(placed) < len(here):
-        _log.warning(
-            "pose file %s: %d of %d rows are at 0, 0, as before there is a fix, and are left out",
-            path,
-            len(here) - len(placed),
-            len(here),
-        )
+        _say_left_out(path, here, placed, "rows are at 0, 0, as before there is a fix,")
     return [_pose(row, begin_s) for row in placed]
 
 
@@ -160,14 +155,9 @@ def _of_one_time(rows: list[_Values], path: Path) -> list[_Values]:
     longest = max(runs, key=len)
     together = [row for row in rows if "utc_s" not in row or longest[0] <= row["utc_s"] <= longest[-1]]
     if len(together) < len(rows):
-        begin = datetime.fromtimestamp(longest[0], UTC)
-        _log.warning(
-            "pose file %s: %d of %d poses are more than a day from the others, which begin at %s, and are left out",
-            path,
-            len(rows) - len(together),
-            len(rows),
-            begin.isoformat(timespec="seconds"),
-        )
+        begin = datetime.fromtimestamp(longest[0], UTC).isoformat(timespec="seconds")
+        why = f"poses are more than a day from the others, which begin at {begin},"
+        _say_left_out(path, rows, together, why)
     return together
 
 
@@ -184,12 +174,7 @@ def _in_order(poses: list[Pose], path: Path) -> list[Pose]:
     if len(rising) == 1 < len(poses):
         raise UserError(f"pose file {path} has times that do not rise")
     if len(rising) < len(poses):
-        _log.warning(
-            "pose file %s: %d of %d poses have the time of another, and are left out",
-            path,
-            len(poses) - len(rising),
-            len(poses),
-        )
+        _say_left_out(path, poses, rising, "poses have the time of another,")
     return rising
 
 
@@ -204,16 +189,16 @@ def _together(poses: list[Pose], path: Path) -> list[Pose]:
         near = metres <= _MOST_M + _MOST_SPEED * passed_s
         good[step:] |= near
         good[:-step] |= near
-    wrong = len(poses) - int(good.sum())
-    if 0 < wrong < len(poses) / 2:
-        _log.warning(
-            "pose file %s: %d of %d places are far from those around them, and are left out",
-            path,
-            wrong,
-            len(poses),
-        )
-        return [one for one, is_good in zip(poses, good.tolist(), strict=True) if is_good]
-    return poses
+    near_others = [one for one, is_good in zip(poses, good.tolist(), strict=True) if is_good]
+    if not len(poses) / 2 < len(near_others) < len(poses):
+        return poses
+    _say_left_out(path, poses, near_others, "places are far from those around them,")
+    return near_others
+
+
+def _say_left_out(path: Path, rows: Sequence[object], left: Sequence[object], why: str) -> None:
+    left_out, sentence = len(rows) - len(left), "pose file %s: %d of %d %s and are left out"
+    _log.warning(sentence, path, left_out, len(rows), why)
 
 
 def _check(row: _Values, path: Path, number: int) -> None:

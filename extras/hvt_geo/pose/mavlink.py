@@ -15,6 +15,7 @@ from collections.abc import Callable
 from contextlib import closing
 from typing import Any
 
+from hvt_common.runtime.statistics import Newest
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Orientation, Pose
 from hvt_geo.pose.angles import compass_deg, euler_deg
@@ -80,7 +81,7 @@ class MavlinkPose:
         self._stop = threading.Event()
         where = Address.parse(address)
         self._is_stream = where.is_stream
-        self._parsers: dict[object, FrameParser] = {}
+        self._parsers: Newest[object, FrameParser] = Newest(_MOST_SENDERS)
         self._connection = Connection(where, stop=self._stop)
         self._thread = threading.Thread(target=self._read, name="hvt-pose", daemon=True)
         self._thread.start()
@@ -174,8 +175,6 @@ class MavlinkPose:
             while not self._stop.is_set():
                 data = connection.read()
                 sender = connection.sender
-                if sender not in self._parsers and len(self._parsers) >= _MOST_SENDERS:
-                    self._parsers.pop(next(iter(self._parsers)))
                 parser = self._parsers.setdefault(sender, FrameParser(is_stream=self._is_stream))
                 for message in parser.messages(data):
                     self._take(message)

@@ -244,21 +244,17 @@ class FrameParser:
 
     def __init__(self, *, is_stream: bool) -> None:
         self._is_stream = is_stream
-        self._rest = b""
-
-    @property
-    def buffered_bytes(self) -> int:
+        self.rest = b""
         """Bytes that wait for the rest of their frame."""
-        return len(self._rest)
 
     def messages(self, data: bytes) -> list[Any]:
         """All messages that end in ``data``; other bytes are left out."""
-        found, rest = _parsed(self._rest + data)
-        if not self._is_stream and self._rest:
+        found, rest = _parsed(self.rest + data)
+        if not self._is_stream and self.rest:
             alone, rest_alone = _parsed(data)
             if len(alone) > len(found):
                 found, rest = alone, rest_alone
-        self._rest = rest if len(rest) <= MAX_FRAME_BYTES else b""
+        self.rest = rest if len(rest) <= MAX_FRAME_BYTES else b""
         return found
 
 

@@ -78,8 +78,8 @@ class MotionDetector:
 
     class_names: tuple[str, ...] = (MOVING,)
 
-    def __init__(self, *, confidence: float = 0.25, settings: MotionSettings | None = None) -> None:
-        self._settings = settings or MotionSettings()
+    def __init__(self, *, confidence: float = 0.25) -> None:
+        self._settings = MotionSettings()
         self._confidence = confidence
         self._camera = CameraMotion()
         self._history: deque[tuple[_Gray, Affine]] = deque(maxlen=self._settings.memory_calls)

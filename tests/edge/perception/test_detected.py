@@ -12,7 +12,7 @@ FPS = 15
 
 def difference(*counts: int, here: float = 10, receiver_id: int = 1) -> GroundDifference:
     """Compared once a second, a report of each at once."""
-    return told(GroundDifference(memory_s=8, grace_ns=SECOND_NS), *counts, here=here, receiver_id=receiver_id)
+    return told(GroundDifference(), *counts, here=here, receiver_id=receiver_id)
 
 
 def told(

@@ -24,6 +24,8 @@ _PRIOR_AREAS_PX = (1_000.0, 6_000.0, 30_000.0)
 _PRIORS = {"residual": (100.0, 0.06), "h264-intra": (120.0, 0.09)}
 """(fixed bytes, bytes a pixel) between the cost of cars of 60 pixels and of vehicles of 15 at quality 65."""
 _PRIOR_MEAN_PX = 7_000.0
+_PRIOR_WEIGHT = 0.5 / len(_PRIOR_AREAS_PX)
+_MEMORY, _MEAN_MEMORY = 0.98, 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,26 +53,15 @@ class CostModel:
     crops of the drone_carpark clip JPEG at quality 65 costs 639 bytes plus 0.119 a pixel, which is where the estimate
     starts. Least squares with forgetting, each still weighted by its relative error, so that large ones do not rule.
 
-    The prior stays in as three points that weigh as much as ``prior_weight`` stills together: with all stills
-    of one size the slope would be undetermined without it.
+    The prior stays in as three points that weigh as much as half a still together: with all stills of one size the
+    slope would be undetermined without it.
     """
 
-    def __init__(
-        self,
-        *,
-        memory: float = 0.98,
-        mean_memory: float = 0.95,
-        prior_weight: float = 0.5,
-        prior: CostEstimate = CostEstimate(),
-    ) -> None:
-        self._memory = memory
-        self._mean_memory = mean_memory
+    def __init__(self, prior: CostEstimate = CostEstimate()) -> None:
         self._mean = prior.mean_bytes
         self._prior = self._sums = np.zeros(5)
         for area in _PRIOR_AREAS_PX:
-            self._prior = self._prior + _weighted(
-                area, prior.of_px(area), prior_weight / len(_PRIOR_AREAS_PX)
-            )
+            self._prior = self._prior + _weighted(area, prior.of_px(area), _PRIOR_WEIGHT)
 
     @classmethod
     def of_codec(cls, name: str) -> CostModel:
@@ -78,12 +69,12 @@ class CostModel:
         if name not in _PRIORS:
             return cls()
         fixed, slope = _PRIORS[name]
-        return cls(prior=CostEstimate(fixed, slope, fixed + slope * _PRIOR_MEAN_PX))
+        return cls(CostEstimate(fixed, slope, fixed + slope * _PRIOR_MEAN_PX))
 
     def observe(self, *, area_px: float, size_bytes: int) -> None:
         """A still of that many coded pixels took that many payload bytes."""
-        self._sums = self._memory * self._sums + _weighted(area_px, float(size_bytes), 1.0)
-        self._mean = self._mean_memory * self._mean + (1 - self._mean_memory) * size_bytes
+        self._sums = _MEMORY * self._sums + _weighted(area_px, float(size_bytes), 1.0)
+        self._mean = _MEAN_MEMORY * self._mean + (1 - _MEAN_MEMORY) * size_bytes
 
     def estimate(self) -> CostEstimate:
         """The line as it stands; neither its height at zero nor its slope is ever negative."""

@@ -233,7 +233,7 @@ def test_a_classifier_takes_every_batch_with_openvino(tmp_path: Path, dtype: typ
     assert isinstance(theirs, OnnxClassifier)
     for count in (1, 5, 40):
         runner.run(np.zeros((count, *theirs.model.inputs[0].shape[1:]), dtype))
-    assert len(runner.compiled_shapes) == 1
+    assert len(runner.compiled) == 1
 
 
 DROPPED_ELSEWHERE = """
