@@ -12,7 +12,8 @@ import pytest
 
 from hvt_common.camera_motion import CameraMotion
 from hvt_common.tracking import kalman
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections
 
 WIDTH, HEIGHT = 640, 360
@@ -124,14 +125,14 @@ def test_a_cut_to_another_scene_is_no_motion() -> None:
 
 def test_warp_moves_boxes_as_the_picture_moves() -> None:
     """With a turning and zooming camera, boxes and their velocities would point the wrong way."""
-    states = kalman.initiate(np.array([[100.0, 50.0, 0.5, 40.0]]))
-    states[:, kalman.VELOCITY] = [3.0, 0.0, 0.01, 0.5]
+    states = kalman.initiate(np.array([[100.0, 50.0, 0.5, 40.0]]).T)
+    states[kalman.VELOCITY, :, 0] = [3.0, 0.0, 0.01, 0.5]
     before = states.copy()
     kalman.warp(states, np.array([[0.0, -2.0, 10.0], [2.0, 0.0, 20.0]]))  # a quarter turn, twice the size
-    np.testing.assert_allclose(states[0, kalman.POSITION], [-90, 220, 0.5, 80])
-    np.testing.assert_allclose(states[0, kalman.VELOCITY], [0, 6, 0.01, 1.0], atol=1e-12)
+    np.testing.assert_allclose(states[kalman.POSITION, :, 0], [-90, 220, 0.5, 80])
+    np.testing.assert_allclose(states[kalman.VELOCITY, :, 0], [0, 6, 0.01, 1.0], atol=1e-12)
     np.testing.assert_allclose(
-        states[0, kalman.VAR_P :] / before[0, kalman.VAR_P :].clip(1e-30),
+        states[kalman.VAR_P :, :, 0] / before[kalman.VAR_P :, :, 0].clip(1e-30),
         [[4, 4, 1, 4], [0, 0, 0, 0], [4, 4, 1, 4]],  # lengths by the square of the scale; no covariance yet
     )
 

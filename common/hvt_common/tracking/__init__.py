@@ -1,4 +1,4 @@
-"""ByteTrack: others use `bytetrack`, and `association` of boxes; Kalman filter and table are its parts.
+"""ByteTrack: others use `bytetrack`, its `settings`, and `association` of boxes; the rest are its parts.
 
 `recall` weighs an object that only one of two detectors finds.
 """

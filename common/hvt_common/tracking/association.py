@@ -12,6 +12,10 @@ _Floats = npt.NDArray[np.float64]
 _Indices = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
+# A box as x1, y1, -x2, -y2: what two boxes share is the larger one of each number. Its sides come out negative.
+_SIGNS = np.array([[1.0], [1], [-1], [-1]])
+_PIXEL = np.array([[0.0], [0], [1], [1]])
+
 
 class Overlaps(NamedTuple):
     """The pairs of two lists of boxes that share anything: of most lists few do."""
@@ -21,26 +25,35 @@ class Overlaps(NamedTuple):
     iou: _Floats
 
 
-def overlaps(a_xyxy_px: _Floats, b_xyxy_px: _Floats) -> Overlaps:
-    """IoU of (N, 4) with (M, 4) boxes.
+def overlaps(a: _Floats, b: _Floats) -> Overlaps:
+    """IoU of (4, N) with (4, M) boxes x1, y1, x2, y2, by rising row.
 
     Boxes are measured as ByteTrack measures them (``cython_bbox``, from the time of whole pixels): a box reaches
     from x1 to x2 *inclusive*, so that one pixel is added to each side. It matters for objects of a few pixels.
     """
-    a, b = a_xyxy_px.T.copy(), b_xyxy_px.T.copy()
-    a[2:] += 1
-    b[2:] += 1
-    near = np.less.outer(a[0], b[2])
-    near &= np.greater.outer(a[2], b[0])
-    near &= np.less.outer(a[1], b[3])
-    near &= np.greater.outer(a[3], b[1])
-    places = near.ravel().nonzero()[0]  # ten times as fast as in two dimensions
-    if not len(places):
-        return Overlaps(places, places, np.empty(0))
-    rows, columns = np.divmod(places, near.shape[1])
-    a, b = np.take(a, rows, axis=1), np.take(b, columns, axis=1)
-    shared = _areas(np.concatenate((np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:]))))
-    return Overlaps(rows, columns, shared / (_areas(a) + _areas(b) - shared))
+    rows, columns = _near(a, b)
+    a, b = a * _SIGNS - _PIXEL, b * _SIGNS - _PIXEL
+    wide, high = _sides(np.maximum(a.take(rows, axis=1), b.take(columns, axis=1)))
+    some = (np.maximum(wide, high) < 0).nonzero()[0]
+    rows, columns, shared = rows.take(some), columns.take(some), (wide * high).take(some)
+    areas_a, areas_b = np.multiply(*_sides(a)).take(rows), np.multiply(*_sides(b)).take(columns)
+    return Overlaps(rows, columns, shared / (areas_a + areas_b - shared))
+
+
+def _sides(signed: _Floats) -> _Floats:
+    return signed[:2] + signed[2:]
+
+
+def _near(a: _Floats, b: _Floats) -> tuple[_Indices, _Indices]:
+    # The pairs that may share something, by rising row: those that do along x, and some more.
+    order = b[0].argsort()
+    starts = b[0].take(order)
+    widest = np.maximum.reduce(b[2] - b[0], initial=0.0)
+    first, end = starts.searchsorted(a[0] - widest - 1), starts.searchsorted(a[2] + 1)
+    count = end - first
+    rows = np.arange(len(count)).repeat(count)
+    places = np.arange(len(rows)) + (end - count.cumsum()).repeat(count)
+    return rows, order.take(places)
 
 
 def larger(a: Overlaps, b: Overlaps) -> Overlaps:
@@ -62,33 +75,37 @@ def assign(cost: _Floats, *, limit: float) -> tuple[_Indices, _Indices]:
     A pair whose row and column have no other candidate under the limit is part of every optimum, and a row
     without candidates of none: both are resolved without the solver, which gets only the rest.
     """
-    return _assign(cost, *(cost < limit).nonzero(), limit=limit)
+    rows, columns = (cost < limit).nonzero()
+    return _assign(rows, columns, cost[rows, columns], limit=limit)
 
 
-def _assign(cost: _Floats, rows: _Indices, columns: _Indices, *, limit: float) -> tuple[_Indices, _Indices]:
-    by_row = np.bincount(rows, minlength=cost.shape[0])
-    by_column = np.bincount(columns, minlength=cost.shape[1])
+def _assign(rows: _Indices, columns: _Indices, cost: _Floats, *, limit: float) -> tuple[_Indices, _Indices]:
+    # From the pairs under the limit.
+    by_row, by_column = np.bincount(rows), np.bincount(columns)
     alone = (by_row.take(rows) == 1) & (by_column.take(columns) == 1)
     lone_rows, lone_columns = rows[alone], columns[alone]
     if len(lone_rows) == len(rows):
         return rows, columns
     by_row[lone_rows] = by_column[lone_columns] = 0
     open_rows, open_columns = by_row.nonzero()[0], by_column.nonzero()[0]
-    contested = np.ascontiguousarray(cost[open_rows[:, None], open_columns])
-    picked_rows, picked_columns = lap.lapjvx(contested, extend_cost=True, cost_limit=limit, return_cost=False)
-    under = contested[picked_rows, picked_columns] < limit
+    others = (~alone).nonzero()[0]
+    contested = np.full((len(open_rows), len(open_columns)), limit + 1)
+    places = open_rows.searchsorted(rows[others]), open_columns.searchsorted(columns[others])
+    contested[places] = cost[others]
+    picked, _ = lap.lapjv(contested, extend_cost=True, cost_limit=limit, return_cost=False)
+    some = (picked >= 0).nonzero()[0]
     return (
-        np.concatenate((lone_rows, open_rows[picked_rows[under]])),
-        np.concatenate((lone_columns, open_columns[picked_columns[under]])),
+        np.concatenate((lone_rows, open_rows[some])),
+        np.concatenate((lone_columns, open_columns[picked[some]])),
     )
 
 
 def grown(boxes: _Floats, growth: float) -> _Floats:
-    """Boxes larger by ``growth`` of their own width and height on every side."""
-    if growth <= 0:
+    """(4, N) boxes larger by ``growth`` of their own width and height on every side."""
+    if not growth:
         return boxes
-    margin = (boxes[:, 2:] - boxes[:, :2]) * growth
-    return np.concatenate((boxes[:, :2] - margin, boxes[:, 2:] + margin), axis=1)
+    margin = (boxes[2:] - boxes[:2]) * growth
+    return np.concatenate((boxes[:2] - margin, boxes[2:] + margin))
 
 
 def pair(similar: Overlaps, tracks: _Mask, free: _Mask, match: _Indices, *, limit: float) -> None:
@@ -96,19 +113,12 @@ def pair(similar: Overlaps, tracks: _Mask, free: _Mask, match: _Indices, *, limi
 
     Writes the detections into ``match`` and takes them out of ``free``, in place.
     """
+    if not np.count_nonzero(tracks):
+        return
     rows, columns = similar.rows, similar.columns
     cost = 1 - similar.iou
     under = (tracks.take(rows) & free.take(columns) & (cost < limit)).nonzero()[0]
     if not len(under):
         return
-    costs = np.ones((len(tracks), len(free)))
-    costs[rows, columns] = cost
-    rows, columns = _assign(costs, rows.take(under), columns.take(under), limit=limit)
-    match[rows] = columns
-    free[columns] = False
-
-
-def _areas(corners: _Floats) -> _Floats:
-    # (N,) areas of (4, N) corner rows.
-    width, height = corners[2:] - corners[:2]
-    return np.asarray(width * height, np.float64)
+    paired, given = _assign(rows.take(under), columns.take(under), cost.take(under), limit=limit)
+    match[paired], free[given] = given, False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -14,12 +14,18 @@ from hvt_common.values import Detections
 
 _Floats = npt.NDArray[np.float64]
 _Indices = npt.NDArray[np.int64]
-_Mask = npt.NDArray[np.bool_]
+_Scores = npt.NDArray[np.float32]
 
 _FARTHEST_PX: Final = 1e9
 
-UNCONFIRMED, TRACKED, LOST = range(3)
-"""The phases of a track: seen once; found by the last update; not found by it."""
+UNCONFIRMED, LOST, OVER_TIME, TRACKED, OVERDUE, ENDED = range(6)
+"""The phases of a track: seen once; not found by the last update; not for so long that the next is its last chance;
+found by the last update; so at its last chance: lost once more, it is forgotten at once. None outlasts an update in
+the third or the last."""
+
+IF_FOUND = np.array([TRACKED, TRACKED, OVERDUE, TRACKED, OVERDUE])
+IF_MISSED = np.array([ENDED, LOST, ENDED, LOST, ENDED])
+"""The next phase."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +33,9 @@ class TrackerInput:
     """The usable detections of one frame, best first."""
 
     boxes: _Floats
+    """(4, M) x1, y1, x2, y2."""
     measured: _Floats
-    """(M, 4) centre x, centre y, aspect ratio, height."""
+    """(4, M) centre x, centre y, aspect ratio, height."""
     confidences: npt.NDArray[np.float32]
     class_ids: npt.NDArray[np.int32]
 
@@ -40,95 +47,89 @@ class TrackerInput:
         """Leave out what is weak, not finite or without area; order what remains.
 
         New ids are given in this order, so it must not depend on the order of the input: equal confidences are
-        ordered by box and class.
+        ordered by box and class. A `ValueError` means that one of the class ids is negative.
         """
-        boxes = detections.boxes_xyxy_px.astype(np.float64)
+        boxes = detections.boxes_xyxy_px.T.astype(np.float64, order="C")
         confidences, class_ids = detections.confidences, detections.class_ids
         # Comparisons with NaN are false: what is not a number fails them all.
-        usable = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & (np.abs(boxes) < _FARTHEST_PX).all(axis=1)
+        usable = (
+            (boxes[0] < boxes[2]) & (boxes[1] < boxes[3]) & (np.maximum.reduce(np.abs(boxes)) < _FARTHEST_PX)
+        )
         usable &= (confidences > low_confidence) & (confidences < math.inf)
         order = usable.nonzero()[0]
-        ranked = confidences[order]
-        if not (ranked[1:] < ranked[:-1]).all():
-            order = order[np.lexsort((class_ids[order], *boxes[order].T, -ranked))]
-        boxes = boxes[order]
-        return cls(boxes, kalman.measure(boxes), confidences[order], class_ids[order])
+        ranked = confidences.take(order)
+        if np.count_nonzero(ranked[1:] >= ranked[:-1]):
+            order = order[np.lexsort((class_ids[order], *boxes[:, order], -ranked))]
+        boxes, class_ids = boxes.take(order, axis=1), class_ids.take(order)
+        if np.count_nonzero(class_ids < 0):
+            raise ValueError(f"class_ids holds {class_ids.min()}, must not be negative")
+        return cls(boxes, kalman.measure(boxes), confidences.take(order), class_ids)
 
-    def take(self, index: _Indices) -> TrackerInput:
-        """Some of them, in the order of ``index``."""
+    def take(self, rows: _Indices) -> TrackerInput:
+        """Some of them, in the order of ``rows``."""
         return TrackerInput(
-            self.boxes[index], self.measured[index], self.confidences[index], self.class_ids[index]
+            self.boxes.take(rows, axis=1),
+            self.measured.take(rows, axis=1),
+            self.confidences.take(rows),
+            self.class_ids.take(rows),
         )
 
 
-@dataclass(slots=True)
 class TrackTable:
-    """All living tracks as parallel arrays, ordered by id."""
+    """All living tracks, ordered by id: one column each."""
 
-    states: kalman.States
-    ids: _Indices
-    born: _Indices
-    seen: _Indices
-    heights: _Floats
-    """Of the boxes when they were last seen."""
-    lost_at: _Indices
-    """Frame of the update that did not find the track; means something in phase lost only."""
-    phase: npt.NDArray[np.int8]
-    overdue: _Mask
-    """Found again after its time was up: when lost once more, it is forgotten at once."""
-    started: _Mask
-    confidences: npt.NDArray[np.float32]
-    votes: npt.NDArray[np.float32]
-    """(N, C) decayed sum of confidences for each class up to the highest seen so far."""
+    def __init__(self, states: kalman.States, heights: _Floats, numbers: _Indices, scores: _Scores) -> None:
+        self.states = states
+        self.heights = heights
+        """(N,) of the boxes when they were last seen."""
+        self.numbers = numbers
+        """(5, N), which these are the rows of."""
+        self.ids, self.born, self.seen, self.since, self.phase = numbers
+        """``since``: the update that put the track into its phase. It and the two before are frames."""
+        self.scores = scores
+        """(1 + C, N) the confidence of the last detection; the decayed sum of confidences for each class so far."""
 
     def __len__(self) -> int:
-        return len(self.ids)
+        return len(self.heights)
 
     @classmethod
     def empty(cls) -> TrackTable:
-        return cls.new(
-            TrackerInput.of(Detections.none(), low_confidence=0), first_id=1, frame_index=0, classes=0
-        )
-
-    @classmethod
-    def new(cls, seen: TrackerInput, *, first_id: int, frame_index: int, classes: int) -> TrackTable:
-        """One unconfirmed track a detection, with votes on ``classes`` classes."""
-        count = len(seen)
-        votes = np.zeros((count, classes), np.float32)
-        votes[np.arange(count), seen.class_ids] = seen.confidences
-        return cls(
-            states=kalman.initiate(seen.measured),
-            ids=np.arange(first_id, first_id + count),
-            born=np.full(count, frame_index),
-            seen=np.full(count, frame_index),
-            heights=seen.measured[:, 3].copy(),
-            lost_at=np.full(count, frame_index),
-            phase=np.full(count, UNCONFIRMED, np.int8),
-            overdue=np.zeros(count, bool),
-            started=np.zeros(count, bool),
-            confidences=seen.confidences,
-            votes=votes,
-        )
+        numbers, scores = np.zeros((5, 0), np.int64), np.zeros((2, 0), np.float32)
+        return cls(kalman.initiate(np.zeros((4, 0))), np.zeros(0), numbers, scores)
 
     def copy(self) -> TrackTable:
         """The same tracks, which change no more."""
-        return TrackTable(*(getattr(self, name).copy() for name in _COLUMNS))
+        return TrackTable(self.states.copy(), self.heights.copy(), self.numbers.copy(), self.scores.copy())
 
-    def retain(self, mask: _Mask) -> None:
-        """Drop all tracks but the marked ones."""
-        for name in _COLUMNS:
-            setattr(self, name, getattr(self, name)[mask])
+    def take(self, rows: _Indices) -> TrackTable:
+        """Some of the tracks, by rising ``rows``."""
+        return TrackTable(
+            self.states.take(rows, axis=2),
+            self.heights.take(rows),
+            self.numbers.take(rows, axis=1),
+            self.scores.take(rows, axis=1),
+        )
 
-    def append(self, other: TrackTable) -> None:
-        """Add tracks with higher ids and as many classes."""
-        for name in _COLUMNS:
-            setattr(self, name, np.concatenate((getattr(self, name), getattr(other, name))))
+    def with_new(self, seen: TrackerInput, *, first_id: int, frame_index: int, phase: int) -> TrackTable:
+        """One track more a detection, at rest."""
+        count, classes = len(seen), len(self.scores)
+        numbers = np.full((5, count), frame_index)
+        numbers[0] = np.arange(first_id, first_id + count)
+        numbers[4] = phase
+        scores = np.zeros((classes, count), np.float32)
+        scores[0] = scores[1 + seen.class_ids, np.arange(count)] = seen.confidences
+        return TrackTable(
+            np.concatenate((self.states, kalman.initiate(seen.measured)), axis=2),
+            np.concatenate((self.heights, seen.measured[3])),
+            np.concatenate((self.numbers, numbers), axis=1),
+            np.concatenate((self.scores, scores), axis=1),
+        )
 
-    def widen(self, classes: int) -> None:
-        """Extend the table by votes on classes up to ``classes``."""
-        missing = classes - self.votes.shape[1]
-        if missing > 0:
-            self.votes = np.pad(self.votes, ((0, 0), (0, missing)))
-
-
-_COLUMNS: Final = tuple(column.name for column in fields(TrackTable))
+    def widened(self, classes: int) -> TrackTable:
+        """With votes on so many classes at least."""
+        missing = 1 + classes - len(self.scores)
+        if missing <= 0:
+            return self
+        return TrackTable(
+            self.states, self.heights, self.numbers, np.pad(self.scores, ((0, missing), (0, 0)))
+        )

@@ -29,7 +29,8 @@ from hvt_common.inference.scale_search import ScaleSearch
 from hvt_common.inference.store import MOTION
 from hvt_common.inference.tiles import detect_whole, searches_scale, tiled
 from hvt_common.inference.view_trust import ViewTrust
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.settings import TrackerSettings, weak_confidence
 from hvt_common.values import Detections, Image, View
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.config import EdgeConfig

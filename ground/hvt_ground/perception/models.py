@@ -25,7 +25,7 @@ from hvt_common.inference.view_trust import trust_from
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.process import lower_priority
-from hvt_common.tracking.bytetrack import weak_confidence
+from hvt_common.tracking.settings import weak_confidence
 from hvt_common.values import Detections, Image
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
 from hvt_ground.perception.stills.vocabulary import check_common

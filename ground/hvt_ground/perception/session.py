@@ -18,7 +18,8 @@ from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import searches_scale
 from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.messages import Info
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, Image
 from hvt_ground.config import DETECTOR, GroundConfig
 from hvt_ground.events import Event, Overlay

@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError, check_not_read
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, Tracks
 from hvt_study.datasets.annotation_rows import LAST_FRAME, Rows, read_rows
 

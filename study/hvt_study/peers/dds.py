@@ -24,7 +24,8 @@ import numpy as np
 
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.channels import Channel
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import RollingBudget

@@ -26,7 +26,7 @@ from hvt_common.inference.detect import Detector
 from hvt_common.inference.labels import default_confidence, first_synonym
 from hvt_common.inference.store import MOTION, resolve_model
 from hvt_common.inference.tiles import tiled
-from hvt_common.tracking.bytetrack import weak_confidence
+from hvt_common.tracking.settings import weak_confidence
 from hvt_ground.config import DETECTOR, NONE
 from hvt_study.cache.cached_detector import CachedDetector
 from hvt_study.cache.results import CacheError, ResultCache, content_key, file_digest, flight_code, installed

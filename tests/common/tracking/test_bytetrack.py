@@ -17,8 +17,9 @@ from scipy.optimize import linear_sum_assignment
 
 from hvt_common.tracking import kalman
 from hvt_common.tracking.association import assign, larger, overlaps
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.flow import box_flow
+from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, Tracks, iou
 from studies.clear_mot import Frames, score
 
@@ -136,15 +137,16 @@ def test_the_split_filter_equals_the_dense_one() -> None:
     rng = np.random.default_rng(1)
     steps = np.cumsum(rng.normal(0, [4, 4, 0.01, 1], (20, 5, 4)), axis=0)
     steps += [200, 100, 0.5, 80]
-    states = kalman.initiate(steps[0])
+    states = kalman.initiate(steps[0].T)
     for measured in steps[1:]:
         kalman.predict(states)
-        kalman.correct(states, measured)
+        kalman.correct(states, measured.T)
     for k in range(5):
         mean, covariance = dense_filter(steps[:, k])
-        np.testing.assert_allclose(states[k, :2].ravel(), mean, rtol=1e-9, atol=1e-9)
-        blocks = np.diag([*states[k, kalman.VAR_P], *states[k, kalman.VAR_V]])
-        blocks += np.diag(states[k, kalman.COV_PV], 4) + np.diag(states[k, kalman.COV_PV], -4)
+        state = states[..., k]
+        np.testing.assert_allclose(state[:2].ravel(), mean, rtol=1e-9, atol=1e-9)
+        blocks = np.diag([*state[kalman.VAR_P], *state[kalman.VAR_V]])
+        blocks += np.diag(state[kalman.COV_PV], 4) + np.diag(state[kalman.COV_PV], -4)
         np.testing.assert_allclose(blocks, covariance, rtol=1e-9, atol=1e-12)
 
 
@@ -168,12 +170,12 @@ def test_assignment_has_the_optimum_of_lap_with_a_cost_limit(
 
 def test_overlap_counts_whole_pixels() -> None:
     """Small objects would be matched more strictly than in ByteTrack."""
-    a = np.array([[0.0, 0.0, 9.0, 9.0]])
-    b = np.array([[0.0, 0.0, 9.0, 9.0], [5.0, 0.0, 14.0, 9.0], [20.0, 0.0, 29.0, 9.0]])
+    a = np.array([[0.0, 0.0, 9.0, 9.0]]).T
+    b = np.array([[0.0, 0.0, 9.0, 9.0], [5.0, 0.0, 14.0, 9.0], [20.0, 0.0, 29.0, 9.0]]).T
     shared = overlaps(a, b)
     assert (shared.rows.tolist(), shared.columns.tolist()) == ([0, 0], [0, 1]), "nothing of the third"
     np.testing.assert_allclose(shared.iou, [1.0, 50 / 150])
-    nothing = overlaps(a, b[2:])
+    nothing = overlaps(a, b[:, 2:])
     assert [len(column) for column in larger(nothing, nothing)] == [0, 0, 0], "a session ended with it"
     for pair in ((shared, nothing), (nothing, shared)):
         np.testing.assert_array_equal(larger(*pair).iou, shared.iou)

@@ -17,7 +17,8 @@ from hvt_common.inference.view_trust import ViewTrust
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
 from hvt_common.video.hevc import YuvPicture

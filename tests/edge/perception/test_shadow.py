@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from hvt_common.inference.detect import Detector, open_detector
 from hvt_common.inference.store import EMBEDDED_DETECTOR
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Detections, Frame
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
 from hvt_edge.perception.shadow import Detected, Shadow, ShadowGround

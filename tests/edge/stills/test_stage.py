@@ -15,7 +15,8 @@ import pytest
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.failures import Failures
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
 from hvt_common.video.base_crop import base_crop

@@ -9,7 +9,8 @@ import numpy as np
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Command, ControlRequest, RoiHeader, parse_backlog_still
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.values import Frame, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.backlog.stage import BacklogStage

@@ -26,7 +26,8 @@ from hvt_common.protocol.messages import (
     RoiHeader,
     TrackStepEncoder,
 )
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.settings import TrackerSettings
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Detections, Image, Posterior, Tracks, View
 from hvt_edge.video.encoder import EncoderSettings
