@@ -31,8 +31,7 @@ from hvt_common.video.still_codecs import (
 )
 from hvt_edge.link.stills import Still
 from hvt_edge.perception.candidates import PADDING
-from hvt_edge.stills.merging import union_crop
-from hvt_edge.stills.policy.base import Request
+from hvt_edge.stills.policy.base import Request, union_crop
 
 Allowance = Callable[[Still], int]
 """How many payload bytes a still with this header may take now; the header's own data does not count."""

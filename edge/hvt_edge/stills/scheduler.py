@@ -14,10 +14,9 @@ from hvt_edge.link.stills import Still
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import BaseLoss, Candidate, TrackMemory
 from hvt_edge.stills.maker import Allowance, NoStill
-from hvt_edge.stills.merging import expected_bytes, group
 from hvt_edge.stills.on_demand import OnDemand, OnDemandStill
 from hvt_edge.stills.outbox import OutboxStill
-from hvt_edge.stills.policy.base import CostModel, Method, Request, Step
+from hvt_edge.stills.policy.base import CostModel, Method, Request, Step, expected_bytes, group
 
 
 @dataclass(frozen=True, slots=True)

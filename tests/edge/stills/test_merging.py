@@ -14,8 +14,15 @@ from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.protocol.messages import AlsoShown
 from hvt_common.video.base_crop import coded_size
 from hvt_edge.perception.candidates import crop_box
-from hvt_edge.stills.merging import ALSO_BYTES, expected_bytes, group, union_crop
-from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, CostEstimate, Request
+from hvt_edge.stills.policy.base import (
+    ALSO_BYTES,
+    STILL_OVERHEAD_BYTES,
+    CostEstimate,
+    Request,
+    expected_bytes,
+    group,
+    union_crop,
+)
 from rigs.examples import candidate
 from rigs.messages import ROI
 
