@@ -30,7 +30,7 @@ from hvt_ground.link.group import GroundGroup
 from hvt_ground.report.state import GroundState, StateMaker
 from hvt_ground.report.status import completed, status_text, summary
 from hvt_ground.session.edge_port import EdgePort
-from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
+from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs, Sink
@@ -73,9 +73,9 @@ class Ground:
         self._stop = stop
         self._on_started = on_started
         self._clock = SteadyClock()
-        self._edges: dict[str, EdgeThread] = {}
-        self._leaving: list[EdgeThread] = []
-        """Threads of edges that are served no more: they finish."""
+        self._edges: dict[str, EdgeSessions] = {}
+        self._leaving: list[EdgeSessions] = []
+        """Edges that are served no more: they finish."""
         self._moved: dict[str, EdgeSessions] = {}
         """Sessions of edges that have left their place to another edge, or to another member of the group."""
         self._ended: defaultdict[str, deque[tuple[dict[str, Any], Sequence[Sink[Event]]]]] = defaultdict(
@@ -170,9 +170,7 @@ class Ground:
                 self._stop_edges()
         return [
             completed(content, sessions, sinks=sinks, failures=models.failures)
-            for edge, sessions in sorted(
-                (self._moved | {edge: one.sessions for edge, one in self._edges.items()}).items()
-            )
+            for edge, sessions in sorted((self._moved | self._edges).items())
             for content, sinks in self._ended[edge]
         ]
 
@@ -221,24 +219,22 @@ class Ground:
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
                 give_back_holes()
-                self._state = maker.make([(edge, one.sessions) for edge, one in sorted(self._edges.items())])
+                self._state = maker.make(sorted(self._edges.items()))
                 for one in services:
                     one.show(self._state)
                 line.show(status_text(self._state) or ("no link" if watch.trouble else "no edge yet"))
             if config.once and self._all_ended(loading=models.loading):
                 return
 
-    def _serve_edge(self, port: EdgePort, factory: SessionFactory) -> EdgeThread:
-        return EdgeThread(
-            EdgeSessions(
-                port,
-                open_session=factory.open_session,
-                on_ended=self._note_ended,
-                recordings=BacklogRecordings(factory.open_backlog) if factory.records else None,
-                clock=self._clock,
-                patience_s=self._config.patience_s,
-            )
-        )
+    def _serve_edge(self, port: EdgePort, factory: SessionFactory) -> EdgeSessions:
+        return EdgeSessions(
+            port,
+            open_session=factory.open_session,
+            on_ended=self._note_ended,
+            recordings=BacklogRecordings(factory.open_backlog) if factory.records else None,
+            clock=self._clock,
+            patience_s=self._config.patience_s,
+        ).start()
 
     def _note_ended(self, session: Session) -> None:
         # In the thread of its edge: forget the session and remember the numbers of the last ones.
@@ -246,21 +242,21 @@ class Ground:
 
     def _leave_edges(self, ports: list[EdgePort], link: GroundLink) -> None:
         # The link has left those without a session, for others, and those that moved.
-        for one in [one for one in self._edges.values() if one.sessions.port not in ports]:
-            del self._edges[one.sessions.port.edge]
+        for one in [one for one in self._edges.values() if one.port not in ports]:
+            del self._edges[one.port.edge]
             one.stop()
             self._leaving.append(one)
-        for one in [one for one in self._leaving if one.ended]:
+        for one in [one for one in self._leaving if one.finished]:
             if one.error is not None:
                 raise one.error
             self._leaving.remove(one)
-            if one.sessions.ended:
-                self._moved[one.sessions.port.edge] = one.sessions
+            if one.ended:
+                self._moved[one.port.edge] = one
             if len(self._moved) > _MOST_MOVED:
                 del self._moved[oldest := next(iter(self._moved))]
                 if oldest not in self._edges:
                     self._ended.pop(oldest, None)
-            link.closed(one.sessions.port)
+            link.closed(one.port)
 
     def _say_rights(self, port: EdgePort, line: StatusLine, watch: LinkWatch) -> None:
         if not watch.may_command(port.edge):
@@ -270,7 +266,7 @@ class Ground:
             )
 
     def _all_ended(self, *, loading: bool) -> bool:
-        edges = [one.sessions for one in self._edges.values()]
+        edges = self._edges.values()
         gone = all(one.idle and not one.port.present.is_set() for one in edges)
         if not any(one.ended for one in edges):  # nobody came, or who came left without a picture
             waited_s = time.monotonic() - self._began_s
@@ -280,7 +276,7 @@ class Ground:
     def _close_edges(self) -> None:
         self._stop_edges()
         for one in (*self._edges.values(), *self._leaving):
-            one.close()
+            one.join()
         self._raise_error()
 
     def _stop_edges(self) -> None:

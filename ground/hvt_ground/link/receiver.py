@@ -41,6 +41,9 @@ _SILENT_NS = 2_000_000_000
 """A keyframe is requested only of an edge that sent something so long ago at most."""
 _MOST_HELD = 16
 """Stills, and poses, that are held for a session that is not open yet."""
+_UNSEEN_NS, _UNSEEN = 15 * SECOND_NS, 3
+"""An edge that says for so long that it sends pictures, and so many of them, of which none comes. A keyframe is coded
+for less than a second of the rate: it takes so long on a link of a fifteenth of that."""
 _AGAIN_NS = 60 * SECOND_NS
 """Between two warnings: sessions' ids cost a forger nothing, and a log is not to fill."""
 
@@ -51,6 +54,11 @@ class Packet:
 
     header: RoiHeader | TrackStep | PoseReport | BacklogHeader | Status
     item: Received
+
+    def is_of(self, session_id: int) -> bool:
+        if isinstance(self.header, PoseReport):
+            return self.header.is_of(session_id)
+        return self.header.session_id == session_id
 
 
 class Uptime:
@@ -103,6 +111,9 @@ class Receiver:
             PoseReport: deque(maxlen=_MOST_HELD),
             RoiHeader: deque(maxlen=_MOST_HELD),
         }
+        self._unseen: tuple[tuple[int, int], int, int] | None = None
+        """Of the first report since a picture came: its session and how many had come damaged, how many were sent by
+        then, and when it came."""
         self._uptime = Uptime()
         self._captures = CaptureTimes()
         self._last_message_ns = time.monotonic_ns()
@@ -131,6 +142,7 @@ class Receiver:
             match message:
                 case BaseHeader():
                     self._captures.note(message)
+                    self._unseen = None
                     return self.stream.accept(message, item, now_ns=at_ns)
                 case RoiHeader():
                     otherwise_ns = item.received_ns - message.send_delay_ns
@@ -153,6 +165,18 @@ class Receiver:
             return False
         self.stream.keyframe_requested(at_ns)
         return True
+
+    def is_unseen(self, status: Status | None, now_ns: int) -> bool:
+        """Whether the edge has said for long that it sends pictures of which none comes; None: it says nothing."""
+        of = None if status is None else (status.session_id, self.stream.counters.corrupt)
+        if status is None or status.state == "ended" or (self._unseen is not None and self._unseen[0] != of):
+            self._unseen = None
+        if status is None or of is None:
+            return False
+        if self._unseen is None:
+            self._unseen = of, status.base_messages, now_ns
+        _, sent, since_ns = self._unseen
+        return now_ns - since_ns >= _UNSEEN_NS and status.base_messages - sent >= _UNSEEN
 
     def hold(self, packet: Packet) -> None:
         """Hold a still, a pose, or the first report of a session: it may overtake the keyframe that begins it."""

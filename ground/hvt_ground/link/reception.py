@@ -105,7 +105,7 @@ class Reception:
         """Since when each part of the edge fails, by its clock: a report has the newest try."""
         self.analyzed = (-1, -1)
         """The last frame that was analyzed, and what was detected by then: reports want both of one moment."""
-        self._first_capture_ns: int | None = None
+        self._first_capture_ns = 0
         self._info = info
         self._keys = EdgeKeys(info.edge)
         self._clock, self._emit, self._note = clock, emit, note
@@ -136,10 +136,10 @@ class Reception:
         at_ns = item.received_ns  # its own, also where it waited behind a hole
         self._time_capture(header.capture_ns, at_ns)
         self.count(Channel.BASE, item, at_ns=header.send_ns)
-        self.frames += 1
-        if self._first_capture_ns is None:
+        if not self.frames:
             self._first_capture_ns = header.capture_ns
         self.newest_index, self.newest_capture_ns = header.frame_index, header.capture_ns
+        self.frames += 1
         self._base_ns = self._clock()
         with self._lock:
             if header.sequence > self._base_sequence:
@@ -197,10 +197,8 @@ class Reception:
         self._status_ns = now_ns
         self.count(Channel.STATUS, item, at_ns=status.send_ns)
         self.time(Channel.STATUS, item, status, handled=True)
-        since = self.edge_failing
-        self.edge_failing = {
-            one.part: since.get(one.part, one.failed_ns) for one in status.failed if not one.working
-        }
+        failing, since = (one for one in status.failed if not one.working), self.edge_failing
+        self.edge_failing = {one.part: since.get(one.part, one.failed_ns) for one in failing}
         self.last_status = status
         before, now = ([one for one, _ in lever_decisions(says)] for says in (self.levers, status.levers))
         self.levers = status.levers or self.levers
@@ -228,15 +226,12 @@ class Reception:
     def time(self, kind: str, item: Received, header: Message, *, handled: bool | None) -> None:
         """Give out when a message came; ``handled``: something was made of it, None is said later."""
         size, extra = len(item.payload), len(item.attachment)
-        frame_index, capture_ns = -1, 0
-        if isinstance(header, BaseHeader | RoiHeader | TrackStep):
-            frame_index, capture_ns = header.frame_index, header.capture_ns
         self._emit(
             MessageTiming(
                 kind=kind,
                 sequence=header.number if isinstance(header, BacklogHeader | PoseReport) else header.sequence,
-                frame_index=frame_index,
-                capture_ns=capture_ns,
+                frame_index=getattr(header, "frame_index", -1),
+                capture_ns=getattr(header, "capture_ns", 0),
                 send_ns=header.send_ns,
                 received_ns=item.received_ns,
                 handled_ns=None if handled is None else self._clock() if handled else 0,
@@ -284,11 +279,8 @@ class Reception:
         self.capture_clock.note(capture_ns, received_ns=received_ns)
         if was_sound and not self.capture_clock.is_sound:
             off_s = abs(received_ns - self.clock_offset.to_local_ns(capture_ns)) // SECOND_NS
-            self._note(
-                "warning",
-                f"the camera's clock is {off_s} s off: ages count from the arrival of pictures, and delays are not "
-                "known",
-            )
+            hence = "ages count from the arrival of pictures, and delays are not known"
+            self._note("warning", f"the camera's clock is {off_s} s off: {hence}")
 
     # What is known of it
 
@@ -298,16 +290,9 @@ class Reception:
         return self.capture_clock.is_sound and not self.lockstep
 
     @property
-    def newest_captured_ns(self) -> int | None:
-        """The capture time of the newest picture, this ground's clock; None before the first."""
-        if self._first_capture_ns is None:
-            return None
-        return self.capture_clock.to_local_ns(self.newest_capture_ns)
-
-    @property
     def duration_s(self) -> float:
         """From the first frame received to the last by their capture, with one frame's length."""
-        if self._first_capture_ns is None:
+        if not self.frames:
             return 0.0
         span_ns = max(0, self.newest_capture_ns - self._first_capture_ns)
         return span_ns / SECOND_NS + 1 / self._info.fps
@@ -330,8 +315,8 @@ class Reception:
 
     def traffic(self, now_ns: int) -> Traffic | None:
         """The link's load; None before the first access unit, and where none has come lately."""
-        fps = self._info.fps if self.last_status is None else self.last_status.coded_fps or self._info.fps
-        lately_ns = max(_LATELY_NS, round(_FRAMES_LATELY * SECOND_NS / fps))
+        coded_fps = 0.0 if self.last_status is None else self.last_status.coded_fps
+        lately_ns = max(_LATELY_NS, round(_FRAMES_LATELY * SECOND_NS / (coded_fps or self._info.fps)))
         return None if now_ns - self._base_ns > lately_ns else self._traffic
 
     def health(self, now_ns: int) -> Health | None:
@@ -358,7 +343,11 @@ class Reception:
             if self._reported_ns is None:
                 return True
             since_ns = now_ns - self._reported_ns
-            return since_ns >= _MOST_NS or (self._news and since_ns >= self._interval_ns(now_ns))
+            if since_ns >= _MOST_NS or self.lockstep or not self._news:
+                return since_ns >= _MOST_NS
+            self._forget(now_ns)
+            arriving = self._size_bytes / _RATE_OVER_NS
+            return arriving > 0 and since_ns >= max(_LEAST_NS, round(REPORT_LINE_BYTES / (_SHARE * arriving)))
 
     def feedback(self, *, send_ns: int, **of_receiver: Any) -> Feedback:
         """The report of now, with what is of all sessions; delays begin anew."""
@@ -391,15 +380,6 @@ class Reception:
                 delay_p50_ms=min(statistics.median(delays), _MOST_DELAY_MS) if delays else -1.0,
                 **of_receiver,
             )
-
-    def _interval_ns(self, now_ns: int) -> int:
-        if self.lockstep:
-            return _MOST_NS
-        self._forget(now_ns)
-        arriving = self._size_bytes / _RATE_OVER_NS
-        if arriving <= 0:
-            return _MOST_NS
-        return min(_MOST_NS, max(_LEAST_NS, round(REPORT_LINE_BYTES / (_SHARE * arriving))))
 
     def _miss(self, first: int, end: int, *, at_ns: int) -> None:
         # Of many, the newest count; what was sent before this ground was there is not missed.

@@ -82,8 +82,10 @@ def _delay_ms(percent: int) -> Any:
 
 
 def _picture_age_s(at: _Moment) -> float | None:
-    captured_ns = None if at.session.lockstep else at.session.reception.newest_captured_ns
-    return None if captured_ns is None else max(0.0, (at.now_ns - captured_ns) / SECOND_NS)
+    came = at.session.reception
+    if came.lockstep or not came.frames:
+        return None
+    return max(0.0, (at.now_ns - came.capture_clock.to_local_ns(came.newest_capture_ns)) / SECOND_NS)
 
 
 def _pose(at: _Moment) -> PoseState | None:

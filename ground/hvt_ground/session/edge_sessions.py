@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Self
 
 from hvt_common import __version__
 from hvt_common.protocol.clock_offset import ClockOffset
@@ -43,9 +44,6 @@ _BACKLOG_PAUSE_NS = 3 * SECOND_NS
 """After so long without another chunk the recording says how much of the backlog came."""
 _CLOCK_EVERY_NS = 20 * SECOND_NS
 """Time between two queries of the edge's clock."""
-_UNSEEN_NS, _UNSEEN = 15 * SECOND_NS, 3
-"""An edge that says for so long that it sends pictures, and so many of them, of which none comes. A keyframe is coded
-for less than a second of the rate: it takes so long on a link of a fifteenth of that."""
 _BURST, _EVERY_NS = 30, 5 * SECOND_NS
 """So many sessions begin at once, then one in so long: each is a file, and has a log of its own."""
 
@@ -54,19 +52,12 @@ class EdgeSessions:
     """Routes what comes to the session that is open; requests keyframes and lets the session report.
 
     Whatever goes wrong ends the session that is open, with its recording whole, and nothing else: another begins with
-    the next keyframe, after a pause that grows where it goes wrong again and again. For one thread; `EdgeThread` is
-    that of a ground.
+    the next keyframe, after a pause that grows where it goes wrong again and again. For one thread: that of `start`,
+    which no callback of the link waits for, or without it another's.
 
-    Args:
-        port: of the edge.
-        open_session: makes what the messages of a session go to.
-        on_ended: takes each session when it is closed; it is not remembered here.
-        clock: the port's, Unix nanoseconds without steps; one of its own by default.
-        recordings: of sessions that are over, closed with this; without it nothing of one is taken.
-        patience_s: an edge whose token is gone and that sends nothing for so long has ended without saying so.
-        ended_patience_s: how long the rest of a session may take to arrive after its edge has said that it ended.
-        pause: between a session that failed and the next.
-        versions: of the wire, that are read.
+    ``on_ended`` takes each session when it is closed. ``clock`` is Unix nanoseconds without steps. Without
+    ``recordings``, which are closed with this, nothing of a session that is over is taken. An edge without a token
+    that sends nothing for ``patience_s`` has ended; where it said so, the rest has ``ended_patience_s`` to arrive.
     """
 
     def __init__(
@@ -112,10 +103,48 @@ class EdgeSessions:
         self.ended = 0
         """Sessions that have ended."""
         self._part, self._video = f"session of {port.edge}", f"video of {port.edge}"
-        self._unseen: tuple[tuple[int, int], int, int] | None = None
-        """Of the first report since a picture came: its session and how many had come damaged, how many were sent by
-        then, and when it came."""
         self._unseen_failure = 0
+        self.error: BaseException | None = None
+        """The error that ended the thread."""
+        self._stopped_ns: int | None = None
+
+    def start(self, *, drain_s: float = 1.0) -> Self:
+        """Begin the thread. When it stops, what has already arrived is still taken in, for so long at the most."""
+        self._drain_ns = round(drain_s * SECOND_NS)
+        name = f"hvt-receive-{self.port.edge}"
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Begin to finish; `join` waits for it. Several threads finish in the time of one."""
+        if self._stopped_ns is None:
+            self._stopped_ns = time.monotonic_ns()
+            self.port.inbox.close()
+
+    def join(self, *, timeout_s: float = 4.0) -> bool:
+        """Finish what has arrived, close the session, join the thread; False where that took too long."""
+        self.stop()
+        self._thread.join(timeout_s)
+        return self.finished
+
+    @property
+    def finished(self) -> bool:
+        """Whether the thread has ended."""
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        inbox = self.port.inbox
+        log_fields(edge=self.port.edge)
+        try:
+            while self._stopped_ns is None or (
+                len(inbox) and time.monotonic_ns() - self._stopped_ns <= self._drain_ns
+            ):
+                item = inbox.get(timeout_s=0.05)
+                self.work(item, pending=len(inbox) > 0)
+            self.close()
+        except BaseException as error:  # noqa: BLE001 - handed to the app, which ends the process
+            self.error = error
 
     @property
     def idle(self) -> bool:
@@ -158,9 +187,12 @@ class EdgeSessions:
             self.port.request_keyframe()
             if session is not None:
                 session.note("warning", "the ground has asked for a keyframe")
-        if session is None:
-            self._end_unseen(silent=True)
-            return
+        if session is not None:
+            self._serve(session, now_ns)
+        elif self.receiver.silent_ns > self._patience_ns:
+            self._say_unseen(self.receiver.is_unseen(None, now_ns))
+
+    def _serve(self, session: Session, now_ns: int) -> None:
         if session.take_resumed():
             self.port.request_keyframe()
         session.worker.raise_error()
@@ -212,7 +244,6 @@ class EdgeSessions:
 
     def _route(self, packet: Arrival[Received] | Packet) -> None:
         if isinstance(packet, Arrival):
-            self._unseen = None
             self.failures.works(self._video)
             self._unseen_failure = 0
             self._base(packet)
@@ -222,7 +253,7 @@ class EdgeSessions:
         try:
             if isinstance(header, BacklogHeader):
                 self._backlog(header, item)
-            elif session is not None and _is_of(header, session.info.session_id):
+            elif session is not None and packet.is_of(session.info.session_id):
                 session.take(header, item)
                 if isinstance(header, Status) and header.state == "ended":
                     self._ended_ns = time.monotonic_ns()
@@ -231,7 +262,7 @@ class EdgeSessions:
             ):
                 self.receiver.hold(packet)  # it may overtake the first keyframe of its session
                 if isinstance(header, Status) and session is None:
-                    self._note_unseen(header, item.received_ns)
+                    self._say_unseen(self.receiver.is_unseen(header, item.received_ns))
             elif isinstance(header, TrackStep) and session is None:
                 pass  # who joins between two keyframes gets some; the next ones say all of it again
             else:
@@ -239,28 +270,16 @@ class EdgeSessions:
         except WireError as error:
             self.receiver.skip(row, error)
 
-    def _note_unseen(self, status: Status, now_ns: int) -> None:
-        of = status.session_id, self.receiver.stream.counters.corrupt
-        if status.state == "ended" or (self._unseen is not None and self._unseen[0] != of):
-            self._end_unseen()
-        if self._unseen is None:
-            self._unseen = of, status.base_messages, now_ns
-        _, sent, since_ns = self._unseen
-        unseen = now_ns - since_ns >= _UNSEEN_NS and status.base_messages - sent >= _UNSEEN
-        if unseen and not self._unseen_failure:
+    def _say_unseen(self, unseen: bool) -> None:  # noqa: FBT001 - an answer
+        if not unseen:
+            self.failures.over(self._video, self._unseen_failure)
+            self._unseen_failure = 0
+        elif not self._unseen_failure:
             self._unseen_failure = self.failures.failed(
                 self._video,
                 "the edge sends pictures, and only small messages come: something on the way drops large packets "
                 "(lower the MTU of the tunnel, docs/deployment.md), or the link is too slow for a picture",
             )
-
-    def _end_unseen(self, *, silent: bool = False) -> None:
-        # ``silent``: only if nothing comes at all.
-        if silent and self.receiver.silent_ns <= self._patience_ns:
-            return
-        self._unseen = None
-        self.failures.over(self._video, self._unseen_failure)
-        self._unseen_failure = 0
 
     def _base(self, arrival: Arrival[Received]) -> None:
         session_id = arrival.header.session_id
@@ -275,9 +294,8 @@ class EdgeSessions:
             if self.session is None:
                 self.receiver.stream.decoder_failed()  # the next keyframe is the next try
         session = self.session
-        if session is None or arrival.verdict not in ("decode", "skip"):
-            return
-        if session_id != session.info.session_id:
+        usable = arrival.verdict in ("decode", "skip")
+        if session is None or not usable or session_id != session.info.session_id:
             return
         if arrival.lost_before:
             lost = "1 picture was" if arrival.lost_before == 1 else f"{arrival.lost_before} pictures were"
@@ -293,11 +311,8 @@ class EdgeSessions:
         return header.frame_index > session.reception.newest_index
 
     def _backlog(self, header: BacklogHeader, item: Received) -> None:
-        if (
-            self.session is None
-            and header.session_id == self._lost_id
-            and self._pause.due(time.monotonic_ns())
-        ):
+        lost = self.session is None and header.session_id == self._lost_id
+        if lost and self._pause.due(time.monotonic_ns()):
             self._begin_session(header.session_id)
         session = self.session
         if session is None:
@@ -327,10 +342,8 @@ class EdgeSessions:
                 self.receiver.skip("info", WireError("the edge does not say what its session is"))
             return
         if not self._beginnings.take(self._clock()):
-            every_s = _EVERY_NS // SECOND_NS
-            self.receiver.skip(
-                "base", WireError(f"the edge begins sessions again and again: one in {every_s} s is shown")
-            )
+            text = f"the edge begins sessions again and again: one in {_EVERY_NS // SECOND_NS} s is shown"
+            self.receiver.skip("base", WireError(text))
             return
         self.port.used.set()
         self._next_clock_ns = time.monotonic_ns() + _CLOCK_EVERY_NS
@@ -384,60 +397,3 @@ class EdgeSessions:
             return not self.port.present.is_set() and self.receiver.silent_ns > self._patience_ns
         whole = session.reception.is_whole and not self.backlog.working
         return whole or now_ns - self._ended_ns > self._ended_patience_ns
-
-
-def _is_of(header: RoiHeader | TrackStep | PoseReport | Status, session_id: int) -> bool:
-    return header.is_of(session_id) if isinstance(header, PoseReport) else header.session_id == session_id
-
-
-class EdgeThread:
-    """The thread of one edge, which no callback of the link waits for.
-
-    When it stops, what has already arrived is still taken in, for ``drain_s`` at the most.
-    """
-
-    def __init__(self, sessions: EdgeSessions, *, drain_s: float = 1.0) -> None:
-        self.sessions = sessions
-        self._drain_ns = round(drain_s * SECOND_NS)
-        self.error: BaseException | None = None
-        """The error that ended the thread."""
-        self._inbox = sessions.port.inbox
-        self._stop = threading.Event()
-        self._stop_ns = 0
-        self._thread = threading.Thread(
-            target=self._run, name=f"hvt-receive-{sessions.port.edge}", daemon=True
-        )
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Begin to finish; `close` waits for it. Several threads finish in the time of one."""
-        if not self._stop.is_set():
-            self._stop_ns = time.monotonic_ns()
-            self._stop.set()
-            self._inbox.close()
-
-    @property
-    def ended(self) -> bool:
-        """Whether it has finished."""
-        return not self._thread.is_alive()
-
-    def close(self, *, timeout_s: float = 4.0) -> bool:
-        """Finish what has arrived, close the session, join the thread; False where that took too long."""
-        self.stop()
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
-
-    def _run(self) -> None:
-        log_fields(edge=self.sessions.port.edge)
-        try:
-            while not self._finished():
-                item = self._inbox.get(timeout_s=0.05)
-                self.sessions.work(item, pending=len(self._inbox) > 0)
-            self.sessions.close()
-        except BaseException as error:  # noqa: BLE001 - handed to the app, which ends the process
-            self.error = error
-
-    def _finished(self) -> bool:
-        if not self._stop.is_set():
-            return False
-        return len(self._inbox) == 0 or time.monotonic_ns() - self._stop_ns > self._drain_ns

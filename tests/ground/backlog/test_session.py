@@ -37,7 +37,7 @@ from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import ViewTilt
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
-from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
+from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.event_tables import SessionTiming, timing_table
@@ -121,7 +121,7 @@ class Rig:
             patience_s=patience_s,
             ended_patience_s=ended_patience_s,
         )
-        self.thread = EdgeThread(self.receiver, drain_s=PATIENT_S)
+        self.receiver.start(drain_s=PATIENT_S)
 
     def put_former(self, former: Flight, still: bytes) -> None:
         """A still of a former session, as its edge sends it."""
@@ -167,8 +167,10 @@ class Rig:
         self._wait_for(lambda: self.outputs.idle)
 
     def _wait_for(self, condition) -> None:
-        eventually(lambda: condition() or self.thread.error is not None or bool(self.receiver.failures.parts))
-        check(self.thread)
+        eventually(
+            lambda: condition() or self.receiver.error is not None or bool(self.receiver.failures.parts)
+        )
+        check(self.receiver)
 
     def base(self, *indices: int) -> None:
         """Access units as they come."""
@@ -196,7 +198,7 @@ class Rig:
         return self
 
     def __exit__(self, kind, *_) -> None:
-        end(self.thread, failing=kind is not None)
+        end(self.receiver, failing=kind is not None)
         self.outputs.close(within_s=60)
         assert all(one.working for one in self.failures.parts)
 
@@ -631,7 +633,7 @@ def test_damaged_and_foreign_pieces_are_counted_and_skipped(flight, tmp_path):
         garbage = video_object(flight, range(65, 70))
         noise = garbage.replace(flight.units[66].data, bytes(len(flight.units[66].data)))
         rig.put(*backlog(flight, "base", 65, noise))
-        assert rig.thread.error is None
+        assert rig.receiver.error is None
         assert rig.session.backlog.totals.frames == 1, "what follows a broken frame is no picture"
         assert rig.session.backlog.totals.left_out == 4
         third = flight.units[3].data
@@ -659,7 +661,7 @@ def test_the_last_moment_there_is_can_be_shown(flight, tmp_path, own):
             kept = still_object(sender, 12, sequence, **changes)
             rig.put(*chunks(sender.session_id, "still", sequence, kept))
         rig.base(*range(65, 75))
-        assert rig.thread.error is None
+        assert rig.receiver.error is None
         assert rig.session.frames_decoded == 35
     recording = Recording(tmp_path / ("0.rrd" if own else "backlog-0.rrd"))
     assert [(frame, at_ns) for frame, at_ns, _ in recording.video()][-2:] == [
@@ -893,8 +895,8 @@ def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path):
     rig.base(*range(65, 70))
     for item in backlog(flight, "base", 40, video_object(flight, range(40, 65))):
         rig.inbox.put(item)
-    assert rig.thread.close(timeout_s=200)
-    assert rig.thread.error is None
+    assert rig.receiver.join(timeout_s=200)
+    assert rig.receiver.error is None
     assert not rig.receiver.failures.parts
     rig.outputs.close(within_s=60)
     assert len(Recording(tmp_path / "0.rrd").video()) == 30 + 25

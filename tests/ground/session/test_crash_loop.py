@@ -24,7 +24,7 @@ from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import status_text, summary
-from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
+from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.session.subscribe import GroundLink
 from hvt_ground.sinks import Outputs
@@ -129,14 +129,13 @@ def served(link: GroundLink, folder: Path, ended: list[str], clock: Clock) -> It
         on_ended=note,
         recordings=BacklogRecordings(factory.open_backlog),
         clock=clock,
-    )
-    thread = EdgeThread(sessions)
+    ).start()
     try:
         yield sessions
     finally:
-        assert thread.close(timeout_s=PATIENT_S)
+        assert sessions.join(timeout_s=PATIENT_S)
         outputs.close()
-    assert thread.error is None
+    assert sessions.error is None
 
 
 @pytest.mark.nightly

@@ -17,7 +17,7 @@ from hvt_ground.events import Event, Overlay
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import completed, status_text, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
-from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
+from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -100,7 +100,7 @@ class Rig:
             pause=pause or RetryPause(first_ns=SECOND_NS // 50, longest_ns=SECOND_NS // 10),
             patience_s=patience_s,
         )
-        self.thread = EdgeThread(self.sessions)
+        self.sessions.start()
 
     def put(self, *indices: int) -> None:
         """Access units; returns when they are handled and analyzed."""
@@ -157,7 +157,7 @@ def test_an_edge_of_which_all_but_the_pictures_comes_is_named(flight, tmp_path, 
     assert all("only small messages come" in one.reason for one in rig.sessions.failures.now)
     rig.put(0, 1)
     assert "FAILED" not in rig.said
-    assert rig.thread.close()
+    assert rig.sessions.join()
 
 
 @pytest.mark.parametrize("how", ["ended", "damaged", "silent"])
@@ -173,7 +173,7 @@ def test_the_pictures_of_an_edge_fail_no_longer_than_it_sends_them(flight, tmp_p
     if how != "silent":
         rig.report(state="ended" if how == "ended" else "running")
     eventually(lambda: "FAILED" not in rig.said, what="it is over")
-    assert rig.thread.close()
+    assert rig.sessions.join()
 
 
 CAUSES = {
@@ -209,8 +209,8 @@ def test_a_session_that_fails_ends_alone_and_begins_anew(flight, tmp_path, caplo
     assert rig.decoded[1] == 30, "from the next keyframe on"
     assert rig.sessions.failures.parts[0].working
     for one in (rig, neighbour):
-        assert one.thread.close(timeout_s=60)
-        assert one.thread.error is None
+        assert one.sessions.join(timeout_s=60)
+        assert one.sessions.error is None
     lines = [one.getMessage() for one in caplog.records if one.levelno >= logging.WARNING]
     assert [one for one in lines if "all else goes on" in one] == [
         f"session of uav-1: {CAUSES[cause]}; all else goes on, and it is tried again"
@@ -266,7 +266,7 @@ def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path,
     assert consumer.tried == 2
     assert rig.decoded == [4]
     assert rig.sessions.failures.parts[0].working
-    assert rig.thread.close(timeout_s=60)
+    assert rig.sessions.join(timeout_s=60)
     assert sum("all else goes on" in one.getMessage() for one in caplog.records) == 1
 
 
@@ -276,7 +276,7 @@ def test_what_waits_behind_a_hole_is_received_though_nothing_more_comes(flight, 
     rig.put(0, 1, 3)
     session = rig.sessions.session
     eventually(lambda: session.reception.frames == 3, what="the one behind the hole is received")
-    assert rig.thread.close(timeout_s=60)
+    assert rig.sessions.join(timeout_s=60)
 
 
 def test_a_flight_that_has_ended_holds_no_place(tmp_path):
@@ -284,6 +284,6 @@ def test_a_flight_that_has_ended_holds_no_place(tmp_path):
     rig = Rig(Flight(1), Consumer(tmp_path))
     rig.put(0)
     assert rig.port.used.is_set()
-    rig.thread.close()
+    rig.sessions.join()
     assert rig.decoded == [1]
     assert not rig.port.used.is_set()

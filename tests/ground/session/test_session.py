@@ -21,7 +21,7 @@ from hvt_ground.perception.models import DetectorThread
 from hvt_ground.perception.worker import LockstepWorker
 from hvt_ground.report.status import completed, summary, table
 from hvt_ground.session.edge_port import ReceiverReports
-from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
+from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import Session
 from programs.processes import PATIENT_S, eventually
 from rigs.flight import Flight, Port, RedSquares, SameAnswer, patient_worker, pipeline_of, square_box
@@ -44,7 +44,7 @@ class Rig:
         self.receiver = EdgeSessions(
             self.port, open_session=self._open, on_ended=self.ended.append, clock=clock, **patience
         )
-        self.thread = EdgeThread(self.receiver, drain_s=PATIENT_S)
+        self.receiver.start(drain_s=PATIENT_S)
 
     def _open(self, info: Info, reports: ReceiverReports) -> Session:
         session = Session(
@@ -69,18 +69,18 @@ class Rig:
         eventually(lambda: self.inbox.handled or self.broken)
         for session in self.opened:
             eventually(lambda one=session: one.idle or self.broken)
-        check(self.thread)
+        check(self.receiver)
 
     @property
     def broken(self) -> bool:
         """Whether the thread or one of its sessions failed."""
-        return self.thread.error is not None or bool(self.receiver.failures.parts)
+        return self.receiver.error is not None or bool(self.receiver.failures.parts)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind, *_) -> None:
-        end(self.thread, failing=kind is not None)
+        end(self.receiver, failing=kind is not None)
 
 
 @pytest.fixture(scope="module")
@@ -672,7 +672,7 @@ def test_closing_keeps_what_has_arrived_and_ends(flight):
     rig.put(flight.base(0))
     eventually(lambda: bool(rig.opened))
     rig.put(*bases(flight, *range(1, 30)))
-    assert rig.thread.close(timeout_s=60)
+    assert rig.receiver.join(timeout_s=60)
     (session,) = rig.ended
     assert session.frames_decoded == 30
     assert session.reception.analyzed[0] == 29

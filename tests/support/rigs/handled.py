@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 
 from hvt_common.transport.inbox import Inbox, Received
-from hvt_ground.session.edge_sessions import EdgeThread
+from hvt_ground.session.edge_sessions import EdgeSessions
 
 
 class WatchedInbox(Inbox):
@@ -34,15 +34,15 @@ class WatchedInbox(Inbox):
         return super().get(timeout_s=timeout_s)
 
 
-def check(thread: EdgeThread) -> None:
+def check(edge: EdgeSessions) -> None:
     """Raise what ended the thread, or one of its sessions."""
-    if thread.error is not None:
-        raise thread.error
-    assert not thread.sessions.failures.parts
+    if edge.error is not None:
+        raise edge.error
+    assert not edge.failures.parts
 
 
-def end(thread: EdgeThread, *, failing: bool) -> None:
+def end(edge: EdgeSessions, *, failing: bool) -> None:
     """Close it, and check it; ``failing``: the test has failed already, and that is what is to be seen."""
-    assert thread.close(timeout_s=60), "the thread of the edge did not end"
+    assert edge.join(timeout_s=60), "the thread of the edge did not end"
     if not failing:
-        check(thread)
+        check(edge)

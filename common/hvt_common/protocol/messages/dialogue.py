@@ -151,9 +151,9 @@ class Feedback(Message):
     roi_messages: int = wire_field(_COUNT)
     roi_bytes: int = wire_field(_COUNT)
     lost: int = wire_field(_COUNT)
-    """Messages of base and roi that were not received."""
+    """Messages of base that were not received."""
     corrupt: int = wire_field(_COUNT)
-    """Messages that came and could not be used."""
+    """Messages of base that came damaged."""
     base_sequence: int = wire_field(Int(-1, U32))
     """The highest of ``base`` received; -1 for none. With the next field, it drives the edge's rate control."""
     base_held_us: int = wire_field(Int(0, U32))
