@@ -156,11 +156,3 @@ def test_make_targets_exist() -> None:
     named = {target for name in DOCUMENTS for target in re.findall(r"`make ([a-z-]+)\b", _text(name))}
     assert len(named) >= 5
     assert named <= targets
-
-
-def test_the_documented_configuration_is_the_sample() -> None:
-    """Numbers of the text that follow from the sample file have to follow it when it changes."""
-    sample = _text("deploy/config/edge.toml")
-    assert 'budget = "250kbps"' in sample
-    assert 'profile = "auto"\n' in sample
-    assert "`--budget 250kbps`" in _text("docs/deployment.md")

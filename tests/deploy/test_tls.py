@@ -210,12 +210,3 @@ def test_a_ground_with_keys_may_listen_beyond_this_machine(fleet: Fleet, free_po
     """With keys --insecure must not be needed, or everybody would set it."""
     with open_session(fleet.settings("base", "ground", listen=(f"tls/0.0.0.0:{free_port}",))):
         pass
-
-
-def test_without_keys_only_loopback(free_port: int) -> None:
-    """What nobody has thought about must not be open to a network."""
-    with (
-        pytest.raises(UserError, match=r"without keys .* accept it with --insecure"),
-        open_session(LinkSettings("ground", listen=(f"tcp/0.0.0.0:{free_port}",))),
-    ):
-        pass

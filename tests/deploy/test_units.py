@@ -138,17 +138,6 @@ def test_systemd_accepts_the_units(installed: list[str]) -> None:
     assert found.returncode == 0, found.stderr
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
-def test_systemd_finds_a_misspelt_option(installed: list[str]) -> None:
-    """Shows that the test above can fail."""
-    broken = Path(installed[-1])
-    broken.write_text(broken.read_text().replace("NoNewPrivileges", "NoNewPrivilege"))
-    found = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", str(broken)], capture_output=True, text=True, check=False
-    )
-    assert "NoNewPrivilege" in found.stderr
-
-
 # The sample configurations, read by what will read them.
 
 

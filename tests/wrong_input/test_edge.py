@@ -45,71 +45,6 @@ def test_a_source_that_is_not_there(edge, source, accepted):
     assert accepted in sentence
 
 
-@pytest.mark.parametrize("content", [b"", b"no video, only words\n" * 50, b"\x00\x01\x02garbage" * 99])
-def test_a_file_that_is_no_video(edge, here, content):
-    """The wrong file of a folder would crash the decoder."""
-    Path("notes.mp4").write_bytes(content)
-    sentence = edge(source="notes.mp4")
-    assert "'notes.mp4'" in sentence
-    assert "accepted is" in sentence
-
-
-def test_a_folder_without_pictures(edge, here):
-    """An empty card would look like a broken program."""
-    Path("empty").mkdir()
-    sentence = edge(source="empty")
-    assert "'empty'" in sentence
-    assert "jpg" in sentence
-
-
-def test_a_folder_of_pictures_that_cannot_be_read(edge, here):
-    """A card that was pulled out too early would look like a broken program."""
-    Path("broken").mkdir()
-    Path("broken/1.jpg").write_bytes(b"\xff\xd8\xff nothing")
-    assert "'broken'" in edge(source="broken")
-
-
-# Where the camera is
-
-
-@pytest.mark.parametrize(
-    ("pose", "told"),
-    [
-        ("mavlink:udpin:127.0.0.1:99999", "port 99999, accepted is 1 to 65535"),
-        ("mavlink:tcp:127.0.0.1:99999", "port 99999, accepted is 1 to 65535"),
-        ("mavlink:/dev/null", "cannot be opened"),
-        ("mavlink:smoke", "mavlink:udpin:HOST:PORT"),
-        ("x" * 5000, "accepted is FILE.csv"),
-        ("pictures", "accepted is FILE.csv"),
-        ("fixed:1,2,3", "fixed:LAT,LON,HEIGHT,AZIMUTH,TILT"),
-    ],
-)
-def test_a_pose_that_is_not_there(edge, pose, told):
-    """A flight would be lost to a typing mistake, with a traceback for an answer."""
-    if pose.startswith("mavlink:"):
-        pytest.importorskip("pymavlink")
-    sentence = edge("--pose", pose)
-    assert f"--pose {pose:.100}" in sentence
-    assert told in sentence
-    assert len(sentence) < 600
-
-
-@pytest.mark.parametrize(
-    ("file", "text", "told"),
-    [
-        ("p.csv", f"time_s,latitude_deg,longitude_deg\n0,1,{'2' * 200_000}\n", "is no table"),
-        ("p.csv", "time_s,latitude_deg,longitude_deg,position_error_m\n0,1,2,-5\n", "position_error_m is -5"),
-        ("p.srt", f"1\n{'9' * 5000}:00:00,000 --> 00:00:01,000\n[latitude: 1] [longitude: 2]\n", "no row"),
-    ],
-)
-def test_a_file_of_poses_that_is_wrong(edge, here, file, text, told):
-    """The same for a damaged file."""
-    Path(file).write_text(text)
-    sentence = edge("--pose", file)
-    assert f"pose file {file}" in sentence
-    assert told in sentence
-
-
 # Numbers and words
 
 
@@ -184,6 +119,8 @@ def test_a_value_that_is_not_accepted(edge, flag, value, accepted):
         ),
         *((words, [words.split()[0], "--help"]) for words in ("--bogus", "stray", "--budgit 1M", "--bud 1M")),
         ("--budget", ["--budget"]),
+        ("--pose pictures", ["--pose pictures", "accepted is FILE.csv"]),
+        ("--pose fixed:1,2,3", ["--pose fixed:1,2,3", "fixed:LAT,LON,HEIGHT,AZIMUTH,TILT"]),
         ("--truth truth.txt --summary s.json --record-base b.mkv", ["--truth truth.txt", "demo"]),
         *((f"--zenoh-config {file}", [file]) for file in ("missing.json5", "pictures")),
         *((f"{flag} smoke/x:1", ["'smoke/x:1'", "PROTOCOL/HOST:PORT"]) for flag in ("--connect", "--listen")),

@@ -10,7 +10,7 @@ import pytest
 from hvt_archive.replay.message_log import MessageLog
 from hvt_common.redaction import redacted
 from hvt_common.transport.inbox import Received
-from media.onnx_models import colour_classifier, colour_detector
+from media.onnx_models import colour_classifier
 
 
 @pytest.fixture
@@ -136,14 +136,6 @@ def test_a_classifier_with_no_class_in_common(ground, tmp_path):
     sentence = ground("--classifier", str(fruit), "--labels", str(names))
     assert f"--classifier {fruit} has no class in common with --detector aerial-nano" in sentence
     assert "apple, pear, plum; tracks are car, van" in sentence
-
-
-def test_a_detector_whose_own_threshold_makes_no_sense(ground, tmp_path):
-    """Everything, or nothing, would be an object."""
-    path = colour_detector(tmp_path / "d.onnx", "yolox", metadata={"hvt.confidence": "high"})
-    sentence = ground("--detector", str(path))
-    assert f"{path} has hvt.confidence 'high'" in sentence
-    assert "0.01 to 1" in sentence
 
 
 def test_types_without_anybody_to_tell_and_types_that_are_none(ground):

@@ -223,13 +223,6 @@ def test_the_real_network_knows_a_flower_and_a_dragonfly(data: Path) -> None:
     assert blank.entropy_nats > 3 * max(flower.entropy_nats, dragonfly.entropy_nats)
 
 
-@pytest.mark.realdata
-def test_a_real_detector_is_no_classifier(data: Path) -> None:
-    """Swapping the two model options would go unnoticed."""
-    with pytest.raises(UserError, match="is not a classifier"):
-        open_classifier(str(data / "models/yolox_nano.onnx"))
-
-
 def test_of_several_outputs_the_names_tell_which(tmp_path: Path) -> None:
     """A network that names kind and colour would call every car red, or the reverse."""
     path = constant_model(tmp_path / "c.onnx", np.array([[0.1, 0.9]]), np.array([[0.2, 0.3, 0.5]]))

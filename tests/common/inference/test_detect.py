@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import OnnxDetector, detect_every, detect_still_every, open_detector
-from hvt_common.inference.heads.choose import anchor_count
 from hvt_common.inference.heads.contract import YoloxCells
 from hvt_common.inference.letterbox import Letterbox, Letterboxer, Preparation, as_bgr
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
@@ -136,12 +135,6 @@ def test_broken_numbers_never_become_detections(tmp_path: Path) -> None:
     rows = empty(9, 6)
     rows[0, :, 2:] = [5, 5, 0.9, np.nan]
     assert len(Listed(0, 4, 5)([rows], confidence=0.25, input_size=(64, 64)).scores) == 0
-
-
-def test_cells_are_counted_by_stride() -> None:
-    """A YOLOX model would be read as an Ultralytics one, or the reverse."""
-    assert anchor_count((640, 640), STRIDES) == 8400
-    assert anchor_count((1280, 736), STRIDES) == 19320
 
 
 # --- letterbox -----------------------------------------------------------------------------------------------------
@@ -524,40 +517,6 @@ def test_real_models_agree_with_a_plain_decode(data: Path, name: str, size: tupl
     for box, score, class_id in expected:
         same = (np.abs(found.confidences - score) < 2e-3) & (found.class_ids == class_id)
         assert np.abs(found.boxes_xyxy_px[same] - box).max(axis=1).min() < 1.0
-
-
-@pytest.mark.realdata
-@pytest.mark.parametrize(
-    ("name", "size", "least"),
-    [
-        ("yolox_nano", None, 0.4),
-        ("yolov5su_visdrone_640", None, 0.55),
-        ("yolov5su_visdrone_736x1280", None, 0.75),
-    ],
-)
-def test_real_models_find_the_cars_of_the_annotation(
-    data: Path, name: str, size: tuple[int, int] | None, least: float
-) -> None:
-    """The product would stand on a detector that does not see cars."""
-    image, annotation = street(data)
-    rows = np.loadtxt(annotation, delimiter=",", usecols=range(8))
-    truth = rows[np.isin(rows[:, 5], (4, 5)) & (rows[:, 4] == 1), :4]
-    truth[:, 2:] += truth[:, :2]
-    labels = Path("coco") if name == "yolox_nano" else None
-    detector = open_detector(str(data / f"models/{name}.onnx"), confidence=0.25, size=size, labels=labels)
-    found = detector.detect(image)
-    names = np.array(detector.class_names)[found.class_ids]
-    cars = found.boxes_xyxy_px[np.isin(names, ("car", "van", "truck", "bus"))]
-    recall = (iou(truth, cars).max(axis=1) >= 0.5).mean()
-    print(f"{name}: {len(truth)} cars, recall {recall:.3f}, {len(cars)} found")
-    assert recall >= least
-
-
-@pytest.mark.realdata
-def test_the_real_classifier_is_no_detector(data: Path) -> None:
-    """Swapping the two model options would be noticed only by an empty recording."""
-    with pytest.raises(UserError, match=r"probs \(\?, 1001\) float32; logits \(\?, 1001\) float32"):
-        open_detector(str(data / "models/mobilenet_v2_imagenet.onnx"))
 
 
 @pytest.mark.parametrize(("fps", "every"), [(0.5, 1), (2, 1), (5, 2), (10, 3), (15, 5), (60, 5)])

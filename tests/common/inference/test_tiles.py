@@ -14,7 +14,6 @@ from hvt_common.inference.tiles import (
     TiledDetector,
     auto_grid,
     parse_tiles,
-    searches_scale,
     tile_boxes,
     tiled,
 )
@@ -181,17 +180,3 @@ def test_on_real_small_objects_tiles_find_more(data):
         return float((iou(detector.detect(high).boxes_xyxy_px, truth).max(axis=0) > 0.5).mean())
 
     assert recall(tiled(whole, "auto")) > 3 * recall(whole) > 0.2
-
-
-@pytest.mark.parametrize(
-    ("tiles", "pace", "searches"),
-    [
-        ("auto", "realtime", True),
-        ("auto", "lockstep", False),
-        ("search", "lockstep", True),
-        ("off", "realtime", False),
-    ],
-)
-def test_the_scale_is_found_in_real_time_and_where_it_is_wanted(tiles, pace, searches):
-    """A study that is repeated would have other figures."""
-    assert searches_scale(tiles, pace=pace) is searches

@@ -7,21 +7,12 @@ import io
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image as Pillow
 
 from hvt_common.video.still_codecs import JpegCodec, StillError
-from hvt_common.video.still_codecs.jpeg import jpeg_size
+from media.crops import textured
 
 CODEC = JpegCodec()
-
-
-def textured(width: int, height: int, *, seed: int = 0) -> np.ndarray:
-    """A smooth random picture."""
-    rng = np.random.default_rng(seed)
-    coarse = rng.integers(0, 256, (max(2, height // 6), max(2, width // 6), 3), dtype=np.uint8)
-    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
 
 
 def coded(crop: np.ndarray, quality_pct: int = 65) -> bytes:
@@ -59,41 +50,6 @@ def test_real_crops_cost_and_look_like_pillow(data):
     assert len(coded(crop)) == pytest.approx(len(reference), rel=0.01)
     ours, theirs = (CODEC.decode(data, size=(200, 160)) for data in (coded(crop), reference))
     assert psnr(ours, crop) == pytest.approx(psnr(theirs, crop), abs=0.1)
-
-
-@given(
-    width=st.integers(1, 90), height=st.integers(1, 90), quality=st.integers(1, 100), seed=st.integers(0, 9)
-)
-@settings(max_examples=60, deadline=None)
-def test_every_crop_comes_back_in_its_size(width, height, quality, seed):
-    """A crop of an odd size would fail at the ground, or come back as another picture."""
-    crop = textured(width, height, seed=seed)
-    data = coded(crop, quality)
-    assert jpeg_size(data) == (width, height)
-    back = CODEC.decode(data, size=(width, height))
-    assert back.shape == crop.shape
-    assert back.dtype == np.uint8
-    if quality >= 90 and min(width, height) >= 16:
-        assert psnr(back, crop) > 25
-
-
-def test_a_bomb_is_refused_before_it_is_decoded():
-    """One message of 20 bytes more than a header would make the ground allocate 12 GB."""
-    data = bytearray(coded(textured(32, 32)))
-    at = data.index(b"\xff\xc0")
-    data[at + 5 : at + 9] = b"\xff\xff\xff\xff"
-    assert jpeg_size(bytes(data)) == (65535, 65535)
-    with pytest.raises(StillError, match="65535x65535 in place of 32x32"):
-        CODEC.decode(bytes(data), size=(32, 32))
-
-
-@pytest.mark.parametrize("size", [(31, 20), (30, 19), (20, 30)])
-def test_another_size_than_announced_is_refused(size):
-    """A still would be stretched over its box, or laid on its side."""
-    data = coded(textured(30, 20))
-    assert CODEC.decode(data, size=(30, 20)).shape == (20, 30, 3)
-    with pytest.raises(StillError):
-        CODEC.decode(data, size=size)
 
 
 def _foreign() -> dict[str, bytes]:

@@ -156,15 +156,6 @@ def test_a_wrong_file_is_refused_in_a_sentence(tmp_path, capsys):
     assert f"--terrain {wrong} is no elevation model" in capsys.readouterr().err
 
 
-def test_a_picture_without_coordinates_is_refused(tmp_path):
-    """It would lie at 0, 0."""
-    path = tmp_path / "plain.tif"
-    with rasterio.open(path, "w", driver="GTiff", width=8, height=8, count=1, dtype="float32") as file:
-        file.write(np.zeros((8, 8), np.float32), 1)
-    with pytest.raises(UserError, match="does not say where it lies"):
-        ElevationModel(path)
-
-
 @pytest.mark.parametrize("height_m", [0.5, 2.0, 3.0])
 @pytest.mark.parametrize("said", ["altitude", "height"])
 def test_a_camera_that_is_hardly_above_the_ground_ends_no_session(tmp_path, height_m, said):
@@ -215,6 +206,7 @@ def test_what_a_mask_leaves_out_is_a_hole(tmp_path):
         ({"crs": MOON}, "is no elevation model that can be read"),
         ({"crs": PLAN}, "has neither degrees nor the coordinates of a map"),
         ({"crs": "EPSG:4978"}, "has neither degrees nor the coordinates of a map"),
+        ({"crs": None}, "does not say where it lies"),
         ({"crs": "EPSG:4326", "transform": rasterio.Affine.identity()}, "does not say where it lies"),
     ],
 )

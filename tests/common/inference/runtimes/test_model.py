@@ -69,12 +69,6 @@ def test_a_network_of_a_study_gives_way_to_nobody(tmp_path: Path) -> None:
     assert threading.active_count() <= before
 
 
-def test_free_sizes_are_none(tmp_path: Path) -> None:
-    """A model of any size would be taken for one of a fixed size."""
-    model = open_model(colour_detector(tmp_path / "m.onnx", "yolox", size=None))
-    assert model.inputs[0].shape == (1, 3, None, None)
-
-
 def test_what_is_no_model_is_refused_in_one_sentence(tmp_path: Path) -> None:
     """A user who mistypes a path would read a traceback of onnxruntime."""
     good = constant_model(tmp_path / "good.onnx", np.ones((1, 2))).read_bytes()
@@ -113,48 +107,9 @@ def test_damaged_models_are_refused_or_open_but_never_crash(
     path = tmp_path / "m.onnx"
     content = bytearray(constant_model(path, np.ones((1, 2))).read_bytes())
     content[place % len(content)] = byte
-    path.write_bytes(bytes(content[: len(content) - cut % 60]))
+    path.write_bytes(bytes(content[: len(content) - cut % len(content)]))
     with contextlib.suppress(UserError):
         assert open_model(path, settings=ModelSettings(threads=1)).path == path
-
-
-@pytest.mark.parametrize("location", ["../weights.bin", "/etc/hostname"])
-def test_weights_outside_the_folder_of_the_model_are_refused(tmp_path: Path, location: str) -> None:
-    """A model from elsewhere could read any file of the user's."""
-    folder = tmp_path / "models"
-    folder.mkdir()
-    (tmp_path / "weights.bin").write_bytes(np.ones(4, np.float32).tobytes())
-    weights = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[4], data_location=TensorProto.EXTERNAL)
-    weights.external_data.add(key="location", value=location)
-    value = helper.make_tensor_value_info
-    graph = helper.make_graph(
-        [helper.make_node("Add", ["x", "w"], ["y"])],
-        "external",
-        [value("x", TensorProto.FLOAT, [4])],
-        [value("y", TensorProto.FLOAT, [4])],
-        [weights],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    (folder / "m.onnx").write_bytes(model.SerializeToString())
-    with pytest.raises(UserError, match=r"m\.onnx cannot be opened"):
-        open_model(folder / "m.onnx")
-
-
-def test_an_operator_of_a_foreign_library_is_refused(tmp_path: Path) -> None:
-    """A model that needs custom code must say so when it is opened, not in flight."""
-    value = helper.make_tensor_value_info
-    graph = helper.make_graph(
-        [helper.make_node("Secret", ["x"], ["y"], domain="elsewhere")],
-        "custom",
-        [value("x", TensorProto.FLOAT, [4])],
-        [value("y", TensorProto.FLOAT, [4])],
-    )
-    opsets = [helper.make_opsetid("", 13), helper.make_opsetid("elsewhere", 1)]
-    (tmp_path / "m.onnx").write_bytes(
-        helper.make_model(graph, opset_imports=opsets, ir_version=8).SerializeToString()
-    )
-    with pytest.raises(UserError, match=r"cannot be opened: .*elsewhere"):
-        open_model(tmp_path / "m.onnx")
 
 
 def test_an_input_of_the_wrong_shape_is_a_sentence(tmp_path: Path) -> None:
@@ -334,19 +289,6 @@ def test_a_model_is_read_as_onnx_whatever_its_name_ends_in(tmp_path):
         b"\x80\x04\x95\x1d\x00\x00\x00\x00\x00\x00\x00\x8c\x02os\x8c\x06system\x93\x8c\x04true\x85R."
     )
     assert "is not an ONNX file" in sentence(pickled)
-
-
-def test_every_truncation_of_a_model_is_refused_or_opens(tmp_path):
-    """A download that broke off would end the process."""
-    whole = adding(tmp_path, weight("w"), where="branch").read_bytes()
-    path, refused = tmp_path / "cut.onnx", 0
-    for length in range(len(whole)):
-        path.write_bytes(whole[:length])
-        try:
-            open_model(path, settings=ONE_THREAD)
-        except UserError:
-            refused += 1
-    assert refused > 0.9 * len(whole)
 
 
 def test_messages_nested_without_end_are_refused(tmp_path):

@@ -15,36 +15,42 @@ from programs.processes import PATIENT_S
 class Autopilot:
     """Packs what an autopilot says several times a second, as MAVLink 2 unless it is asked for 1."""
 
-    def __init__(self, *, system: int = 1, version: int = 2) -> None:
+    def __init__(self, *, system: int = 1, component: int = 1, version: int = 2) -> None:
         from pymavlink.dialects.v20 import ardupilotmega
 
-        self._mav = ardupilotmega.MAVLink(None, srcSystem=system, srcComponent=1)
+        self._mav = ardupilotmega.MAVLink(None, srcSystem=system, srcComponent=component)
         self._is_old = version == 1
 
-    def _pack(self, message) -> bytes:
+    def say(self, kind: str, *values) -> bytes:
+        """Any message."""
+        message = getattr(self._mav, f"{kind}_encode")(*values)
         return bytes(message.pack(self._mav, force_mavlink1=self._is_old))
 
     def heartbeat(self) -> bytes:
         """It is there."""
-        return self._pack(self._mav.heartbeat_encode(6, 8, 0, 0, 0))
+        return self.say("heartbeat", 6, 8, 0, 0, 0)
 
-    def place(self, latitude: float = 47.1) -> bytes:
+    def place(self, latitude: float = 47.1, longitude: float = 8.5) -> bytes:
         """Where it is."""
-        return self._pack(
-            self._mav.global_position_int_encode(
-                1000, round(latitude * 1e7), round(8.5 * 1e7), 550_000, 120_000, 0, 0, 0, 9000
-            )
-        )
+        at = (round(latitude * 1e7), round(longitude * 1e7))
+        return self.say("global_position_int", 1000, *at, 550_000, 120_000, 0, 0, 0, 9000)
 
     def attitude(self, yaw_deg: float = 80.0) -> bytes:
         """Where it flies."""
-        return self._pack(
-            self._mav.attitude_encode(1000, math.radians(3), math.radians(-2), math.radians(yaw_deg), 0, 0, 0)
-        )
+        turn = (math.radians(3), math.radians(-2), math.radians(yaw_deg))
+        return self.say("attitude", 1000, *turn, 0, 0, 0)
+
+    def fix(self, kind: int) -> bytes:
+        """What its receiver says."""
+        return self.say("gps_raw_int", 0, kind, 0, 0, 0, *([65535] * 4), 0, 0, 0, 0)
 
     def mount(self) -> bytes:
         """Where the camera points, 10 degrees to the right of the nose."""
-        return self._pack(self._mav.mount_orientation_encode(1000, 0.0, -60.0, 10.0, 0.0))
+        return self.say("mount_orientation", 1000, 0.0, -60.0, 10.0, 0.0)
+
+    def old_mount(self) -> bytes:
+        """30 degrees to the right, in hundredths of a degree."""
+        return self.say("mount_status", 0, 0, -4500, 0, 3000)
 
     def gimbal(self, yaw_deg: float, pitch_deg: float, *, flags: int) -> bytes:
         """The same as a quaternion."""
@@ -55,9 +61,7 @@ class Autopilot:
             math.cos(yaw) * math.sin(pitch),
             math.sin(yaw) * math.cos(pitch),
         )
-        return self._pack(
-            self._mav.gimbal_device_attitude_status_encode(0, 0, 1000, flags, q, 0, 0, 0, 0, 0, 0, 0)
-        )
+        return self.say("gimbal_device_attitude_status", 0, 0, 1000, flags, q, 0, 0, 0, 0, 0, 0, 0)
 
 
 @pytest.fixture

@@ -78,17 +78,6 @@ def test_subtitles_with_a_long_word_are_read_as_any_others(tmp_path):
     assert at(file, 0.0).latitude_deg == 47.3769
 
 
-def test_a_yaw_a_hair_below_north_is_north(tmp_path):
-    """The ground would refuse a report of 360 degrees."""
-    file = tmp_path / "north.csv"
-    file.write_text(
-        f"{PLACE},camera_yaw_deg,camera_pitch_deg,yaw_deg,pitch_deg\n0,1,2,-1e-17,-90,-1e-17,0\n",
-        encoding="utf-8",
-    )
-    pose = at(file, 0.0)
-    assert (pose.camera.yaw_deg, pose.platform.yaw_deg) == (0.0, 0.0)
-
-
 def test_errors_of_a_centimetre_are_taken(tmp_path):
     """A receiver that is as good as that would count for no more than any other."""
     file = tmp_path / "rtk.csv"
@@ -219,14 +208,13 @@ def test_a_wrong_file_is_named_with_what_is_wrong(tmp_path, name, text, says):
 )
 def test_what_is_no_pose_is_refused_in_a_sentence(spec, says):
     """A flight would begin, and its map stay empty."""
-    with pytest.raises(UserError, match=says):
+    with pytest.raises(UserError, match=says) as refused:
         open_pose(spec, hfov_deg=None, clock=lambda: 0)
+    assert len(str(refused.value)) < 600
 
 
 def test_a_fixed_camera_is_where_it_was_put():
     """North and height would be mixed up."""
-    north = open_pose("fixed:1,2,3,-1e-17,-30", hfov_deg=80, clock=lambda: 0).at(0, capture_ns=5)
-    assert north.camera.yaw_deg == 0.0
     pose = open_pose("fixed:52.5,13.4,12,-90,-30", hfov_deg=80, clock=lambda: 0).at(0, capture_ns=5)
     assert pose is not None
     assert (pose.latitude_deg, pose.longitude_deg, pose.height_m, pose.hfov_deg) == (52.5, 13.4, 12, 80)

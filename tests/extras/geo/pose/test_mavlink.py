@@ -85,15 +85,6 @@ def test_a_gimbal_that_does_not_know_hides_no_mount(source, send, autopilot, wai
     assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((60, -60), abs=0.01)
 
 
-@pytest.mark.parametrize("yaw", [33.0, 90.0, 200.0])
-def test_a_camera_that_looks_straight_down_still_has_a_direction(source, send, autopilot, wait_for, yaw):
-    """The survey flight, which looks straight down, would have its picture turned at random."""
-    one = autopilot()
-    send(one.place(), one.attitude(), one.gimbal(yaw, -90, flags=64))
-    pose = wait_for(source, accept=has_camera)
-    assert (pose.camera.yaw_deg, pose.camera.pitch_deg) == pytest.approx((yaw, -90), abs=0.01)
-
-
 def test_an_old_device_that_speaks_first_hides_nothing(source, send, autopilot, wait_for, monkeypatch):
     """One part that speaks MAVLink 1 would take the gimbal away, whose message only MAVLink 2 has."""
     monkeypatch.delenv("MAVLINK20", raising=False)
