@@ -27,6 +27,7 @@ from hvt_ground.sinks import QueuedSink, SinkWriter
 _log = logging.getLogger(__name__)
 
 _POLL_S = 60.0
+_AGAIN_NS = 3600 * SECOND_NS
 _END_S = 3.0
 _SET_NS = 10 * SECOND_NS
 _DOUBT_NS = 3600 * SECOND_NS
@@ -60,8 +61,8 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         self._since_boot = since_boot
         self._doubted_ns: int | None = None
         """When the clock was found to have been set, by ``since_boot``."""
-        self._refused: set[str] = set()
-        """Files that could not be removed or stripped: said once."""
+        self._refused: dict[str, int] = {}
+        """Files that could not be removed or stripped, and when that was tried last (steady time): said once."""
         self._index = Index(folder)
         try:
             now = self._pass_time()
@@ -135,7 +136,11 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
         if self._doubted_ns is not None and now.steady_ns - self._doubted_ns < _DOUBT_NS:
             return
         any(self._remove(name, "it is older than --keep allows") for name in found.outdated)
-        any(self._strip(rows[name]) for name in found.strip)
+        any(self._strip(rows[name]) for name in found.strip if self._may_try(name, now))
+
+    def _may_try(self, name: str, now: Moment) -> bool:
+        # A file of which nothing can be read takes seconds each time; room on the disk may come back.
+        return now.steady_ns - self._refused.get(name, now.steady_ns - _AGAIN_NS) >= _AGAIN_NS
 
     def _remove(self, name: str, why: str) -> bool:
         if not self._done(name, "removed", (self._folder / name).unlink):
@@ -160,8 +165,8 @@ class IndexWriter(SinkWriter[RecordingRow | None]):
                 do()
         except (OSError, UserError, subprocess.SubprocessError) as error:
             if name not in self._refused:
-                self._refused.add(name)
                 _log.warning("recording %s cannot be %s: %s", name, what, error)
+            self._refused[name] = self._since_boot()[1]
             return False
         return True
 

@@ -20,8 +20,9 @@ import pyarrow as pa
 import pytest
 import rerun as rr
 
+from hvt_archive.index import folder
 from hvt_archive.index.database import INDEX, read_index
-from hvt_archive.index.files import claimed, is_claimed
+from hvt_archive.index.files import claimed, is_claimed, remove_video
 from hvt_archive.index.folder import IndexWriter, RecordingsFolder
 from hvt_archive.index.retention import Retention
 from hvt_common.errors import UserError
@@ -412,12 +413,15 @@ IndexWriter(Path({str(tmp_path)!r}), Retention()).close()
     assert (after.frames, after.begin_ns, after.end_ns) == (before.frames, before.begin_ns, before.end_ns)
 
 
-def test_a_file_that_cannot_be_stripped_holds_up_no_other(tmp_path, events, caplog):
-    """One bad file, and nothing is removed any more."""
+def test_a_file_that_cannot_be_stripped_holds_up_no_other(tmp_path, events, caplog, monkeypatch):
+    """One bad file, and nothing is removed any more; or seconds of processor went into it each minute."""
+    tried = []
+    monkeypatch.setattr(folder, "remove_video", lambda path: (tried.append(path.name), remove_video(path)))
     fly(tmp_path, events)
     (tmp_path / NAMES[0]).write_bytes(b"RRF2 no more")
-    rows = look(tmp_path, Retention(video_age=Limit(seconds=60.0)), later_s=1000, times=2)
+    rows = look(tmp_path, Retention(video_age=Limit(seconds=60.0)), later_s=1000, times=4)
     assert [one.video for one in rows] == [True, False]
+    assert sorted(tried) == sorted(NAMES)
     assert len([one for one in caplog.messages if "cannot be stripped" in one]) == 1
     assert (tmp_path / NAMES[0]).read_bytes() == b"RRF2 no more"
 
