@@ -75,15 +75,6 @@ def test_the_selector_and_the_pattern_agree(edge, pattern):
     assert key_expr.includes(key) == matches(edge, edges=pattern)
 
 
-def test_matches_examples():
-    """The rule itself, on the pattern that the documentation shows."""
-    assert matches("uav-1", edges="uav-*")
-    assert matches("uav-", edges="uav-*")
-    assert not matches("rover-1", edges="uav-*")
-    assert selector(Channel.ROI, edges="uav-*") == "hvt/uav-$*/roi"
-    assert selector(Channel.ROI) == "hvt/*/roi"
-
-
 @pytest.mark.parametrize("pattern", ["", "uav?", "a/b", "[a-z]", "UAV-*", "$*", "a" * 65])
 def test_a_pattern_outside_the_alphabet_is_one_sentence(pattern):
     """A pattern that Zenoh reads otherwise would silently match nothing."""

@@ -331,20 +331,6 @@ def test_bytes_count_as_arrived_once_whatever_the_link_does(tmp_path):
         assert rig.backfill.acknowledged_bytes == total
 
 
-def test_a_piece_whose_room_was_gone_goes_out_next(tmp_path):
-    """The ground would wait for a hole in the object until the whole of it began again."""
-    with opened(tmp_path) as folder:
-        add_stills(folder, {1: 1.0})
-        backfill = Backfill(folder, session_id=7)
-        first = backfill.next_chunk(1000, now_ns=1, round_trip_ns=RTT)
-        second = backfill.next_chunk(600, now_ns=1, round_trip_ns=RTT)
-        backfill.take_back(second)
-        again = backfill.next_chunk(2000, now_ns=1, round_trip_ns=RTT)
-        assert (first.offset, again.offset) == (0, second.offset)
-        backfill.interrupt()
-        backfill.take_back(again)  # it was on its way when the link went: nothing to take back
-
-
 def test_memory_holds_one_object(tmp_path):
     """A store of 200 MB would be read into the memory of a drone."""
     with opened(tmp_path) as folder:

@@ -417,12 +417,3 @@ def test_a_full_disk_evicts_nothing_in_vain(small_disk):
     add_stills(folder, {1: 1.0})
     assert numbers(folder.newest_segments()) == stored[:1]
     folder.close()
-
-
-def test_a_folder_that_cannot_be_made_is_an_error_of_the_disk(tmp_path):
-    """A traceback in mid-flight."""
-    (tmp_path / "file").write_text("in the way")
-    folder = opened(tmp_path / "file" / "store")
-    with pytest.raises(OSError, match=r"."):
-        add_stills(folder, {1: 1.0})
-    folder.close()

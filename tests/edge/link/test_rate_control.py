@@ -638,12 +638,6 @@ def test_x265_is_opened_anew_only_where_it_is_worth_it():
     assert trigger.wants(103, 100, at_ceiling=True, now_ns=15 * S)
 
 
-def test_the_same_reports_give_the_same_rates():
-    """A run could not be understood afterwards."""
-    runs = [World(steps((0, 1e6), (5, 2e5))).run(15).rates for _ in range(2)]
-    assert runs[0] == runs[1]
-
-
 def test_one_report_cannot_do_more_than_its_share():
     """A single odd delay would take the picture down."""
     controller = RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))

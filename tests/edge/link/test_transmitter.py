@@ -6,8 +6,6 @@ import random
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-import msgpack
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -416,28 +414,6 @@ def test_behind_the_last_report_goes_nothing():
     assert (rig.ledger.line_bytes, len(rig.out.puts)) == before
     assert rig.ledger.outcomes("sent") == {"utility": 1}
     assert rig.ledger.outcomes("dropped") == {"ended": 1}
-
-
-def test_attachments_are_messagepack_arrays():
-    """Another program could not read them."""
-    rig = Rig()
-    rig.sender.base(unit(0, keyframe=True), now_ns=NOW_NS)
-    assert isinstance(msgpack.unpackb(rig.out.puts[0][2]), list)
-    assert DELIVERIES[Channel.BASE].encoding == rig.out.puts[0][3]
-
-
-@pytest.mark.parametrize("fits", [True, False])
-def test_a_keyframe_is_weighed_against_the_window(fits):
-    """Keyframes would come into full windows, or never."""
-    rig = Rig()
-    rng = np.random.default_rng(0)
-    for index in range(30):
-        now_ns = NOW_NS + index * SECOND_NS // 15
-        rig.sender.base(unit(index, int(rng.integers(4_900, 5_100))), now_ns=now_ns)
-    now_ns += SECOND_NS // 15
-    if not fits:
-        rig.sender.still(still(15_000), now_ns=now_ns)
-    assert rig.sender.budget.keyframe_fits(20_000, now_ns=now_ns) is fits
 
 
 def test_a_second_copy_has_the_same_number_and_bytes_and_is_counted():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hvt_common.units import exact_rate
 from hvt_common.values import View
-from hvt_edge.source.resample import Gate, Resizer, base_frame_count, capture_time_ns, hold, into_canvas
+from hvt_edge.source.resample import Gate, Resizer, base_frame_count, capture_time_ns, hold
 
 rates = st.fractions(min_value=Fraction(1, 2), max_value=240, max_denominator=1001)
 
@@ -175,15 +175,6 @@ def test_fine_texture_is_averaged_and_not_aliased():
     stripes[:, ::2] = 255
     frame = Resizer((640, 360), (214, 120), fit="crop").frame(stripes, index=0, capture_ns=0)
     assert frame.base_bgr.std() < 50  # picking single pixels gives about 127
-
-
-def test_another_size_is_centred_whole_in_the_canvas():
-    """A sequence with one odd image would end the run or be distorted."""
-    inside = into_canvas(np.full((50, 100, 3), 200, np.uint8), (100, 100))
-    assert inside.shape == (100, 100, 3)
-    assert (inside[25:75] == 200).all()
-    assert (inside[:25] == 0).all()
-    assert (inside[75:] == 0).all()
 
 
 def test_broadcast_rates_are_exact():

@@ -203,14 +203,6 @@ def test_sequence_numbers_count_stills_and_nothing_else():
     assert len(numbers) >= 4
 
 
-def test_closing_says_what_becomes_of_those_that_wait():
-    """The sums of the ledger would not agree."""
-    rig = Rig()
-    rig.consider({1: SMALL, 2: box_at(5)})
-    rig.chooser.close()
-    assert rig.outcomes == {("dropped", "ended"): 2}
-
-
 # Neighbours, the gate, and stills that build on the base
 
 NEIGHBOURS = {1: (20.0, 20.0, 44.0, 40.0), 2: (46.0, 22.0, 70.0, 42.0), 3: (400.0, 200.0, 440.0, 240.0)}
@@ -282,32 +274,6 @@ def test_stills_that_build_on_the_base_wait_for_a_frame_that_has_one():
     plain = Rig()
     plain.consider({1: SMALL}, base=None)
     assert plain.stills(100_000) == [1], "what needs no base waits for none"
-
-
-def test_a_still_without_its_base_is_sent_once_more_and_only_once():
-    """The object would stay unseen, or a ground could make the edge send for ever."""
-    rig = Rig(maker=BASE_CODED, cooldown=60.0)
-    rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
-    assert rig.stills(100_000) == [2, 1]
-    for sequence in (1, 1, 7, 2**32 - 1):
-        rig.outbox.on_undecodable(sequence)
-    rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
-    assert rig.stills(100_000) == [1]
-    first, again = (one.header for one in rig.sent[1:])
-    assert (again.sequence, again.reason, again.codec, again.parameters) == (2, "again", "jpeg", {"again": 1})
-    for name in ("frame_index", "capture_ns", "track_id", "box_source_px", "crop_source_px", "class_name"):
-        assert getattr(again, name) == getattr(first, name)
-    crop = PICTURE[
-        first.crop_source_px[1] : first.crop_source_px[3], first.crop_source_px[0] : first.crop_source_px[2]
-    ]
-    seen = JpegCodec().decode(rig.sent[2].data, size=crop.shape[1::-1])
-    assert np.mean((seen.astype(float) - crop) ** 2) < 150
-    for sequence in (1, 2):
-        rig.outbox.on_undecodable(sequence)
-    rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
-    assert [one.sent_count for one in rig.steps[-1][0]] == [1, 1], "its rest began with the first"
-    assert rig.stills(100_000) == []
-    assert rig.outcomes["sent", "again"] == 1
 
 
 def test_stills_of_other_codecs_are_never_sent_again():

@@ -148,17 +148,6 @@ def test_a_still_that_the_ground_cannot_show_is_sent_again_from_the_same_frame()
     assert len(rig.out.stills) == 2
 
 
-def test_a_flood_of_requests_costs_no_more_than_each_still_once():
-    """Whoever can speak to the edge could spend its budget."""
-    rig = Rig()
-    for index in range(30):
-        rig.stage.on_results([answer(number, again=True) for number in range(500)])
-        rig.run(index + 1, start=index)
-    headers = [header for header, _ in rig.out.stills]
-    assert [one.reason for one in headers] == ["due", "again", "due", "again"]
-    assert len({one.sequence for one in headers}) == len(headers)
-
-
 def test_between_coded_ticks_tracks_go_on_and_stills_wait_for_a_coded_one():
     """With fewer coded pictures the edge would send stills that nobody can show, or none at all."""
     rig = Rig(sparse=True)

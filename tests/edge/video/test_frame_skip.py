@@ -97,18 +97,6 @@ def test_keyframes_and_unknown_quantisers_do_not_count():
     assert frame_skip.at_keyframe(150) == 1
 
 
-def test_the_same_frames_give_the_same_rates():
-    """In lockstep the same clip would give other bytes."""
-    runs = []
-    for _ in range(2):
-        frame_skip = measured()
-        runs.append(
-            coded(frame_skip, range(900), keyframes=range(0, 900, 150), qp=lambda index: 38 + index / 60)
-        )
-    assert runs[0] == runs[1]
-    assert len(runs[0]) < 900
-
-
 def prompt(decimation: int) -> MeasuredFrameSkip:
     """As ``--profile auto`` at 15 frames a second."""
     return MeasuredFrameSkip(

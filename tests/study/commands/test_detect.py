@@ -120,42 +120,6 @@ def test_coco_and_yolo_say_the_same(tmp_path: Path) -> None:
     assert scores[0] == scores[1]
 
 
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
-        ("9 0.5 0.5 0.1 0.1", "line 1 has class 9; there are 7, from 0"),
-        ("0 1.5 0.5 0.1 0.1", "line 1 has a box outside the picture"),
-        ("0 nan 0.5 0.1 0.1", "line 1 is '0 nan 0.5 0.1 0.1'; accepted is class cx cy w h, all numbers"),
-        ("car", "line 1 is 'car'; accepted is class cx cy w h, all numbers"),
-    ],
-)
-def test_wrong_labels_are_named_with_file_and_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, said: str
-) -> None:
-    """A label that cannot be must not move a figure."""
-    folder = draw(tmp_path / "set", moments=1)
-    (folder / "labels/0.txt").write_text(line + "\n")
-    heard = sentence(capsys, folder, "--out", tmp_path / "out")
-    assert "labels/0.txt, " in heard
-    assert said in heard
-
-
-@pytest.mark.parametrize("box", [[float("nan"), 1, 2, 3], [1, 2, 3], [5, 5, -2, 4], [9000, 5, 20, 20], None])
-def test_wrong_boxes_of_coco_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], box: object
-) -> None:
-    """A traceback in place of the number of the annotation to mend."""
-    folder = draw(tmp_path / "set", moments=1)
-    coco = {
-        "images": [{"id": 7, "file_name": "0.png"}],
-        "categories": [{"id": 1, "name": "car"}],
-        "annotations": [{"id": 31, "image_id": 7, "category_id": 1, "bbox": box}],
-    }
-    (folder / "coco.json").write_text(json.dumps(coco))
-    heard = sentence(capsys, folder / "coco.json", "--out", tmp_path / "out")
-    assert "COCO annotation 31 of coco.json has" in heard
-
-
 def write_sequence(folder: Path, *, frames: int, targets: int) -> Path:
     """Write a MOTChallenge sequence of the drawn scene that labels the ``targets`` largest cars, and nothing else."""
     (folder / "img1").mkdir(parents=True)

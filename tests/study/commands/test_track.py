@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hvt_common.errors import UserError
 from hvt_study.cli import main
 from hvt_study.commands.track import detections_by_frame, read_detections
 
@@ -166,12 +165,6 @@ def test_wrong_files_and_arguments_are_one_sentence(
     assert "--out" in sentence(capsys, "track", source)
     assert "invalid choice: 'fly'" in sentence(capsys, "fly")
     assert "COMMAND" in sentence(capsys)
-
-
-def test_reading_raises_what_the_command_prints(tmp_path: Path) -> None:
-    """Other subcommands that read such files would end in a traceback."""
-    with pytest.raises(UserError, match="line 1 is 'x'"):
-        read_detections(write(tmp_path / "bad.txt", ["x\n"]))
 
 
 @pytest.mark.parametrize(

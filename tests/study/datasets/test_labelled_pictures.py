@@ -200,7 +200,14 @@ def test_labels_that_nothing_finds_are_said_with_the_places(tmp_path: Path) -> N
 def test_one_bad_row_costs_itself_alone(tmp_path: Path) -> None:
     """A side of 1.0005, which exporters write, ended the whole set."""
     label_img(tmp_path)
-    rows = ["0 0.25 0.50025 0.5 1.0005", "0 0.9 0.5 0.4 0.2", "9 0.5 0.5 0.1 0.1", "car", "0 3 0.5 0.1 0.1"]
+    rows = [
+        "0 0.25 0.50025 0.5 1.0005",
+        "0 0.9 0.5 0.4 0.2",
+        "9 0.5 0.5 0.1 0.1",
+        "car",
+        "0 3 0.5 0.1 0.1",
+        "0 nan .5 .1 .1",
+    ]
     text(tmp_path / "a.txt", "\n".join([*rows, ROW, "1 0.1 0.1 0.4 0.1 0.4 0.6 0.1 0.6"]))
     ((one, labels),) = read(tmp_path)
     assert labels.class_names == ("car", "car", "bus", "bus")
@@ -211,7 +218,7 @@ def test_one_bad_row_costs_itself_alone(tmp_path: Path) -> None:
     assert len(said) == 2
     assert "2 labels end outside their picture and were cut; the worst is" in said[0]
     assert "a.txt, line 2, by 20 px" in said[0]
-    assert "3 labels were left out; the first: " in said[1]
+    assert "4 labels were left out; the first: " in said[1]
     assert "a.txt, line 3 has class 9; there are 2, from 0" in said[1]
 
 
@@ -222,6 +229,9 @@ def test_one_bad_row_costs_itself_alone(tmp_path: Path) -> None:
         ([190, 90, 20, 20], [BOX, [190, 90, 200, 100]], "by 10 px"),
         ([500, 90, 20, 20], [BOX], "1 labels were left out; the first: COCO annotation 1"),
         ([1, 2, 3], [BOX], "has the box [1, 2, 3]"),
+        ([float("nan"), 1, 2, 3], [BOX], "annotation 1 of labels.json has no box of four numbers"),
+        ([5, 5, -2, 4], [BOX], "has a box outside the picture of 200x100, or without area"),
+        ("none", [BOX], "has the box none: it has no box of four numbers"),
     ],
 )
 def test_boxes_of_coco_are_cut_at_the_picture(

@@ -177,24 +177,6 @@ def refused(capsys, *words):
     return said.err.splitlines()[-1]
 
 
-@pytest.mark.parametrize(
-    ("line", "says"),
-    [
-        ("9 0.5 0.5 0.1 0.1", "line 1 has class 9; there are 3, from 0"),
-        ("0 1.5 0.5 0.1 0.1", "line 1 has a box outside the picture"),
-        ("0 nan 0.5 0.1 0.1", "line 1 is '0 nan 0.5 0.1 0.1'; accepted is class cx cy w h, all numbers"),
-    ],
-)
-def test_labels_that_are_all_wrong_are_named_before_anything_is_trained(tmp_path, water, capsys, line, says):
-    """A label that cannot be would be found out, or learnt, an hour later."""
-    pytest.importorskip("torch")
-    pytest.importorskip("onnx")
-    for path in (water / "labels").glob("*.txt"):
-        path.write_text(line + "\n")
-    sentence = refused(capsys, "--data", f"yolo:{water}", "--out", tmp_path / "b.onnx")
-    assert f".txt, {says}" in sentence
-
-
 def test_what_cannot_be_is_one_sentence(tmp_path, water, capsys):
     """Nothing is worse than an hour of training whose file cannot be written."""
     pytest.importorskip("torch")
