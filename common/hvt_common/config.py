@@ -72,12 +72,10 @@ SIZE = SettingType("WxH", parse_size, lambda size: f"{size[0]}x{size[1]}")
 
 
 def integer(low: int, high: int, *, unit: str = "") -> SettingType:
-    """A whole number within ``low … high``."""
     return _within(low, high, int, "N", f"a whole number from {low} to {high}{unit}")
 
 
 def number(low: float, high: float, *, unit: str = "") -> SettingType:
-    """A finite number within ``low … high``."""
     return _within(low, high, float, "X", f"a number from {low:g} to {high:g}{unit}")
 
 

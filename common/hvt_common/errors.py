@@ -98,7 +98,6 @@ class FlightError(Exception):
     """
 
     said = False
-    """As of `UserError`."""
 
 
 class Parser(argparse.ArgumentParser):

@@ -65,7 +65,6 @@ POSE_BPS = 1_200
 TRACKS_BPS = 8_000
 """The share of ``--send-tracks`` in the budget: about that for 45 boxes three times a second."""
 
-
 _SOURCE, _LINK, _SENT = Group("source"), Group("budget and link"), Group("what to send")
 _MODELS, _FILES = Group("models"), Group("files")
 _SOURCE_RARE, _LINK_RARE, _SENT_RARE, _MODELS_RARE, _FILES_RARE = (

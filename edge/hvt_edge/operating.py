@@ -75,7 +75,6 @@ class OperatingPoint:
     highest_budget_bps: int
     """Of all budgets that were in force."""
     preset: str = ""
-    """Of x265."""
     preset_says: str = ""
     """Why it is that, in one line for people; empty where nothing had to be given up."""
     levers: Levers = Levers()

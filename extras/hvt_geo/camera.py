@@ -120,7 +120,8 @@ def places_of_boxes(
     if pose.camera is None or pose.hfov_deg is None or at_a_pole(pose) or not surface.usable(pose):
         return None
     boxes = view.to_source(boxes_base_px).astype(np.float64)
-    points = _standing(pose, boxes, focal_px=_focal_px(pose.hfov_deg, view), size=view.source_size)
+    focal_px = view.source_size[0] / 2 / math.tan(math.radians(pose.hfov_deg) / 2)
+    points = _standing(pose, boxes, focal_px=focal_px, size=view.source_size)
     at = partial(ground_points, size=view.source_size, surface=surface)
     metres = at(pose, points)
     covariance = np.zeros((len(boxes), 2, 2))
@@ -146,10 +147,6 @@ def places_of_boxes(
     ellipses = np.column_stack((half_axes, azimuth))
     ellipses[~known] = np.nan
     return Places(places, ellipses)
-
-
-def _focal_px(hfov_deg: float, view: View) -> float:
-    return view.source_size[0] / 2 / math.tan(math.radians(hfov_deg) / 2)
 
 
 def _standing(

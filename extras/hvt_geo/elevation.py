@@ -41,7 +41,6 @@ _WGS_84: Final = "EPSG:4326"
 _TURNS_DEG: Final = (0, 360, -360)
 """A model may say 190 degrees for -170, and the other way round."""
 
-
 _ALONG: Final = 11
 """Points on a side by which an area is found in a file."""
 _EDGE: Final = 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +32,7 @@ class ModelReport:
     opsets: dict[str, int]
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
-    metadata: dict[str, str]
+    metadata: Mapping[str, str]
     adapter: str
     """detector, classifier or none."""
     because: str

@@ -63,7 +63,6 @@ class ModelEntry(PinnedFile):
 
 
 def builtin_manifest() -> dict[str, ModelEntry]:
-    """The models that this version knows."""
     text = (files("hvt_models") / "manifest.toml").read_text(encoding="utf-8")
     return parse_manifest(text, origin="the built-in manifest")
 

@@ -199,7 +199,8 @@ class Store:
         with self._lock(name):
             parts = [self._part(self.folder / name, pin) for pin in pins]
             for source, part in zip(brought, parts, strict=True):
-                _copy_file(source, part)  # before the pin changes: the disk may have no room for it
+                with telling(f"{source} cannot be copied to {part} (", ")"):
+                    shutil.copyfile(source, part)  # before the pin changes: the disk may have no room for it
             if pinned != found:
                 first, *more = pins
                 self._note(
@@ -309,11 +310,6 @@ def _from_address(
             _from_address(url, part, file, progress=progress, pauses_s=pauses_s)
             return
         raise DownloadError(f"{url} gives a file that {wrong.rstrip(',')}")
-
-
-def _copy_file(source: Path, target: Path) -> None:
-    with telling(f"{source} cannot be copied to {target} (", ")"):
-        shutil.copyfile(source, target)
 
 
 def _put_in_place(part: Path, path: Path) -> None:

@@ -243,10 +243,14 @@ class Hub:
                     viewer.put_picture(edge.thumbnail)
             return
         if isinstance(item, Start):
-            stream = edge.streams[rung] = self._new_stream()
+            self._streams += 1
+            stream = edge.streams[rung] = _Stream(self._streams)
             head = text("start", edge=edge.edge, rung=rung, codec=item.codec, stream=stream.number)
             stream.start = (head, packed("init", item.data, stream=stream.number))
-            self._begin(edge, rung)
+            for viewer in self._watching(edge, rung):
+                viewer.leave_video()
+                self._put_thumbnails(viewer)
+                self._join_stream(viewer, stream)
         elif isinstance(item, Fragment):
             self._fragment(edge, rung, item, about)
         else:
@@ -336,16 +340,6 @@ class Hub:
         for edge in self.edges.values() if viewer.wall else ():
             if edge.thumbnail is not None:
                 viewer.put_picture(edge.thumbnail)
-
-    def _new_stream(self) -> _Stream:
-        self._streams += 1
-        return _Stream(self._streams)
-
-    def _begin(self, edge: EdgePage, rung: Rung) -> None:
-        for viewer in self._watching(edge, rung):
-            viewer.leave_video()
-            self._put_thumbnails(viewer)
-            self._join_stream(viewer, edge.streams[rung])
 
     def _join_stream(self, viewer: Viewer, stream: _Stream | None) -> None:
         if stream is None or stream.start is None:

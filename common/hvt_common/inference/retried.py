@@ -12,18 +12,16 @@ from hvt_common.values import Detections, Image, Posterior
 
 
 class RetriedDetector(Retried[Detector]):
-    """A `FailingDetector`."""
+    """A `FailingDetector`: it finds None while its model fails."""
 
     @property
     def class_names(self) -> tuple[str, ...]:
         return self.part.class_names
 
     def detect(self, image_bgr: Image) -> Detections | None:
-        """Like the model's; None while it fails."""
         return self.run(lambda model: model.detect(image_bgr))
 
     def detect_whole(self, image_bgr: Image) -> Detections | None:
-        """Like `hvt_common.inference.tiles.detect_whole`; None while it fails."""
         return self.run(lambda model: detect_whole(model, image_bgr))
 
 
@@ -35,5 +33,4 @@ class RetriedClassifier(Retried[Classifier]):
         return self.part.class_names
 
     def classify(self, crops_bgr: Sequence[Image]) -> list[Posterior]:
-        """Like the model's; empty while it fails."""
         return self.run(lambda model: model.classify(crops_bgr)) or []

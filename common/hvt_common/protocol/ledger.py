@@ -122,7 +122,6 @@ class LedgerSummary:
     """For each outcome the number of stills by reason."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Bytes, rates and windows, for JSON."""
         rates = asdict(self)
         return {name: value for name, value in rates.items() if name.endswith(("_bytes", "_bps"))}
 

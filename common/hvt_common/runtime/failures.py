@@ -137,7 +137,6 @@ class RetryPause:
         self._failed_ns = now_ns
 
     def due(self, now_ns: int) -> bool:
-        """Whether it may be tried."""
         return now_ns - self._failed_ns >= self.pause_ns
 
 

@@ -128,7 +128,6 @@ class _HeldLog(logging.handlers.MemoryHandler):
             self.target.handle(record)
 
     def shouldFlush(self, record: logging.LogRecord) -> bool:  # noqa: ARG002, N802 - the library's name
-        """At once, when free."""
         return self._free
 
     def flush(self) -> None:

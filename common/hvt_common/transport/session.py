@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any
 
 import zenoh
 
@@ -25,7 +24,7 @@ from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, 
 from hvt_common.runtime.failures import Awaited, Failures
 from hvt_common.transport.inbox import Received, ReceivedQueue
 from hvt_common.transport.link_doctor import link_doctor
-from hvt_common.transport.stale_sockets import StaleSockets
+from hvt_common.transport.stale_sockets import StaleSockets, own_sockets
 from hvt_common.transport.zenoh_config import LinkSettings, configure, without_build_paths
 
 _log = logging.getLogger(__name__)
@@ -92,16 +91,12 @@ def _open_listening_later(
 
 def _listening_ports() -> set[int]:
     # Ports that this process listens on, from Linux: Zenoh does not say when its listener has come.
-    sockets = set()
-    for one in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # closed meanwhile
-            sockets.add(str(one.readlink()))
-    ports = set()
+    sockets, ports = own_sockets(), set()
     for table in ("tcp", "tcp6", "udp", "udp6"):
         with suppress(OSError):  # a kernel without IPv6
             for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
                 _, local, _, state, *_, inode = line.split()[:10]
-                if f"socket:[{inode}]" in sockets and (state == _TCP_LISTEN or table.startswith("udp")):
+                if int(inode) in sockets and (state == _TCP_LISTEN or table.startswith("udp")):
                     ports.add(int(local.rpartition(":")[2], 16))
     return ports
 
@@ -234,17 +229,17 @@ def query_later(
             on_answer(reply.ok.payload.to_bytes())
 
     handler: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(reply, on_end)
-    session.get(keys.key(channel), handler, payload=question, timeout=timeout_s, **_query_options(channel))
-
-
-def _query_options(channel: Channel) -> dict[str, Any]:
     delivery = DELIVERIES[channel]
-    return {
-        "target": zenoh.QueryTarget.ALL,
-        "consolidation": zenoh.ConsolidationMode.NONE,
-        "congestion_control": getattr(zenoh.CongestionControl, delivery.congestion),
-        "priority": getattr(zenoh.Priority, delivery.priority),
-    }
+    session.get(
+        keys.key(channel),
+        handler,
+        payload=question,
+        timeout=timeout_s,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        congestion_control=getattr(zenoh.CongestionControl, delivery.congestion),
+        priority=getattr(zenoh.Priority, delivery.priority),
+    )
 
 
 def serve(

@@ -151,7 +151,7 @@ class StaleSockets:
 
     def _zenohs(self) -> dict[int, int]:
         # Inode → descriptor. Each socket is looked at once: a host program may have thousands.
-        own = _own_sockets()
+        own = own_sockets()
         self._known = {inode: self._known[inode] for inode in own.keys() & self._known.keys()}
         for inode in own.keys() - self._known.keys():
             with suppress(OSError), same_socket(own[inode], inode) as one:
@@ -191,8 +191,8 @@ class StaleSockets:
             self._answered_s[theirs] = max(began_s, self._answered_s.get(theirs, 0.0))
 
 
-def _own_sockets() -> dict[int, int]:
-    # Inode → descriptor.
+def own_sockets() -> dict[int, int]:
+    """Inode → descriptor, of this process."""
     found = {}
     for one in Path("/proc/self/fd").iterdir():
         with suppress(OSError):  # closed meanwhile

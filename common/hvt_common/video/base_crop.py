@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Image, View
-from hvt_common.video.hevc import YuvPicture
+from hvt_common.video.hevc import Plane, YuvPicture
 
 MAX_SIDE_PX = 512
 """A longer crop is coded smaller: an object that fills 512 pixels needs no more to be classified."""
@@ -92,7 +92,6 @@ _MATRIX = np.array([[76309, 138438, 0], [76309, -13975, -34925], [76309, 0, 1174
 """2^16 times rows B, G, R of BT.709, columns Y, Cb, Cr, limited range."""
 _OFFSETS = np.array([16, 128, 128], np.float64) * 2**_LEVEL_BITS
 
-Plane = npt.NDArray[np.uint8]
 _Floats = npt.NDArray[np.float64]
 
 

@@ -32,36 +32,32 @@ MAX_SIDE_PX = 8192
 MAX_PICTURE_PX = 35_651_584
 """The luma samples of a picture of level 6.2 (ITU-T H.265, table A.8): 8192x4352."""
 _BLOCK_PX = 64
+"""A coded picture is filled up to whole blocks, and libavcodec's rows to as much."""
 _YUV420 = ("yuv420p", "yuvj420p")
 _FULL_RANGE = np.clip(np.rint((np.arange(256) - 16) * 255 / 219), 0, 255).astype(np.uint8)
 """Of the luma of ITU-T H.273, 16 to 235."""
 Plane = npt.NDArray[np.uint8]
-"""A coded picture is filled up to whole blocks, and libavcodec's rows to as much."""
 
 
 class YuvPicture:
     """A decoded picture, 4:2:0, half the memory of its BGR; one thread at a time converts a decoder's pictures."""
 
     def __init__(self, picture: av.VideoFrame, converter: VideoReformatter) -> None:
-        self._picture = picture
+        self.frame = picture
+        """That of libavcodec, for coding it again."""
         self._converter = converter
         self.size = (picture.width, picture.height)
 
     @property
-    def frame(self) -> av.VideoFrame:
-        """The frame of libavcodec, for coding it again."""
-        return self._picture
-
-    @property
     def nbytes(self) -> int:
-        return sum(plane.buffer_size for plane in self._picture.planes)
+        return sum(plane.buffer_size for plane in self.frame.planes)
 
     @property
     def planes(self) -> tuple[Plane, Plane, Plane] | None:
         """Y (H, W), Cb and Cr (half of it, rounded up), uint8, read-only; None if it is not 4:2:0, 8 bits."""
-        if self._picture.format.name not in _YUV420:
+        if self.frame.format.name not in _YUV420:
             return None
-        (width, height), whole = self.size, self._picture.planes
+        (width, height), whole = self.size, self.frame.planes
         half = -(-width // 2), -(-height // 2)
         luma, first, second = (
             np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)[: side[1], : side[0]]
@@ -74,14 +70,14 @@ class YuvPicture:
         planes = self.planes
         if planes is None:
             return np.asarray(cv2.cvtColor(self.bgr(), cv2.COLOR_BGR2GRAY), np.uint8)
-        if self._picture.color_range == ColorRange.JPEG:
+        if self.frame.color_range == ColorRange.JPEG:
             return planes[0].copy()
         return np.asarray(cv2.LUT(planes[0], _FULL_RANGE), np.uint8)
 
     def bgr(self) -> Image:
         """Uint8 (H, W, 3), the same at every call."""
         bgr = self._converter.reformat(
-            self._picture,
+            self.frame,
             format="bgr24",
             src_colorspace=Colorspace.ITU709,
             src_color_range=ColorRange.MPEG,

@@ -62,10 +62,8 @@ BASE_PEAK = 1.15
 _WHOLE_NS = 2 * SECOND_NS
 """A window of at most so long is back within the three seconds in which live video has to be."""
 
-
 _PART_MARGIN = 1.03
 """So much smaller are frames of which a window holds a part more than its share: ``status`` goes beside them."""
-
 
 _Events = Sequence[tuple[int, int]]
 """(time, line bytes), in order of time."""

@@ -200,12 +200,10 @@ class TrackMemory:
         self,
         *,
         padding: float = PADDING,
-        max_side_px: int = MAX_SIDE_PX,
         forget_s: float = 30.0,
         max_tracks: int = 4096,
     ) -> None:
         self._padding = padding
-        self._max_side_px = max_side_px
         self._forget_ns = round(forget_s * 1e9)
         self._max_tracks = max_tracks
         self._histories: dict[int, _History] = {}
@@ -278,7 +276,7 @@ class TrackMemory:
             history, class_id = self._histories[track_id], int(tracks.class_ids[row])
             box_base_px, box_source_px = tuple(boxes_base[row].tolist()), tuple(boxes_source[row].tolist())
             crop = crop_box(box_source_px, padding=self._padding, source_size=view.source_size)
-            coded = coded_size(crop, max_side_px=self._max_side_px)
+            coded = coded_size(crop)
             touches, leaving = _note_border(history, box_base_px, picture=picture, now_ns=now_ns)
             x1, y1, x2, y2 = box_base_px
             sharp = loss = None

@@ -129,10 +129,12 @@ class FrameRing:
             last = frames[-1] if frames else None
             if last is not None and (base is not None or last.base is None):
                 frames.pop()
-                if not frames or self._gap_ns(last) >= self._spacing_ns(last):
+                if not frames or last.capture_ns - frames[-1].capture_ns >= self._spacing_ns(last):
                     frames.append(last.packed())
             frames.append(newest)
-            self._let_go(frame.capture_ns - self._max_age_ns)
+            oldest_ns = frame.capture_ns - self._max_age_ns
+            while len(frames) > 1 and (self.size_bytes > self._max_bytes or frames[0].capture_ns < oldest_ns):
+                frames.pop(0)
 
     def near_time(self, capture_ns: int, *, tracked: bool = True) -> RingFrame | None:
         """The frame kept that was taken nearest to this time; None where that is further back than the ring goes."""
@@ -180,15 +182,6 @@ class FrameRing:
         # The least time between two frames on the grid, for them to reach back all the seconds.
         count = self._max_bytes // (frame.packed_bytes + frame.base_bytes)
         return self._max_age_ns // max(1, count - 1)  # one more is about to grow too old
-
-    def _gap_ns(self, newer: RingFrame) -> int:
-        return newer.capture_ns - self._frames[-1].capture_ns
-
-    def _let_go(self, oldest_ns: int) -> None:
-        while len(self._frames) > 1 and (
-            self.size_bytes > self._max_bytes or self._frames[0].capture_ns < oldest_ns
-        ):
-            self._frames.pop(0)
 
 
 def _nearest(frames: Sequence[RingFrame], distance_ns: Callable[[RingFrame], int]) -> RingFrame:

@@ -164,20 +164,18 @@ class LeverControl:
             self._pauses = min(settings.most_pauses, 2 * self._pauses)
             while len(self._changed) > settings.least_answers // 2:  # some are tried, no more
                 self._changed.popleft()
-        if len(self._changed) < settings.least_answers or self._share() >= settings.least_changed:
+        changed_share = sum(self._changed) / max(1, len(self._changed))
+        if len(self._changed) < settings.least_answers or changed_share >= settings.least_changed:
             return True
         self._paused_until_ns = now_ns + self._pauses * settings.pause_ns
         return False
-
-    def _share(self) -> float:
-        return sum(self._changed) / max(1, len(self._changed))
 
     def _says(self, *, tracks: bool, stills: bool) -> str:
         if self._too_slow:
             return "video alone: this machine is too slow for the detector"
         measured = self.measured
         who = "the ground misses" if measured.reported else "the video hides"
-        hidden = f"{who} {_objects(measured.hidden)}"
+        hidden = f"{who} {measured.hidden:.0f} object{'s' * (round(measured.hidden) != 1)}"
         for count, what in ((measured.suppressed, "shows {} false"), (measured.misnamed, "misnames {}")):
             if round(count):
                 hidden += f", {what.format(f'{count:.0f}')}"
@@ -189,7 +187,3 @@ class LeverControl:
         renamed = renamed if self._changed else "no answer yet"
         details = "stills show details, " if self._settings.finer else "stills: "
         return f"{of_tracks}; {details if stills else 'stills paused: '}{renamed}"
-
-
-def _objects(count: float) -> str:
-    return f"{count:.0f} object" + "s" * (round(count) != 1)

@@ -86,7 +86,6 @@ class OperatingState:
     fps: float
     """Frames a second that are coded, where nothing is dropped."""
     decimation: int
-    """Each n-th source frame is coded."""
     profile: str | None
     preset: str
     preset_says: str

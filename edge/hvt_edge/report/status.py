@@ -10,6 +10,7 @@ from typing import Any, Literal
 from hvt_common import __version__
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.edge_words import counts_text
+from hvt_common.protocol.ledger import StillOutcome
 from hvt_common.protocol.messages import (
     BASE_CODEC,
     MOST_FAILED_PARTS,
@@ -29,6 +30,7 @@ _PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
 _MOST_MS, _MOST_AGE_MS, _MOST_CORES = 60_000.0, 2**32 - 1, 4096.0
 """The largest numbers that a report can say."""
 _LEVERS_REST = 10
+_REPORTED: tuple[StillOutcome, ...] = ("sent", "deferred", "dropped")
 _LATE_NS = 2 * SECOND_NS
 """A report that has waited so long for what video leaves goes before the next frame: grounds live by it too."""
 
@@ -128,6 +130,11 @@ class StatusReporter:
         account = self._of.ledger.summary(state.duration_s)
         worst, frames, transmitter = account.worst_window_bps, state.frames, self._of.transmitter
         measured, reported_s = not state.lockstep, state.link.reported_s
+        totals: dict[str, Any] = {
+            **{name: size for name, size in account.as_dict().items() if name.endswith("_bytes")},
+            **{f"{name}_messages": count for name, count in account.messages.items()},
+            **{outcome: account.outcomes[outcome] for outcome in _REPORTED},
+        }
         return Status(
             session_id=self._of.session_id,
             sequence=self._sequence,
@@ -136,19 +143,8 @@ class StatusReporter:
             media_ns=max(0, at_ns - self._of.operating.now.started_ns),
             last_base_sequence=transmitter.base_sequence,
             last_still_sequence=transmitter.still_sequence,
-            base_bytes=account.base_bytes,
-            roi_bytes=account.roi_bytes,
-            backlog_bytes=account.backlog_bytes,
-            meta_bytes=account.meta_bytes,
-            overhead_bytes=account.overhead_bytes,
-            base_messages=account.messages["base"],
-            roi_messages=account.messages["roi"],
-            backlog_messages=account.messages["backlog"],
-            meta_messages=account.messages["meta"],
+            **totals,
             worst_window_bps=(worst.base, worst.roi, worst.total),
-            sent=account.outcomes["sent"],
-            deferred=account.outcomes["deferred"],
-            dropped=account.outcomes["dropped"],
             health=Health(
                 frames_captured=frames.account.came,
                 frames_encoded=frames.encoded,
@@ -225,7 +221,7 @@ def summary(of: Heartbeat, *, unreached: str) -> dict[str, Any]:
     keyframes, analyzer, cores = of.stills.keyframes, of.stills.analyzer, counts.cpu.short
     duration_s = counts.duration_s(config.nominal_fps)
     account = ledger.summary(duration_s)
-    reasons = {outcome: account.outcomes[outcome] for outcome in ("sent", "deferred", "dropped")}
+    reasons = {outcome: account.outcomes[outcome] for outcome in _REPORTED}
     stills: dict[str, Any] = {outcome: sum(by.values()) for outcome, by in reasons.items()}
     on_roi = stills["sent"] - account.outcomes["sent"].get("stored", 0)
     stills["reasons"] = reasons

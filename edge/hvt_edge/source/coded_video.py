@@ -7,9 +7,6 @@ from collections.abc import Generator, Iterator
 from contextlib import closing
 from typing import Any
 
-import av
-import av.error
-
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS, exact_rate
 from hvt_common.values import Frame
@@ -24,7 +21,14 @@ from hvt_edge.source.camera_stream import (
     without_jumps,
 )
 from hvt_edge.source.contract import CameraStream, ClipSource, Notes, SeenUnit, SourceSettings
-from hvt_edge.source.decoding.container import name_of, open_video, said_rate, survey, without_stamps
+from hvt_edge.source.decoding.container import (
+    name_of,
+    open_video,
+    packets_of,
+    said_rate,
+    survey,
+    without_stamps,
+)
 from hvt_edge.source.decoding.timeline import Stamps
 from hvt_edge.source.resample import Resizer
 
@@ -105,13 +109,8 @@ class CodedVideoSource(ClipSource):
     ) -> Generator[tuple[float, bytes], None, None]:
         # (seconds, packet) in order; a jump of the time stamps is mended, and told of in the log if ``say``.
         timeline = self._stamps.timeline(stream)
-        packets = container.demux(stream)
-        while True:
-            try:
-                packet = next(packets)
-            except (StopIteration, av.error.FFmpegError):  # what breaks off is played up to there
-                break
-            if not packet.size:
+        for packet in packets_of(container, stream):
+            if isinstance(packet, Exception) or not packet.size:  # what breaks off is played up to there
                 continue
             usable = self._stamps.usable and packet.pts is not None
             yield float(timeline.at(packet.pts * packet.time_base if usable else None)), bytes(packet)

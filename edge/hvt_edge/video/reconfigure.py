@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 _WORTH = 0.04
 """At a keyframe that comes anyway, a base rate that is off by less is left as it is."""
 
-
 OpenEncoder = Callable[[Rates], Encoder]
 """Opens the encoder for these rates."""
 
@@ -238,7 +237,8 @@ class EncoderReconfiguration:
     def _proposed_bps(self, decimation: int, *, changed: bool) -> int:
         now = self.operating.now
         if not self._moving or self.split is None:
-            return self._base_of_budget() if changed else now.base_bps
+            base_bps = base_rate_bps(now.budget_bps, self._share, metadata_bps=self._metadata_bps)
+            return base_bps if changed else now.base_bps
         total_bps = now.budget_bps if self.pacer is None else self.pacer.steady_bps
         with self.split.lock:
             self._tell_split(decimation)
@@ -247,9 +247,6 @@ class EncoderReconfiguration:
             share = self.split.propose()
             share = self.split.share if share is None and changed else share
         return now.base_bps if share is None else round(now.budget_bps * share)
-
-    def _base_of_budget(self) -> int:
-        return base_rate_bps(self.operating.now.budget_bps, self._share, metadata_bps=self._metadata_bps)
 
 
 @dataclass(eq=False)

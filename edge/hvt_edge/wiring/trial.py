@@ -40,11 +40,9 @@ class Beginning:
     """The decisions at the beginning of a flight."""
 
     decimation: int
-    """Each n-th source frame is coded."""
     share: float
     """Of the budget, for the base stream."""
     preset: PresetChoice
-    """Of x265."""
     shadow: Shadow = UNMEASURED
     """The shadow ground's comparison of that second."""
 

@@ -183,15 +183,11 @@ def make_encoder(
     return plan.open(rates, preset=preset or (SLOWEST if config.preset == AUTO else config.preset))
 
 
-def _video_bps(config: EdgeConfig, rates: Rates) -> int:
-    return max(rates.total_bps - config.metadata_bps, rates.base_bps)
-
-
 def _allowed(config: EdgeConfig, size: tuple[int, int], rates: Rates) -> Allowed:
     return allowed(
         size=size,
         fps=config.nominal_fps / rates.decimation,
-        total_bps=_video_bps(config, rates),
+        total_bps=max(rates.total_bps - config.metadata_bps, rates.base_bps),
         base_bps=rates.base_bps,
         window_s=config.window,
     )

@@ -29,7 +29,6 @@ _GX: Final = "http://www.google.com/kml/ext/2.2"
 ET.register_namespace("", _KML)
 ET.register_namespace("gx", _GX)
 
-
 _DIGITS: Final = 7
 """Digits of degrees: a centimetre."""
 

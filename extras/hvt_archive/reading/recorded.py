@@ -212,7 +212,8 @@ class _File:
             return
         for (entity, component), found in self.rows.items():
             if component == _PICTURE and isinstance(found, SpooledRows):
-                found.keep(partial(self._is_new, found, _hashes(before.get((entity, component), []))))
+                known = {hash(value) for _, _, value in before.get((entity, component), [])}
+                found.keep(partial(self._is_new, found, known))
         for layer in _LAYERS:
             ids = self.rows.get((layer, "track_id"))
             if not (isinstance(ids, SpooledRows) and any(frame <= self.first for frame in ids.frames)):
@@ -238,10 +239,6 @@ class _File:
 
     def _is_new(self, found: SpooledRows, known: set[int], place: int) -> bool:
         return found.frames[place] > self.first or hash(found.value(place)) not in known
-
-
-def _hashes(rows: Iterable[Timed]) -> set[int]:
-    return {hash(value) for _, _, value in rows}
 
 
 def _opened(path: Path, spool: Spool, number: int) -> _File:

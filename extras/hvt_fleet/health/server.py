@@ -88,11 +88,11 @@ def serve(
         "/healthz": alive,
         "/readyz": lambda: of_state(lambda state: said(state, ready=True)),
     }
-    return HealthServer(address, answers, name="--metrics", failures=failures)
+    return HealthServer(address, answers, failures=failures)
 
 
 class HealthServer:
-    """Serves ``answers``, by path, at ``address`` (HOST:PORT) while the context lasts; ``name`` is the option's.
+    """Serves ``answers``, by path, at ``address`` (HOST:PORT) while the context lasts.
 
     An address that is not there yet, or a port that is not free, is waited for. Raises `UserError` where the
     address is none or can never be listened on.
@@ -103,17 +103,16 @@ class HealthServer:
         address: str,
         answers: Mapping[str, Callable[[], Answer]],
         *,
-        name: str,
         failures: Failures,
     ) -> None:
-        host, port = host_and_port(address, name=name, example="127.0.0.1:9464")
+        host, port = host_and_port(address, name="--metrics", example="127.0.0.1:9464")
 
         def bound() -> _Server:
             try:
                 return _Server(host, port, answers)
             except OSError as error:
                 kind = NotYetError if may_come(error) else UserError
-                raise kind(f"{name} {address} cannot be listened on: {listening_trouble(error)}") from None
+                raise kind(f"--metrics {address} cannot be listened on: {listening_trouble(error)}") from None
 
         self._server = Awaited(bound, "metrics", failures)
         self._stop = threading.Event()

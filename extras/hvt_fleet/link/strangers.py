@@ -78,8 +78,8 @@ class Strangers:
         # The kernel goes on with the connection of a link that was lost: that was one all the same.
         self._linked = connected & (linked | self._linked)
         self._pending = connected - self._linked
-        hosts = [host for host in map(_host, sorted(ended)) if host not in self._known]
-        return [host for host in hosts if self._note(host, now_s)]
+        hosts = [far_end.rpartition(":")[0] for far_end in sorted(ended)]
+        return [host for host in hosts if host not in self._known and self._note(host, now_s)]
 
     def _note(self, host: str, now_s: float) -> bool:
         before = (one for one in self._refused.get(host, ()) if now_s - one < _WITHIN_S)
@@ -95,7 +95,3 @@ def listening_ports(endpoints: Iterable[str]) -> set[int]:
     """The ports of the TCP and TLS endpoints, such as ``tls/0.0.0.0:7447``."""
     found = (re.match(r"(?:tcp|tls)/.*:(\d+)(?:[?#]|$)", one) for one in endpoints)
     return {int(one[1]) for one in found if one is not None}
-
-
-def _host(far_end: str) -> str:
-    return far_end.rpartition(":")[0]

@@ -67,7 +67,8 @@ class Authority:
             .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
             .sign(key, hashes.SHA256())
         )
-        _make_folder(folder)
+        with telling(f"the folder {folder} cannot be made (", ")"):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         _write_pair(folder, "ca", key, certificate)
         return cls(folder, key, certificate)
 
@@ -145,11 +146,6 @@ def _host(text: str) -> x509.GeneralName:
     if _HOST_NAME.fullmatch(text) is None:
         raise UserError(f"--host {text!r} is neither an address nor a host name: give it without a port")
     return x509.DNSName(text)
-
-
-def _make_folder(folder: Path) -> None:
-    with telling(f"the folder {folder} cannot be made (", ")"):
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
 
 def _write_pair(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -138,7 +137,7 @@ def _annotations(overlay: Overlay) -> ImageAnnotations:
             "origin": overlay.origins[row],
             "doubted": int(overlay.doubted[row]),
         }
-        corners = _points(((x1, y1), (x2, y1), (x2, y2), (x1, y2)))
+        corners = [Point2(x=x, y=y) for x, y in ((x1, y1), (x2, y1), (x2, y2), (x1, y2))]
         result.points.append(
             PointsAnnotation(
                 type=PointsAnnotation.LINE_LOOP,
@@ -154,10 +153,6 @@ def _annotations(overlay: Overlay) -> ImageAnnotations:
             )
         )
     return result
-
-
-def _points(corners: Iterable[tuple[float, float]]) -> list[Point2]:
-    return [Point2(x=x, y=y) for x, y in corners]
 
 
 def _colour(rgb: Rgb) -> Color:

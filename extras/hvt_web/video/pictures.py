@@ -230,5 +230,4 @@ def _bgr(picture: av.VideoFrame, width: int | None = None, height: int | None = 
 
 
 def jpeg(picture_bgr: Image, *, quality_pct: int = 80) -> bytes:
-    """A picture for a browser."""
     return cv2.imencode(".jpg", picture_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality_pct])[1].tobytes()

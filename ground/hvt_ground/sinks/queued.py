@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -33,7 +34,7 @@ class Sink(Protocol[T_contra]):
         """Write the buffer; skip slow extras once ``hurry`` is set."""
 
 
-class SinkWriter(Generic[T]):
+class SinkWriter(ABC, Generic[T]):
     """A sink that one thread uses; this one writes to no file, and holds nothing. An error that it raises ends it."""
 
     path: Path | None = None
@@ -41,8 +42,8 @@ class SinkWriter(Generic[T]):
     awaits_keyframe = False
     """Without one it can show nothing of what came last, and somebody looks: one is asked for, once."""
 
-    def log(self, item: T) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def log(self, item: T) -> None: ...
 
     def skipped(self, count: int) -> None:
         """So many items were left out before the next one."""

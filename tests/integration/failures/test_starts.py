@@ -72,7 +72,7 @@ def answers(port: int) -> bool:
 def metrics(holder: Holder, failures: Failures) -> Iterator[Callable[[], bool]]:
     """Of either program."""
     found = {"/": lambda: Answer(b"ok")}
-    with HealthServer(f"127.0.0.1:{holder.port}", found, name="--metrics", failures=failures):
+    with HealthServer(f"127.0.0.1:{holder.port}", found, failures=failures):
         yield lambda: answers(holder.port)
 
 
@@ -119,7 +119,7 @@ def test_who_waits_for_a_port_ends_at_once(opened):
     "open_it",
     [
         pytest.param(
-            lambda at, failures: HealthServer(f"{at}:9464", {}, name="--metrics", failures=failures),
+            lambda at, failures: HealthServer(f"{at}:9464", {}, failures=failures),
             id="metrics",
         ),
         pytest.param(

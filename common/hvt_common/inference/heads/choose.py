@@ -36,7 +36,6 @@ class Trial:
     """The answers of one network to `trial_pictures`."""
 
     ports: Sequence[Port]
-    """Its outputs."""
     runs: Sequence[Sequence[npt.NDArray[Any]]]
     """For each picture, the outputs in the order of ``ports``."""
     tops: Sequence[int]
@@ -236,7 +235,6 @@ def _yolox(trial: Trial) -> Match | None:
 
 
 YOLOX = Kind("YOLOX, raw: (1, A, 5+C)", _yolox, "top-left", BGR_255)
-
 
 HEAD_NAMES = (
     "yolox",

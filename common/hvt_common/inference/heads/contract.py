@@ -52,7 +52,6 @@ class Head:
     outputs: tuple[int, ...]
     """Which of the network's outputs ``decoder`` gets."""
     anchor: Anchor
-    """Where the image lies on the input."""
     preparation: Preparation
     suppresses: bool
     """The boxes still need non-maximum suppression."""

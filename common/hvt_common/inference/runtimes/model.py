@@ -130,32 +130,18 @@ class _Runner(Protocol):
     def run(self, feed: npt.NDArray[Any], *more: npt.NDArray[Any]) -> list[npt.NDArray[Any]]: ...
 
 
+@dataclass(eq=False)
 class OnnxModel:
-    """An opened ONNX model; made by `open_model`.
+    """An opened ONNX model; made by `open_model`."""
 
-    Attributes:
-        path: The file, for messages.
-        inputs, outputs: The ports as the file declares them.
-        metadata: What the exporter wrote into the file.
-        provider: What runs it, and why.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        *,
-        inputs: tuple[Port, ...],
-        outputs: tuple[Port, ...],
-        metadata: Mapping[str, str],
-        runner: _Runner,
-        provider: ProviderChoice,
-    ) -> None:
-        self.path = path
-        self.inputs = inputs
-        self.outputs = outputs
-        self.metadata: dict[str, str] = dict(metadata)
-        self.provider = provider
-        self._runner = runner
+    path: Path
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    metadata: Mapping[str, str]
+    """What the exporter wrote into the file."""
+    runner: _Runner
+    provider: ProviderChoice
+    """What runs it, and why."""
 
     def run(self, feed: npt.NDArray[Any], *more: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
         """Run the model on its inputs, mostly one; return its outputs in their declared order.
@@ -168,7 +154,7 @@ class OnnxModel:
         ):
             shape = "x".join(map(str, feed.shape))
             raise UserError(f"model {self.path} does not run on a {shape} input: it takes {port}")
-        return self._runner.run(feed, *more)
+        return self.runner.run(feed, *more)
 
 
 class _OnnxRuntimeRunner:

@@ -38,7 +38,6 @@ _MAX_HEADER_BYTES = 1024
 _MAX_ENCODING_BYTES = 64
 _SIZE = Int(1, MAX_BACKLOG_BYTES)
 
-
 _T = TypeVar("_T")
 ObjectKey = tuple[int, str, int]
 """Session, kind and number: an object's key on the link."""
@@ -72,7 +71,6 @@ class BacklogHeader(Message):
     offset: int = wire_field(Int(0, MAX_BACKLOG_BYTES))
     """Where the chunk begins in the object, bytes."""
     total_bytes: int = wire_field(_SIZE)
-    """Of the object."""
     send_ns: int = wire_field(Int(0, I63))
     """When the chunk was handed to Zenoh, the edge's clock."""
 
@@ -119,7 +117,6 @@ class BacklogUnit:
 
 
 def pack_backlog_still(still: BacklogStill) -> bytes:
-    """The object's bytes."""
     packed: bytes = msgpack.packb([still.attachment, still.encoding, still.payload])
     return packed
 

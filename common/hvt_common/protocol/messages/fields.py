@@ -17,7 +17,6 @@ U32 = 2**32 - 1
 U64 = 2**64 - 1
 I63 = 2**63 - 1
 
-
 _MOST_REAL = 1e300
 REFUSED_CHARACTERS = ((0x00, 0x1F), (0x7F, 0x9F), (0x2028, 0x202E), (0x2066, 0x2069))
 """First and last code points: controls, the two that begin a line or a paragraph, changes of direction."""

@@ -95,7 +95,6 @@ class Info(Message):
 
     @property
     def view(self) -> View:
-        """The map between source and base pixels."""
         return View(self.source_size, self.base_size, self.view_scale, self.view_offset_px)
 
 
@@ -139,7 +138,6 @@ class FailedPart:
     failed_ns: int = wire_field(_TIME)
     """When it failed last, the edge's clock."""
     working: bool = wire_field(Flag())
-    """It works again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

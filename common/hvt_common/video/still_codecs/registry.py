@@ -27,7 +27,6 @@ _WHAT = "still codec"
 _NAME = re.compile(r"[a-z0-9-]{1,24}")
 _MEDIA_TYPE = re.compile(r"[a-z]+/[a-z0-9.+-]{1,60}")
 
-
 _PACKAGE = "hvt_common.video.still_codecs"
 _BUILT_IN: Mapping[str, str] = MappingProxyType(
     {

@@ -121,7 +121,7 @@ def choose_stream(container: Any, *, note: Callable[[str], None] = lambda _: Non
     """
     able = [one for one in container.streams.video if one.codec_context is not None]
     able = [one for one in able if one.codec_context.name not in _TEXT_CODECS]
-    films = [one for one in able if _is_film(one)] or able
+    films = [one for one in able if not one.disposition & _NO_FILM and one.frames != 1] or able
     if not films:
         return None
     best = container.streams.best("video")
@@ -142,10 +142,6 @@ def choose_stream(container: Any, *, note: Callable[[str], None] = lambda _: Non
             f"({codec.name}, {codec.width}x{codec.height}): no cover picture, then the default, then the largest"
         )
     return chosen
-
-
-def _is_film(stream: Any) -> bool:
-    return not stream.disposition & _NO_FILM and stream.frames != 1
 
 
 def without_stamps(stream: Any) -> bool:
@@ -179,7 +175,7 @@ def survey(container: Any, stream: Any) -> tuple[Stamps, Any]:
     """The times in the stream's first packets, and its first frame; None if none decodes there."""
     times: list[tuple[Fraction | None, Fraction | None]] = []
     first: av.VideoFrame | None = None
-    for packet in _packets(container, stream):
+    for packet in packets_of(container, stream):
         if first is None:
             with suppress(av.error.FFmpegError):
                 first = next(iter(_decode(stream, packet)), None)
@@ -234,7 +230,7 @@ class _Reading:
         self._end_s: Fraction | None = None
 
     def frames(self) -> Iterator[av.VideoFrame]:
-        for packet in _packets(self._container, self._stream):
+        for packet in packets_of(self._container, self._stream):
             if isinstance(packet, Exception):
                 self._ended = f"it breaks off ({cause_of(packet)})"
             else:
@@ -292,8 +288,8 @@ class _Reading:
         )
 
 
-def _packets(container: Any, stream: Any) -> Iterator[Any]:
-    # All of a stream; where it breaks off, the error is the last.
+def packets_of(container: Any, stream: Any) -> Iterator[Any]:
+    """All of a stream; where it breaks off, the error is the last."""
     packets = container.demux(stream)
     while True:
         try:

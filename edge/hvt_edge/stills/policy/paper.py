@@ -140,7 +140,8 @@ class Utility:
 
         The threshold is thereby the score of the last that fits: the distribution it is taken from is this step's.
         """
-        wanted = [one for one in self._scored(candidates, step) if one.score >= self.min_score]
+        scored = ranked(candidates, score=lambda one: self.score(one, step), reason="utility")
+        wanted = [one for one in scored if one.score >= self.min_score]
         spent = 0.0
         for count, request in enumerate(wanted):
             spent += step.cost.of(request.candidate)
@@ -155,9 +156,6 @@ class Utility:
             + self.novelty_weight * novelty(candidate, now_ns=step.now_ns, time_constant_s=self.novelty_s)
         )
         return gain / max(self.min_cost, step.cost.of(candidate) / step.cost.mean_bytes)
-
-    def _scored(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
-        return ranked(candidates, score=lambda one: self.score(one, step), reason="utility")
 
 
 def uncertainty(candidate: Candidate) -> float:

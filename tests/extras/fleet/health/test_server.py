@@ -72,7 +72,7 @@ def answers(port: int) -> bool:
 def test_state_is_told_under_names_of_this_machine_alone(served_at, names, strangers):
     """Another site could have its name lead here, and its page would read where the drone is."""
     (port,) = free_ports(1)
-    with HealthServer(f"{served_at}:{port}", STATE, name="--metrics", failures=Failures(time.time_ns)):
+    with HealthServer(f"{served_at}:{port}", STATE, failures=Failures(time.time_ns)):
         eventually(lambda: answers(port), what="it serves")
         assert {one: asked(port, one) for one in names} == dict.fromkeys(names, 200)
         assert {one: asked(port, one) for one in strangers} == dict.fromkeys(strangers, 403)
@@ -98,7 +98,7 @@ def test_threads_and_descriptors_that_are_used_up_for_a_while(monkeypatch):
 
     monkeypatch.setattr(ThreadingMixIn, "process_request", start)
     monkeypatch.setattr(HTTPServer, "get_request", take)
-    with HealthServer(f"127.0.0.1:{port}", STATE, name="--metrics", failures=Failures(time.time_ns)):
+    with HealthServer(f"127.0.0.1:{port}", STATE, failures=Failures(time.time_ns)):
         eventually(lambda: answers(port), what="it serves")
         while len(refused) < 20:
             answers(port)
@@ -119,7 +119,6 @@ def serving(port, answer):
     return HealthServer(
         f"127.0.0.1:{port}",
         {"/state.json": lambda: answer},
-        name="--metrics",
         failures=Failures(time.time_ns),
     )
 
