@@ -279,8 +279,11 @@ class Reception:
         self.capture_clock.note(capture_ns, received_ns=received_ns)
         if was_sound and not self.capture_clock.is_sound:
             off_s = abs(received_ns - self.clock_offset.to_local_ns(capture_ns)) // SECOND_NS
-            hence = "ages count from the arrival of pictures, and delays are not known"
-            self._note("warning", f"the camera's clock is {off_s} s off: {hence}")
+            self._note(
+                "warning",
+                f"the camera's clock is {off_s} s off: ages count from the arrival of pictures, and delays are not "
+                "known",
+            )
 
     # What is known of it
 

@@ -456,7 +456,7 @@ def noted(path: Path) -> Iterator[str]:
     """The texts of events that a module makes."""
     for call in calls(path):
         name = called(call)
-        if name == "note" and len(call.args) == 2:  # level, text
+        if name in ("note", "_note") and len(call.args) == 2:  # level, text
             yield from spoken(call.args[1])
         elif name in ("Notice", "_notice"):
             yield from spoken(call.args[-1])
