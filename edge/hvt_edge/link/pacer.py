@@ -172,21 +172,17 @@ class BaseInFlight:
         self._lock = threading.Lock()
         self._units: deque[tuple[int, int, AccessUnit]] = deque()
         """(sequence, time of sending, unit)."""
-        self._size_bytes = 0
+        self.size_bytes = 0
 
     def __len__(self) -> int:
         return len(self._units)
 
-    @property
-    def size_bytes(self) -> int:
-        return self._size_bytes
-
     def sent(self, sequence: int, unit: AccessUnit, *, now_ns: int) -> None:
         with self._lock:
             self._units.append((sequence, now_ns, unit))
-            self._size_bytes += len(unit.data)
+            self.size_bytes += len(unit.data)
             while self._units and (
-                self._size_bytes > self._max_bytes or now_ns - self._units[0][1] > self._max_age_ns
+                self.size_bytes > self._max_bytes or now_ns - self._units[0][1] > self._max_age_ns
             ):
                 self._forget()
 
@@ -203,11 +199,11 @@ class BaseInFlight:
         with self._lock:
             units = [unit for _, _, unit in self._units]
             self._units.clear()
-            self._size_bytes = 0
+            self.size_bytes = 0
         return units
 
     def _forget(self) -> None:
-        self._size_bytes -= len(self._units.popleft()[2].data)
+        self.size_bytes -= len(self._units.popleft()[2].data)
 
 
 class Pacer:
@@ -227,7 +223,8 @@ class Pacer:
         """When it last named a base message that was on its way."""
         self._held_ns = _FIRST_HELD_NS
         self._round_trip, self._return = LeastDelay(_MEMORY_NS), LeastDelay(_MEMORY_NS)
-        self._round_trip_ns = SECOND_NS // 2
+        self.round_trip_ns = SECOND_NS // 2
+        """From sending to hearing of it, at its shortest; half a second until one was measured."""
         self._return_ns = 0
         """How long reports are on their way, at the shortest, and the difference of the clocks."""
         self._given_up = -1
@@ -258,11 +255,6 @@ class Pacer:
     def steady_bps(self) -> int:
         """The rate that x265 should be opened for a share of."""
         return self._controller.steady_bps
-
-    @property
-    def round_trip_ns(self) -> int:
-        """From sending to hearing of it, at its shortest; half a second until one was measured."""
-        return self._round_trip_ns
 
     @property
     def measures(self) -> bool:
@@ -463,7 +455,7 @@ class Pacer:
         return 0 if oldest is None else self._late_ns(oldest, now_ns)
 
     def _late_ns(self, sent: Sent, now_ns: int) -> int:
-        return now_ns - sent.sent_ns - sent.serialization_ns - self._round_trip_ns
+        return now_ns - sent.sent_ns - sent.serialization_ns - self.round_trip_ns
 
     def _leave(self) -> None:
         self._reported_ns = None
@@ -472,7 +464,7 @@ class Pacer:
     def _forget_path(self) -> None:
         self._held_ns = _FIRST_HELD_NS
         self._round_trip, self._return = LeastDelay(_MEMORY_NS), LeastDelay(_MEMORY_NS)
-        self._round_trip_ns = SECOND_NS // 2
+        self.round_trip_ns = SECOND_NS // 2
         self._controller.forget_path()
 
     def _take_longer(self, sent: Sent, return_ns: int, now_ns: int) -> bool:
@@ -480,7 +472,7 @@ class Pacer:
         longer_ns = 0 if self._return.empty else return_ns - self._return_ns
         if longer_ns <= 0:
             return False
-        round_trip_ns = min(now_ns - sent.sent_ns, self._round_trip_ns + longer_ns)
+        round_trip_ns = min(now_ns - sent.sent_ns, self.round_trip_ns + longer_ns)
         self._round_trip, self._return = LeastDelay(_MEMORY_NS), LeastDelay(_MEMORY_NS)
         self._round_trip.add(round_trip_ns, now_ns=now_ns)
         return True
@@ -490,5 +482,5 @@ class Pacer:
         held_ns = min(max(held_ns, _LEAST_HELD_NS), _MOST_HELD_NS)
         self._held_ns = max((9 * self._held_ns + held_ns) // 10, min(held_ns, 2 * self._held_ns))
         self._progress_ns = now_ns
-        self._round_trip_ns = self._round_trip.add(max(0, now_ns - sent.sent_ns), now_ns=now_ns)
+        self.round_trip_ns = self._round_trip.add(max(0, now_ns - sent.sent_ns), now_ns=now_ns)
         self._return_ns = self._return.add(return_ns, now_ns=now_ns)
