@@ -34,15 +34,15 @@ _MOST_S = 100.0
 # Functions: name and bound of their walk, the largest of each taken together.
 _WALKS = {
     ("RealtimePace.send",): ("a frame at the edge, from the loop to put, with an encoder that is opened", 22),
-    ("StillStage.analyze",): ("a frame's objects at the edge", 24),
+    ("StillStage.analyze",): ("a frame's objects at the edge", 27),
     ("StillStage.send",): ("a still at the edge, from choosing to put", 26),
     ("commands.run", "EdgeListener._on_control", "BaseStage._at_keyframe"): (
         "a command, from hvt-ground set-budget to the encoder",
         33,
     ),
     ("EdgeSessions.handle",): ("a message at the ground, received", 34),
-    ("SessionPerception.pipeline",): ("a session's perception at the ground, made", 25),
-    ("Pipeline.analyze",): ("a frame at the ground, analyzed", 26),
+    ("SessionPerception.pipeline",): ("a session's perception at the ground, made", 26),
+    ("Pipeline.analyze",): ("a frame at the ground, analyzed", 28),
     ("Recorder.log",): ("an event at the ground, recorded", 13),
 }
 _MEASURED = {one for functions in _WALKS for one in functions}
