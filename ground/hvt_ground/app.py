@@ -21,7 +21,7 @@ from hvt_common.runtime.reporting import StatusLine
 from hvt_common.transport.link_doctor import LinkWatch, link_doctor
 from hvt_common.transport.session import loses_declarations, open_session
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
-from hvt_ground.backlog.recordings import BacklogRecordings
+from hvt_ground.backlog.edge_backlog import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event

@@ -15,7 +15,7 @@ from hvt_common.protocol.messages import RoiHeader
 from hvt_common.runtime.failures import Failures
 from hvt_ground import app
 from hvt_ground.app import Ground
-from hvt_ground.backlog.edge_backlog import read_still
+from hvt_ground.backlog.session_backlog import read_still
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception import models as ground_models
 from hvt_ground.perception.models import NotOpenError

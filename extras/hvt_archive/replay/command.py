@@ -39,7 +39,7 @@ from hvt_common.runtime.reporting import print_table, write_json
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
 from hvt_common.video.hevc import parameter_sets
-from hvt_ground.backlog.recordings import BacklogRecordings
+from hvt_ground.backlog.edge_backlog import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import PoseUpdate, VideoSample
 from hvt_ground.extras import checked, config_class

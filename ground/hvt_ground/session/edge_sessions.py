@@ -28,8 +28,7 @@ from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.runtime.log import log_fields
 from hvt_common.transport.inbox import Received, TokenBucket
 from hvt_common.units import SECOND_NS
-from hvt_ground.backlog.edge_backlog import EdgeBacklog
-from hvt_ground.backlog.recordings import BacklogRecordings
+from hvt_ground.backlog.edge_backlog import BacklogRecordings, EdgeBacklog
 from hvt_ground.link.reassemble import Arrival, StreamCounters
 from hvt_ground.link.receiver import Packet, Receiver
 from hvt_ground.session.edge_port import EdgePort, InfoAnswer, ReceiverReports

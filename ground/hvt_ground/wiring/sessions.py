@@ -17,7 +17,7 @@ from hvt_common.errors import NotYetError, UserError
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import Limit, bitrate_text
-from hvt_ground.backlog.recordings import BacklogRecording
+from hvt_ground.backlog.edge_backlog import BacklogRecording
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Refinement
 from hvt_ground.extras import Flight, Service, extras_of, locators, written

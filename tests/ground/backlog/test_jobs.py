@@ -11,8 +11,7 @@ import pytest
 
 from hvt_common.protocol.messages import BacklogUnit, RoiHeader, parse_backlog_units
 from hvt_common.runtime.failures import Failures, RetryPause
-from hvt_ground.backlog.edge_backlog import read_still, show_video
-from hvt_ground.backlog.session_backlog import SessionBacklog
+from hvt_ground.backlog.session_backlog import SessionBacklog, read_still, show_video
 from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import Job

@@ -8,7 +8,7 @@ import time
 from dataclasses import replace
 
 from hvt_common.runtime.failures import Failures
-from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
+from hvt_ground.backlog.edge_backlog import BacklogRecording, BacklogRecordings
 from hvt_ground.backlog.session_backlog import SessionBacklog
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.line_file import LineFile

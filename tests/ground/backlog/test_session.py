@@ -29,7 +29,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Posterior
 from hvt_common.video.hevc import BaseDecoder
-from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
+from hvt_ground.backlog.edge_backlog import BacklogRecording, BacklogRecordings
 from hvt_ground.backlog.session_backlog import LateStills
 from hvt_ground.perception.pipeline import DecodedFrame
 from hvt_ground.perception.session import FIRST_TRACK_ID

@@ -20,7 +20,7 @@ from hvt_common.transport.inbox import Received
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
-from hvt_ground.backlog.recordings import BacklogRecordings
+from hvt_ground.backlog.edge_backlog import BacklogRecordings
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.report.state import StateMaker
 from hvt_ground.report.status import status_text, summary
