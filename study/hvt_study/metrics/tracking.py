@@ -1,4 +1,4 @@
-"""Tracks: MOTA and IDF1 by the kept library ``motmetrics``, HOTA by `hota`.
+"""Tracks: MOTA by the kept library ``motmetrics``, HOTA by `hota`, IDF1 by `_in_common`.
 
 HOTA is after Luiten et al., "HOTA: A Higher Order Metric for Evaluating Multi-Object Tracking", IJCV 129 (2021), and
 gives the authors' figures to the last digit. Their package (``trackeval``) brings ``opencv-python`` with it, which
@@ -87,9 +87,6 @@ _COUNTS: Final = {
     "num_misses": "misses",
     "num_false_positives": "false_positives",
     "num_switches": "switches",
-    "idtp": "id_true_positives",
-    "idfp": "id_false_positives",
-    "idfn": "id_false_negatives",
 }
 
 
@@ -144,19 +141,40 @@ def compare_tracks(
     Ids are unique within a frame; boxes are x1 y1 x2 y2 in one pixel space.
     """
     sequence = list(frames)
+    shown = sum(len(ids) for _, (ids, _) in sequence)
     if not any(len(ids) for (ids, _), _ in sequence):
         # motmetrics has no answer here.
-        false = sum(len(ids) for _, (ids, _) in sequence)
-        counts = dict.fromkeys(_COUNTS.values(), 0) | {"false_positives": false, "id_false_positives": false}
-        return TrackingScore(**counts, hota=math.nan)
+        return TrackingScore(0, 0, shown, 0, 0, shown, 0, hota=math.nan)
     events = motmetrics.MOTAccumulator()
+    pairs = [np.empty((0, 2), np.int64)]
     for number, ((true_ids, true_boxes), (ids, boxes)) in enumerate(sequence):
         distance = 1 - iou(true_boxes, boxes)  # motmetrics' own needs NumPy 1
         distance[distance > 1 - least_iou] = np.nan
         events.update(true_ids.tolist(), ids.tolist(), distance, frameid=number)
+        rows, columns = np.isfinite(distance).nonzero()
+        pairs.append(np.stack((true_ids[rows], ids[columns]), axis=1))
     summary = _judge().compute(events, metrics=list(_COUNTS), return_dataframe=False)
     counts = {name: round(float(summary[key])) for key, name in _COUNTS.items()}
-    return TrackingScore(**counts, hota=hota(sequence))
+    hits = _in_common(np.concatenate(pairs))
+    return TrackingScore(
+        **counts,
+        id_true_positives=hits,
+        id_false_positives=shown - hits,
+        id_false_negatives=counts["objects"] - hits,
+        hota=hota(sequence),
+    )
+
+
+def _in_common(pairs: npt.NDArray[np.integer[Any]]) -> int:
+    """IDTP of (N, 2) true and shown ids, a row for each frame in which the two are at the same place.
+
+    That is the most frames that an assignment of tracks to tracks has in common (Ristani et al., section 4).
+    motmetrics finds the same in five matrices of (all true + all shown)², gigabytes for 10,000 tracks.
+    """
+    (true, row), (shown, column) = (np.unique(ids, return_inverse=True) for ids in pairs.T)
+    together = np.zeros((len(true), len(shown)))
+    np.add.at(together, (row, column), 1)
+    return int(together[linear_sum_assignment(together, maximize=True)].sum())
 
 
 @cache
